@@ -1,0 +1,1 @@
+"""Readers of depth-camera sequences, and the renderer that makes synthetic ones."""

@@ -1,0 +1,1 @@
+"""Rerun's only home: what a run shows while it runs."""
