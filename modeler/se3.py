@@ -104,7 +104,7 @@ def translation(offset_m: Array) -> Array:
 
 def rotation_angle(pose: Array) -> Array:
     """Return the rotation angles (...) in rad of motions (..., 4, 4)."""
-    return np.asarray(np.linalg.norm(log(pose)[..., :3], axis=-1), dtype=np.float64)
+    return np.sqrt(np.sum(log(pose)[..., :3] ** 2, axis=-1))
 
 
 def inverse_covariance(pose: Array, covariance: Array) -> Array:
