@@ -30,9 +30,10 @@ def _coefficients(angle_rad: Array) -> tuple[Array, Array, Array]:
     small = angle_rad < _SMALL_ANGLE_RAD
     safe = np.where(small, 1.0, angle_rad)
     square = angle_rad**2
+    half = np.sin(0.5 * safe) / safe  # 1 - cos a = 2 sin²(a/2), which does not cancel
     return (
         np.where(small, 1.0 - square / 6.0, np.sin(safe) / safe),
-        np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(safe)) / safe**2),
+        np.where(small, 0.5 - square / 24.0, 2.0 * half**2),
         np.where(small, 1.0 / 6.0 - square / 120.0, (safe - np.sin(safe)) / safe**3),
     )
 

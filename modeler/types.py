@@ -65,8 +65,8 @@ class Camera:
 
     def rays(self) -> tuple[Array, Array]:
         """Return w = x/z and h = y/z of every pixel, each (h, w)."""
-        w = (np.arange(self.width) - self.cx) / self.fx
-        h = (np.arange(self.height) - self.cy) / self.fy
+        w = (np.arange(self.width, dtype=np.float64) - self.cx) / self.fx
+        h = (np.arange(self.height, dtype=np.float64) - self.cy) / self.fy
         return np.broadcast_to(w, (self.height, self.width)), np.broadcast_to(h[:, None], (self.height, self.width))
 
 
