@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import enum
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -263,6 +263,11 @@ class Edge:
         return self.posterior.target
 
 
+def _unsolved(target: int, source: int) -> Array:
+    """Refuse: nothing was solved."""
+    raise KeyError(f"no motion from frame {source} to frame {target} was solved")
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
     """The optimised poses."""
@@ -273,6 +278,14 @@ class Solution:
     """Marginal covariance (6, 6) by frame number; the first frame's is the gauge's."""
     odometry: Mapping[int, Array] = field(default_factory=dict)
     """object_from_camera (4, 4) of the pairwise chain alone, before closure."""
+    outliers: tuple[Edge, ...] = ()
+    """Accepted edges that the optimisation left out because all others contradict them."""
+    relative_covariance: Callable[[int, int], Array] = _unsolved
+    """Covariance (6, 6) of `relative(target, source)`, worked out when called."""
+
+    def relative_gaussian(self, target: int, source: int) -> PoseGaussian:
+        """Return target_from_source between two different solved frames, with its uncertainty."""
+        return PoseGaussian(self.relative(target, source), self.relative_covariance(target, source))
 
     def relative(self, target: int, source: int) -> Array:
         """Return target_from_source (4, 4) between two solved frames."""
