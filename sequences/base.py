@@ -1,0 +1,167 @@
+"""What every sequence offers, whatever it is read from."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+from modeler.types import Array, Frame, InputError
+
+
+class AbstractSequence(ABC):
+    """Frames of one rigid object in order of time, as often as one asks for them.
+
+    Frame numbers ascend, but need be neither dense nor start at 0. Frames are read when asked for.
+    """
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What the sequence is called."""
+
+    @property
+    @abstractmethod
+    def indices(self) -> tuple[int, ...]:
+        """Frame numbers, ascending."""
+
+    @abstractmethod
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`.
+
+        Raises:
+            InputError: where there is no such frame or it cannot be read.
+        """
+
+    @abstractmethod
+    def truth(self) -> dict[int, Array] | None:
+        """Return the true camera_from_model (4, 4), in m, by frame number; None where it is not known.
+
+        Frames whose truth is not known are left out.
+
+        Raises:
+            InputError: where the ground truth cannot be read.
+        """
+
+    @abstractmethod
+    def sensor(self) -> tuple[float, float] | None:
+        """Return the sensor's noise `(sigma_wh, sigma_r_m)`; None where the sequence does not say."""
+
+    @property
+    @abstractmethod
+    def motion(self) -> Mapping[str, object] | None:
+        """What is known of the motion, `{"kind": "turntable", "step_deg": 25, …}`; None where nothing is."""
+
+    @property
+    @abstractmethod
+    def robot_path(self) -> Path | None:
+        """The trajectory of the hand that holds the object; None where there is none."""
+
+    @property
+    @abstractmethod
+    def model_path(self) -> Path | None:
+        """The true surface as a mesh in m, in the model frame of `truth()`; None where it is not known."""
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.indices)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Read the frames in order."""
+        return (self.frame(index) for index in self.indices)
+
+    def select(self, every: int = 1, frames: slice | None = None) -> AbstractSequence:
+        """Return a part of the sequence.
+
+        Args:
+            every: keep the first frame and every so many-th after it.
+            frames: keep frame numbers from `start` up to but not including `stop`.
+
+        Raises:
+            InputError: where nothing is left.
+        """
+        if every < 1:
+            raise InputError(f"--every {every} keeps no frame; give a whole number of at least 1.")
+        start, stop = (None, None) if frames is None else (frames.start, frames.stop)
+        kept = tuple(i for i in self.indices if (start is None or i >= start) and (stop is None or i < stop))[::every]
+        if not kept:
+            wanted = f"{'' if start is None else start}:{'' if stop is None else stop}"
+            raise InputError(
+                f"--frames {wanted} leaves nothing of sequence {self.name!r}; its frames are {span(self.indices)}."
+            )
+        return self if kept == self.indices else SelectedSequence(self, kept)
+
+
+@final
+@dataclass(frozen=True)
+class SelectedSequence(AbstractSequence):
+    """Some frames of another sequence."""
+
+    whole: AbstractSequence
+    """The sequence the frames are taken from."""
+    kept: tuple[int, ...]
+    """Numbers of the frames to keep, ascending."""
+
+    @property
+    def name(self) -> str:
+        """What the sequence is called."""
+        return self.whole.name
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Frame numbers, ascending."""
+        return self.kept
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`."""
+        if index not in self.kept:
+            raise InputError(
+                f"frame {index} is not among the selected frames ({span(self.kept)}); ask for one of those."
+            )
+        return self.whole.frame(index)
+
+    def truth(self) -> dict[int, Array] | None:
+        """Return the true camera_from_model (4, 4) by frame number; None where it is not known."""
+        truth = self.whole.truth()
+        return None if truth is None else {index: truth[index] for index in self.kept if index in truth} or None
+
+    def sensor(self) -> tuple[float, float] | None:
+        """Return the sensor's noise `(sigma_wh, sigma_r_m)`; None where the sequence does not say."""
+        return self.whole.sensor()
+
+    @property
+    def motion(self) -> Mapping[str, object] | None:
+        """What is known of the motion between consecutive frames of the whole sequence."""
+        return self.whole.motion
+
+    @property
+    def robot_path(self) -> Path | None:
+        """The trajectory of the hand that holds the object; None where there is none."""
+        return self.whole.robot_path
+
+    @property
+    def model_path(self) -> Path | None:
+        """The true surface as a mesh in m; None where it is not known."""
+        return self.whole.model_path
+
+
+def frame_range(text: str) -> slice:
+    """Read a range of frame numbers `A:B`, half-open; either end may be left out.
+
+    Raises:
+        InputError: where the text is no such range.
+    """
+    match = re.fullmatch(r"([0-9]*):([0-9]*)", text.strip())
+    if match is None:
+        raise InputError(f"--frames {text!r} is not a range of frame numbers; write A:B, for instance 0:14.")
+    start, stop = (int(end) if end else None for end in match.groups())
+    return slice(start, stop)
+
+
+def span(indices: tuple[int, ...]) -> str:
+    """Return frame numbers in words, for messages."""
+    count = f"{len(indices)} frame" + ("" if len(indices) == 1 else "s")
+    return f"{indices[0]} to {indices[-1]}, {count}" if indices else "none"

@@ -1,0 +1,82 @@
+"""Depth, colour and mask pictures on disk."""
+
+import struct
+import warnings
+import zlib
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from modeler.types import BoolArray, InputError
+
+MAX_PIXELS = 50_000_000
+"""Larger pictures are refused before they are decoded: no depth camera makes them, decompression bombs do."""
+
+_BROKEN = (OSError, SyntaxError, ValueError, EOFError, MemoryError, struct.error, zlib.error)
+
+
+def _open(path: Path, formats: tuple[str, ...]) -> Image.Image:
+    """Return a picture fully decoded."""
+    wanted = " or ".join(formats)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(path, formats=formats) as picture:
+                if picture.width * picture.height > MAX_PIXELS:
+                    raise Image.DecompressionBombError
+                picture.load()
+                return picture
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the folder is complete.") from None
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise InputError(f"{path}: has more than {MAX_PIXELS // 1_000_000} million pixels; scale it down.") from None
+    except _BROKEN as error:
+        why = " ".join(str(error).split()).replace(str(path), "the file") or type(error).__name__
+        raise InputError(f"{path}: is not a readable {wanted} picture ({why}); replace it.") from None
+
+
+def read_depth(path: Path) -> npt.NDArray[np.uint16]:
+    """Return a 16-bit PNG (h, w) in raw units; 0 = no measurement.
+
+    Raises:
+        InputError: where the file is missing, broken, too large or not 16-bit greyscale.
+    """
+    picture = _open(path, ("PNG",))
+    if picture.mode not in ("I;16", "I;16B", "I"):
+        raise InputError(f"{path}: is a picture of mode {picture.mode}; depth must be a 16-bit greyscale PNG.")
+    return np.asarray(picture).astype(np.uint16)
+
+
+def read_mask(path: Path) -> BoolArray:
+    """Return a mask (h, w), True where the picture is not black.
+
+    Raises:
+        InputError: where the file is missing, broken or too large.
+    """
+    picture = _open(path, ("PNG",))
+    pixels = np.asarray(picture if picture.mode in ("1", "L", "I;16", "I") else picture.convert("L"))
+    return pixels != 0
+
+
+def read_colour(path: Path) -> npt.NDArray[np.uint8]:
+    """Return a PNG or JPEG as RGB (h, w, 3).
+
+    Raises:
+        InputError: where the file is missing, broken or too large.
+    """
+    picture = _open(path, ("PNG", "JPEG"))
+    if picture.mode.startswith("I"):  # 16-bit grey, which Pillow would clip rather than scale
+        grey = (np.asarray(picture).astype(np.uint32) >> 8).astype(np.uint8)
+        return np.repeat(grey[:, :, None], 3, axis=2)
+    return np.array(picture.convert("RGB"))
+
+
+def write_picture(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
+    """Write pixels as the suffix says: PNG as small as it gets, or JPEG at quality 85."""
+    picture = Image.fromarray(np.ascontiguousarray(pixels))
+    if path.suffix == ".jpg":
+        picture.save(path, quality=85, optimize=True)
+    else:
+        picture.save(path, compress_level=9, optimize=True)

@@ -1,0 +1,126 @@
+"""Values from JSON and TOML files that people wrote, with faults that say where they are."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+
+from modeler.types import Array, InputError
+
+
+@final
+@dataclass(frozen=True)
+class Node:
+    """One value of a file, and where it stands there."""
+
+    value: object
+    """The value as parsed."""
+    path: Path
+    """The file it comes from."""
+    keys: tuple[str, ...] = ()
+    """The keys that lead to it."""
+
+    def fault(self, expected: str) -> InputError:
+        """Return the error that says what should stand here."""
+        shown = json.dumps(self.value, default=str)
+        shown = shown if len(shown) <= 60 else shown[:57] + "..."
+        return InputError(f"{self.path}: {self.where} is {shown}; it must be {expected}.")
+
+    @property
+    def where(self) -> str:
+        """The place in the file, as in `"0"."cam_K"`."""
+        return ".".join(json.dumps(key) for key in self.keys) or "the top level"
+
+    def items(self) -> dict[str, Node]:
+        """Return the entries of an object."""
+        if not isinstance(self.value, dict):
+            raise self.fault('an object {"key": value, ...}')
+        return {str(key): Node(value, self.path, (*self.keys, str(key))) for key, value in self.value.items()}
+
+    def frames(self) -> dict[int, Node]:
+        """Return the entries of an object whose keys are frame numbers."""
+        found: dict[int, Node] = {}
+        for key, node in self.items().items():
+            if not (key.isascii() and key.isdigit()):
+                raise InputError(f'{self.path}: key {json.dumps(key)} is not a frame number; use keys such as "0".')
+            found[int(key)] = node
+        return found
+
+    def elements(self) -> list[Node]:
+        """Return the elements of a list."""
+        if not isinstance(self.value, list):
+            raise self.fault("a list [...]")
+        return [Node(value, self.path, (*self.keys, str(i))) for i, value in enumerate(self.value)]
+
+    def get(self, key: str) -> Node | None:
+        """Return one entry of an object; None where it is absent or null."""
+        node = self.items().get(key)
+        return None if node is None or node.value is None else node
+
+    def need(self, key: str) -> Node:
+        """Return one entry of an object that must be there."""
+        node = self.get(key)
+        if node is None:
+            raise InputError(f"{self.path}: {self.where} lacks {json.dumps(key)}; add it.")
+        return node
+
+    def text(self) -> str:
+        """Return a string that is not empty."""
+        if not isinstance(self.value, str) or not self.value.strip():
+            raise self.fault("a text that is not empty")
+        return self.value
+
+    def number(self, low: float = -math.inf, high: float = math.inf) -> float:
+        """Return a finite number between `low` and `high`, both included."""
+        expected = "a finite number"
+        if math.isfinite(low) or math.isfinite(high):
+            expected = f"a number of at least {low:g}" if math.isinf(high) else f"a number from {low:g} to {high:g}"
+        if isinstance(self.value, bool) or not isinstance(self.value, int | float):
+            raise self.fault(expected)
+        try:
+            number = float(self.value)
+        except OverflowError:
+            raise self.fault(expected) from None
+        if not (math.isfinite(number) and low <= number <= high):
+            raise self.fault(expected)
+        return number
+
+    def numbers(self, count: int) -> Array:
+        """Return a list of exactly `count` finite numbers (count,)."""
+        expected = f"a list of {count} finite numbers"
+        if not isinstance(self.value, list) or len(self.value) != count:
+            raise self.fault(expected)
+        try:
+            return np.array([element.number() for element in self.elements()])
+        except InputError:
+            raise self.fault(expected) from None
+
+
+def read_tree(path: Path) -> Node:
+    """Parse a JSON file, or a TOML file by its suffix.
+
+    Raises:
+        InputError: where the file is missing or is not JSON or TOML.
+    """
+    kind = "TOML" if path.suffix == ".toml" else "JSON"
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the path.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not UTF-8 text (byte {error.start}); save it as {kind}.") from None
+    try:
+        return Node(tomllib.loads(text) if kind == "TOML" else json.loads(text), path)
+    except json.JSONDecodeError as error:
+        why = f"line {error.lineno}, column {error.colno}: {error.msg}"
+    except (ValueError, RecursionError) as error:
+        why = " ".join(str(error).split())
+    raise InputError(f"{path}: is not valid {kind} ({why}); correct it there.")
