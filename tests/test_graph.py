@@ -1,0 +1,285 @@
+"""Laws of the pose graph: calibrated poses, closure that helps, and independence of labels, direction and gauge."""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+import pytest
+from scipy import stats
+
+from modeler import se3
+from modeler.graph import PoseGraph, solve
+from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior
+
+OBJECT_M = np.array([0.05, 0.02, 0.8])
+
+
+def _edge(target: int, source: int, pose: PoseGaussian, kind: str = "odometry", *, accepted: bool = True) -> Edge:
+    return Edge(Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.8), kind, accepted, "made up")
+
+
+def _covariance(rng: np.random.Generator, sigma_rad: float = 0.01, sigma_m: float = 0.002) -> Array:
+    """A covariance (6, 6) as registration gives it: compact at the object, strongly correlated at the camera."""
+    scale = np.diag([sigma_rad] * 3 + [sigma_m] * 3)
+    factor = 0.3 * rng.normal(size=(6, 6)) + np.eye(6)
+    adjoint = se3.adjoint(se3.translation(OBJECT_M))
+    return adjoint @ scale @ factor @ factor.T @ scale @ adjoint.T
+
+
+def _turn(angle_rad: float) -> Array:
+    """Motion (4, 4) of an object turned about a tilted axis through itself."""
+    about = se3.exp(np.array([0.1, angle_rad, -0.05 * angle_rad, 0.0, 0.0, 0.0]))
+    return se3.translation(OBJECT_M) @ about @ se3.translation(-OBJECT_M)
+
+
+def _truth(count: int) -> dict[int, Array]:
+    """True object_from_camera of a turntable with `count` stops."""
+    first_from_first = _turn(0.0)
+    return {k: se3.inverse(_turn(2.0 * np.pi * k / count)) @ first_from_first for k in range(count)}
+
+
+def _measured(
+    truth: Mapping[int, Array], target: int, source: int, rng: np.random.Generator, luck: float = 1.0
+) -> PoseGaussian:
+    """A measurement with the error that its covariance states, or `luck` times that: truth = mean @ exp(ξ)."""
+    covariance = _covariance(rng)
+    xi = luck * rng.multivariate_normal(np.zeros(6), covariance)
+    return PoseGaussian(se3.inverse(truth[target]) @ truth[source] @ se3.exp(-xi), covariance)
+
+
+def _ring(
+    count: int, rng: np.random.Generator, closures: Sequence[tuple[int, int]], luck: float = 1.0
+) -> tuple[PoseGraph, dict[int, Array]]:
+    truth = _truth(count)
+    odometry = [_edge(k - 1, k, _measured(truth, k - 1, k, rng, luck)) for k in range(1, count)]
+    loops = [_edge(t, s, _measured(truth, t, s, rng, luck), "closure") for t, s in closures]
+    return PoseGraph((*odometry, *loops)), truth
+
+
+def _nees(gaussian: PoseGaussian, truth: Array) -> float:
+    xi = se3.log(se3.inverse(gaussian.mean) @ truth)
+    return float(xi @ np.linalg.solve(gaussian.covariance, xi))
+
+
+def _assert_same(actual: Mapping[int, Array], expected: Mapping[int, Array], atol: float = 1e-8) -> None:
+    assert set(actual) == set(expected)
+    for frame, pose in expected.items():
+        np.testing.assert_allclose(actual[frame], pose, atol=atol)
+
+
+def _assert_same_covariance(actual: Array, expected: Array, atol: float = 2e-3) -> None:
+    """Compare in the units in which `expected` is the identity, so that every direction counts."""
+    whiten = np.linalg.inv(np.linalg.cholesky(expected))
+    np.testing.assert_allclose(whiten @ actual @ whiten.T, np.eye(6), atol=atol)
+    np.testing.assert_array_equal(actual, actual.T)
+
+
+def test_graph_is_a_value() -> None:
+    graph, _ = _ring(3, np.random.default_rng(0), [])
+    longer = PoseGraph().plus(graph.edges[:1]).plus(graph.edges[1:])
+    assert longer.edges == graph.edges
+    assert PoseGraph().edges == ()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        graph.edges = ()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_empty_graph_has_no_poses_and_a_started_one_has_its_first() -> None:
+    assert dict(solve(PoseGraph(), {}).trajectory) == {}
+    solution = solve(PoseGraph(first=7), {})
+    _assert_same(solution.trajectory, {7: np.eye(4)})
+    _assert_same(solution.odometry, {7: np.eye(4)})
+    np.linalg.cholesky(solution.covariances[7])
+
+
+def test_chain_is_dead_reckoning_with_first_order_covariances() -> None:
+    graph, _ = _ring(5, np.random.default_rng(1), [])
+    solution = solve(graph, {})
+    pose, covariance = np.eye(4), np.zeros((6, 6))
+    for edge in graph.edges:
+        pose = pose @ edge.posterior.pose.mean
+        covariance = se3.composed_covariance(covariance, edge.posterior.pose.mean, edge.posterior.pose.covariance)
+        np.testing.assert_allclose(solution.trajectory[edge.source], pose, atol=1e-14)
+        _assert_same_covariance(solution.covariances[edge.source], covariance)
+    _assert_same(solution.odometry, solution.trajectory, atol=0.0)
+
+
+def test_two_measurements_of_one_motion_fuse_in_the_source_frame() -> None:
+    """Where the covariance is read in any other frame or order, the weighted mean comes out elsewhere."""
+    rng = np.random.default_rng(2)
+    truth = {0: np.eye(4), 1: se3.exp(np.array([0.1, np.pi / 2, 0.2, 0.3, -0.2, 0.5]))}
+    first, second = (_measured(truth, 0, 1, rng) for _ in range(2))
+    solution = solve(PoseGraph((_edge(0, 1, first), _edge(0, 1, second, "closure"))), {})
+    information: Array = (np.linalg.inv(first.covariance) + np.linalg.inv(second.covariance)).astype(np.float64)
+    offset = se3.log(se3.inverse(first.mean) @ second.mean)
+    step: Array = np.linalg.solve(information, np.linalg.solve(second.covariance, offset)).astype(np.float64)
+    fused = first.mean @ se3.exp(step)
+    np.testing.assert_allclose(solution.trajectory[1], fused, atol=2e-4)  # second order in errors of 0.01
+    assert np.abs(first.mean - fused).max() > 2e-3
+    # Both sit at the fused pose to first order only: a hundredth here.
+    _assert_same_covariance(solution.covariances[1], np.linalg.inv(information).astype(np.float64), atol=0.05)
+
+
+def test_optimised_poses_are_calibrated_and_closure_helps() -> None:
+    """NEES of a pose is chi² with 6 degrees of freedom over many random loops, alone and relative to another frame."""
+    trials = 250
+    nees, relative, before, after = (np.zeros(trials) for _ in range(4))
+    for trial in range(trials):
+        rng = np.random.default_rng(trial)
+        graph, truth = _ring(12, rng, [(0, 11), (1, 11)])
+        frame, other = 1 + trial % 11, (5 + 3 * trial) % 12
+        other = other if other != frame else 0
+        solution = solve(graph, {})
+        assert solution.outliers == ()
+        nees[trial] = _nees(PoseGaussian(solution.trajectory[frame], solution.covariances[frame]), truth[frame])
+        relative[trial] = _nees(solution.relative_gaussian(other, frame), se3.inverse(truth[other]) @ truth[frame])
+        before[trial] = se3.rotation_angle(se3.inverse(truth[11]) @ solution.odometry[11])
+        after[trial] = se3.rotation_angle(se3.inverse(truth[11]) @ solution.trajectory[11])
+    for values in (nees, relative):
+        assert values.mean() == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / trials))
+        assert stats.kstest(values, stats.chi2(6).cdf).pvalue > 1e-3
+    # Two edges of the odometry's kind against a chain of eleven.
+    assert after.mean() < 0.4 * before.mean()
+
+
+def test_closure_lowers_every_predicted_uncertainty() -> None:
+    graph, _ = _ring(10, np.random.default_rng(4), [(0, 9)])
+    open_loop = solve(PoseGraph(graph.edges[:-1]), {})
+    closed = solve(graph, {})
+    for frame in range(1, 10):
+        assert np.linalg.slogdet(closed.covariances[frame])[1] < np.linalg.slogdet(open_loop.covariances[frame])[1]
+
+
+def test_relative_covariance_is_that_of_the_joint_marginal() -> None:
+    graph, _ = _ring(8, np.random.default_rng(5), [(0, 7), (2, 6)], luck=1e-3)
+    solution = solve(graph, {})
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    for edge in graph.edges:
+        noise = gtsam.noiseModel.Gaussian.Covariance(edge.posterior.pose.covariance)
+        factors.add(gtsam.BetweenFactorPose3(edge.target, edge.source, gtsam.Pose3(edge.posterior.pose.mean), noise))
+    for frame, pose in solution.trajectory.items():
+        values.insert(frame, gtsam.Pose3(pose))
+    marginals = gtsam.Marginals(factors, values)
+    for target, source in itertools.permutations((1, 4, 7), 2):
+        joint = marginals.jointMarginalCovariance([target, source]).fullMatrix()
+        jacobian = np.hstack([-se3.adjoint(se3.inverse(solution.relative(target, source))), np.eye(6)])
+        expected = jacobian @ joint @ jacobian.T
+        _assert_same_covariance(solution.relative_covariance(target, source), expected)
+    for frame in range(1, 8):
+        _assert_same_covariance(solution.covariances[frame], marginals.marginalCovariance(frame))
+
+
+def test_swapping_source_and_target_of_every_edge_changes_nothing() -> None:
+    graph, _ = _ring(9, np.random.default_rng(6), [(0, 8), (1, 7)], luck=1e-3)
+    swapped = [_edge(e.source, e.target, e.posterior.pose.inverse(), e.kind) for e in graph.edges]
+    one, other = solve(graph, {}), solve(PoseGraph(tuple(swapped), first=0), {})
+    _assert_same(other.trajectory, one.trajectory, atol=1e-7)  # log(a⁻¹b) against log(ba⁻¹)
+    _assert_same(other.odometry, one.odometry, atol=1e-12)
+    for frame in range(9):
+        _assert_same_covariance(other.covariances[frame], one.covariances[frame])
+
+
+@pytest.mark.parametrize("labels", list(itertools.permutations((3, 0, 12, 700))))
+def test_frame_numbers_are_names_only(labels: tuple[int, ...]) -> None:
+    graph, _ = _ring(4, np.random.default_rng(7), [(0, 3)])
+    renamed = PoseGraph(tuple(_edge(labels[e.target], labels[e.source], e.posterior.pose, e.kind) for e in graph.edges))
+    one, other = solve(graph, {}), solve(renamed, {})
+    _assert_same(other.trajectory, {labels[frame]: pose for frame, pose in one.trajectory.items()})
+    _assert_same(other.odometry, {labels[frame]: pose for frame, pose in one.odometry.items()}, atol=0.0)
+    for frame in range(4):
+        np.testing.assert_allclose(other.covariances[labels[frame]], one.covariances[frame], rtol=1e-6)
+
+
+def test_order_of_arrival_does_not_matter() -> None:
+    rng = np.random.default_rng(8)
+    graph, _ = _ring(8, rng, [(0, 7), (1, 6)])
+    shuffled = [graph.edges[k] for k in rng.permutation(len(graph.edges))]
+    _assert_same(solve(PoseGraph(tuple(shuffled), first=0), {}).trajectory, solve(graph, {}).trajectory)
+
+
+def test_guess_and_its_gauge_do_not_move_the_answer() -> None:
+    rng = np.random.default_rng(9)
+    graph, truth = _ring(10, rng, [(0, 9)])
+    solution = solve(graph, {})
+    elsewhere = se3.exp(rng.normal(size=6))
+    disturbed = {frame: elsewhere @ pose @ se3.exp(0.2 * rng.normal(size=6)) for frame, pose in truth.items()}
+    for guess in (solution.trajectory, disturbed, {4: elsewhere}):
+        again = solve(graph, guess)
+        _assert_same(again.trajectory, solution.trajectory)
+        np.testing.assert_allclose(again.trajectory[0], np.eye(4), atol=1e-12)
+
+
+def test_same_edges_same_answer_to_the_bit(capfd: pytest.CaptureFixture[str]) -> None:
+    graph, _ = _ring(14, np.random.default_rng(10), [(0, 13), (1, 12)])
+    one, other = solve(graph, {}), solve(graph, {})
+    for frame in range(14):
+        assert np.array_equal(one.trajectory[frame], other.trajectory[frame])
+        assert np.array_equal(one.covariances[frame], other.covariances[frame])
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("good", [[], [(0, 11)]])
+def test_false_closure_is_left_out(good: list[tuple[int, int]]) -> None:
+    rng = np.random.default_rng(11)
+    graph, truth = _ring(12, rng, good)
+    wrong = se3.exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))
+    false = _edge(1, 10, PoseGaussian(se3.inverse(truth[1]) @ truth[10] @ wrong, _covariance(rng)), "closure")
+    solution = solve(graph.plus([false]), {})
+    assert solution.outliers == (false,)
+    _assert_same(solution.trajectory, solve(graph, {}).trajectory)
+    np.testing.assert_allclose(solution.covariances[11], solve(graph, {}).covariances[11], rtol=1e-9)
+
+
+def test_edges_not_accepted_take_no_part() -> None:
+    rng = np.random.default_rng(12)
+    graph, truth = _ring(6, rng, [])
+    refused = _edge(0, 5, _measured(truth, 0, 5, rng), "closure", accepted=False)
+    _assert_same(solve(graph.plus([refused]), {}).trajectory, solve(graph, {}).trajectory, atol=0.0)
+
+
+def test_closure_that_alone_holds_a_frame_is_part_of_the_chain() -> None:
+    rng = np.random.default_rng(13)
+    graph, truth = _ring(5, rng, [])
+    lost = dataclasses.replace(graph.edges[3], accepted=False)
+    alone = _edge(0, 4, _measured(truth, 0, 4, rng), "closure")
+    solution = solve(PoseGraph((*graph.edges[:3], lost, alone)), {})
+    np.testing.assert_allclose(solution.odometry[4], alone.posterior.pose.mean, atol=1e-14)
+    np.testing.assert_allclose(solution.trajectory[4], alone.posterior.pose.mean, atol=1e-14)
+
+
+def test_frames_apart_from_the_first_are_left_out() -> None:
+    graph, truth = _ring(3, np.random.default_rng(14), [])
+    island = _edge(7, 8, _measured(_truth(12), 7, 8, np.random.default_rng(0)))
+    loop = _edge(7, 8, island.posterior.pose, "closure")
+    solution = solve(graph.plus([island, loop]), {})
+    assert set(solution.trajectory) == set(solution.odometry) == set(solution.covariances) == set(truth)
+    with pytest.raises(KeyError):
+        solution.covariances[8]
+
+
+@pytest.mark.parametrize("sigma_roll_rad", [1e-5, 1e-2, 1.0, np.pi])
+def test_direction_nobody_observed_keeps_its_spread(sigma_roll_rad: float) -> None:
+    """A tube's roll beside directions known to 10 µm: round a loop of n equal edges, k in series beside n - k."""
+    count = 10
+    about_object = np.diag([1e-5, sigma_roll_rad, 1e-5, 1e-5, 1e-5, 1e-5]) ** 2  # the same in every frame
+    adjoint = se3.adjoint(se3.translation(OBJECT_M))
+    covariance = adjoint @ about_object @ adjoint.T
+    stops = [
+        se3.translation(OBJECT_M) @ se3.exp(np.array([0.0, angle, 0.0, 0.0, 0.0, 0.0])) @ se3.translation(-OBJECT_M)
+        for angle in np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    ]
+    step = se3.inverse(stops[1])
+    edges = [_edge(k - 1, k, PoseGaussian(step, covariance)) for k in range(1, count)]
+    closure = _edge(0, count - 1, PoseGaussian(se3.inverse(step), covariance), "closure")
+    solution = solve(PoseGraph((*edges, closure)), {})
+    _assert_same(solution.trajectory, {k: se3.inverse(stop) for k, stop in enumerate(stops)}, atol=1e-7)
+    for frame in range(1, count):
+        _assert_same_covariance(solution.covariances[frame], covariance * frame * (count - frame) / count)
+
+
+def test_covariance_that_is_none_is_refused() -> None:
+    flat = PoseGaussian(np.eye(4), np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 0.0]))
+    with pytest.raises(ValueError, match="edge 1 -> 0 is not positive definite"):
+        solve(PoseGraph((_edge(0, 1, flat), _edge(0, 1, flat, "closure"))), {})
