@@ -1,0 +1,456 @@
+"""The recording holds what was promised, truly drawn; and no viewer can stop a run."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import socket
+import subprocess
+import sys
+import urllib.request
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import rerun as rr
+import rerun.chunk
+from PIL import Image
+from turning_box import CENTRE_M, COVARIANCE, HALF_M, object_from_camera, steps
+
+from modeler import se3
+from modeler.types import Array, Outcome, PoseGaussian, Segmentation, Solution, Step
+from viz import clouds, entities, images, readings, uncertainty, viewer
+from viz.stream import RerunStream, open_stream
+
+Recording = dict[str, dict[int, dict[str, Any]]]
+COUNT, LOST = 6, 3
+EDGES = (entities.ODOMETRY, entities.CLOSURE, entities.REJECTED)
+
+
+def read(path: Path) -> Recording:
+    """Return the rows of a recording by entity and frame (-1: static), each by component; rows of a frame merge."""
+    rows: Recording = defaultdict(lambda: defaultdict(dict))
+    for chunk in rerun.chunk.RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        columns = {name: batch[name].to_pylist() for name in batch.schema.names if name == "frame" or ":" in name}
+        frames = columns.pop("frame", [-1] * chunk.num_rows)
+        for row, frame in enumerate(frames):
+            values = {name: column[row] for name, column in columns.items()}
+            entity = rows[chunk.entity_path.removeprefix("/")][frame]
+            entity |= {name.partition(":")[2]: value for name, value in values.items() if value is not None}
+    return {entity: dict(frames) for entity, frames in rows.items()}
+
+
+def record(path: Path, run: list[Step]) -> Recording:
+    """Stream a run to a file and read it back."""
+    stream = open_stream("box", save=path)
+    for step in run:
+        stream(step)
+    stream.close()
+    return read(path)
+
+
+@pytest.fixture(scope="module")
+def run() -> list[Step]:
+    return list(steps(COUNT, lost=LOST))
+
+
+@pytest.fixture(scope="module")
+def recording(run: list[Step], tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return record(tmp_path_factory.mktemp("viz") / "recording.rrd", run)
+
+
+def drawn(recording: Recording, entity: str, component: str) -> dict[int, Array]:
+    """Return a component by frame, without the frames that cleared it."""
+    return {
+        frame: np.array(row[component], dtype=np.float64)
+        for frame, row in recording[entity].items()
+        if component in row
+    }
+
+
+def decoded(blob: list[list[int]]) -> npt.NDArray[Any]:
+    return np.asarray(Image.open(io.BytesIO(bytes(blob[0]))))
+
+
+def test_every_promised_entity_is_recorded(recording: Recording) -> None:
+    promised = {
+        "blob": [entities.COLOUR, entities.DEPTH],
+        "buffer": [entities.MASK],
+        "positions": [entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER, entities.CLOUD],
+        "vertex_positions": [entities.MESH],
+        "strips": [entities.CAMERAS, entities.CURRENT, entities.CHAIN, *EDGES],
+        "vectors": [entities.AXES],
+        "half_sizes": [entities.POSITION_1_SIGMA, entities.POSITION_3_SIGMA, entities.AXIS_TIPS_1_SIGMA],
+        "labels": [entities.MAGNIFICATION],
+        "scalars": [f"{path}/{kind}" for path in entities.READINGS for kind in ("odometry", "closure")]
+        + [f"{path}/pose" for path in entities.POSE_READINGS],
+        "text": [entities.NOW, entities.LOG, entities.LEGEND],
+        "xyz": [entities.PAIR, entities.WORLD],
+    }
+    for component, paths in promised.items():
+        for path in paths:
+            values = [np.array(row[component]) for row in recording[path].values() if component in row]
+            assert values, path
+            assert all(value.size > 0 for value in values), path
+            assert all(np.isfinite(value).all() for value in values if value.dtype.kind == "f"), path
+
+
+def test_both_timelines_run_forward(run: list[Step], tmp_path: Path) -> None:
+    record(tmp_path / "r.rrd", run)
+    for chunk in rerun.chunk.RrdReader(tmp_path / "r.rrd").stream():
+        if not chunk.is_static:
+            batch = chunk.to_record_batch()
+            order = np.argsort(batch["frame"].to_numpy(), kind="stable")
+            elapsed_s = batch["elapsed"].to_numpy()[order] / np.timedelta64(1, "s")
+            assert elapsed_s[0] >= 0.0
+            assert (np.diff(elapsed_s) >= 0.0).all()
+
+
+def test_a_recording_opens_with_a_layout(tmp_path: Path, run: list[Step]) -> None:
+    record(tmp_path / "r.rrd", run)
+    reader = rerun.chunk.RrdReader(tmp_path / "r.rrd")
+    waiting, knowing = sorted((list(reader.stream(store=entry)) for entry in reader.blueprints()), key=len)
+    views = [sum(str(chunk.entity_path).endswith("/ViewContents") for chunk in layout) for layout in (waiting, knowing)]
+    assert views == [14, 14]
+    eyes = [c.to_record_batch() for c in knowing if str(c.entity_path).endswith("/EyeControls3D")]
+    targets = np.array([batch["EyeControls3D:look_target"][0].as_py()[0] for batch in eyes])
+    assert len(targets) == 4
+    assert np.linalg.norm(targets - CENTRE_M, axis=1).max() < HALF_M.max()
+
+
+def test_images_survive_compression(run: list[Step], recording: Recording) -> None:
+    for step in run:
+        index, frame = step.frame.index, step.frame
+        row = recording[entities.DEPTH][index]
+        depth_m = decoded(row["blob"]) / row["meter"][0]
+        np.testing.assert_allclose(depth_m, np.nan_to_num(frame.depth_m), atol=0.51e-3)
+        near, far = row["depth_range"][0]
+        of_object = frame.depth_m[step.segmentation.mask] * row["meter"][0]
+        assert near < np.median(of_object) < far
+        mask = np.array(recording[entities.MASK][index]["buffer"][0], dtype=bool).reshape(frame.depth_m.shape)
+        np.testing.assert_array_equal(mask, step.segmentation.mask)
+        assert frame.colour is not None
+        luma = np.array([0.299, 0.587, 0.114])  # JPEG keeps colour at half the resolution
+        difference = (decoded(recording[entities.COLOUR][index]["blob"]).astype(float) - frame.colour) @ luma
+        assert np.abs(difference).mean() < 5.0
+
+
+def test_a_frame_without_colour_has_none_in_the_recording(tmp_path: Path) -> None:
+    grey = record(tmp_path / "r.rrd", list(steps(2, colour=False)))
+    assert "blob" not in grey[entities.COLOUR][0]
+    assert "blob" in grey[entities.DEPTH][0]
+    assert len(grey[entities.CLOUD][0]["positions"]) > 100
+
+
+def test_large_images_are_shown_smaller(run: list[Step]) -> None:
+    depth_m = np.ones((960, 1280), dtype=np.float32)
+    frame = replace(run[0].frame, depth_m=depth_m, colour=None)
+    step = replace(run[0], frame=frame, segmentation=replace(run[0].segmentation, mask=depth_m > 0.0))
+    (depth,) = [archetype for path, archetype in images.drawing(step) if path == entities.DEPTH]
+    assert isinstance(depth, rr.EncodedDepthImage)
+    assert depth.blob is not None
+    assert decoded(depth.blob.as_arrow_array().to_pylist()).shape == (480, 640)
+
+
+def test_alignment_brings_the_pair_together(recording: Recording) -> None:
+    targets = drawn(recording, entities.PAIR_TARGET, "positions")
+    before, after = (drawn(recording, path, "positions") for path in (entities.PAIR_BEFORE, entities.PAIR_AFTER))
+    assert set(targets) == set(before) == set(after) == set(range(1, COUNT))
+    for index in targets:
+        # The box moved into the target's frame fills the target's box: compare in the box's own axes.
+        box_from_target = object_from_camera(index - 1 if index - 1 != LOST else LOST - 1)
+        for clouds_m, inside in ((targets, True), (after, True), (before, False)):
+            in_box = np.abs(se3.transform(box_from_target, clouds_m[index]) - CENTRE_M) - HALF_M
+            assert (np.percentile(in_box.max(axis=1), 95) < 0.004) == inside
+
+
+def test_the_camera_stands_where_its_pose_says(run: list[Step], recording: Recording) -> None:
+    currents = drawn(recording, entities.CURRENT, "strips")
+    assert set(currents) == set(range(COUNT)) - {LOST}  # a lost frame has no place
+    for index, strips in currents.items():
+        pose = run[index].solution.trajectory[index]
+        np.testing.assert_allclose(strips[0][0], pose[:3, 3], atol=1e-6)
+        looks = (strips[0][1:5].mean(axis=0) - strips[0][0]) @ pose[:3, 2]
+        assert 0.02 < looks < 0.3
+    assert len(drawn(recording, entities.CAMERAS, "strips")[COUNT - 1]) == COUNT - 1
+
+
+def test_edges_are_told_apart(run: list[Step], recording: Recording) -> None:
+    last = run[-1]
+    for path, kind, accepted in (
+        (entities.ODOMETRY, "odometry", True),
+        (entities.CLOSURE, "closure", True),
+        (entities.REJECTED, "closure", False),
+    ):
+        wanted = [edge for edge in last.edges_so_far if edge.kind == kind and edge.accepted == accepted]
+        row = recording[path][COUNT - 1]
+        ends = [[last.solution.trajectory[k][:3, 3] for k in (edge.target, edge.source)] for edge in wanted]
+        np.testing.assert_allclose(np.array(row["strips"]), np.array(ends), atol=1e-6)
+    colours = {
+        tuple(recording[p][COUNT - 1]["colors"]) for p in (entities.ODOMETRY, entities.CLOSURE, entities.REJECTED)
+    }
+    assert len(colours) == 3
+
+
+def test_ellipsoids_are_the_covariance_as_magnified(run: list[Step], recording: Recording) -> None:
+    for step in run:
+        label = recording[entities.MAGNIFICATION][step.frame.index]["labels"][0]
+        factor = float(label.rpartition("\N{MULTIPLICATION SIGN}")[2])
+        one, three = (recording[p][step.frame.index] for p in (entities.POSITION_1_SIGMA, entities.POSITION_3_SIGMA))
+        np.testing.assert_allclose(3.0 * np.array(one["half_sizes"]), three["half_sizes"], rtol=1e-5)
+        for n, index in enumerate(sorted(step.solution.covariances)):
+            rotation = step.solution.trajectory[index][:3, :3]
+            wanted = rotation @ step.solution.covariances[index][3:, 3:] @ rotation.T
+            axes = se3.Rotation.from_quat(one["quaternions"][n]).as_matrix()
+            got = axes @ np.diag((np.array(one["half_sizes"][n]) / factor) ** 2) @ axes.T
+            np.testing.assert_allclose(got, wanted, atol=1e-3 * np.trace(wanted))
+            np.testing.assert_allclose(one["centers"][n], step.solution.trajectory[index][:3, 3], atol=1e-6)
+
+
+def test_closure_makes_the_drawn_ellipsoids_smaller(recording: Recording) -> None:
+    half_axes = drawn(recording, entities.POSITION_1_SIGMA, "half_sizes")
+    assert half_axes[COUNT - 1][-1].max() < half_axes[COUNT - 2][-1].max()
+
+
+def test_axis_tips_spread_as_sampled_rotations_do() -> None:
+    rng = np.random.default_rng(0)
+    rotation = se3.exp(np.array([0.3, -1.0, 0.4, 0.0, 0.0, 0.0]))[:3, :3]
+    factor = rng.standard_normal((3, 3)) * 0.02
+    omegas = rng.standard_normal((100_000, 3)) @ factor.T
+    samples = rotation @ se3.exp(np.concatenate([omegas, np.zeros_like(omegas)], axis=1))[:, :3, :3]
+    got = uncertainty.axis_tip_covariances(rotation, factor @ factor.T)
+    for axis in range(3):
+        wanted = np.cov(samples[:, :, axis].T)
+        np.testing.assert_allclose(got[axis], wanted, atol=0.03 * np.trace(wanted))
+
+
+def test_magnification_is_round_and_never_grows(run: list[Step]) -> None:
+    edges = run[-1].edges_so_far
+    factors = [uncertainty.magnification(edges[:k], 0.8) for k in range(1, len(edges) + 1)]
+    assert (np.diff(factors) <= 0.0).all()
+    for scale in (1e-8, 1e-4, 1.0, 1e6):
+        posterior = edges[0].posterior
+        sure = replace(posterior, pose=PoseGaussian(posterior.pose.mean, scale * COVARIANCE))
+        factor = uncertainty.magnification([replace(edges[0], posterior=sure)], 0.8)
+        assert factor in {m * 10**e for m in (1, 2, 5) for e in range(4)}
+    assert uncertainty.magnification([], 0.8) == 1.0
+
+
+def test_the_model_grows_and_ends_as_a_mesh(run: list[Step], recording: Recording) -> None:
+    sizes = {frame: len(points) for frame, points in drawn(recording, entities.CLOUD, "positions").items()}
+    assert sorted(sizes) == list(range(COUNT - 1))
+    assert sizes[COUNT - 2] > sizes[0]
+    mesh = recording[entities.MESH][COUNT - 1]
+    assert run[-1].model is not None
+    np.testing.assert_allclose(mesh["vertex_positions"], run[-1].model.vertices_m, atol=1e-6)
+    np.testing.assert_array_equal(mesh["triangle_indices"], run[-1].model.triangles)
+
+
+def test_a_coarsened_mesh_keeps_its_shape() -> None:
+    count = 200
+    u, v = np.meshgrid(np.linspace(0, 1, count), np.linspace(0, 1, count), indexing="ij")
+    vertices = np.stack([u, v, 0.1 * np.sin(3 * u), u + v], axis=-1).reshape(-1, 4)
+    corner = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).reshape(-1)
+    triangles = np.concatenate(
+        [
+            np.stack([corner, corner + 1, corner + count], 1),
+            np.stack([corner + 1, corner + count + 1, corner + count], 1),
+        ]
+    )
+    coarse, kept = clouds.coarsened(vertices, triangles, 5_000)
+    assert 500 < len(kept) <= 5_000
+    np.testing.assert_allclose(coarse[:, 2], 0.1 * np.sin(3 * coarse[:, 0]), atol=1e-3)
+    np.testing.assert_allclose(coarse[:, 3], coarse[:, 0] + coarse[:, 1], atol=1e-9)
+    one, other = coarse[kept[:, 1]] - coarse[kept[:, 0]], coarse[kept[:, 2]] - coarse[kept[:, 0]]
+    assert (np.cross(one[:, :3], other[:, :3])[:, 2] <= 1e-12).all()  # all still face the same way
+    same, all_of_them = clouds.coarsened(vertices, triangles, len(triangles))
+    assert same is vertices
+    assert all_of_them is triangles
+
+
+def test_readings_are_those_of_the_posterior(run: list[Step], recording: Recording) -> None:
+    posterior = run[1].posteriors[0]
+    values = {path: recording[f"{path}/odometry"][1]["scalars"][0] for path in entities.READINGS}
+    assert values[entities.EFFECTIVE_SAMPLES] == pytest.approx(posterior.effective_samples)
+    assert values[entities.OVERLAP] == pytest.approx(100 * posterior.overlap)
+    assert values[entities.SECONDS] == pytest.approx(posterior.seconds)
+    samples = np.random.default_rng(0).multivariate_normal(np.zeros(6), posterior.pose.covariance, 50_000)
+    turned = np.linalg.eigvalsh(np.cov(samples[:, :3].T))[-1] ** 0.5
+    assert values[entities.ROTATION_SD] == pytest.approx(np.rad2deg(turned), rel=0.02)
+    assert run[1].view is not None
+    centre = np.append(run[1].view.centroid_m, 1.0)
+    shifted = np.linalg.eigvalsh(np.cov((se3.exp(samples) @ centre)[:, :3].T))[-1] ** 0.5
+    assert values[entities.TRANSLATION_SD] == pytest.approx(1000 * shifted, rel=0.02)
+
+
+def test_every_pair_is_put_into_words(run: list[Step], recording: Recording) -> None:
+    for step in run:
+        now = recording[entities.NOW][step.frame.index]["text"][0]
+        assert now.startswith(f"### Frame {step.frame.index}: {step.outcome}")
+        for edge in step.edges:
+            assert readings.pair_words(edge, step) in now
+            assert edge.posterior.outcome.advice in now
+            assert ("rejected" in readings.pair_words(edge, step)) == (not edge.accepted)
+    assert "nan" not in " ".join(row["text"][0] for row in recording[entities.NOW].values())
+
+
+def test_readings_that_a_method_does_not_give_are_left_out(run: list[Step]) -> None:
+    edge = run[1].edges[0]
+    poor = replace(edge, posterior=replace(edge.posterior, effective_samples=float("nan"), seconds=float("nan")))
+    assert "nan" not in readings.pair_words(poor, run[1])
+    paths = {path for path, _ in readings.drawing(replace(run[1], edges=(poor,)))}
+    assert f"{entities.OVERLAP}/odometry" in paths
+    assert f"{entities.SECONDS}/odometry" not in paths
+
+
+def odd_steps(run: list[Step]) -> list[Step]:
+    """Return steps that lack what steps may lack."""
+    step = run[1]
+    nothing = Segmentation(np.zeros_like(step.segmentation.mask), None, Outcome.TOO_FEW_POINTS)
+    blind = replace(step.frame, depth_m=np.full_like(step.frame.depth_m, np.nan))
+    assert step.model is not None
+    empty = replace(
+        step.model,
+        points_m=np.zeros((0, 3)),
+        normals=np.zeros((0, 3)),
+        colours=None,
+        triangles=np.zeros((0, 3), dtype=np.int64),
+    )
+    unknown = Solution(step.solution.trajectory, {1: np.full((6, 6), np.nan)}, {})
+    posterior = step.posteriors[0]
+    lost = replace(posterior, pose=PoseGaussian(posterior.pose.mean, np.full((6, 6), np.inf)))
+    bare = Step(blind, nothing, None, (), (), Outcome.TOO_FEW_POINTS.label, Solution(), None)
+    return [
+        bare,
+        replace(bare, last=True),
+        replace(step, model=empty, last=True),
+        replace(step, solution=unknown),
+        replace(step, posteriors=(lost,), edges=(replace(step.edges[0], posterior=lost),)),
+        replace(run[1], views={}),
+    ]
+
+
+def test_every_step_is_accepted_and_none_is_changed(run: list[Step], tmp_path: Path) -> None:
+    everything = [*run, *odd_steps(run)]
+    before = [repr(step) + str([p.pose.mean.tobytes() for p in step.posteriors]) for step in everything]
+    recording = record(tmp_path / "r.rrd", everything)
+    assert before == [repr(step) + str([p.pose.mean.tobytes() for p in step.posteriors]) for step in everything]
+    assert entities.NOW in recording
+
+
+def test_a_recording_stays_small(tmp_path: Path) -> None:
+    run = list(steps(3, width=640))
+    record(tmp_path / "r.rrd", run)
+    assert (tmp_path / "r.rrd").stat().st_size / len(run) < 15e6 / 14
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_run_that_is_killed_leaves_a_readable_recording(run: list[Step], tmp_path: Path) -> None:
+    stream = open_stream("box", save=tmp_path / "r.rrd")
+    stream(run[0])
+    stream(run[1])
+    stream.recording.flush()
+    (tmp_path / "cut.rrd").write_bytes((tmp_path / "r.rrd").read_bytes())
+    stream.close()
+    assert set(read(tmp_path / "cut.rrd")[entities.NOW]) == {0, 1}
+
+
+def listeners(process: subprocess.Popen[bytes]) -> set[str]:
+    """Return the local addresses, as the kernel writes them, on which a process listens."""
+    inodes = set()
+    for descriptor in Path(f"/proc/{process.pid}/fd").iterdir():
+        link = os.readlink(descriptor)
+        if link.startswith("socket:["):
+            inodes.add(link[8:-1])
+    lines = [
+        line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]
+    ]
+    return {line[1].partition(":")[0] for line in lines if line[3] == "0A" and line[9] in inodes}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_the_page_is_served_on_this_machine_alone(run: list[Step], tmp_path: Path) -> None:
+    stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
+    stream(run[0])
+    assert stream.address is not None
+    assert stream.address.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(stream.address, timeout=5.0) as page:
+        assert b"<html" in page.read()
+    (server,) = stream.viewers
+    assert listeners(server.process) == {"0100007F"}
+    stream.close()
+    assert server.process.poll() is not None
+
+
+def test_a_viewer_that_dies_does_not_stop_the_run(run: list[Step], tmp_path: Path) -> None:
+    stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
+    stream(run[0])
+    stream.viewers[0].stop()
+    for step in run[1:]:
+        stream(step)
+    stream.close()
+    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
+
+
+def closed_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_a_viewer_that_is_not_there_is_reported_and_left_out(
+    run: list[Step], tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    address = f"rerun+http://127.0.0.1:{closed_port()}/proxy"
+    with caplog.at_level(logging.WARNING):
+        stream: RerunStream = open_stream("box", save=tmp_path / "r.rrd", spawn=True, connect=address)
+    assert address in caplog.text
+    assert "no display" in caplog.text
+    assert stream.address is None
+    stream(run[0])
+    stream.close()
+    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == {0}
+
+
+def test_a_stream_to_nowhere_takes_steps(run: list[Step]) -> None:
+    stream = open_stream("box", save=None)
+    stream(run[0])
+    stream.close()
+    assert stream.address is None
+
+
+@pytest.mark.parametrize("address", ["localhost", "http://127.0.0.1:9876", "rerun+http://127.0.0.1:x/proxy"])
+def test_a_wrong_address_is_refused(address: str) -> None:
+    with pytest.raises(viewer.InputError, match=r"--connect .*rerun\+http://127\.0\.0\.1:9876/proxy"):
+        open_stream("box", save=None, connect=address)
+
+
+def test_a_recording_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(viewer.InputError, match=r"r\.rrd"):
+        open_stream("box", save=tmp_path / "missing" / "r.rrd")
+
+
+def test_viewing_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(viewer.InputError, match=r"no recording\.rrd"):
+        viewer.view(tmp_path)
+
+
+def test_a_recording_is_viewed_in_the_browser(run: list[Step], tmp_path: Path) -> None:
+    record(tmp_path / "recording.rrd", run[:2])
+    served = viewer.view(tmp_path, web=True)
+    with urllib.request.urlopen(served.address, timeout=5.0) as page:
+        assert b"<html" in page.read()
+    served.stop()
+
+
+def test_rerun_is_not_imported_before_it_is_needed() -> None:
+    program = "import sys, viz.stream, viz.viewer, viz.entities; sys.exit('rerun' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

@@ -1,0 +1,123 @@
+"""Readings of each pair over time, and the same in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import rerun as rr
+
+from modeler import se3
+from modeler.types import Array, Edge, Posterior, Step
+from viz import entities
+
+Drawing = Iterator[tuple[str, rr.AsComponents]]
+
+_SERIES_RGB = {"odometry": entities.ODOMETRY_RGB, "closure": entities.CLOSURE_RGB, "pose": entities.UNCERTAINTY_RGB}
+
+
+def statics() -> Drawing:
+    """Yield what is said once: how each series looks, and the legend."""
+    for reading in entities.READINGS:
+        for series in entities.SERIES:
+            if series != "pose" or reading in entities.POSE_READINGS:
+                path, rgb = f"{reading}/{series}", _SERIES_RGB[series]
+                yield path, rr.SeriesLines(colors=rgb, names=series, widths=1.5)
+                yield path, rr.SeriesPoints(colors=rgb, names=series, markers="circle", marker_sizes=3.0)
+    yield entities.LEGEND, rr.TextDocument(entities.LEGEND_TEXT, media_type=rr.MediaType.MARKDOWN)
+
+
+def drawing(step: Step) -> Drawing:
+    """Yield the readings of the step's pairs; of several closures the surest."""
+    for kind in ("odometry", "closure"):
+        judged = [edge for edge in step.edges if edge.kind == kind]
+        if judged:
+            best = min(judged, key=lambda edge: float(np.trace(edge.posterior.pose.covariance[:3, :3])))
+            for reading, value in _readings(best.posterior, step).items():
+                if math.isfinite(value):
+                    yield f"{reading}/{kind}", rr.Scalars(value)
+    covariance = step.solution.covariances.get(step.frame.index)
+    if covariance is not None and np.isfinite(covariance).all():
+        for reading, value in _sds(covariance, _centre_m(step)).items():
+            yield f"{reading}/pose", rr.Scalars(value)
+
+
+def words(step: Step) -> Drawing:
+    """Yield what happened to the frame in words, and a line for the log for each pair."""
+    level = rr.TextLogLevel.INFO if step.outcome == "accepted" else rr.TextLogLevel.WARN
+    if not step.edges:
+        yield entities.LOG, rr.TextLog(f"frame {step.frame.index}: {step.outcome}", level=level)
+    for edge in step.edges:
+        level = rr.TextLogLevel.INFO if edge.accepted else rr.TextLogLevel.WARN
+        yield entities.LOG, rr.TextLog(pair_words(edge, step), level=level)
+    yield entities.NOW, rr.TextDocument(now_words(step), media_type=rr.MediaType.MARKDOWN)
+
+
+def pair_words(edge: Edge, step: Step) -> str:
+    """Say in one line how the registration of a pair ended and how sure it is."""
+    posterior = edge.posterior
+    readings = _readings(posterior, step)
+    parts = [
+        f"rotation sd {readings[entities.ROTATION_SD]:.2g}°",
+        f"translation sd {readings[entities.TRANSLATION_SD]:.2g} mm",
+        f"overlap {readings[entities.OVERLAP]:.0f} %",
+        f"{readings[entities.EFFECTIVE_SAMPLES]:.0f} effective samples",
+        f"{readings[entities.SECONDS]:.2g} s",
+    ]
+    verdict = edge.kind if edge.accepted else f"{edge.kind} rejected ({edge.reason})"
+    known = ", ".join(part for part in parts if not part.startswith("nan") and " nan" not in part)
+    return f"{edge.source} → {edge.target} {verdict}: {posterior.outcome.label}; {known}"
+
+
+def now_words(step: Step) -> str:
+    """Say in Markdown what the frame brought, pair by pair, and where the model stands."""
+    lines = [f"### Frame {step.frame.index}: {step.outcome}"]
+    for edge in step.edges:
+        lines.append(f"- **{pair_words(edge, step)}.** {edge.posterior.outcome.advice}")
+    if not step.edges:
+        lines.append(
+            f"- {step.segmentation.outcome.advice}" if step.view is None else "- The first view of the object."
+        )
+    accepted = [edge.kind for edge in step.edges_so_far if edge.accepted]
+    rejected = len(step.edges_so_far) - len(accepted)
+    points = 0 if step.model is None else len(step.model.points_m)
+    lines.append(
+        f"\nSo far: views {len(step.views)}, odometry edges {accepted.count('odometry')}, "
+        f"loop closures {accepted.count('closure')}, pairs rejected {rejected}; the model has {points:,} points"
+        + (f" and {len(step.model.triangles):,} triangles." if step.model is not None and step.last else ".")
+    )
+    return "\n".join(lines)
+
+
+def worst_axis_sd(covariance: Array) -> float:
+    """Return the sd along the least certain axis of a covariance (3, 3)."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
+
+
+def _readings(posterior: Posterior, step: Step) -> dict[str, float]:
+    """Return the readings of a pair by entity path, NaN where a method does not give one."""
+    return _sds(posterior.pose.covariance, _centre_m(step)) | {
+        entities.EFFECTIVE_SAMPLES: posterior.effective_samples,
+        entities.OVERLAP: 100.0 * posterior.overlap,
+        entities.SECONDS: posterior.seconds,
+    }
+
+
+def _sds(covariance: Array, centre_m: Array) -> dict[str, float]:
+    """Return the sd of the rotation in degrees and of the point `centre_m` (3,) in mm, by entity path.
+
+    The translation of the camera's own origin says little: it is the rotation times the distance of the object.
+    """
+    if not np.isfinite(covariance).all():
+        return {entities.ROTATION_SD: math.nan, entities.TRANSLATION_SD: math.nan}
+    jacobian = np.concatenate([-se3.hat(centre_m), np.eye(3)], axis=1)
+    return {
+        entities.ROTATION_SD: math.degrees(worst_axis_sd(covariance[:3, :3])),
+        entities.TRANSLATION_SD: 1000.0 * worst_axis_sd(jacobian @ covariance @ jacobian.T),
+    }
+
+
+def _centre_m(step: Step) -> Array:
+    """Return the object's centre (3,) in the frame's own camera coordinates; the camera where it was not found."""
+    return np.zeros(3) if step.view is None else step.view.centroid_m

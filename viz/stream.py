@@ -1,0 +1,134 @@
+"""A sink of steps: what a run does, as it does it, in a recording and in the viewer."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from modeler.types import InputError, Step
+from viz import entities, viewer
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class RerunStream:
+    """A recording that grows with every step. Nothing that happens to a viewer reaches the run."""
+
+    recording: rr.RecordingStream
+    """Where steps are drawn."""
+    viewers: tuple[viewer.Viewer, ...]
+    """The viewers opened for this run."""
+    started_s: float
+    """When the stream was opened, by `time.monotonic`."""
+
+    @property
+    def address(self) -> str | None:
+        """What a person opens to watch: the page in the browser, or else where the window listens; None without."""
+        return self.viewers[-1].address if self.viewers else None
+
+    def __call__(self, step: Step) -> None:
+        """Draw a step."""
+        if not self.recording.is_enabled():
+            return
+        # Rerun takes half a second to import: only runs that record pay for it.
+        from viz import blueprint, clouds, images, poses, readings, uncertainty
+
+        self.recording.set_time(entities.FRAME, sequence=step.frame.index)
+        self.recording.set_time(entities.ELAPSED, duration=time.monotonic() - self.started_s)
+        if step.view is not None and set(step.views) == {step.frame.index}:
+            self.recording.send_blueprint(blueprint.layout(step.view))
+        for path, archetype in itertools.chain(
+            images.drawing(step),
+            clouds.pair_drawing(step),
+            clouds.model_drawing(step),
+            poses.drawing(step),
+            uncertainty.drawing(step),
+            readings.drawing(step),
+            readings.words(step),
+        ):
+            self.recording.log(path, archetype)
+
+    def close(self) -> None:
+        """Complete the recording. A window stays open with what it was sent; a page in the browser ends."""
+        try:
+            self.recording.flush(timeout_sec=10.0)
+        except RuntimeError as error:  # the viewer is gone; the file is written all the same
+            _log.info("the viewer did not receive everything: %s", error)
+        self.recording.disconnect()
+        for own in self.viewers:
+            if not own.lasting:
+                own.stop()
+
+
+def open_stream(
+    name: str, *, save: Path | None, spawn: bool = False, web: bool = False, connect: str | None = None
+) -> RerunStream:
+    """Open a recording and the viewer that is to watch it.
+
+    A viewer that does not start or cannot be reached is reported to the log and left out.
+
+    Args:
+        name: what the viewer calls the recording, say the sequence's name.
+        save: file to record to; None records nowhere.
+        spawn: open the viewer in a window.
+        web: serve the viewer in the browser on 127.0.0.1; `address` names the page.
+        connect: `rerun+http://HOST:PORT/proxy` of a viewer that is already open.
+
+    Raises:
+        InputError: where `save` cannot be written, or `connect` is not an address.
+    """
+    import rerun as rr
+
+    from viz import blueprint, clouds, images, readings
+
+    sinks: list[rr.FileSink | rr.GrpcSink] = [] if save is None else [_file_sink(save)]
+    viewers = _own_viewers(spawn=spawn, web=web)
+    sinks += [rr.GrpcSink(own.sink) for own in viewers]
+    if connect is not None:
+        if viewer.reachable(connect):
+            sinks.append(rr.GrpcSink(connect))
+        else:
+            _log.warning("--connect %s: no viewer listens there; the run goes on without it", connect)
+    recording = rr.RecordingStream(entities.APPLICATION, default_enabled=bool(sinks))
+    if sinks:
+        recording.set_sinks(*sinks)
+        recording.send_recording_name(name)
+        recording.send_blueprint(blueprint.layout(None))
+        for path, archetype in itertools.chain(images.statics(), clouds.statics(), readings.statics()):
+            recording.log(path, archetype, static=True)
+    return RerunStream(recording, viewers, time.monotonic())
+
+
+def _own_viewers(*, spawn: bool, web: bool) -> tuple[viewer.Viewer, ...]:
+    """Start the viewers that were asked for, as far as they start."""
+    viewers: list[viewer.Viewer] = []
+    for wanted, start in ((spawn, viewer.start_window), (web, viewer.start_web)):
+        if wanted:
+            try:
+                viewers.append(start())
+            except InputError as error:
+                _log.warning("%s; the run goes on without it", error)
+    return tuple(viewers)
+
+
+def _file_sink(save: Path) -> rr.FileSink:
+    """Return the sink that writes a file.
+
+    Raises:
+        InputError: where it cannot be written.
+    """
+    import rerun as rr
+
+    try:
+        save.open("wb").close()
+    except OSError as error:
+        raise InputError(f"{save}: cannot write the recording ({error.strerror}); choose another folder") from error
+    return rr.FileSink(save)

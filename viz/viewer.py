@@ -1,0 +1,148 @@
+"""The Rerun viewer as a process of its own, and `modeler view`."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+from urllib.parse import quote
+
+from modeler.types import InputError
+
+_HOST: Final = "127.0.0.1"
+_START_S: Final = 20.0
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """A running viewer, reachable from this machine alone."""
+
+    process: subprocess.Popen[bytes]
+    """The viewer, or the server of the one in the browser."""
+    sink: str
+    """Where recordings are sent to."""
+    address: str
+    """What a person opens: the page of the viewer in the browser; the sink for a window."""
+    lasting: bool
+    """Whether it outlives this process: a window does, a page in the browser does not."""
+
+    def wait(self) -> None:
+        """Return when the viewer is closed or the user interrupts; end the server then."""
+        try:
+            self.process.wait()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            self.stop()
+
+    def stop(self) -> None:
+        """End the viewer."""
+        if self.process.poll() is None:
+            self.process.terminate()
+        self.process.wait()
+
+
+def start_window(recordings: Sequence[Path] = ()) -> Viewer:
+    """Open the viewer in a window that outlives this process, showing the given recordings.
+
+    Raises:
+        InputError: where there is no display, or the viewer does not start.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise InputError(
+            "cannot open the viewer: no display (DISPLAY is not set); use --web and open the page it names"
+        )
+    port = _free_port()
+    sink = _sink(port)
+    return Viewer(_start(["--port", str(port)], recordings, port=port, own_session=True), sink, sink, lasting=True)
+
+
+def start_web(recordings: Sequence[Path] = ()) -> Viewer:
+    """Serve the viewer in the browser on 127.0.0.1 for as long as this process lives, showing the given recordings.
+
+    Raises:
+        InputError: where the server does not start.
+    """
+    port, page = _free_port(), _free_port()
+    arguments = ["--serve-web", "--port", str(port), "--web-viewer-port", str(page)]
+    process = _start(arguments, recordings, port=page, own_session=False)
+    return Viewer(process, _sink(port), f"http://{_HOST}:{page}?url={quote(_sink(port), safe='')}", lasting=False)
+
+
+def view(run: Path, *, web: bool = False) -> Viewer:
+    """Show the recording of a run folder in the viewer, in a window or in the browser.
+
+    Raises:
+        InputError: where the folder has no recording, or the viewer does not start.
+    """
+    recording = run / "recording.rrd"
+    if not recording.is_file():
+        raise InputError(f"{run}: no recording.rrd in this folder; make one with: modeler build SEQUENCE --out {run}")
+    return start_web([recording]) if web else start_window([recording])
+
+
+def reachable(sink: str) -> bool:
+    """Return whether something listens where recordings are to be sent, `rerun+http://HOST:PORT/proxy`.
+
+    Raises:
+        InputError: where the address is not of that form.
+    """
+    scheme, _, rest = sink.partition("://")
+    place, _, path = rest.partition("/")
+    host, _, port = place.rpartition(":")
+    if scheme not in ("rerun", "rerun+http", "rerun+https") or path != "proxy" or not host or not port.isdigit():
+        raise InputError(f"--connect {sink}: not the address of a viewer; give one like {_sink(9876)}")
+    return _listens(host.strip("[]"), int(port), patience_s=1.0)
+
+
+def _start(
+    arguments: list[str], recordings: Sequence[Path], *, port: int, own_session: bool
+) -> subprocess.Popen[bytes]:
+    """Start the viewer's executable and return once it listens on `port`."""
+    from rerun_cli import __main__ as cli
+
+    # The executable itself, for the script of that name only waits for it and does not pass signals on.
+    executable = Path(cli.__file__).with_name(cli.add_exe_suffix("rerun"))
+    process = subprocess.Popen(
+        [str(executable), "--bind", _HOST, *arguments, *map(str, recordings)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,  # stdout is for data; the viewer chats
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "RERUN_APP_ONLY": "true"},
+        start_new_session=own_session,
+    )
+    deadline = time.monotonic() + _START_S
+    while not _listens(_HOST, port, patience_s=0.2):
+        if process.poll() is not None or time.monotonic() > deadline:
+            process.kill()
+            process.wait()
+            raise InputError("the Rerun viewer did not start; see why with: rerun --version, or leave it out")
+        time.sleep(0.05)
+    return process
+
+
+def _sink(port: int) -> str:
+    """Return the address a recording is sent to."""
+    return f"rerun+http://{_HOST}:{port}/proxy"
+
+
+def _free_port() -> int:
+    """Return a port nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind((_HOST, 0))
+        return int(probe.getsockname()[1])
+
+
+def _listens(host: str, port: int, *, patience_s: float) -> bool:
+    """Return whether a connection to a port is accepted."""
+    try:
+        with socket.create_connection((host, port), timeout=patience_s):
+            return True
+    except OSError:
+        return False
