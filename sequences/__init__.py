@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from modeler.types import InputError
 from sequences.base import AbstractSequence as AbstractSequence
 from sequences.base import frame_range as frame_range
 from sequences.bop import BopSequence as BopSequence
@@ -15,3 +16,16 @@ def open_sequence(path: str | Path) -> AbstractSequence:
         InputError: where the folder does not hold a readable sequence.
     """
     return BopSequence(Path(path))
+
+
+def bundled(name: str) -> Path:
+    """Return the folder of a sequence that comes with the package: `box`, `flashlight` or `tube`.
+
+    Raises:
+        InputError: where there is none of that name.
+    """
+    folder = Path(__file__).parent / "bundled"
+    names = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    if name not in names:
+        raise InputError(f"no bundled sequence is called {name!r}; there are {', '.join(names)}.")
+    return folder / name

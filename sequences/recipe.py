@@ -1,0 +1,174 @@
+"""Recipes of synthetic sequences: what is seen, from where, how it moves and by which camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, final
+
+import numpy as np
+
+from modeler.types import Array, Camera, InputError
+from sequences.depth_sensor import DepthSensor
+from sequences.json_input import read_tree
+from sequences.shapes import AnyShape
+from sequences.structure import build
+from sequences.trajectory import AnyTrajectory, Tabletop
+
+
+@final
+@dataclass(frozen=True)
+class Viewpoint:
+    """The camera, and from where it looks at the middle of the table."""
+
+    width: int = 640
+    """Image width in px."""
+    height: int = 480
+    """Image height in px."""
+    focal_px: float = 575.0
+    """Focal length in px; the principal point is the middle of the image."""
+    distance_m: float = 0.8
+    """Distance from the point looked at."""
+    elevation_deg: float = 35.0
+    """Angle of the line of sight with the table."""
+    look_height_m: float = 0.03
+    """Height above the table of the point looked at."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if not (2 <= self.width <= 8192 and 2 <= self.height <= 8192):
+            raise ValueError("width and height must be from 2 to 8192 px")
+        if self.focal_px < 1.0 or self.distance_m <= 0.0 or not -90.0 <= self.elevation_deg <= 90.0:
+            raise ValueError("focal_px must be at least 1, distance_m positive, elevation_deg from -90 to 90")
+
+    def camera(self) -> Camera:
+        """Return the intrinsics."""
+        focal_px = self.focal_px
+        return Camera(self.width, self.height, focal_px, focal_px, (self.width - 1) / 2.0, (self.height - 1) / 2.0)
+
+    def camera_from_table(self) -> Array:
+        """Return the pose (4, 4) of the table in camera coordinates."""
+        sin, cos = np.sin(np.radians(self.elevation_deg)), np.cos(np.radians(self.elevation_deg))
+        pose = np.eye(4)
+        pose[:3, :3] = [[1.0, 0.0, 0.0], [0.0, -sin, -cos], [0.0, cos, -sin]]
+        pose[:3, 3] = np.array([0.0, 0.0, self.distance_m]) - pose[:3, :3] @ [0.0, 0.0, self.look_height_m]
+        return pose
+
+
+@final
+@dataclass(frozen=True)
+class Table:
+    """A slab whose surface is the plane z = 0."""
+
+    size_m: tuple[float, float] = (0.5, 0.4)
+    """Width and depth in m."""
+    thickness_m: float = 0.02
+    """Thickness in m."""
+    rgb: tuple[int, int, int] = (150, 140, 125)
+    """Colour."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if min(*self.size_m, self.thickness_m) <= 0.0:
+            raise ValueError("size_m and thickness_m must be positive")
+
+
+@final
+@dataclass(frozen=True)
+class Wall:
+    """An upright wall behind the table."""
+
+    distance_m: float = 0.6
+    """Distance from the middle of the table in m."""
+    size_m: tuple[float, float] = (4.0, 3.0)
+    """Width and height in m, centred at the height of the table."""
+    rgb: tuple[int, int, int] = (205, 205, 200)
+    """Colour."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if min(self.size_m) <= 0.0:
+            raise ValueError("size_m must be positive")
+
+
+@final
+@dataclass(frozen=True)
+class Mosaic:
+    """The object's colour varies from cell to cell of a grid in space."""
+
+    cell_m: float = 0.02
+    """Edge length of a cell in m."""
+    contrast: float = 0.6
+    """How much darker the darkest cells are, 0 to 1."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if self.cell_m <= 0.0 or not 0.0 <= self.contrast <= 1.0:
+            raise ValueError("cell_m must be positive and contrast from 0 to 1")
+
+
+@final
+@dataclass(frozen=True)
+class Recipe:
+    """Everything a synthetic sequence depends on."""
+
+    object: AnyShape
+    """Shape of the object in its model frame, z up."""
+    name: str = "rendered"
+    """What the sequence is called."""
+    seed: int = 0
+    """Seed of motion and noise."""
+    rest_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """How the object lies: turns about the fixed x, y and z axes, before it is set on the table."""
+    view: Viewpoint = Viewpoint()
+    """The camera and its place."""
+    table: Table | None = Table()
+    """What the object stands on; null for nothing."""
+    wall: Wall | None = None
+    """What is behind; null for nothing."""
+    trajectory: AnyTrajectory = field(default_factory=Tabletop)
+    """How the object moves."""
+    sensor: DepthSensor | None = field(default_factory=DepthSensor)
+    """How the camera errs; null for exact depth."""
+    colour: Literal["none", "png", "jpg"] = "none"
+    """Whether and how colour images are written."""
+    pattern: Mosaic | None = None
+    """What is painted on the object."""
+    masks: bool = True
+    """Whether the object's masks are written."""
+    period_s: float = 0.5
+    """Time from frame to frame."""
+    depth_unit_mm: float = 0.1
+    """Unit of the depth images."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if self.seed < 0 or self.period_s <= 0.0 or not 1e-3 <= self.depth_unit_mm <= 10.0:
+            raise ValueError("seed must not be negative, period_s positive, depth_unit_mm from 0.001 to 10")
+
+
+def load_recipe(recipe: str | Path) -> Recipe:
+    """Return a recipe from a JSON or TOML file, or a built-in one by its name.
+
+    Raises:
+        InputError: where there is no such recipe or it is not understood.
+    """
+    path = Path(recipe)
+    if not path.exists() and path.name == str(recipe) and not path.suffix:
+        if path.name not in builtin_recipes():
+            raise InputError(
+                f"{recipe}: no such file and no built-in recipe; those are {', '.join(builtin_recipes())}."
+            )
+        path = _FOLDER / f"{path.name}.json"
+    try:
+        return build(Recipe, read_tree(path))
+    except RecursionError:
+        raise InputError(f"{path}: is nested too deeply; describe the shape with fewer compounds.") from None
+
+
+def builtin_recipes() -> tuple[str, ...]:
+    """Return the names of the built-in recipes."""
+    return tuple(sorted(path.stem for path in _FOLDER.glob("*.json")))
+
+
+_FOLDER = Path(__file__).parent / "recipes"

@@ -1,0 +1,194 @@
+"""Synthetic sequences: rays cast at the object and its surroundings, then seen by a depth camera that errs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.types import Array, Camera, Frame, InputError
+from sequences.base import AbstractSequence, span
+from sequences.bop_writer import write_bop
+from sequences.depth_sensor import EXACT, DepthSensor, Exposure
+from sequences.mesh import Mesh, ply_bytes
+from sequences.raycast import Caster, Hits
+from sequences.recipe import Recipe
+from sequences.scenery import mosaic_shade, surroundings
+from sequences.shapes import placement
+from sequences.surface import outer_surface
+from sequences.trajectory import Hand
+
+_MOTION, _READINGS, _FRAMES = range(3)  # keys of the seed's branches
+
+
+@final
+@dataclass(frozen=True)
+class RenderedSequence(AbstractSequence):
+    """A sequence that is rendered as it is read; the same recipe gives the same frames."""
+
+    recipe: Recipe
+    """What to render."""
+
+    @property
+    def name(self) -> str:
+        """What the sequence is called."""
+        return self.recipe.name
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Frame numbers from 0."""
+        return tuple(range(len(self._camera_from_model)))
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`, with mask and, where the recipe asks for it, colour."""
+        if index not in self.indices:
+            raise InputError(f"sequence {self.name!r} has no frame {index}; its frames are {span(self.indices)}.")
+        recipe, camera = self.recipe, self.recipe.view.camera()
+        jitter_rng, sensor_rng = self._rng(_FRAMES, index).spawn(2)
+        nominal = np.stack([*camera.rays(), np.ones((camera.height, camera.width))], axis=-1)
+        looked, on_object = self._look(index, self._jittered(nominal, camera, jitter_rng))
+        exposure = Exposure(looked.depth_m, looked.incidence_rad, self._shadowed(index, looked))
+        depth_m = self._sensor.measure(exposure, recipe.view.focal_px, sensor_rng)
+        colour = None if recipe.colour == "none" else self._painted(index, nominal)
+        mask = on_object if recipe.masks else None
+        return Frame(index, index * recipe.period_s, depth_m, camera, mask, colour)
+
+    def truth(self) -> dict[int, Array]:
+        """Return the true camera_from_model (4, 4), in m, by frame number."""
+        return dict(enumerate(self._camera_from_model))
+
+    def sensor(self) -> tuple[float, float]:
+        """Return the sensor's noise `(sigma_wh, sigma_r_m)` at the distance of the object."""
+        view = self.recipe.view
+        return self._sensor.sigmas(view.distance_m, view.focal_px, self.recipe.depth_unit_mm / 1000.0)
+
+    @property
+    def motion(self) -> Mapping[str, object] | None:
+        """What the recipe says of the motion."""
+        return self.recipe.trajectory.motion()
+
+    @property
+    def robot_path(self) -> Path | None:
+        """None: a rendered sequence has no files."""
+        return None
+
+    @property
+    def model_path(self) -> Path | None:
+        """None: a rendered sequence has no files."""
+        return None
+
+    def model(self) -> Mesh:
+        """Return the true outer surface in the model frame, in m."""
+        return outer_surface(self._mesh)
+
+    def robot_readings(self) -> Array | None:
+        """Return camera_from_hand (n, 4, 4) as the robot reads it; None where no robot holds the object."""
+        trajectory = self.recipe.trajectory
+        if not isinstance(trajectory, Hand) or trajectory.robot is None:
+            return None
+        return trajectory.robot.camera_from_hand(self._camera_from_model, self._rng(_READINGS))
+
+    def _rng(self, *branch: int) -> np.random.Generator:
+        return np.random.default_rng((self.recipe.seed, *branch))
+
+    @property
+    def _sensor(self) -> DepthSensor:
+        return EXACT if self.recipe.sensor is None else self.recipe.sensor
+
+    @cached_property
+    def _mesh(self) -> Mesh:
+        return self.recipe.object.mesh()
+
+    @cached_property
+    def _casters(self) -> tuple[Caster, Caster]:
+        """Return the object in its model frame, and what surrounds it in the camera frame."""
+        return Caster(self._mesh), Caster(surroundings(self.recipe).moved(self.recipe.view.camera_from_table()))
+
+    @cached_property
+    def _camera_from_model(self) -> Array:
+        resting = self._mesh.moved(placement((0.0, 0.0, 0.0), self.recipe.rest_rotation_deg)).vertices_m
+        low, high = resting.min(axis=0), resting.max(axis=0)
+        middle = 0.5 * (low + high)
+        object_from_model = placement((-middle[0], -middle[1], -low[2]), self.recipe.rest_rotation_deg)
+        centre_m = np.array([0.0, 0.0, middle[2] - low[2]])
+        table_from_object = self.recipe.trajectory.table_from_object(centre_m, self._rng(_MOTION))
+        return self.recipe.view.camera_from_table() @ table_from_object @ object_from_model
+
+    def _jittered(self, rays: Array, camera: Camera, rng: np.random.Generator) -> Array:
+        if self._sensor.jitter is None:
+            return rays
+        along_w, along_h = self._sensor.jitter.offsets_px((camera.height, camera.width), rng)
+        return rays + np.stack([along_w / camera.fx, along_h / camera.fy, np.zeros_like(along_w)], axis=-1)
+
+    def _look(self, index: int, rays: Array) -> tuple[Hits, npt.NDArray[np.bool_]]:
+        """Return what rays (h, w, 3) from the camera meet first, and where that is the object."""
+        thing, around = self._casters
+        on_thing, behind = thing.cast(rays, self._camera_from_model[index]), around.cast(rays, np.eye(4))
+        first = on_thing.depth_m < np.where(np.isnan(behind.depth_m), np.inf, behind.depth_m)
+        return on_thing.over(behind, first), first
+
+    def _shadowed(self, index: int, looked: Hits) -> npt.NDArray[np.bool_]:
+        if not self._sensor.shadow:
+            return np.zeros(looked.depth_m.shape, bool)
+        projector_m = np.array([self._sensor.baseline_m, 0.0, 0.0])
+        thing, around = self._casters
+        by_thing = thing.blocks(projector_m, looked.points_m, self._camera_from_model[index])
+        return by_thing | around.blocks(projector_m, looked.points_m, np.eye(4))
+
+    def _painted(self, index: int, rays: Array) -> npt.NDArray[np.uint8]:
+        """Return the colour image (h, w, 3), lit from the camera."""
+        looked, on_object = self._look(index, rays)
+        light = 0.35 + 0.65 * np.cos(looked.incidence_rad)
+        if self.recipe.pattern is not None:
+            model_from_camera = se3.inverse(self._camera_from_model[index])
+            painted = mosaic_shade(se3.transform(model_from_camera, looked.points_m[on_object]), self.recipe.pattern)
+            light[on_object] *= painted
+        lit = np.where(np.isnan(looked.depth_m)[..., None], 0.0, looked.albedo * light[..., None])
+        return np.rint(np.clip(np.nan_to_num(lit), 0.0, 255.0)).astype(np.uint8)
+
+
+def render(recipe: Recipe, folder: Path) -> None:
+    """Write the sequence of a recipe as a BOP scene folder, with the true surface as `model.ply`.
+
+    Raises:
+        InputError: where the folder is not empty or cannot be written.
+    """
+    sequence = RenderedSequence(recipe)
+    sigma_wh, sigma_r_m = sequence.sensor()
+    files = {"model.ply": ply_bytes(sequence.model())}
+    readings = sequence.robot_readings()
+    if readings is not None:
+        files["robot.txt"] = _tum_bytes(readings, recipe.period_s)
+    write_bop(
+        folder,
+        sequence,
+        sequence.truth(),
+        {
+            "name": recipe.name,
+            "sensor": {"sigma_wh": sigma_wh, "sigma_r_m": sigma_r_m},
+            **({} if sequence.motion is None else {"motion": sequence.motion}),
+            "ground_truth": "exact",
+            "source": "rendered",
+            "license": "MIT",
+        },
+        depth_scale_mm=recipe.depth_unit_mm,
+        colour_suffix=f".{recipe.colour}",
+        files=files,
+    )
+
+
+def _tum_bytes(poses: Array, period_s: float) -> bytes:
+    """Return poses (n, 4, 4) as lines `time tx ty tz qx qy qz qw`."""
+    from scipy.spatial.transform import Rotation
+
+    lines = ["# time_s and camera_from_hand: tx ty tz qx qy qz qw"]
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    for index, (pose, quaternion) in enumerate(zip(poses, quaternions, strict=True)):
+        lines.append(" ".join(f"{value:.9f}" for value in (index * period_s, *pose[:3, 3], *quaternion)))
+    return ("\n".join(lines) + "\n").encode()

@@ -1,0 +1,283 @@
+"""Shapes of objects: solids, solids swept from outlines, mesh files, and compounds of them. The z axis points up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from modeler import se3
+from modeler.types import Array
+from sequences.mesh import Mesh, read_mesh
+from sequences.sweeps import bent, ear_clipped, extruded, turned
+
+ROUNDNESS_M = 15e-6
+"""How far facets of round shapes may lie inside the true surface in m."""
+
+_UNIT_CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_CUBE_FACES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+
+
+@final
+@dataclass(frozen=True)
+class Box:
+    """A box about the origin."""
+
+    size_m: tuple[float, float, float]
+    """Edge lengths along x, y, z in m."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        _positive(size_m=min(self.size_m))
+
+    def mesh(self) -> Mesh:
+        """Return the surface."""
+        triangles = [corners for a, b, c, d in _CUBE_FACES for corners in ([a, b, c], [a, c, d])]
+        return Mesh.single(_UNIT_CUBE * np.array(self.size_m), np.array(triangles))
+
+
+@final
+@dataclass(frozen=True)
+class Cylinder:
+    """A cylinder about the z axis, centred at the origin."""
+
+    radius_m: float
+    """Radius in m."""
+    height_m: float
+    """Length along z in m."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        _positive(radius_m=self.radius_m, height_m=self.height_m)
+
+    def mesh(self) -> Mesh:
+        """Return the surface."""
+        half = self.height_m / 2.0
+        return turned(np.array([[self.radius_m, -half], [self.radius_m, half]]), _sides(self.radius_m))
+
+
+@final
+@dataclass(frozen=True)
+class Cone:
+    """A cone or a frustum about the z axis, from z = 0 up."""
+
+    radius_m: float
+    """Radius at the bottom in m."""
+    height_m: float
+    """Height in m."""
+    top_radius_m: float = 0.0
+    """Radius at the top in m."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        _positive(height_m=self.height_m, radius_m=max(self.radius_m, self.top_radius_m))
+        _positive(radius_m=min(self.radius_m, self.top_radius_m) + 1e-12)
+
+    def mesh(self) -> Mesh:
+        """Return the surface."""
+        sides = _sides(max(self.radius_m, self.top_radius_m))
+        return turned(np.array([[self.radius_m, 0.0], [self.top_radius_m, self.height_m]]), sides)
+
+
+@final
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere about the origin."""
+
+    radius_m: float
+    """Radius in m."""
+
+    def __post_init__(self) -> None:
+        """Check the size."""
+        _positive(radius_m=self.radius_m)
+
+    def mesh(self) -> Mesh:
+        """Return the surface."""
+        sides = _sides(self.radius_m)
+        return turned(self.radius_m * _arc(-90.0, 90.0, sides), sides)
+
+
+@final
+@dataclass(frozen=True)
+class Capsule:
+    """A cylinder about the z axis with round ends, centred at the origin."""
+
+    radius_m: float
+    """Radius in m."""
+    height_m: float
+    """Length along z between the centres of the ends in m."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        _positive(radius_m=self.radius_m, height_m=self.height_m)
+
+    def mesh(self) -> Mesh:
+        """Return the surface."""
+        up = np.array([0.0, self.height_m / 2.0])
+        sides = _sides(self.radius_m)
+        ends = [self.radius_m * _arc(-90.0, 0.0, sides) - up, self.radius_m * _arc(0.0, 90.0, sides) + up]
+        return turned(np.concatenate(ends), sides)
+
+
+@final
+@dataclass(frozen=True)
+class Torus:
+    """A round bar bent about the z axis, beginning at the x axis."""
+
+    radius_m: float
+    """Radius of the bar's centre line in m."""
+    tube_radius_m: float
+    """Radius of the bar in m."""
+    arc_deg: float = 360.0
+    """How far it is bent; 360° closes the ring."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        _positive(radius_m=self.radius_m - self.tube_radius_m, tube_radius_m=self.tube_radius_m, arc_deg=self.arc_deg)
+
+    def mesh(self) -> Mesh:
+        """Return the surface."""
+        sides = _sides(self.tube_radius_m)
+        steps = max(4, round(_sides(self.radius_m + self.tube_radius_m) * self.arc_deg / 360.0))
+        return bent(self.radius_m, self.tube_radius_m, arc_deg=self.arc_deg, steps=steps, sides=sides)
+
+
+@final
+@dataclass(frozen=True)
+class Lathe:
+    """A solid turned about the z axis."""
+
+    profile_m: tuple[tuple[float, float], ...]
+    """Radius and height in m, from the bottom outside up to the top; it may go on down inside a hollow."""
+
+    def __post_init__(self) -> None:
+        """Check the profile."""
+        if len(self.profile_m) < 2 or min(radius for radius, _ in self.profile_m) < 0.0:
+            raise ValueError("profile_m must have at least two points, none of negative radius")
+        profile = np.array(self.profile_m)
+        _positive(profile_m=float(profile[:, 0].max()))
+
+    def mesh(self) -> Mesh:
+        """Return the surface."""
+        profile = np.array(self.profile_m)
+        return turned(profile, _sides(float(profile[:, 0].max())))
+
+
+@final
+@dataclass(frozen=True)
+class Extrusion:
+    """A prism over a polygon, from z = 0 up."""
+
+    outline_m: tuple[tuple[float, float], ...]
+    """Corners x, y in m, counter-clockwise."""
+    height_m: float
+    """Height in m."""
+
+    def __post_init__(self) -> None:
+        """Check the outline."""
+        _positive(height_m=self.height_m)
+        if len(self.outline_m) < 3:
+            raise ValueError("outline_m must have at least three corners")
+        try:
+            ear_clipped(np.array(self.outline_m))
+        except ValueError as error:
+            raise ValueError(f"outline_m {error}") from None
+
+    def mesh(self) -> Mesh:
+        """Return the surface."""
+        return extruded(np.array(self.outline_m), self.height_m)
+
+
+@final
+@dataclass(frozen=True)
+class MeshFile:
+    """A closed surface from a file; its z axis should point up."""
+
+    path: Path
+    """PLY, OBJ, STL, GLB or OFF; relative to the recipe."""
+    scale: float = 1.0
+    """Metres per unit of the file: 0.001 where it is in mm."""
+
+    def __post_init__(self) -> None:
+        """Check the scale."""
+        _positive(scale=self.scale)
+
+    def mesh(self) -> Mesh:
+        """Return the surface."""
+        return read_mesh(self.path, self.scale)
+
+
+@final
+@dataclass(frozen=True)
+class Part:
+    """A shape at its place in a compound: stretched, then turned, then shifted."""
+
+    shape: AnyShape
+    """The shape."""
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Shift in m."""
+    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Turns about the fixed x, y and z axes, in this order."""
+    stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factors along the shape's own axes."""
+    rgb: tuple[int, int, int] | None = None
+    """Colour; the shape's own without it."""
+
+    def __post_init__(self) -> None:
+        """Check the factors and the colour."""
+        _positive(stretch=min(self.stretch))
+        if self.rgb is not None and not all(0 <= value <= 255 for value in self.rgb):
+            raise ValueError("rgb must hold numbers from 0 to 255")
+
+    def mesh(self) -> Mesh:
+        """Return the surface at its place."""
+        mesh = self.shape.mesh().scaled(self.stretch).moved(placement(self.offset_m, self.rotation_deg))
+        return mesh if self.rgb is None else mesh.painted(self.rgb)
+
+
+@final
+@dataclass(frozen=True)
+class Compound:
+    """The union of several shapes."""
+
+    parts: tuple[Part, ...]
+    """The shapes at their places."""
+
+    def __post_init__(self) -> None:
+        """Check that there is something."""
+        if not self.parts:
+            raise ValueError("parts must not be empty")
+
+    def mesh(self) -> Mesh:
+        """Return the surfaces of all parts, hidden pieces included."""
+        return Mesh.joined([part.mesh() for part in self.parts])
+
+
+AnyShape = Box | Cylinder | Cone | Sphere | Capsule | Torus | Lathe | Extrusion | MeshFile | Compound
+
+
+def placement(offset_m: tuple[float, float, float], rotation_deg: tuple[float, float, float]) -> Array:
+    """Return the motion (4, 4) that turns about the fixed x, y and z axes, in this order, then shifts."""
+    pose = se3.translation(np.array(offset_m))
+    pose[:3, :3] = Rotation.from_euler("xyz", rotation_deg, degrees=True).as_matrix()
+    return pose
+
+
+def _sides(radius_m: float) -> int:
+    """Return how many facets make a circle of a radius round enough; a multiple of four."""
+    return 4 * int(np.clip(np.ceil(np.pi / np.sqrt(2.0 * ROUNDNESS_M / radius_m) / 4.0), 4, 128))
+
+
+def _arc(start_deg: float, stop_deg: float, sides: int) -> Array:
+    """Return radius and height (n, 2) of a unit arc, its ends exactly on the axis or the equator."""
+    angle = np.radians(np.linspace(start_deg, stop_deg, 1 + round(sides * (stop_deg - start_deg) / 360.0)))
+    return np.column_stack([np.cos(angle), np.sin(angle)]).astype(np.float64).round(12)
+
+
+def _positive(**values: float) -> None:
+    for name, value in values.items():
+        if not value > 0.0:
+            raise ValueError(f"{name} must be positive")

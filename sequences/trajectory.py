@@ -1,0 +1,198 @@
+"""How the object moves from frame to frame, as poses table_from_object.
+
+The table frame has its origin in the middle of the table's surface, z up, y away from the camera. The object frame is
+the object as it rests: standing on z = 0, its bounding box centred over the origin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from modeler import se3
+from modeler.types import Array
+from sequences.shapes import placement
+
+
+@final
+@dataclass(frozen=True)
+class Tabletop:
+    """Somebody pushes the object about the table: it turns by about a step and shifts a little at random."""
+
+    frames: int = 14
+    """Number of frames."""
+    step_deg: float = 25.0
+    """Mean turn about the vertical from frame to frame."""
+    step_sigma_deg: float = 3.0
+    """Standard deviation of the turn."""
+    shift_m: float = 0.03
+    """Mean shift from frame to frame in m; single shifts are half to one and a half of it."""
+    reach_m: float = 0.05
+    """The object stays within this distance of the middle of the table."""
+    start_deg: float = 0.0
+    """Turn of the first frame."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        _checked(self.frames, self.step_sigma_deg, self.shift_m)
+        if self.shift_m > self.reach_m:
+            raise ValueError("reach_m must be at least shift_m")
+
+    def table_from_object(self, centre_m: Array, rng: np.random.Generator) -> Array:
+        """Draw the poses (frames, 4, 4)."""
+        turn_deg, place_m = self.start_deg, np.zeros(2)
+        poses = [placement((0.0, 0.0, 0.0), (0.0, 0.0, turn_deg))]
+        while len(poses) < self.frames:
+            turn_deg += rng.normal(self.step_deg, self.step_sigma_deg)
+            place_m = self._next_place(place_m, rng)
+            poses.append(placement((place_m[0], place_m[1], 0.0), (0.0, 0.0, turn_deg)))
+        return np.array(poses)
+
+    def _next_place(self, place_m: Array, rng: np.random.Generator) -> Array:
+        while True:  # from within reach at least a third of the directions stay within reach, so this soon ends
+            angle, length_m = rng.uniform(0.0, 2.0 * np.pi), self.shift_m * rng.uniform(0.5, 1.5)
+            there_m = place_m + length_m * np.array([np.cos(angle), np.sin(angle)])
+            if np.hypot(*there_m) <= self.reach_m:
+                return there_m
+
+    def motion(self) -> Mapping[str, object]:
+        """Return what `sequence.json` says of it."""
+        return {"kind": "table", "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg, "shift_m": self.shift_m}
+
+
+@final
+@dataclass(frozen=True)
+class Turntable:
+    """The object turns about a fixed vertical axis."""
+
+    frames: int = 15
+    """Number of frames."""
+    step_deg: float = 24.0
+    """Nominal turn from frame to frame."""
+    step_sigma_deg: float = 0.5
+    """Standard deviation of the turn."""
+    offset_m: tuple[float, float] = (0.02, 0.01)
+    """Where the object stands on the disc at the start, from its axis, in m."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        _checked(self.frames, self.step_sigma_deg)
+
+    def table_from_object(self, centre_m: Array, rng: np.random.Generator) -> Array:
+        """Draw the poses (frames, 4, 4)."""
+        steps_deg = rng.normal(self.step_deg, self.step_sigma_deg, self.frames - 1)
+        on_disc = se3.translation(np.array([*self.offset_m, 0.0]))
+        turns_deg = np.concatenate([[0.0], np.cumsum(steps_deg)])
+        return np.array([placement((0.0, 0.0, 0.0), (0.0, 0.0, turn_deg)) @ on_disc for turn_deg in turns_deg])
+
+    def motion(self) -> Mapping[str, object]:
+        """Return what `sequence.json` says of it."""
+        return {"kind": "turntable", "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg}
+
+
+@final
+@dataclass(frozen=True)
+class RobotReadings:
+    """How well a robot knows where the hand is that holds the object."""
+
+    sigma_deg: float = 1.0
+    """Standard deviation of a pose's rotation about each axis."""
+    sigma_m: float = 0.003
+    """Standard deviation of a pose's translation along each axis in m."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        _checked(1, self.sigma_deg, self.sigma_m)
+
+    def camera_from_hand(self, camera_from_model: Array, rng: np.random.Generator) -> Array:
+        """Draw poses (n, 4, 4) of a hand that holds the object still at its model frame."""
+        sigma = np.repeat([np.radians(self.sigma_deg), self.sigma_m], 3)
+        return camera_from_model @ se3.exp(rng.normal(size=(len(camera_from_model), 6)) * sigma)
+
+
+@final
+@dataclass(frozen=True)
+class Hand:
+    """The object is turned freely in the air, about an axis that wanders."""
+
+    frames: int = 20
+    """Number of frames."""
+    step_deg: float = 18.0
+    """Mean turn from frame to frame."""
+    step_sigma_deg: float = 3.0
+    """Standard deviation of the turn."""
+    shift_m: float = 0.015
+    """Standard deviation of the shift along each axis, about the middle, in m."""
+    wander: float = 0.4
+    """How much the axis turns from step to step: 0 keeps it, 1 and more forget it quickly."""
+    height_m: float = 0.1
+    """Height of the object's centre above the table's plane in m."""
+    robot: RobotReadings | None = None
+    """Who holds the object: a robot that writes `robot.txt`, or a person."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        _checked(self.frames, self.step_sigma_deg, self.shift_m, self.wander)
+
+    def table_from_object(self, centre_m: Array, rng: np.random.Generator) -> Array:
+        """Draw the poses (frames, 4, 4)."""
+        middle = se3.translation(np.array([0.0, 0.0, self.height_m]))
+        about_centre = se3.translation(-centre_m)
+        axis, turn = rng.normal(size=3), np.eye(4)
+        poses = [middle @ about_centre]
+        while len(poses) < self.frames:
+            axis = axis / np.linalg.norm(axis) + self.wander * rng.normal(size=3)
+            angle_rad = np.radians(rng.normal(self.step_deg, self.step_sigma_deg))
+            turn = se3.exp(np.concatenate([angle_rad * axis / np.linalg.norm(axis), np.zeros(3)])) @ turn
+            poses.append(middle @ se3.translation(rng.normal(0.0, self.shift_m, 3)) @ turn @ about_centre)
+        return np.array(poses)
+
+    def motion(self) -> Mapping[str, object]:
+        """Return what `sequence.json` says of it."""
+        kind = "general" if self.robot is None else "held"
+        return {"kind": kind, "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg, "shift_m": self.shift_m}
+
+
+@final
+@dataclass(frozen=True)
+class Place:
+    """One pose of the resting object on, or above, the table."""
+
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Shift in m."""
+    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Turns about the fixed x, y and z axes, in this order."""
+
+
+@final
+@dataclass(frozen=True)
+class Places:
+    """Poses that are given one by one."""
+
+    poses: tuple[Place, ...]
+    """The pose of every frame."""
+
+    def __post_init__(self) -> None:
+        """Check that there is something."""
+        _checked(len(self.poses))
+
+    def table_from_object(self, centre_m: Array, rng: np.random.Generator) -> Array:
+        """Return the poses (frames, 4, 4)."""
+        return np.array([placement(pose.offset_m, pose.rotation_deg) for pose in self.poses])
+
+    def motion(self) -> Mapping[str, object] | None:
+        """Return what `sequence.json` says of it: nothing."""
+        return None
+
+
+AnyTrajectory = Tabletop | Turntable | Hand | Places
+
+
+def _checked(frames: int, *spreads: float) -> None:
+    if not 1 <= frames <= 10_000:
+        raise ValueError("the number of frames must be from 1 to 10000")
+    if min(spreads, default=0.0) < 0.0:
+        raise ValueError("standard deviations and shifts must not be negative")
