@@ -198,6 +198,18 @@ def test_edges_are_told_apart(run: list[Step], recording: Recording) -> None:
     assert len(colours) == 3
 
 
+def test_an_edge_that_the_optimisation_left_out_counts_as_rejected(run: list[Step], tmp_path: Path) -> None:
+    last = run[-1]
+    outlier = next(edge for edge in last.edges_so_far if edge.kind == "closure" and edge.accepted)
+    wary = replace(last, solution=replace(last.solution, outliers=(outlier,)))
+    recording = record(tmp_path / "r.rrd", [wary])
+    assert "strips" not in recording[entities.CLOSURE][COUNT - 1]
+    assert len(recording[entities.REJECTED][COUNT - 1]["strips"]) == 2
+    now = recording[entities.NOW][COUNT - 1]["text"][0]
+    assert "left out" in now
+    assert "loop closures 0, pairs rejected 3" in now
+
+
 def test_ellipsoids_are_the_covariance_as_magnified(run: list[Step], recording: Recording) -> None:
     for step in run:
         label = recording[entities.MAGNIFICATION][step.frame.index]["labels"][0]

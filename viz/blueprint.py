@@ -98,7 +98,11 @@ def _readings() -> rrb.Container:
         entities.SECONDS: "Seconds per pair",
     }
     hidden = rrb.PlotLegend(visible=False)
-    plots = [rrb.TimeSeriesView(origin=path, name=title, plot_legend=hidden) for path, title in titles.items()]
+    dark = rrb.archetypes.PlotBackground(color=_BACKGROUND)  # in the browser too, whatever its theme, for white lines
+    plots = [
+        rrb.TimeSeriesView(origin=path, name=title, plot_legend=hidden, background=dark)
+        for path, title in titles.items()
+    ]
     return rrb.Horizontal(
         rrb.Vertical(*plots[:2]),
         rrb.Vertical(*plots[2:4]),

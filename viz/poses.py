@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 
 from modeler import se3
-from modeler.types import Array, Camera, Step
+from modeler.types import Array, Camera, Edge, Step
 from viz import entities
 
 Drawing = Iterator[tuple[str, rr.AsComponents]]
@@ -38,6 +38,11 @@ def drawing(step: Step) -> Drawing:
     yield from _edges(step)
 
 
+def takes_part(edge: Edge, step: Step) -> bool:
+    """Return whether an edge was accepted and not left out by the optimisation since."""
+    return edge.accepted and not any(edge is outlier for outlier in step.solution.outliers)
+
+
 def shown(step: Step) -> list[int]:
     """Return the frames whose poses are drawn: all, or of many every n-th."""
     numbers = sorted(step.solution.trajectory)
@@ -63,7 +68,7 @@ def _edges(step: Step) -> Drawing:
     for edge in step.edges_so_far:
         if edge.source in trajectory and edge.target in trajectory:
             accepted = entities.CLOSURE if edge.kind == "closure" else entities.ODOMETRY
-            path = accepted if edge.accepted else entities.REJECTED
+            path = accepted if takes_part(edge, step) else entities.REJECTED
             lines[path].append([trajectory[edge.target][:3, 3], trajectory[edge.source][:3, 3]])
     yield entities.ODOMETRY, _lines(lines[entities.ODOMETRY], entities.ODOMETRY_RGB, 1.5)
     yield entities.CLOSURE, _lines(lines[entities.CLOSURE], entities.CLOSURE_RGB, 2.5)

@@ -10,7 +10,7 @@ import rerun as rr
 
 from modeler import se3
 from modeler.types import Array, Edge, Posterior, Step
-from viz import entities
+from viz import entities, poses
 
 Drawing = Iterator[tuple[str, rr.AsComponents]]
 
@@ -79,7 +79,9 @@ def now_words(step: Step) -> str:
         lines.append(
             f"- {step.segmentation.outcome.advice}" if step.view is None else "- The first view of the object."
         )
-    accepted = [edge.kind for edge in step.edges_so_far if edge.accepted]
+    accepted = [edge.kind for edge in step.edges_so_far if poses.takes_part(edge, step)]
+    for edge in step.solution.outliers:
+        lines.append(f"- {edge.source} → {edge.target} {edge.kind} is left out, for all other edges contradict it.")
     rejected = len(step.edges_so_far) - len(accepted)
     points = 0 if step.model is None else len(step.model.points_m)
     lines.append(

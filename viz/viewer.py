@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import socket
 import subprocess
@@ -72,7 +73,10 @@ def start_web(recordings: Sequence[Path] = ()) -> Viewer:
     port, page = _free_port(), _free_port()
     arguments = ["--serve-web", "--port", str(port), "--web-viewer-port", str(page)]
     process = _start(arguments, recordings, port=page, own_session=False)
-    return Viewer(process, _sink(port), f"http://{_HOST}:{page}?url={quote(_sink(port), safe='')}", lasting=False)
+    address = f"http://{_HOST}:{page}?url={quote(_sink(port), safe='')}"
+    served = Viewer(process, _sink(port), address, lasting=False)
+    atexit.register(served.stop)  # also where an error ends the run
+    return served
 
 
 def view(run: Path, *, web: bool = False) -> Viewer:
