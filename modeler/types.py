@@ -149,8 +149,8 @@ class RayImage:
 
     @property
     def centroid_m(self) -> Array:
-        """Mean (3,) of the surface points."""
-        return self.points_m.mean(axis=0)
+        """Mean (3,) of the surface points; the origin where there are none."""
+        return self.points_m.mean(axis=0) if len(self.points_m) else np.zeros(3)
 
 
 class AbstractMotion(ABC):

@@ -1,0 +1,72 @@
+"""Nothing known but that the views are neighbours (paper, section IV: the general prior)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeler import se3
+from modeler.types import AbstractMotion, AbstractPrior, Array, RayImage
+
+
+@dataclass(frozen=True)
+class GeneralPrior(AbstractPrior):
+    """Any rotation up to a limit, the centroids of the two surfaces close to each other."""
+
+    max_rotation_deg: float = 50.0
+    """Largest rotation between the two views."""
+    max_offset_m: float = 0.04
+    """Largest distance between the target's centroid and the source's, carried over."""
+
+    def between(self, source: RayImage, target: RayImage) -> "GeneralMotion":
+        """Return the density of target_from_source."""
+        return GeneralMotion(source.centroid_m, target.centroid_m, np.deg2rad(self.max_rotation_deg), self.max_offset_m)
+
+
+@dataclass(frozen=True, eq=False)
+class GeneralMotion(AbstractMotion):
+    """Uniform over rotations up to a limit and over a ball of centroid offsets."""
+
+    source_centroid_m: Array
+    """(3,)."""
+    target_centroid_m: Array
+    """(3,)."""
+    max_rotation_rad: float
+    max_offset_m: float
+    evidence: bool = True
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw motions (count, 4, 4)."""
+        angle = sample_angles(self.max_rotation_rad, count, rng)
+        offset_m = directions(count, rng) * self.max_offset_m * rng.random((count, 1)) ** (1 / 3)
+        motion = se3.exp(np.concatenate([angle[:, None] * directions(count, rng), np.zeros((count, 3))], axis=1))
+        motion[:, :3, 3] = self.target_centroid_m + offset_m - motion[:, :3, :3] @ self.source_centroid_m
+        return motion
+
+    def log_density(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of motions (n, 4, 4); -inf outside."""
+        trace = np.trace(target_from_source[:, :3, :3], axis1=1, axis2=2)
+        offset_m = centroid_offset(target_from_source, self.source_centroid_m, self.target_centroid_m)
+        inside = (trace >= 1.0 + 2.0 * np.cos(self.max_rotation_rad) - 1e-9) & (
+            np.sum(offset_m**2, axis=1) <= self.max_offset_m**2
+        )
+        # The uniform measure of rotations up to an angle a is 8π (a - sin a), in units of rad³ at the identity.
+        rotations = 8.0 * np.pi * (self.max_rotation_rad - np.sin(self.max_rotation_rad))
+        offsets = 4.0 / 3.0 * np.pi * self.max_offset_m**3
+        return np.where(inside, -np.log(rotations * offsets), -np.inf)
+
+
+def directions(count: int, rng: np.random.Generator) -> Array:
+    """Draw unit vectors (count, 3) evenly over the sphere."""
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def sample_angles(limit_rad: float, count: int, rng: np.random.Generator) -> Array:
+    """Draw the angles (count,) of rotations that are uniform on SO(3) up to a limit: density ∝ 1 - cos(angle)."""
+    angle = np.linspace(0.0, limit_rad, 4096)
+    return np.interp(rng.random(count), (angle - np.sin(angle)) / (limit_rad - np.sin(limit_rad)), angle)
+
+
+def centroid_offset(target_from_source: Array, source_centroid_m: Array, target_centroid_m: Array) -> Array:
+    """Return the offsets (n, 3) in m of the source's centroid, carried over, from the target's."""
+    return target_from_source[:, :3, :3] @ source_centroid_m + target_from_source[:, :3, 3] - target_centroid_m

@@ -1,0 +1,90 @@
+"""From a segmented frame to what registration looks up: smoothed surface points, local planes, empty space."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeler.kernels import planes
+from modeler.types import Array, Frame, Plane, RayImage
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Noise of the depth camera in ray coordinates (paper, section II), and how its images are smoothed."""
+
+    sigma_wh: float = 0.002
+    """Lateral noise in (w, h); the paper's value for the first Kinect."""
+    sigma_r_m: float = 0.002
+    """Noise along the ray in m, for a surface that faces the camera."""
+    smoothing: float = 0.025
+    """Radius of the ball in which planes are fitted, as a share of the object's extent."""
+    min_neighbours: float = 25.0
+    """The ball grows until it holds about so many pixels of a surface that faces the camera."""
+    min_cosine: float = 0.35
+    """Surface seen at a flatter angle than this gives no points: its noise and its smoothing are not to be trusted."""
+    max_silhouette_px: float = 60.0
+    """Distance from the silhouette beyond which all empty space counts alike."""
+
+    def ray_image(self, frame: Frame, plane: Plane | None = None) -> RayImage:
+        """Make a segmented frame ready for registration; without object pixels it has no points.
+
+        Args:
+            frame: with its mask; a frame without one is taken to show nothing but the object.
+            plane: the support plane, where one is seen.
+        """
+        camera = frame.camera
+        seen = np.isfinite(frame.depth_m) & (frame.depth_m > 0)
+        mask = seen if frame.mask is None else seen & frame.mask
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        radius_m, reach_px = self._ball(frame, mask)
+        depth_m = np.ascontiguousarray(frame.depth_m, dtype=np.float32)
+        cells = planes.local_planes(depth_m, mask, intrinsics, radius_m, reach_px, self._sigma_inverse(frame, mask))
+        # Object pixels that carry no depth still hide what is behind them: the silhouette is the whole mask's.
+        outline = mask if frame.mask is None else frame.mask
+        cells[..., planes.SILHOUETTE] = planes.silhouette_distance(outline, self.max_silhouette_px)
+        rows, columns = np.nonzero(
+            (cells[..., planes.KIND] == planes.SURFACE) & (cells[..., planes.COSINE] > self.min_cosine)
+        )
+        points_m, normals = surface_points(cells, rows, columns, intrinsics)
+        return RayImage(
+            frame=frame,
+            plane=plane,
+            sigma_wh=self.sigma_wh,
+            sigma_r_m=self.sigma_r_m,
+            points_m=points_m,
+            normals=normals,
+            pixels=np.stack([rows, columns], axis=1),
+            layers={"cells": cells, "sigma_m": cells[rows, columns, planes.SIGMA].astype(np.float64)},
+        )
+
+    def _ball(self, frame: Frame, mask: np.ndarray) -> tuple[float, int]:
+        """Return the radius in m of the smoothing ball, and in px at the object's nearest point."""
+        rows, columns = np.nonzero(mask)
+        if rows.size == 0:
+            return 0.01, 1
+        depth_m = frame.depth_m[rows, columns]
+        middle_m = float(np.median(depth_m))
+        metres_per_px = middle_m / frame.camera.fx
+        extent_m = metres_per_px * float(np.hypot(np.ptp(rows), np.ptp(columns)))
+        density = rows.size / max(float(frame.mask.sum()) if frame.mask is not None else rows.size, 1.0)
+        sparse_px = np.sqrt(self.min_neighbours / (np.pi * max(density, 0.01)))
+        radius_m = max(self.smoothing * extent_m, sparse_px * metres_per_px)
+        nearest_m = float(np.percentile(depth_m, 2))
+        return radius_m, int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, 16))
+
+    def _sigma_inverse(self, frame: Frame, mask: np.ndarray) -> float:
+        """Return the least noise of inverse depth (1/m) that a plane's residuals are taken to show."""
+        if not mask.any():
+            return self.sigma_r_m
+        # A tenth of the sensor's noise: neighbouring pixels may agree better than they are true.
+        return 0.1 * self.sigma_r_m / float(np.median(frame.depth_m[mask])) ** 2
+
+
+def surface_points(cells: np.ndarray, rows: np.ndarray, columns: np.ndarray, intrinsics: Array) -> tuple[Array, Array]:
+    """Return the points (n, 3) in m where pixels' rays meet their local planes, and the planes' normals (n, 3)."""
+    fx, fy, cx, cy = intrinsics
+    plane = cells[rows, columns, planes.PLANE_X : planes.PLANE_Z + 1].astype(np.float64)
+    rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones(len(rows))], axis=1)
+    points_m = rays / np.sum(plane * rays, axis=1, keepdims=True)
+    normals = -plane / np.linalg.norm(plane, axis=1, keepdims=True)
+    return points_m, normals

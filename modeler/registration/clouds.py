@@ -1,0 +1,188 @@
+"""What the methods on bare point clouds share: thinning, where to start, and what residuals say of the uncertainty.
+
+These methods are the field's usual practice, kept as baselines. They know nothing of free space, and of the prior they
+use the centre, to start from, and the spread, for directions that the surfaces leave open.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from modeler import se3
+from modeler.types import AbstractMotion, Array, Outcome, PoseGaussian, Posterior, RayImage
+
+_START_SAMPLES = 1000
+_OPEN_SPREAD_RAD = np.pi / 2  # rotations spread wider than this have no centre to speak of
+_SMALLEST_SIGMA = 1e-6  # rad or m: keeps covariances positive definite where prior or residuals vanish
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Surface points with normals, in one camera's coordinates."""
+
+    points_m: Array
+    """(n, 3)."""
+    normals: Array
+    """(n, 3) unit normals, towards the camera."""
+
+    @staticmethod
+    def of(view: RayImage) -> Cloud:
+        """Return the surface points of a view."""
+        return Cloud(view.points_m, view.normals)
+
+    @property
+    def size_m(self) -> float:
+        """Twice the root mean square distance of the points from their centroid."""
+        return 2.0 * float(np.sqrt(np.sum(np.var(self.points_m, axis=0))))
+
+    def thinned(self, voxel_m: float) -> Cloud:
+        """Return the mean point and normal of each occupied cube of edge `voxel_m`, on a grid about the centroid."""
+        cubes = np.floor((self.points_m - self.points_m.mean(axis=0)) / voxel_m).astype(np.int64)
+        cubes -= cubes.min(axis=0)
+        number = np.ravel_multi_index(tuple(cubes.T), tuple(cubes.max(axis=0) + 1))
+        _, cube, count = np.unique(number, return_inverse=True, return_counts=True)
+        points, normals = np.zeros((2, len(count), 3))
+        np.add.at(points, cube, self.points_m)
+        np.add.at(normals, cube, self.normals)
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        return Cloud(points / count[:, None], normals / np.maximum(lengths, np.finfo(float).tiny))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a local search begins, and how far the prior says that it may be off."""
+
+    target_from_source: Array
+    """(4, 4)."""
+    centre_m: Array
+    """(3,) point of the source about which the spread is stated."""
+    sigma_rad: float
+    """Root mean square rotation of the prior about the start, per axis."""
+    sigma_m: float
+    """Root mean square shift of `centre_m`, per axis."""
+
+    @property
+    def information(self) -> Array:
+        """(6, 6) information of the spread about ξ at the start: isotropic about `centre_m`."""
+        at_centre = se3.adjoint(se3.translation(-self.centre_m))
+        weights = np.repeat([self.sigma_rad, self.sigma_m], 3) ** -2.0
+        return (at_centre.T * weights) @ at_centre
+
+
+def start(source: RayImage, target: RayImage, motion: AbstractMotion, rng: np.random.Generator) -> Start:
+    """Return the centre of the prior: the intrinsic mean of its samples.
+
+    Its fixed point is sought from the motion that puts the centroids together without turning. Where the prior leaves
+    the rotation all but free (a root mean square over 90°) it has no centre, and that motion itself is the start, as
+    for a user who knows nothing. For a prior given by centroids and a largest rotation, the two agree within sampling
+    error.
+    """
+    samples = motion.sample(_START_SAMPLES, rng)
+    if len(source.points_m) and len(target.points_m):
+        centre_m = source.centroid_m
+        guess = se3.translation(target.centroid_m - centre_m)
+    else:
+        centre_m, guess = np.zeros(3), samples[0]
+    pose, _ = se3.mean(samples, np.ones(len(samples)), start=guess)
+    if _rms_angle(pose, samples) > _OPEN_SPREAD_RAD:
+        pose = guess
+    shifts = samples[:, :3, :3] @ centre_m + samples[:, :3, 3] - se3.transform(pose, centre_m[None])
+    return Start(
+        pose,
+        centre_m,
+        sigma_rad=max(_rms_angle(pose, samples) / np.sqrt(3.0), _SMALLEST_SIGMA),
+        sigma_m=max(float(np.sqrt(np.mean(shifts**2))), _SMALLEST_SIGMA),
+    )
+
+
+def _rms_angle(pose: Array, samples: Array) -> float:
+    return float(np.sqrt(np.mean(se3.rotation_angle(se3.inverse(pose) @ samples) ** 2)))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Points of the source, and their nearest partners within reach of where a motion puts them."""
+
+    points_m: Array
+    """(n, 3) points of the source, those with a partner."""
+    partners: Cloud
+    """Their n partners."""
+    fitness: float
+    """Share of the source's points that have a partner."""
+
+
+def matched(source_m: Array, target: Cloud, tree: KDTree, pose: Array, reach_m: float) -> Matches:
+    """Match points (n, 3), carried by `pose`, with their nearest in `target`, which `tree` holds, within `reach_m`."""
+    distances, indices = tree.query(se3.transform(pose, source_m), distance_upper_bound=reach_m)
+    near, indices = np.isfinite(distances), np.asarray(indices)
+    partners = Cloud(target.points_m[indices[near]], target.normals[indices[near]])
+    return Matches(source_m[near], partners, float(np.mean(near)))
+
+
+def plane_residuals(matches: Matches, pose: Array) -> tuple[Array, Array]:
+    """Return how far matched points p, carried by `pose`, lie from the planes (q, n) of their partners.
+
+    Returns:
+        Residuals n · (pose p - q) in m, (n,), and their derivative (n, 6) by the ξ of `pose @ exp(ξ)`.
+    """
+    gaps = se3.transform(pose, matches.points_m) - matches.partners.points_m
+    normals_in_source = matches.partners.normals @ pose[:3, :3]
+    jacobian = np.hstack([np.cross(matches.points_m, normals_in_source), normals_in_source])
+    return np.sum(gaps * matches.partners.normals, axis=1), jacobian
+
+
+def scaled_information(residuals: Array, weights: Array, jacobian: Array) -> Array:
+    """Return the information (6, 6) of a least-squares fit whose noise is judged by its own residuals.
+
+    The usual practice, which takes neighbouring residuals for independent and partners for true: it is over-confident
+    by orders of magnitude, and the negative control of calibration for that reason.
+
+    Args:
+        residuals: (n,) in m.
+        weights: (n,) between 0 and 1.
+        jacobian: (n, 6) by ξ.
+    """
+    return (jacobian.T * weights) @ jacobian / residual_variance(float(weights @ residuals**2), float(np.sum(weights)))
+
+
+def residual_variance(squares: float, count: float) -> float:
+    """Return the variance that a sum of squared residuals leaves after fitting six numbers, never quite zero."""
+    return max(squares / max(count - 6.0, 1.0), _SMALLEST_SIGMA**2)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What a method on clouds found."""
+
+    target_from_source: Array
+    """(4, 4)."""
+    information: Array
+    """(6, 6) about ξ, from the surfaces alone; may be singular."""
+    fitness: float
+    """Share of the source's points that have a partner."""
+
+
+def posterior(source: RayImage, target: RayImage, begin: Start, fit: Fit | None, min_fitness: float) -> Posterior:
+    """Return a fit as a posterior; without one, the prior's centre and spread as TOO_FEW_POINTS.
+
+    Directions without information keep the prior's spread, so that the covariance is positive definite.
+    """
+    if fit is None:
+        pose = PoseGaussian(begin.target_from_source, _inverse(begin.information))
+        return Posterior(source.index, target.index, pose, Outcome.TOO_FEW_POINTS, 0.0, information=np.zeros((6, 6)))
+    pose = PoseGaussian(fit.target_from_source, _inverse(fit.information + begin.information))
+    outcome = Outcome.CONVERGED if fit.fitness >= min_fitness else Outcome.NO_OVERLAP
+    return Posterior(source.index, target.index, pose, outcome, fit.fitness, information=fit.information)
+
+
+def _inverse(information: Array) -> Array:
+    covariance = np.linalg.inv(information)
+    return 0.5 * (covariance + covariance.T)

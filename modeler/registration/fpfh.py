@@ -1,0 +1,168 @@
+"""Global alignment by FPFH features and RANSAC, as in Open3D's global registration tutorial."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import KDTree
+
+from modeler import se3
+from modeler.registration.clouds import Cloud, Fit, matched, plane_residuals, posterior, scaled_information, start
+from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
+
+_DRAW = 3  # correspondences that fix a motion
+_BATCH = 2_000  # draws between two looks at the stopping rule
+
+
+@final
+@dataclass(frozen=True)
+class FpfhRegistrar(AbstractRegistrar):
+    """Match points by Fast Point Feature Histograms (Rusu et al. 2009) and take the motion most matches agree with.
+
+    Open3D computes the features. The RANSAC follows its tutorial step for step (mutual matches, edge lengths,
+    distances, share of the cloud that finds a partner, confidence) but draws from `rng`: Open3D's own shares one
+    generator among threads, so that its seed does not fix the result (its issue 7475). The prior is not used, except
+    for its spread where nothing is seen.
+    """
+
+    voxel: float = 1 / 40
+    """Edge of the thinning cubes, as a share of the object's size."""
+    feature_radius: float = 5.0
+    """Radius of a feature's neighbourhood, in cubes."""
+    reach: float = 1.5
+    """Largest distance of partners, in cubes."""
+    edge_ratio: float = 0.9
+    """Smallest ratio of corresponding edges of a drawn triangle."""
+    draws: int = 100_000
+    """At most so many drawn triangles."""
+    confidence: float = 0.999
+    """Draws end once a better motion would have turned up with this probability."""
+    scored_points: int = 400
+    """Points of the source, drawn at random, by which motions are compared."""
+    min_points: int = 20
+    """Fewest points a side after thinning."""
+    min_fitness: float = 0.1
+    """Smallest share of matched points that counts as overlap."""
+
+    def register(
+        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+    ) -> Posterior:
+        """Return the motion that most feature matches agree with, and the residual-scaled inverse Hessian there."""
+        began = time.perf_counter()
+        begin = start(source, target, motion, rng)
+        fit = self.search(Cloud.of(source), Cloud.of(target), begin.target_from_source, rng)
+        found = posterior(source, target, begin, fit, self.min_fitness)
+        return replace(found, seconds=time.perf_counter() - began)
+
+    def search(self, source: Cloud, target: Cloud, otherwise: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the motion that most feature matches agree with; None where too few points are left to match.
+
+        Args:
+            source: points to carry.
+            target: points to lay them on.
+            otherwise: (4, 4) motion to return, as a poor fit, where no three matches agree.
+            rng: source of the draws.
+        """
+        if min(len(source.points_m), len(target.points_m)) < self.min_points:
+            return None
+        voxel_m = self.voxel * max(source.size_m, target.size_m)
+        source, target = source.thinned(voxel_m), target.thinned(voxel_m)
+        if min(len(source.points_m), len(target.points_m)) < self.min_points:
+            return None
+        radius_m, reach_m = self.feature_radius * voxel_m, self.reach * voxel_m
+        pairs = mutual_matches(fpfh(source, radius_m), fpfh(target, radius_m))
+        tree = KDTree(target.points_m)
+        scored = source.points_m[rng.permutation(len(source.points_m))[: self.scored_points]]
+        pose = self._ransac(
+            source.points_m[pairs[:, 0]], target.points_m[pairs[:, 1]], _Score(scored, tree, reach_m), rng
+        )
+        if pose is None:
+            return Fit(otherwise, np.zeros((6, 6)), 0.0)
+        matches = matched(source.points_m, target, tree, pose, reach_m)
+        residuals, jacobian = plane_residuals(matches, pose)
+        return Fit(pose, scaled_information(residuals, np.ones(len(residuals)), jacobian), matches.fitness)
+
+    def _ransac(self, source_m: Array, target_m: Array, score: _Score, rng: np.random.Generator) -> Array | None:
+        best, best_score, drawn, needed = None, -np.inf, 0, np.inf
+        while drawn < min(needed, self.draws):
+            triples = rng.integers(len(source_m), size=(min(_BATCH, self.draws - drawn), _DRAW))
+            drawn += len(triples)
+            triples = triples[self._similar(source_m[triples], target_m[triples])]
+            poses = kabsch(source_m[triples], target_m[triples])
+            gaps_m = np.linalg.norm(_carried(poses, source_m[triples]) - target_m[triples], axis=2)
+            poses = poses[np.all(gaps_m < score.reach_m, axis=1)]
+            scores = score(poses)
+            if np.max(scores, initial=-np.inf) > best_score:
+                best, best_score = poses[np.argmax(scores)], np.max(scores)
+                agree = np.linalg.norm(se3.transform(best, source_m) - target_m, axis=1) < score.reach_m
+                needed = _draws_needed(float(np.mean(agree)), self.confidence)
+        return best
+
+    def _similar(self, source_m: Array, target_m: Array) -> npt.NDArray[np.bool_]:
+        """Return which triangles (n, 3, 3) have nearly equal edges and no point twice."""
+        source_edges, target_edges = (np.linalg.norm(t - np.roll(t, 1, axis=1), axis=2) for t in (source_m, target_m))
+        shorter, longer = np.minimum(source_edges, target_edges), np.maximum(source_edges, target_edges)
+        return np.all((shorter > self.edge_ratio * longer) & (shorter > 0.0), axis=1)
+
+
+def fpfh(cloud: Cloud, radius_m: float) -> Array:
+    """Return the feature (n, 33) of each point, from the neighbours within `radius_m` (at most 100)."""
+    import open3d as o3d  # slow to load, and only needed here
+
+    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m))
+    points.normals = o3d.utility.Vector3dVector(cloud.normals)
+    search = o3d.geometry.KDTreeSearchParamHybrid(radius_m, 100)
+    features = o3d.pipelines.registration.compute_fpfh_feature(points, search)  # pyright: ignore[reportCallIssue]
+    return np.ascontiguousarray(np.asarray(features.data).T)
+
+
+def mutual_matches(source: Array, target: Array) -> npt.NDArray[np.int64]:
+    """Return pairs (m, 2) of rows that are each other's nearest; of all nearest targets where those are too few."""
+    a, b = source.astype(np.float32), target.astype(np.float32)
+    squares = np.sum(a**2, axis=1)[:, None] + np.sum(b**2, axis=1) - 2.0 * a @ b.T
+    forth, back = np.argmin(squares, axis=1), np.argmin(squares, axis=0)
+    pairs = np.column_stack([np.arange(len(a)), forth])
+    mutual = pairs[back[forth] == pairs[:, 0]]
+    return mutual if len(mutual) >= 3 * _DRAW else pairs
+
+
+def kabsch(source_m: Array, target_m: Array) -> Array:
+    """Return the motions (n, 4, 4) that best carry point sets (n, k, 3) onto their partners (n, k, 3) (Kabsch 1976)."""
+    source_mean, target_mean = source_m.mean(axis=1), target_m.mean(axis=1)
+    spread = np.swapaxes(source_m - source_mean[:, None], 1, 2) @ (target_m - target_mean[:, None])
+    left, _, right = np.linalg.svd(spread)
+    handed = np.sign(np.linalg.det(left @ right))
+    left[:, :, 2] *= handed[:, None]
+    poses = np.broadcast_to(np.eye(4), (len(source_m), 4, 4)).copy()
+    poses[:, :3, :3] = np.swapaxes(left @ right, 1, 2)
+    poses[:, :3, 3] = target_mean - (poses[:, :3, :3] @ source_mean[:, :, None])[:, :, 0]
+    return poses
+
+
+@dataclass(frozen=True, eq=False)
+class _Score:
+    """How well motions lay a sample of the source on the target: the share within reach, less its mean square gap."""
+
+    source_m: Array
+    target: KDTree
+    reach_m: float
+
+    def __call__(self, poses: Array) -> Array:
+        """Return the scores (n,) of motions (n, 4, 4)."""
+        gaps, _ = self.target.query(_carried(poses, self.source_m), distance_upper_bound=self.reach_m)
+        return np.mean(1.0 - np.minimum(gaps / self.reach_m, 1.0) ** 2, axis=1)
+
+
+def _carried(poses: Array, points_m: Array) -> Array:
+    """Carry points (n, k, 3) or (k, 3) by motions (n, 4, 4)."""
+    return points_m @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+
+
+def _draws_needed(agreement: float, confidence: float) -> float:
+    """Return how many draws find, with that confidence, one whose matches all agree."""
+    chance = agreement**_DRAW
+    return 0.0 if chance >= 1.0 else float(np.log1p(-confidence) / np.log1p(-chance)) if chance > 0.0 else np.inf

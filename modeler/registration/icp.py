@@ -1,0 +1,85 @@
+"""Point-to-plane ICP from coarse to fine: the method most users would reach for first."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from modeler import se3
+from modeler.registration.clouds import Cloud, Fit, matched, plane_residuals, posterior, scaled_information, start
+from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
+
+_STEP = 1e-6  # rad and m: a smaller step ends a level
+_DAMPING = 1e-9  # share of the mean curvature; only holds directions still that no plane sees
+
+
+@final
+@dataclass(frozen=True)
+class IcpRegistrar(AbstractRegistrar):
+    """Match nearest points within reach and move onto their planes, level by level (Chen and Medioni 1992).
+
+    As Open3D's multi-scale point-to-plane ICP with Tukey's weights. The arithmetic is our own, since Open3D adds up
+    its residuals in whatever order its threads finish, so that no two runs need agree to the last bit.
+    """
+
+    voxels: tuple[float, ...] = (1 / 8, 1 / 16, 1 / 32, 1 / 64)
+    """Edge of the thinning cubes at each level, coarse to fine, as a share of the object's size."""
+    reach: float = 2.0
+    """Largest distance of partners, in cubes; a pair so far from plane to point has no weight left."""
+    iterations: int = 60
+    """At most so many steps a level."""
+    min_points: int = 20
+    """Fewest points a side at the coarsest level."""
+    min_fitness: float = 0.1
+    """Smallest share of matched points that counts as overlap."""
+
+    def register(
+        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+    ) -> Posterior:
+        """Return the local optimum nearest to the prior's centre, with its residual-scaled inverse Hessian."""
+        began = time.perf_counter()
+        begin = start(source, target, motion, rng)
+        fit = self.refine(Cloud.of(source), Cloud.of(target), begin.target_from_source)
+        found = posterior(source, target, begin, fit, self.min_fitness)
+        return replace(found, seconds=time.perf_counter() - began)
+
+    def refine(self, source: Cloud, target: Cloud, target_from_source: Array) -> Fit | None:
+        """Return the local optimum nearest to a pose (4, 4); None where too few points are left to match."""
+        if min(len(source.points_m), len(target.points_m)) < self.min_points:
+            return None
+        size_m = max(source.size_m, target.size_m)
+        fit = Fit(target_from_source, np.zeros((6, 6)), 0.0)
+        for voxel_m in np.array(self.voxels) * size_m:
+            thin = source.thinned(voxel_m), target.thinned(voxel_m)
+            if min(len(cloud.points_m) for cloud in thin) < self.min_points:
+                return None
+            fit = self._level(*thin, fit.target_from_source, self.reach * voxel_m)
+        return fit
+
+    def _level(self, source: Cloud, target: Cloud, pose: Array, reach_m: float) -> Fit:
+        tree = KDTree(target.points_m)
+        # About the centroid, rotation and translation hardly mix, and damping favours neither.
+        source_from_centred = se3.translation(source.points_m.mean(axis=0))
+        points = source.points_m - source_from_centred[:3, 3]
+        pose = pose @ source_from_centred
+        for _ in range(self.iterations):
+            residuals, jacobian = plane_residuals(matched(points, target, tree, pose, reach_m), pose)
+            weights = _tukey(residuals / reach_m)
+            hessian = (jacobian.T * weights) @ jacobian
+            damping = (_DAMPING * np.trace(hessian) + np.finfo(float).tiny) * np.eye(6)
+            step = np.linalg.solve(hessian + damping, -jacobian.T @ (weights * residuals))
+            pose = pose @ se3.exp(step)
+            if np.max(np.abs(step)) < _STEP:
+                break
+        pose = pose @ se3.inverse(source_from_centred)
+        matches = matched(source.points_m, target, tree, pose, reach_m)
+        residuals, jacobian = plane_residuals(matches, pose)
+        return Fit(pose, scaled_information(residuals, _tukey(residuals / reach_m), jacobian), matches.fitness)
+
+
+def _tukey(ratios: Array) -> Array:
+    return np.maximum(1.0 - ratios**2, 0.0) ** 2

@@ -1,0 +1,189 @@
+"""Registration by what each view should see of the other's surface; the default method."""
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from modeler import se3
+from modeler.kernels import visibility as kernel
+from modeler.registration.annealing import AnnealedSampler, LogLikelihood, Population
+from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, PoseGaussian, Posterior, RayImage
+
+
+@dataclass(frozen=True)
+class VisibilityRegistrar(AbstractRegistrar):
+    """The paper's likelihood with normals: surface that faces a camera is seen by it, other surface is hidden.
+
+    p(surface of B | image A, T) · p(surface of A | image B, T), each a product over points, tempered because
+    neighbouring points err alike, and sampled by annealing from a blurred likelihood to the sharp one.
+    """
+
+    points: int = 300
+    """Surface points taken from each view."""
+    effective_points: float = 60.0
+    """Number of independent measurements that the points of both views together are worth."""
+    blurs_m: tuple[float, ...] = (0.016, 0.008, 0.004, 0.002, 0.001, 0.0)
+    """Blur of the surfaces at each level of the annealing; the last is the likelihood itself."""
+    surface_noise: float = 0.25
+    """Error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
+    hidden_share: float = 0.3
+    """Share of points that face the other camera and are hidden by another part of the object."""
+    worst: float = 10.0
+    """Most that one point may cost (nats)."""
+    bend: float = 2.0
+    """Cost (nats) of normals at right angles."""
+    sampler: AnnealedSampler = field(default_factory=AnnealedSampler)
+    """How the posterior is explored."""
+    min_points: int = 60
+    """Fewer surface points than this in a view are not registered."""
+    min_overlap: float = 0.2
+    """Least share of the surface that both should see and do."""
+    max_sigma_deg: float = 10.0
+    """Rotation less sure than this is called ambiguous."""
+
+    def register(
+        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+    ) -> Posterior:
+        """Return the posterior of target_from_source; failure is its outcome."""
+        started = time.perf_counter()
+        if min(len(source.points_m), len(target.points_m)) < self.min_points:
+            return failed(source, target, Outcome.TOO_FEW_POINTS)
+        pair = Pair(self, source, target, seed=int(rng.integers(2**32)))
+        levels = [pair.level(blur_m) for blur_m in self.blurs_m]
+        population = self.sampler.run(motion, levels, source.centroid_m, rng)
+        pose = gaussian(population.poses, source.centroid_m)
+        overlap = pair.overlap(pose.mean)
+        return Posterior(
+            source=source.index,
+            target=target.index,
+            pose=pose,
+            outcome=self._outcome(population, pose, overlap),
+            overlap=overlap,
+            samples=population.poses,
+            weights=np.full(len(population.poses), 1.0 / len(population.poses)),
+            effective_samples=float(population.ancestors),
+            pareto_k=population.pareto_k,
+            log_evidence=population.log_evidence,
+            seconds=time.perf_counter() - started,
+        )
+
+    def _outcome(self, population: Population, pose: PoseGaussian, overlap: float) -> Outcome:
+        if overlap < self.min_overlap:
+            return Outcome.NO_OVERLAP
+        if population.ancestors < 0.1 * self.sampler.particles or population.acceptance < 0.01:
+            return Outcome.DEGENERATE
+        sigma_rad = np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])
+        return Outcome.AMBIGUOUS if sigma_rad > np.deg2rad(self.max_sigma_deg) else Outcome.CONVERGED
+
+
+class Pair:
+    """Two views with the points drawn that a registration compares; gives the log-likelihood at any blur."""
+
+    def __init__(self, method: VisibilityRegistrar, source: RayImage, target: RayImage, *, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self._method = method
+        self._views = source, target
+        self._points = tuple(spread_points(view, method.points, rng) for view in (source, target))
+        self._weight = method.effective_points / sum(len(points) for points in self._points)
+
+    def level(self, blur_m: float) -> LogLikelihood:
+        """Return the tempered log-likelihood of poses (n, 4, 4) with the surfaces blurred by `blur_m`."""
+        share = 1 if blur_m < 0.003 else 2 if blur_m < 0.006 else 4  # blunt comparisons need fewer points
+        source, target = self._views
+        of_source, of_target = (np.ascontiguousarray(points[::share]) for points in self._points)
+        in_target, in_source = self._model(target, blur_m), self._model(source, blur_m)
+        weight = self._weight * share
+
+        def log_likelihood(target_from_source: Array) -> Array:
+            forward = _rows(target_from_source)
+            backward = _rows(se3.inverse(target_from_source))
+            return weight * (
+                kernel.log_likelihoods(forward, of_source, target.layers["cells"], _intrinsics(target), in_target)
+                + kernel.log_likelihoods(backward, of_target, source.layers["cells"], _intrinsics(source), in_source)
+            )
+
+        return log_likelihood
+
+    def overlap(self, target_from_source: Array) -> float:
+        """Return the share of points that should be seen by both cameras and are."""
+        source, target = self._views
+        verdicts = np.concatenate(
+            [
+                kernel.classify(
+                    _rows(pose[None])[0], points, other.layers["cells"], _intrinsics(other), self._model(other, 0.0)
+                )
+                for pose, points, other in (
+                    (target_from_source, self._points[0], target),
+                    (se3.inverse(target_from_source), self._points[1], source),
+                )
+            ]
+        )
+        wrong = np.isin(verdicts, (kernel.BEHIND, kernel.IN_FRONT, kernel.IN_EMPTY_SPACE)).sum()
+        matched = (verdicts == kernel.MATCHED).sum()
+        return float(matched / max(matched + wrong, 1))
+
+    def _model(self, other: RayImage, blur_m: float) -> Array:
+        """Return the parameters (9,) of the kernel for points looked up in `other`."""
+        method, camera = self._method, other.frame.camera
+        lateral_px = max(other.sigma_wh * camera.fx, 1.0)
+        depth_m = max(float(other.centroid_m[2]), 1e-3)
+        blur_px = blur_m * camera.fx / depth_m
+        return np.array(
+            [
+                np.hypot(method.surface_noise * other.sigma_r_m, blur_m),
+                lateral_px + blur_px,
+                1.25 * lateral_px,
+                3.0 * other.sigma_r_m,
+                0.1,
+                0.35,
+                method.hidden_share,
+                method.worst,
+                method.bend,
+            ]
+        )
+
+
+def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> Array:
+    """Return `count` surface points, or all if fewer, evenly spread over the image.
+
+    Returns:
+        (n, 7): position in m, unit normal, variance along the normal in m².
+    """
+    total = len(view.points_m)
+    stride = max(total / count, 1.0)
+    picks = np.arange(min(count, total)) * stride + rng.random() * stride
+    chosen = np.minimum(picks.astype(np.int64), total - 1)
+    variance = np.asarray(view.layers["sigma_m"], dtype=np.float64)[chosen, None] ** 2
+    points = np.hstack([view.points_m[chosen], view.normals[chosen], variance])
+    # In random order, so that every stride through them is again spread over the object.
+    return points[rng.permutation(len(points))]
+
+
+def gaussian(poses: Array, centre_m: Array) -> PoseGaussian:
+    """Return the mean and covariance of equally weighted motions (n, 4, 4).
+
+    The mean is taken of motions about the object's centre: about the camera, rotation and translation would be
+    strongly coupled, and the mean of a wide posterior would leave the object.
+    """
+    centre = se3.translation(centre_m)
+    mean, covariance = se3.mean(poses @ centre, np.ones(len(poses)))
+    to_camera = se3.adjoint(centre)
+    floor = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
+    covariance = to_camera @ (covariance + floor) @ to_camera.T
+    return PoseGaussian(mean @ se3.translation(-centre_m), 0.5 * (covariance + covariance.T))
+
+
+def failed(source: RayImage, target: RayImage, outcome: Outcome) -> Posterior:
+    """Return the posterior of a registration that could not be tried: nothing known."""
+    pose = PoseGaussian(np.eye(4), np.diag(np.repeat([np.pi, 10.0], 3) ** 2))
+    return Posterior(source=source.index, target=target.index, pose=pose, outcome=outcome, overlap=0.0)
+
+
+def _rows(poses: Array) -> Array:
+    return np.ascontiguousarray(poses[:, :3].reshape(len(poses), 12))
+
+
+def _intrinsics(view: RayImage) -> Array:
+    camera = view.frame.camera
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
