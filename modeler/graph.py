@@ -67,17 +67,15 @@ def solve(graph: PoseGraph, guess: Mapping[int, Array], *, outlier_distance: flo
     tree, loops = _split(graph.accepted, root)
     odometry = _chain(tree, root, {})
     start = _values(_chain(tree, root, _anchored(guess, root)))
-    inlier = _inliers(tree, loops, root, start, threshold=0.5 * outlier_distance**2)
-    closures = [edge for edge, good in zip(loops, inlier, strict=True) if good]
-    outliers = tuple(edge for edge, good in zip(loops, inlier, strict=True) if not good)
-    trajectory: Mapping[int, Array] = odometry  # meets every edge exactly where no loop is closed
-    if closures:
-        factors = _factors([*tree, *closures], root)
-        values = gtsam.LevenbergMarquardtOptimizer(factors, start, _parameters()).optimize()
-        trajectory = {frame: values.atPose3(frame).matrix() for frame in odometry}
+    closures, outliers, trajectory = loops, [], odometry  # without loops dead reckoning meets every edge exactly
+    if loops:
+        values, inlier = _optimise(tree, loops, root, start, threshold=0.5 * outlier_distance**2)
+        closures = [edge for edge, good in zip(loops, inlier, strict=True) if good]
+        outliers = [edge for edge, good in zip(loops, inlier, strict=True) if not good]
+        trajectory = {frame: values.atPose3(frame).matrix() for frame in odometry} if closures else odometry
     relative_covariance = network(trajectory, root, tree, closures)
     covariances = PoseCovariances(root, relative_covariance)
-    return Solution(trajectory, covariances, odometry, outliers, relative_covariance)
+    return Solution(trajectory, covariances, odometry, tuple(outliers), relative_covariance)
 
 
 def _split(edges: Iterable[Edge], root: int) -> tuple[list[Edge], list[Edge]]:
@@ -157,16 +155,22 @@ def _parameters() -> gtsam.LevenbergMarquardtParams:
     return parameters
 
 
-def _inliers(
+def _optimise(
     tree: Sequence[Edge], loops: Sequence[Edge], root: int, start: gtsam.Values, *, threshold: float
-) -> list[bool]:
-    """Return for each loop edge whether the others bear it out."""
-    if not loops:
-        return []
+) -> tuple[gtsam.Values, list[bool]]:
+    """Return the optimum and which loop edges take part in it: those whose error stays below the threshold."""
+    factors = _factors([*tree, *loops], root)
+    trusted = 1 + len(tree)  # the gauge and the tree
+    values = gtsam.LevenbergMarquardtOptimizer(factors, start, _parameters()).optimize()
+    if all(factors.at(number).error(values) <= threshold for number in range(trusted, factors.size())):
+        return values, [True] * len(loops)
     parameters = gtsam.GncLMParams(_parameters())
     parameters.setLossType(gtsam.GncLossType.TLS)
-    parameters.setKnownInliers(list(range(1 + len(tree))))  # the gauge and the tree
-    optimizer = gtsam.GncLMOptimizer(_factors([*tree, *loops], root), start, parameters)
-    optimizer.setInlierCostThresholds(threshold)
-    optimizer.optimize()
-    return [weight > 0.5 for weight in optimizer.getWeights()[1 + len(tree) :]]
+    parameters.setKnownInliers(list(range(trusted)))
+    annealing = gtsam.GncLMOptimizer(factors, start, parameters)
+    annealing.setInlierCostThresholds(threshold)
+    values = annealing.optimize()
+    inlier = [weight > 0.5 for weight in annealing.getWeights()[trusted:]]
+    remaining = [edge for edge, good in zip(loops, inlier, strict=True) if good]
+    factors = _factors([*tree, *remaining], root)  # at full weight, where annealing ended between
+    return gtsam.LevenbergMarquardtOptimizer(factors, values, _parameters()).optimize(), inlier

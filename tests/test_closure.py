@@ -1,0 +1,257 @@
+"""Which pairs are tried on the kinds of sequence people take, and that only closures that agree are accepted."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from modeler import se3
+from modeler.closure import Closer
+from modeler.graph import PoseGraph, solve
+from modeler.types import Array, Camera, Edge, Frame, Outcome, PoseGaussian, Posterior, RayImage, Solution
+
+CENTROID_M = np.array([0.03, -0.02, 0.8])
+ABOUT_OBJECT = se3.translation(CENTROID_M)
+COVARIANCE = se3.adjoint(ABOUT_OBJECT) @ np.diag([0.003**2] * 3 + [0.001**2] * 3) @ se3.adjoint(ABOUT_OBJECT).T
+REGULAR_DEG = 25.0 * np.arange(14)  # the last frame at 325°
+
+
+def _view(index: int) -> RayImage:
+    camera = Camera(2, 2, 500.0, 500.0, 0.5, 0.5)
+    frame = Frame(index, float(index), np.full((2, 2), 0.8, dtype=np.float32), camera)
+    points = CENTROID_M + np.array([[0.05, 0.0, 0.0], [-0.05, 0.0, 0.0], [0.0, 0.05, 0.0], [0.0, -0.05, 0.0]])
+    return RayImage(frame, None, 0.001, 0.001, points, np.tile([0.0, 0.0, -1.0], (4, 1)), np.zeros((4, 2), np.int64))
+
+
+def _turned(angle_deg: float) -> Array:
+    """True object_from_camera of an object turned about a tilted axis through itself."""
+    axis = np.array([0.1, 0.99, -0.1])
+    xi = np.concatenate([np.radians(angle_deg) * axis / np.linalg.norm(axis), np.zeros(3)])
+    return se3.inverse(ABOUT_OBJECT @ se3.exp(xi) @ se3.inverse(ABOUT_OBJECT))
+
+
+def _posterior(source: int, target: int, pose: Array, outcome: Outcome = Outcome.CONVERGED) -> Posterior:
+    return Posterior(source, target, PoseGaussian(pose, COVARIANCE), outcome, overlap=0.8)
+
+
+class Run:
+    """The pipeline's loop, with a registration that knows the truth."""
+
+    def __init__(self, angles_deg: Sequence[float], numbers: Sequence[int] | None = None) -> None:
+        self.numbers = list(range(len(angles_deg))) if numbers is None else list(numbers)
+        self.truth = {k: _turned(angle) for k, angle in zip(self.numbers, angles_deg, strict=True)}
+        self.tried: dict[int, tuple[int, ...]] = {}
+        self.judged: dict[int, tuple[Edge, ...]] = {}
+        self.graph = PoseGraph(first=self.numbers[0])
+        self.views: dict[int, RayImage] = {}
+        self.solution = Solution()
+
+    def measured(self, target: int, source: int, rng: np.random.Generator, bias: Array) -> Posterior:
+        noise = rng.multivariate_normal(np.zeros(6), COVARIANCE) + se3.adjoint(ABOUT_OBJECT) @ bias
+        return _posterior(source, target, self.truth_between(target, source) @ se3.exp(noise))
+
+    def run(
+        self,
+        closer: Closer,
+        spoil: Callable[[Posterior], Posterior] = lambda posterior: posterior,
+        bias: Array | None = None,
+        *,
+        expect: bool = False,
+    ) -> None:
+        rng = np.random.default_rng(0)
+        for source in self.numbers:
+            expected = self.truth[source] if expect else None
+            targets = closer.targets(self.solution, self.views, source, expected)
+            bias_here = np.zeros(6) if bias is None else bias
+            posteriors = [spoil(self.measured(target, source, rng, bias_here)) for target in targets]
+            edges = closer.edges(posteriors, self.views, self.solution)
+            self.tried[source], self.judged[source] = targets, edges
+            self.graph = self.graph.plus(edges)
+            if not self.views or any(edge.accepted for edge in edges):
+                self.views[source] = _view(source)
+            self.solution = solve(self.graph, self.solution.trajectory)
+
+    def truth_between(self, target: int, source: int) -> Array:
+        return se3.inverse(self.truth[target]) @ self.truth[source]
+
+    def closures(self) -> list[Edge]:
+        return [edge for edges in self.judged.values() for edge in edges if edge.kind == "closure"]
+
+
+def test_first_frame_has_nothing_to_be_registered_against() -> None:
+    assert Closer().targets(Solution(), {}, 3) == ()
+    assert Closer().edges([], {}, Solution()) == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "angles_deg"),
+    [
+        ("rendered, 25°", REGULAR_DEG),
+        ("dragon, 24°, ends at 336°", 24.0 * np.arange(15)),
+        ("cap, 17-24°, ends at 375°", np.linspace(0.0, 375.0, 19) + 1.5 * np.sin(np.arange(19.0))),
+        ("kleenex, 16°", 16.0 * np.arange(23)),
+        ("by hand, 11-37°", np.cumsum([0.0, *([11, 25, 18, 37, 14, 15, 19, 22, 13, 17] * 2)[:19]])),
+        ("few frames, 28-92°", np.array([0.0, 60.0, 152.0, 220.0, 300.0, 328.0])),
+    ],
+)
+@pytest.mark.parametrize("expect", [False, True])
+def test_last_frames_of_a_full_turn_close_on_the_first(name: str, angles_deg: Array, expect: bool) -> None:
+    run = Run(list(angles_deg))
+    run.run(Closer(), expect=expect)
+    assert any(0 in run.tried[frame][1:] for frame in run.numbers[-2:]), name
+    closures = run.closures()
+    assert closures
+    assert all(edge.accepted for edge in closures)
+    for edge in closures:
+        between_deg = np.degrees(se3.rotation_angle(run.truth_between(edge.target, edge.source)))
+        assert between_deg < 46.0 or not expect, name
+
+
+def test_previous_view_comes_first_and_recent_neighbours_are_no_closures() -> None:
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer())
+    for frame in run.numbers[1:]:
+        assert run.tried[frame][0] == frame - 1
+        assert len(run.tried[frame]) <= 3
+        assert len(set(run.tried[frame])) == len(run.tried[frame])
+    assert all(run.tried[frame] == (frame - 1,) for frame in range(1, 12))
+    assert run.tried[13] == (12, 0, 1)[: len(run.tried[13])]
+
+
+def test_no_closure_without_coming_back() -> None:
+    for angles_deg in (20.0 * np.arange(9), 4.0 * np.arange(20), np.tile([0.0, 30.0], 8)):
+        run = Run(list(angles_deg))
+        run.run(Closer())
+        assert run.closures() == []
+
+
+def test_number_of_closures_is_bounded_and_none_means_none() -> None:
+    angles_deg = list(15.0 * np.arange(30))
+    for count in (0, 1, 2, 3):
+        run = Run(angles_deg)
+        run.run(Closer(max_closures=count))
+        assert max(len(targets) for targets in run.tried.values()) == 1 + count
+
+
+def test_second_turn_meets_the_first_turn() -> None:
+    run = Run(list(20.0 * np.arange(30)))
+    run.run(Closer())
+    assert {24 - 18, 23 - 18} & set(run.tried[24][1:])
+
+
+def test_frame_numbers_need_not_start_at_zero_nor_be_dense() -> None:
+    dense, sparse = Run(list(REGULAR_DEG)), Run(list(REGULAR_DEG), list(range(7, 7 + 5 * 14, 5)))
+    dense.run(Closer())
+    sparse.run(Closer())
+    renamed = {7 + 5 * k: tuple(7 + 5 * t for t in targets) for k, targets in dense.tried.items()}
+    assert sparse.tried == renamed
+
+
+def test_odometry_is_accepted_where_usable_and_refused_with_advice() -> None:
+    closer = Closer()
+    start = Solution({0: np.eye(4)})
+    for outcome in Outcome:
+        (edge,) = closer.edges([_posterior(1, 0, np.eye(4), outcome)], {0: _view(0)}, start)
+        assert edge.kind == "odometry"
+        assert edge.accepted == (outcome in (Outcome.CONVERGED, Outcome.AMBIGUOUS))
+        assert edge.accepted or outcome.advice in edge.reason
+
+
+@pytest.mark.parametrize(
+    "covariance", [np.zeros((6, 6)), np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-9]), np.full((6, 6), np.nan)]
+)
+def test_covariance_that_is_none_is_refused(covariance: Array) -> None:
+    posterior = replace(_posterior(1, 0, np.eye(4)), pose=PoseGaussian(np.eye(4), covariance))
+    (edge,) = Closer().edges([posterior], {0: _view(0)}, Solution({0: np.eye(4)}))
+    assert not edge.accepted
+    assert "covariance" in edge.reason or "finite" in edge.reason
+
+
+def _spoiled_closures(change: Array) -> Callable[[Posterior], Posterior]:
+    moved = ABOUT_OBJECT @ se3.exp(change) @ se3.inverse(ABOUT_OBJECT)
+
+    def spoil(posterior: Posterior) -> Posterior:
+        if posterior.source - posterior.target == 1:
+            return posterior
+        return replace(posterior, pose=PoseGaussian(posterior.pose.mean @ moved, COVARIANCE))
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]),  # the carton's symmetry
+        np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]),
+        np.array([0.0, np.radians(25.0), 0.0, 0.0, 0.0, 0.0]),  # one step of the turntable
+        np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0]),
+    ],
+)
+def test_closure_that_contradicts_the_chain_is_refused(change: Array) -> None:
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(), _spoiled_closures(change))
+    assert run.closures()
+    for edge in run.closures():
+        assert not edge.accepted
+        assert edge.reason.startswith("contradicts the chain")
+
+
+def test_closure_survives_a_chain_whose_small_errors_all_point_one_way() -> None:
+    """Each edge turns 0.3° too far (1.7 of its own sigmas); over 14 edges that is far outside its stated covariance."""
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(), bias=np.array([0.0, np.radians(0.3), 0.0, 0.0, 0.0, 0.0]))
+    assert run.closures()
+    assert all(edge.accepted for edge in run.closures())
+    assert run.solution.outliers == ()
+    drift_deg = np.degrees(se3.rotation_angle(se3.inverse(run.truth[13]) @ run.solution.odometry[13]))
+    left_deg = np.degrees(se3.rotation_angle(se3.inverse(run.truth[13]) @ run.solution.trajectory[13]))
+    assert left_deg < 0.5 * drift_deg
+
+
+def test_reason_states_how_far_off_a_closure_is_at_the_object() -> None:
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(max_closures=1), _spoiled_closures(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0])))
+    off = run.closures()[-1].reason.split("chain: ")[1]
+    angle_deg, off_mm = float(off.split("°")[0]), float(off.split("and ")[1].split(" mm")[0])
+    assert angle_deg == pytest.approx(90.0, abs=3.0)
+    assert off_mm < 15.0  # turned about its own centroid, not about the camera: that would be a metre
+
+
+def test_closures_need_overlap_and_a_usable_outcome() -> None:
+    for spoiled in ({"overlap": 0.1}, {"overlap": float("nan")}, {"outcome": Outcome.DEGENERATE}):
+        run = Run(list(REGULAR_DEG))
+        run.run(Closer(), lambda p, s=spoiled: p if p.source - p.target == 1 else replace(p, **s))
+        assert run.closures()
+        assert not any(edge.accepted for edge in run.closures())
+
+
+def test_closure_takes_the_place_of_failed_odometry() -> None:
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(), lambda p: replace(p, outcome=Outcome.NO_OVERLAP) if (p.source, p.target) == (13, 12) else p)
+    odometry, closure, *rest = run.judged[13]
+    assert not odometry.accepted
+    assert closure.accepted
+    assert all(edge.accepted for edge in rest)  # judged by way of the closure
+    np.testing.assert_allclose(run.solution.trajectory[13], run.truth[13], atol=0.05)
+
+
+def test_wrong_closure_cannot_take_the_place_of_failed_odometry() -> None:
+    def spoil(posterior: Posterior) -> Posterior:
+        if (posterior.source, posterior.target) == (13, 12):
+            return replace(posterior, outcome=Outcome.NO_OVERLAP)
+        return _spoiled_closures(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))(posterior)
+
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(), spoil)
+    assert not any(edge.accepted for edge in run.judged[13])
+    assert 13 not in run.solution.trajectory
+    assert all(edge.reason for edge in run.judged[13])
+
+
+def test_lost_frame_is_bridged_from_the_last_accepted_one() -> None:
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(), lambda p: replace(p, outcome=Outcome.TOO_FEW_POINTS) if p.source == 5 else p)
+    assert run.tried[6][0] == 4
+    assert 5 not in run.solution.trajectory
+    assert 0 in run.tried[13]
