@@ -21,11 +21,11 @@ def layout(first: RayImage | None) -> rrb.Blueprint:
     Args:
         first: the first accepted view, which tells where to look from; None before there is one.
     """
-    upper = rrb.Horizontal(_images(first), *_object(first), _pair(first), column_shares=[1.0, 1.1, 1.3, 1.1])
+    upper = rrb.Horizontal(_images(first), *_object(first), _pair(first), column_shares=[0.95, 1.15, 1.5, 0.95])
     lower = rrb.Horizontal(_words(), _readings(), column_shares=[1.0, 2.0])
     return rrb.Blueprint(
         rrb.Vertical(upper, lower, row_shares=[2.1, 1.0]),
-        rrb.TimePanel(state="collapsed", timeline=entities.FRAME),
+        rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=3.0),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
@@ -63,7 +63,7 @@ def _object(first: RayImage | None) -> tuple[rrb.View, rrb.View]:
             "Camera poses, edges and uncertainty",
             entities.WORLD,
             [f"{entities.WORLD}/**"],
-            _eye(centre, 2.7 * distance_m, np.array([-0.45, -0.8, -0.4])),
+            _eye(centre, 3.3 * distance_m, np.array([-0.45, -0.8, -0.4])),
         )
     return model, graph
 
@@ -74,8 +74,8 @@ def _pair(first: RayImage | None) -> rrb.Container:
     before = [entities.PAIR_TARGET, entities.PAIR_BEFORE]
     after = [entities.PAIR_TARGET, entities.PAIR_AFTER]
     return rrb.Vertical(
-        _spatial("Pair before: target teal, source orange", entities.PAIR, before, eye),
-        _spatial("Pair after alignment", entities.PAIR, after, eye),
+        _spatial("Before: target teal, source orange", entities.PAIR, before, eye),
+        _spatial("After alignment", entities.PAIR, after, eye),
     )
 
 

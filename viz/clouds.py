@@ -20,7 +20,7 @@ _PAIR_POINTS: Final = 6_000
 _MODEL_POINTS: Final = 15_000
 _TRIANGLES: Final = 60_000
 _CLEAR: Final = rr.Clear(recursive=False)
-_POINT_SIZE: Final = rr.Radius.ui_points(1.5)
+_POINT_SIZE: Final = rr.Radius.ui_points(1.75)
 
 
 def statics() -> Drawing:

@@ -61,7 +61,7 @@ def pair_words(edge: Edge, step: Step) -> str:
     parts = [
         f"rotation sd {readings[entities.ROTATION_SD]:.2g}°",
         f"translation sd {readings[entities.TRANSLATION_SD]:.2g} mm",
-        f"overlap {readings[entities.OVERLAP]:.0f} %",
+        f"overlap {readings[entities.OVERLAP]:.0f}%",
         f"{readings[entities.EFFECTIVE_SAMPLES]:.0f} effective samples",
         f"{readings[entities.SECONDS]:.2g} s",
     ]
@@ -72,21 +72,20 @@ def pair_words(edge: Edge, step: Step) -> str:
 
 def now_words(step: Step) -> str:
     """Say in Markdown what the frame brought, pair by pair, and where the model stands."""
-    lines = [f"### Frame {step.frame.index}: {step.outcome}"]
+    accepted = step.outcome == "accepted"
+    lines = [f"### Frame {step.frame.index}: {'accepted' if accepted else 'left out'}"]
     for edge in step.edges:
         lines.append(f"- **{pair_words(edge, step)}.** {edge.posterior.outcome.advice}")
     if not step.edges:
-        lines.append(
-            f"- {step.segmentation.outcome.advice}" if step.view is None else "- The first view of the object."
-        )
-    accepted = [edge.kind for edge in step.edges_so_far if poses.takes_part(edge, step)]
+        lines.append("- The first view of the object." if accepted else f"- {step.outcome}")
+    kinds = [edge.kind for edge in step.edges_so_far if poses.takes_part(edge, step)]
     for edge in step.solution.outliers:
         lines.append(f"- {edge.source} → {edge.target} {edge.kind} is left out, for all other edges contradict it.")
-    rejected = len(step.edges_so_far) - len(accepted)
+    rejected = len(step.edges_so_far) - len(kinds)
     points = 0 if step.model is None else len(step.model.points_m)
     lines.append(
-        f"\nSo far: views {len(step.views)}, odometry edges {accepted.count('odometry')}, "
-        f"loop closures {accepted.count('closure')}, pairs rejected {rejected}; the model has {points:,} points"
+        f"\nSo far: views {len(step.views)}, odometry edges {kinds.count('odometry')}, "
+        f"loop closures {kinds.count('closure')}, pairs rejected {rejected}; the model has {points:,} points"
         + (f" and {len(step.model.triangles):,} triangles." if step.model is not None and step.last else ".")
     )
     return "\n".join(lines)
