@@ -24,7 +24,7 @@ from turning_box import CENTRE_M, COVARIANCE, HALF_M, object_from_camera, steps
 
 from modeler import se3
 from modeler.types import Array, Outcome, PoseGaussian, Segmentation, Solution, Step
-from viz import clouds, entities, images, readings, uncertainty, viewer
+from viz import blueprint, clouds, entities, images, readings, uncertainty, viewer
 from viz.stream import RerunStream, open_stream
 
 Recording = dict[str, dict[int, dict[str, Any]]]
@@ -156,6 +156,20 @@ def test_large_images_are_shown_smaller(run: list[Step]) -> None:
     assert isinstance(depth, rr.EncodedDepthImage)
     assert depth.blob is not None
     assert decoded(depth.blob.as_arrow_array().to_pylist()).shape == (480, 640)
+
+
+def test_the_depth_view_opens_around_the_object_at_any_size(run: list[Step]) -> None:
+    view = run[0].view
+    assert view is not None
+    depth_m = np.kron(view.frame.depth_m, np.ones((10, 10), dtype=np.float32))
+    large = replace(view, frame=replace(view.frame, depth_m=depth_m), pixels=10 * view.pixels)
+    for shown, shrunk in ((view, 1), (large, 2)):
+        bounds = blueprint.around(shown).range
+        assert bounds is not None
+        (ranges,) = bounds.as_arrow_array().to_pylist()
+        rows, columns = shown.pixels.T / shrunk
+        for (low, high), pixels in ((ranges["x_range"], columns), (ranges["y_range"], rows)):
+            assert low < pixels.min() < pixels.max() < high < 5 * pixels.max()
 
 
 def test_alignment_brings_the_pair_together(recording: Recording) -> None:

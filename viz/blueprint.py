@@ -8,7 +8,7 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from modeler.types import Array, RayImage
-from viz import entities
+from viz import entities, images
 
 _BACKGROUND: Final = (24, 26, 30)
 _ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object towards the eye; the camera is at -z, up is -y
@@ -39,7 +39,7 @@ def _images(first: RayImage | None) -> rrb.Container:
         origin=entities.CAMERA,
         contents=[entities.DEPTH, entities.MASK],
         name="Depth around the object",
-        visual_bounds=None if first is None else _around(first),
+        visual_bounds=None if first is None else around(first),
     )
     if first is not None and first.frame.colour is None:
         return rrb.Vertical(depth)
@@ -135,9 +135,10 @@ def _radius_m(view: RayImage) -> float:
     return float(np.percentile(np.linalg.norm(view.points_m - view.centroid_m, axis=1), 95))
 
 
-def _around(view: RayImage) -> rrb.VisualBounds2D:
+def around(view: RayImage) -> rrb.VisualBounds2D:
     """Return the part of the image around the object, with room for it to move."""
-    low, high = view.pixels.min(axis=0), view.pixels.max(axis=0)
+    pixels = view.pixels / images.stride_px(view.frame)
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
     margin = 0.6 * float((high - low).max())
     return rrb.VisualBounds2D(
         x_range=(float(low[1]) - margin, float(high[1]) + margin),

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import rerun as rr
 from PIL import Image
 
-from modeler.types import BoolArray, Step
+from modeler.types import BoolArray, Frame, Step
 from viz import entities
 
 Drawing = Iterator[tuple[str, rr.AsComponents]]
@@ -31,8 +31,7 @@ def statics() -> Drawing:
 
 def drawing(step: Step) -> Drawing:
     """Yield the colour image, the depth image and the mask of the step's frame."""
-    height, width = step.frame.depth_m.shape
-    stride = math.ceil(math.sqrt(height * width / _PIXELS))
+    stride = stride_px(step.frame)
     depth_m = step.frame.depth_m[::stride, ::stride]
     mask = step.segmentation.mask[::stride, ::stride]
     if step.frame.colour is None:
@@ -41,6 +40,11 @@ def drawing(step: Step) -> Drawing:
         yield entities.COLOUR, _jpeg(step.frame.colour[::stride, ::stride])
     yield entities.DEPTH, _depth_png(depth_m, mask)
     yield entities.MASK, rr.SegmentationImage(mask.astype(np.uint8), opacity=_DIMMED, draw_order=1.0)
+
+
+def stride_px(frame: Frame) -> int:
+    """Return how many pixels of the frame one pixel of its pictures stands for, along either axis."""
+    return math.ceil(math.sqrt(frame.depth_m.size / _PIXELS))
 
 
 def _jpeg(colour: npt.NDArray[np.uint8]) -> rr.EncodedImage:
