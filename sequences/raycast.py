@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -19,12 +21,18 @@ _SHORT = 1.0 - 2e-3
 
 
 @final
+@dataclass(frozen=True, eq=False)
 class Hits:
     """What a bundle of rays met first."""
 
-    def __init__(self, depth_m: Array, incidence_rad: Array, points_m: Array, albedo: npt.NDArray[np.uint8]) -> None:
-        """Keep depth (h, w) and incidence (h, w), NaN where nothing was met, points and albedo (h, w, 3)."""
-        self.depth_m, self.incidence_rad, self.points_m, self.albedo = depth_m, incidence_rad, points_m, albedo
+    depth_m: Array
+    """(h, w) distance along the optical axis; NaN where nothing was met."""
+    incidence_rad: Array
+    """(h, w) angle between ray and normal; NaN where nothing was met."""
+    points_m: Array
+    """(h, w, 3) camera coordinates of what was met; NaN where nothing was."""
+    albedo: npt.NDArray[np.uint8]
+    """(h, w, 3) RGB of what was met."""
 
     def over(self, other: Hits, first: BoolArray) -> Hits:
         """Return these hits where `first` (h, w) holds, the others elsewhere."""
@@ -38,18 +46,21 @@ class Hits:
 
 
 @final
+@dataclass(frozen=True, eq=False)
 class Caster:
-    """A mesh made ready for rays."""
+    """A mesh made ready for rays; one without triangles is met by no ray."""
 
-    def __init__(self, mesh: Mesh) -> None:
-        """Build the search tree; a mesh without triangles is met by no ray."""
-        self._albedo = mesh.albedo
-        self._scene = _scene(mesh)
+    mesh: Mesh
+    """What the rays are to meet."""
+
+    @cached_property
+    def _scene(self) -> o3d.t.geometry.RaycastingScene:
+        return _scene(self.mesh)
 
     def cast(self, rays: Array, camera_from_mesh: Array) -> Hits:
         """Follow rays (h, w, 3) of unit depth from the camera's centre."""
         shape = rays.shape[:2]
-        if not len(self._albedo):
+        if not len(self.mesh.triangles):
             missed = np.full(shape, np.nan)
             return Hits(missed, missed, np.full((*shape, 3), np.nan), np.zeros((*shape, 3), np.uint8))
         mesh_from_camera = se3.inverse(camera_from_mesh)
@@ -62,11 +73,11 @@ class Caster:
         facing = np.abs(np.sum(found["primitive_normals"].numpy() * turned, axis=-1)) / np.linalg.norm(turned, axis=-1)
         incidence_rad = np.where(met, np.arccos(np.clip(facing, 0.0, 1.0)), np.nan)
         triangle = np.where(met, found["primitive_ids"].numpy(), 0)
-        return Hits(depth_m, incidence_rad, rays * depth_m[..., None], self._albedo[triangle])
+        return Hits(depth_m, incidence_rad, rays * depth_m[..., None], self.mesh.albedo[triangle])
 
     def blocks(self, lamp_m: Array, points_m: Array, camera_from_mesh: Array) -> BoolArray:
         """Return where (h, w) the mesh stands between a lamp (3,) and points (h, w, 3), all in camera coordinates."""
-        if not len(self._albedo):
+        if not len(self.mesh.triangles):
             return np.zeros(points_m.shape[:2], bool)
         mesh_from_camera = se3.inverse(camera_from_mesh)
         lamp = se3.transform(mesh_from_camera, lamp_m)

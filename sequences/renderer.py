@@ -10,6 +10,7 @@ from typing import final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.types import Array, Camera, Frame, InputError
@@ -185,8 +186,6 @@ def render(recipe: Recipe, folder: Path) -> None:
 
 def _tum_bytes(poses: Array, period_s: float) -> bytes:
     """Return poses (n, 4, 4) as lines `time tx ty tz qx qy qz qw`."""
-    from scipy.spatial.transform import Rotation
-
     lines = ["# time_s and camera_from_hand: tx ty tz qx qy qz qw"]
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     for index, (pose, quaternion) in enumerate(zip(poses, quaternions, strict=True)):

@@ -6,12 +6,12 @@ from modeler.types import Array, BoolArray
 from sequences.mesh import IntArray, Mesh
 from sequences.raycast import inside
 
-_COARSE_M, _FINE_M = 0.01, 0.0005
+_COARSE_M, _FINE_M = 0.01, 0.001
 _SKIN_M = 1e-5
 
 
 def outer_surface(mesh: Mesh) -> Mesh:
-    """Return the mesh without what lies inside other parts; where parts meet, the cut is right to half a millimetre.
+    """Return the mesh without what lies inside other parts; where parts meet, the cut is right to a millimetre.
 
     Triangles that two parts cut are halved until they are small; the pieces inside another part are left out.
     """
