@@ -53,7 +53,7 @@ def against_surface(pose, point, x, y, z, cell):
     mx = pose[0] * point[3] + pose[1] * point[4] + pose[2] * point[5]
     my = pose[4] * point[3] + pose[5] * point[4] + pose[6] * point[5]
     mz = pose[8] * point[3] + pose[9] * point[4] + pose[10] * point[5]
-    plane_x, plane_y, plane_z = cell[PLANE_X], cell[PLANE_Y], cell[PLANE_Z]
+    plane_x, plane_y, plane_z = np.float64(cell[PLANE_X]), np.float64(cell[PLANE_Y]), np.float64(cell[PLANE_Z])
     scale = 1.0 / math.sqrt(plane_x * plane_x + plane_y * plane_y + plane_z * plane_z)
     in_front = (1.0 - plane_x * x - plane_y * y - plane_z * z) * scale
     facing = -(mx * x + my * y + mz * z) / math.sqrt(x * x + y * y + z * z)
@@ -96,13 +96,14 @@ def log_likelihoods(poses, points, cells, intrinsics, model):
             cell = cells[row, column]
             kind = cell[KIND]
             if kind == BACKGROUND:
-                beyond = cell[SILHOUETTE] - dead_px
+                beyond = np.float64(cell[SILHOUETTE]) - dead_px
                 if beyond > 0.0 and z < cell[DEPTH] - clearance_m:
                     beyond /= silhouette_px
                     total -= min(0.5 * beyond * beyond, worst)
             elif kind == SURFACE:
                 in_front, facing, agreement = against_surface(pose, point, x, y, z, cell)
-                square = in_front * in_front / (point[6] + cell[SIGMA] * cell[SIGMA] + blur)
+                spread = np.float64(cell[SIGMA])
+                square = in_front * in_front / (point[6] + spread * spread + blur)
                 faces = min(max((facing - low) / (high - low), 0.0), 1.0)
                 if faces > 0.0:
                     match = 0.5 - 0.5 * square - bend * (1.0 - agreement)

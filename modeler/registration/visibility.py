@@ -8,6 +8,7 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import visibility as kernel
 from modeler.registration.annealing import AnnealedSampler, LogLikelihood, Population
+from modeler.registration.posterior import failed, intrinsics, rows, weighted_gaussian
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, PoseGaussian, Posterior, RayImage
 
 
@@ -25,8 +26,12 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Number of independent measurements that the points of both views together are worth."""
     blurs_m: tuple[float, ...] = (0.016, 0.008, 0.004, 0.002, 0.001, 0.0)
     """Blur of the surfaces at each level of the annealing; the last is the likelihood itself."""
+    trusts: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    """Weight of each level: a blurred likelihood ranks distant modes badly, so it may only lean, not decide."""
     surface_noise: float = 0.25
     """Error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
+    surface_detail: float = 0.0015
+    """Error of local planes on a curved surface, as a share of the object's size."""
     hidden_share: float = 0.3
     """Share of points that face the other camera and are hidden by another part of the object."""
     worst: float = 10.0
@@ -50,9 +55,10 @@ class VisibilityRegistrar(AbstractRegistrar):
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS)
         pair = Pair(self, source, target, seed=int(rng.integers(2**32)))
-        levels = [pair.level(blur_m) for blur_m in self.blurs_m]
+        levels = [pair.level(blur_m, trust) for blur_m, trust in zip(self.blurs_m, self.trusts, strict=True)]
         population = self.sampler.run(motion, levels, source.centroid_m, rng)
-        pose = gaussian(population.poses, source.centroid_m)
+        weights = np.full(len(population.poses), 1.0 / len(population.poses))
+        pose = weighted_gaussian(population.poses, weights, source.centroid_m)
         overlap = pair.overlap(pose.mean)
         return Posterior(
             source=source.index,
@@ -61,7 +67,7 @@ class VisibilityRegistrar(AbstractRegistrar):
             outcome=self._outcome(population, pose, overlap),
             overlap=overlap,
             samples=population.poses,
-            weights=np.full(len(population.poses), 1.0 / len(population.poses)),
+            weights=weights,
             effective_samples=float(population.ancestors),
             pareto_k=population.pareto_k,
             log_evidence=population.log_evidence,
@@ -85,22 +91,24 @@ class Pair:
         self._method = method
         self._views = source, target
         self._points = tuple(spread_points(view, method.points, rng) for view in (source, target))
+        sizes_m = [np.sqrt(np.sum(np.var(view.points_m, axis=0))) for view in (source, target)]
+        self._surface_m = method.surface_detail * float(np.mean(sizes_m))
         self._weight = method.effective_points / sum(len(points) for points in self._points)
 
-    def level(self, blur_m: float) -> LogLikelihood:
-        """Return the tempered log-likelihood of poses (n, 4, 4) with the surfaces blurred by `blur_m`."""
+    def level(self, blur_m: float, trust: float = 1.0) -> LogLikelihood:
+        """Return `trust` × the tempered log-likelihood of poses (n, 4, 4), the surfaces blurred by `blur_m`."""
         share = 1 if blur_m < 0.003 else 2 if blur_m < 0.006 else 4  # blunt comparisons need fewer points
         source, target = self._views
         of_source, of_target = (np.ascontiguousarray(points[::share]) for points in self._points)
         in_target, in_source = self._model(target, blur_m), self._model(source, blur_m)
-        weight = self._weight * share
+        weight = self._weight * share * trust
 
         def log_likelihood(target_from_source: Array) -> Array:
-            forward = _rows(target_from_source)
-            backward = _rows(se3.inverse(target_from_source))
+            forward = rows(target_from_source)
+            backward = rows(se3.inverse(target_from_source))
             return weight * (
-                kernel.log_likelihoods(forward, of_source, target.layers["cells"], _intrinsics(target), in_target)
-                + kernel.log_likelihoods(backward, of_target, source.layers["cells"], _intrinsics(source), in_source)
+                kernel.log_likelihoods(forward, of_source, target.layers["cells"], intrinsics(target), in_target)
+                + kernel.log_likelihoods(backward, of_target, source.layers["cells"], intrinsics(source), in_source)
             )
 
         return log_likelihood
@@ -111,7 +119,7 @@ class Pair:
         verdicts = np.concatenate(
             [
                 kernel.classify(
-                    _rows(pose[None])[0], points, other.layers["cells"], _intrinsics(other), self._model(other, 0.0)
+                    rows(pose[None])[0], points, other.layers["cells"], intrinsics(other), self._model(other, 0.0)
                 )
                 for pose, points, other in (
                     (target_from_source, self._points[0], target),
@@ -131,7 +139,7 @@ class Pair:
         blur_px = blur_m * camera.fx / depth_m
         return np.array(
             [
-                np.hypot(method.surface_noise * other.sigma_r_m, blur_m),
+                np.sqrt(blur_m**2 + self._surface_m**2 + (method.surface_noise * other.sigma_r_m) ** 2),
                 lateral_px + blur_px,
                 1.25 * lateral_px,
                 3.0 * other.sigma_r_m,
@@ -158,32 +166,3 @@ def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> Array
     points = np.hstack([view.points_m[chosen], view.normals[chosen], variance])
     # In random order, so that every stride through them is again spread over the object.
     return points[rng.permutation(len(points))]
-
-
-def gaussian(poses: Array, centre_m: Array) -> PoseGaussian:
-    """Return the mean and covariance of equally weighted motions (n, 4, 4).
-
-    The mean is taken of motions about the object's centre: about the camera, rotation and translation would be
-    strongly coupled, and the mean of a wide posterior would leave the object.
-    """
-    centre = se3.translation(centre_m)
-    mean, covariance = se3.mean(poses @ centre, np.ones(len(poses)))
-    to_camera = se3.adjoint(centre)
-    floor = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
-    covariance = to_camera @ (covariance + floor) @ to_camera.T
-    return PoseGaussian(mean @ se3.translation(-centre_m), 0.5 * (covariance + covariance.T))
-
-
-def failed(source: RayImage, target: RayImage, outcome: Outcome) -> Posterior:
-    """Return the posterior of a registration that could not be tried: nothing known."""
-    pose = PoseGaussian(np.eye(4), np.diag(np.repeat([np.pi, 10.0], 3) ** 2))
-    return Posterior(source=source.index, target=target.index, pose=pose, outcome=outcome, overlap=0.0)
-
-
-def _rows(poses: Array) -> Array:
-    return np.ascontiguousarray(poses[:, :3].reshape(len(poses), 12))
-
-
-def _intrinsics(view: RayImage) -> Array:
-    camera = view.frame.camera
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])

@@ -1,0 +1,103 @@
+"""Readable twins of the kernels: float64 NumPy, one idea a line, as slow as they like."""
+
+import numpy as np
+from scipy.special import erf
+
+from modeler.kernels import planes
+
+
+def to_ray(point):
+    """(w, h, r) of a point (paper, eq. 1)."""
+    x, y, z = point
+    return np.array([x / z, y / z, np.linalg.norm(point)])
+
+
+def ray_jacobian(point):
+    """Q by central differences of the definition."""
+    step = 1e-6 * np.linalg.norm(point)
+    return np.stack([(to_ray(point + step * e) - to_ray(point - step * e)) / (2 * step) for e in np.eye(3)], axis=1)
+
+
+def paper_density(point_b, a_from_b, ranges_m, intrinsics, noise):
+    """p(b_j | M_A, T) of eq. pbd, over all pixels of A, with the appendix's Λ, K2, D and v as printed."""
+    fx, fy, cx, cy = intrinsics
+    point_a = a_from_b[:3, :3] @ point_b + a_from_b[:3, 3]
+    if point_a[2] <= 0:
+        return 0.0
+    rotation = a_from_b[:3, :3].T  # the appendix's R takes A to B
+    q_a, q_b = ray_jacobian(point_a), ray_jacobian(point_b)
+    inv, t = np.linalg.inv, np.transpose
+    lam = inv(q_a @ inv(rotation) @ inv(q_b) @ noise @ inv(t(q_b)) @ rotation @ t(q_a) + noise)
+    k2 = np.linalg.det(noise + q_b @ rotation @ inv(q_a) @ noise @ inv(t(q_a)) @ t(rotation) @ t(q_b)) ** -0.5
+    d = np.array(
+        [
+            [lam[0, 0] * lam[2, 2] - lam[2, 0] ** 2, lam[2, 2] * lam[1, 0] - lam[2, 0] * lam[2, 1]],
+            [lam[2, 2] * lam[1, 0] - lam[2, 0] * lam[2, 1], lam[1, 1] * lam[2, 2] - lam[2, 1] ** 2],
+        ]
+    )
+    d = d / lam[2, 2]
+    v = np.array([lam[2, 0], lam[2, 1], lam[2, 2]]) / np.sqrt(2 * lam[2, 2])
+    total = 0.0
+    for row in range(ranges_m.shape[0]):
+        for column in range(ranges_m.shape[1]):
+            pixel = np.array([(column - cx) / fx, (row - cy) / fy, ranges_m[row, column]])
+            off = to_ray(point_a) - pixel
+            total += np.exp(-0.5 * off[:2] @ d @ off[:2]) * (1 + erf(v @ off))
+    return k2 * total
+
+
+def visibility(pose, points, cells, intrinsics, model):
+    """Log-likelihood of one pose: every point judged in turn, as `kernels.visibility` documents it."""
+    blur, silhouette_px, dead_px, clearance_m, low, high, hidden, worst, bend = model
+    fx, fy, cx, cy = intrinsics
+    total = 0.0
+    for point in points:
+        position = pose[:3, :3] @ point[:3] + pose[:3, 3]
+        normal = pose[:3, :3] @ point[3:6]
+        if position[2] <= 0:
+            continue
+        column = int(np.floor(fx * position[0] / position[2] + cx + 0.5))
+        row = int(np.floor(fy * position[1] / position[2] + cy + 0.5))
+        if not (0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]):
+            continue
+        cell = cells[row, column].astype(np.float64)
+        if cell[planes.KIND] == planes.BACKGROUND:
+            beyond = max(cell[planes.SILHOUETTE] - dead_px, 0.0) / silhouette_px
+            if position[2] < cell[planes.DEPTH] - clearance_m:
+                total -= min(0.5 * beyond**2, worst)
+        if cell[planes.KIND] != planes.SURFACE:
+            continue
+        plane = cell[: planes.PLANE_Z + 1]
+        in_front = (1 - plane @ position) / np.linalg.norm(plane)
+        facing = -normal @ position / np.linalg.norm(position)
+        agreement = -normal @ plane / np.linalg.norm(plane)
+        square = in_front**2 / (point[6] + cell[planes.SIGMA] ** 2 + blur**2)
+        faces = np.clip((facing - low) / (high - low), 0, 1)
+        match = 0.5 - 0.5 * square - bend * (1 - agreement)
+        seen = np.log((1 - hidden) * np.exp(max(match, -700)) + hidden)
+        if in_front > 0 and match < np.log(hidden):
+            seen = max(match, -worst)
+        total += faces * seen
+        if in_front > 0:
+            total -= (1 - faces) * min(0.5 * square, worst)
+    return total
+
+
+def local_plane(depth_m, mask, intrinsics, pixel, radius_m):
+    """Plane N (3,) with N · p = 1 through a pixel's neighbours in a ball, by least squares in inverse depth."""
+    fx, fy, cx, cy = intrinsics
+    rows, columns = np.nonzero(mask & (depth_m > 0))
+    z = depth_m[rows, columns]
+    points = np.stack([z * (columns - cx) / fx, z * (rows - cy) / fy, z], axis=1)
+    centre = points[(rows == pixel[0]) & (columns == pixel[1])][0]
+    near = np.linalg.norm(points - centre, axis=1) <= radius_m
+    rays = points[near] / points[near, 2:]
+    solution, *_ = np.linalg.lstsq(rays, 1 / points[near, 2], rcond=None)
+    return solution
+
+
+def silhouette_distance(mask):
+    """Exact Euclidean distance of every pixel from the mask."""
+    rows, columns = np.nonzero(mask)
+    grid = np.indices(mask.shape)
+    return np.sqrt(((grid[:, :, :, None] - np.stack([rows, columns])[:, None, None, :]) ** 2).sum(axis=0).min(axis=-1))

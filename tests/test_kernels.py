@@ -1,0 +1,158 @@
+"""Every kernel of the registration against its readable twin, on random inputs."""
+
+import naive
+import numpy as np
+import pytest
+
+from modeler import se3
+from modeler.kernels import paper, planes, visibility
+from modeler.registration.posterior import rows
+
+INTRINSICS = np.array([40.0, 42.0, 9.3, 7.1])
+SHAPE = (16, 20)
+ISOTROPIC = np.diag([0.02, 0.02, 0.02]) ** 2
+ANISOTROPIC = np.array([[4e-4, 1e-4, 2e-5], [1e-4, 9e-4, -5e-5], [2e-5, -5e-5, 1e-4]])
+
+
+def random_pose(rng, angle_rad=0.6):
+    return se3.exp(np.concatenate([rng.normal(0, angle_rad, 3), rng.normal(0, 0.03, 3)])) @ se3.translation(
+        np.array([0.0, 0.0, rng.normal(0, 0.02)])
+    )
+
+
+def random_points(rng, count):
+    z = rng.uniform(0.7, 0.9, count)
+    return np.stack([rng.uniform(-0.15, 0.15, count), rng.uniform(-0.12, 0.12, count), z], axis=1)
+
+
+def random_ranges(rng):
+    ranges_m = rng.uniform(0.7, 0.9, SHAPE)
+    ranges_m[rng.random(SHAPE) < 0.2] = 0.0  # missing
+    ranges_m[rng.random(SHAPE) < 0.2] = 2.0  # background
+    return ranges_m
+
+
+@pytest.mark.parametrize("noise", [ISOTROPIC, ANISOTROPIC], ids=["isotropic", "anisotropic"])
+@pytest.mark.parametrize("seed", range(10))
+def test_paper_is_the_paper(noise, seed):
+    rng = np.random.default_rng(seed)
+    ranges_m, pose = random_ranges(rng), random_pose(rng)
+    for points, motion in (
+        (random_points(rng, 5), pose),
+        (random_points(rng, 5), se3.inverse(pose)),
+    ):
+        want = sum(np.log(naive.paper_density(point, motion, ranges_m, INTRINSICS, noise)) for point in points)
+        got = paper.log_likelihoods(rows(motion[None]), points, ranges_m, INTRINSICS, noise, np.array([np.inf, 0.0]))
+        # The twin takes Q by differences, good to about 1e-10.
+        np.testing.assert_allclose(got[0], want, rtol=1e-9, atol=1e-8)
+
+
+def test_ray_jacobians_are_derivatives_and_inverses(rng):
+    for point in random_points(rng, 20):
+        np.testing.assert_allclose(paper.ray_jacobian(point), naive.ray_jacobian(point), rtol=1e-7, atol=1e-8)
+        np.testing.assert_allclose(paper.ray_jacobian(point) @ paper.ray_jacobian_inverse(point), np.eye(3), atol=1e-12)
+
+
+def test_passing_over_far_pixels_changes_little(rng):
+    ranges_m, pose, points = random_ranges(rng), random_pose(rng, 0.1), random_points(rng, 5)
+    ranges_m[:] = 0.0  # nothing forbidden: the nearest pixels decide
+    full, near = (
+        paper.log_likelihoods(rows(pose[None]), points, ranges_m, INTRINSICS, ISOTROPIC, np.array([reach, 0.0]))[0]
+        for reach in (np.inf, 6.0)
+    )
+    np.testing.assert_allclose(near, full, atol=1e-5)
+
+
+def test_a_point_in_front_of_every_pixel_rejects_the_sample(rng):
+    ranges_m = np.full(SHAPE, 2.0)
+    points = np.array([[0.0, 0.0, 0.8]])
+    for reject_below, rejected in ((1e-6, True), (0.0, True)):
+        options = np.array([np.inf, reject_below])
+        value = paper.log_likelihoods(rows(np.eye(4)[None]), points, ranges_m, INTRINSICS, ISOTROPIC, options)[0]
+        assert np.isneginf(value) == rejected
+
+
+def random_cells(rng):
+    cells = np.zeros((*SHAPE, planes.CELL_SIZE), dtype=np.float32)
+    depth = rng.uniform(0.7, 0.9, SHAPE)
+    tilt = rng.normal(0, 0.8, (*SHAPE, 2))
+    cells[..., :2] = tilt
+    w = (np.arange(SHAPE[1]) - INTRINSICS[2]) / INTRINSICS[0]
+    h = ((np.arange(SHAPE[0]) - INTRINSICS[3]) / INTRINSICS[1])[:, None]
+    cells[..., planes.PLANE_Z] = 1 / depth - tilt[..., 0] * w - tilt[..., 1] * h
+    cells[..., planes.SIGMA] = rng.uniform(0.0005, 0.01, SHAPE)
+    cells[..., planes.DEPTH] = depth
+    cells[..., planes.KIND] = rng.choice(4, SHAPE, p=[0.1, 0.6, 0.1, 0.2])
+    cells[..., planes.SILHOUETTE] = rng.uniform(0, 6, SHAPE)
+    return cells
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_visibility_equals_its_twin(seed):
+    rng = np.random.default_rng(seed)
+    cells = random_cells(rng)
+    normals = rng.normal(size=(40, 3)) - [0, 0, 1.5]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = np.hstack([random_points(rng, 40), normals, rng.uniform(1e-7, 1e-4, (40, 1))])
+    model = np.array([0.004, 1.5, 1.5, 0.006, 0.1, 0.35, 0.3, 10.0, 2.0])
+    poses = np.stack([random_pose(rng, 0.3) for _ in range(20)])
+    got = visibility.log_likelihoods(rows(poses), points, cells, INTRINSICS, model)
+    want = [naive.visibility(pose, points, cells, INTRINSICS, model) for pose in poses]
+    np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-9)
+
+
+def test_verdicts_follow_from_where_a_point_lies():
+    cells = np.zeros((*SHAPE, planes.CELL_SIZE), dtype=np.float32)
+    cells[..., planes.PLANE_Z] = 1 / 0.8
+    cells[..., planes.SIGMA], cells[..., planes.DEPTH], cells[..., planes.KIND] = 0.001, 0.8, planes.SURFACE
+    cells[:, 15:, planes.KIND], cells[:, 15:, planes.DEPTH] = planes.BACKGROUND, 2.0
+    cells[:, 15:, planes.SILHOUETTE] = np.arange(1, 6)
+    model = np.array([0.001, 1.0, 1.5, 0.006, 0.1, 0.35, 0.3, 10.0, 2.0])
+    towards, away = [0.0, 0.0, -1.0], [0.0, 0.0, 1.0]
+    cases = [
+        ([0.0, 0.0, 0.8], towards, visibility.MATCHED),
+        ([0.0, 0.0, 0.82], towards, visibility.BEHIND),
+        ([0.0, 0.0, 0.78], towards, visibility.IN_FRONT),
+        ([0.0, 0.0, 0.85], away, visibility.HIDDEN),
+        ([0.0, 0.0, 0.75], away, visibility.IN_FRONT),
+        ([0.17, 0.0, 0.8], towards, visibility.IN_EMPTY_SPACE),
+        ([5.0, 0.0, 0.8], towards, visibility.UNKNOWN),
+    ]
+    points = np.array([[*position, *normal, 1e-6] for position, normal, _ in cases])
+    verdicts = visibility.classify(rows(np.eye(4)[None])[0], points, cells, INTRINSICS, model)
+    assert verdicts.tolist() == [want for *_, want in cases]
+
+
+def test_local_planes_are_least_squares_in_inverse_depth(rng):
+    depth_m = 0.8 + 0.05 * rng.random(SHAPE)
+    depth_m[rng.random(SHAPE) < 0.1] = np.nan
+    mask = np.zeros(SHAPE, dtype=bool)
+    mask[2:14, 3:17] = True
+    radius_m = 0.09
+    cells = planes.local_planes(depth_m.astype(np.float32), mask, INTRINSICS, radius_m, 4, 1e-6)
+    fitted = np.argwhere(cells[..., planes.SIGMA] > 0)
+    assert len(fitted) > 60
+    for pixel in fitted[::5]:
+        want = naive.local_plane(np.where(mask, depth_m, 0).astype(np.float32), mask, INTRINSICS, pixel, radius_m)
+        np.testing.assert_allclose(cells[(*pixel, slice(0, 3))], want, rtol=2e-3, atol=2e-4)
+
+
+def test_a_noise_free_plane_is_found_whatever_its_tilt():
+    w = (np.arange(64) - 31.5) / 100.0
+    normal = np.array([0.5, -0.3, -0.8])
+    plane = -normal / np.linalg.norm(normal) / 0.6
+    depth_m = 1 / (plane[0] * w[None, :] + plane[1] * w[:, None] + plane[2])
+    mask = np.ones((64, 64), dtype=bool)
+    intrinsics = np.array([100.0, 100.0, 31.5, 31.5])
+    cells = planes.local_planes(depth_m.astype(np.float32), mask, intrinsics, 0.04, 6, 1e-6)
+    inner = cells[20:44, 20:44]
+    assert (inner[..., planes.KIND] == planes.SURFACE).all()
+    np.testing.assert_allclose(inner[..., :3], np.broadcast_to(plane, (24, 24, 3)), atol=1e-3)
+
+
+def test_silhouette_distance_is_euclidean_within_the_chamfer_error(rng):
+    mask = rng.random((40, 50)) < 0.004
+    mask[20, 25] = True
+    got, want = planes.silhouette_distance(mask, 60.0), naive.silhouette_distance(mask)
+    assert (np.abs(got - want) <= 0.09 * want + 1e-5).all()
+    np.testing.assert_array_equal(planes.silhouette_distance(mask, 3.0), np.minimum(got, 3.0))
