@@ -1,0 +1,298 @@
+"""The baselines' algebra: where they start, what they match, and in which tangent they state their information."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import small_gicp
+import tabletop
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from modeler import se3
+from modeler.priors import GeneralPrior
+from modeler.registration import FpfhIcpRegistrar, FpfhRegistrar, GicpRegistrar, IcpRegistrar
+from modeler.registration.clouds import (
+    Cloud,
+    Fit,
+    Matches,
+    matched,
+    plane_residuals,
+    posterior,
+    scaled_information,
+    start,
+)
+from modeler.registration.fpfh import kabsch, mutual_matches
+from modeler.types import AbstractMotion, Array, Outcome, RayImage
+
+BODY = tabletop.Box((0.05, 0.08, 0.035))
+POSES = tabletop.turntable(24)[2:4]
+Pair = tuple[RayImage, RayImage]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(11)
+
+
+@pytest.fixture(scope="module")
+def pair() -> Pair:
+    """Two views of a box that turns by 15° between them, with depth noise."""
+    first, second = (
+        tabletop.view(BODY, pose, index, rng=np.random.default_rng(index), table=False)
+        for index, pose in enumerate(POSES)
+    )
+    return first, second
+
+
+@dataclass(frozen=True)
+class Normal(AbstractMotion):
+    """A Gaussian about a motion, isotropic in rotation about a point and in shift."""
+
+    pose: Array
+    centre_m: Array
+    sigma_rad: float
+    sigma_m: float
+    evidence: bool = True
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        xi = rng.normal(size=(count, 6)) * np.repeat([self.sigma_rad, self.sigma_m], 3)
+        return self.pose @ se3.translation(self.centre_m) @ se3.exp(xi) @ se3.translation(-self.centre_m)
+
+    def log_density(self, target_from_source: Array) -> Array:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class AnyTurn(AbstractMotion):
+    """Any rotation at all about the centroids."""
+
+    source_m: Array
+    target_m: Array
+    evidence: bool = True
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        turn = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
+        turn[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
+        return se3.translation(self.target_m) @ turn @ se3.translation(-self.source_m)
+
+    def log_density(self, target_from_source: Array) -> Array:
+        raise NotImplementedError
+
+
+def degrees_between(first: Array, second: Array) -> float:
+    return float(np.degrees(se3.rotation_angle(se3.inverse(first) @ second)))
+
+
+def second_derivative(cost: Callable[[Array], float], step: float = 1e-4) -> Array:
+    """Return the Hessian (6, 6) of a cost of ξ at zero by central differences."""
+    unit = step * np.eye(6)
+    return np.array(
+        [[(cost(a + b) - cost(a - b) - cost(b - a) + cost(-a - b)) / (4.0 * step**2) for b in unit] for a in unit]
+    )
+
+
+def test_starts_with_the_centroids_together_where_the_prior_is_general(pair: Pair, rng: np.random.Generator) -> None:
+    source, target = pair
+    begin = start(source, target, GeneralPrior(50.0, 0.04).between(source, target), rng)
+    aligned = se3.translation(target.centroid_m - source.centroid_m)
+    assert degrees_between(begin.target_from_source, aligned) < 3.0
+    carried = se3.transform(begin.target_from_source, source.centroid_m[None])[0]
+    assert np.linalg.norm(carried - target.centroid_m) < 0.004
+
+
+def test_starts_at_the_centre_of_a_prior_that_knows_the_motion(pair: Pair, rng: np.random.Generator) -> None:
+    source, target = pair
+    truth = POSES[1] @ se3.inverse(POSES[0])
+    begin = start(source, target, Normal(truth, source.centroid_m, 0.02, 0.003), rng)
+    assert degrees_between(begin.target_from_source, truth) < 0.2
+    assert begin.sigma_rad == pytest.approx(0.02, rel=0.05)
+    assert begin.sigma_m == pytest.approx(0.003, rel=0.05)
+
+
+def test_starts_without_turning_where_the_prior_has_no_centre(pair: Pair, rng: np.random.Generator) -> None:
+    source, target = pair
+    begin = start(source, target, AnyTurn(source.centroid_m, target.centroid_m), rng)
+    np.testing.assert_allclose(begin.target_from_source, se3.translation(target.centroid_m - source.centroid_m))
+
+
+def test_spread_is_stated_at_the_start_in_our_tangent(pair: Pair, rng: np.random.Generator) -> None:
+    source, target = pair
+    motion = Normal(POSES[1] @ se3.inverse(POSES[0]), source.centroid_m, 0.1, 0.02)
+    begin = start(source, target, motion, rng)
+    xi = se3.log(se3.inverse(begin.target_from_source) @ motion.sample(20_000, rng))
+    # Sampled Gaussians of this spread have squared Mahalanobis length 6 on average.
+    assert np.mean(np.einsum("ni,ij,nj->n", xi, begin.information, xi)) == pytest.approx(6.0, rel=0.05)
+
+
+def test_thinning_keeps_one_mean_point_a_cube(rng: np.random.Generator) -> None:
+    points = rng.uniform(-0.1, 0.1, (4000, 3))
+    points -= points.mean(axis=0)
+    cloud = Cloud(points, np.tile([0.0, 0.0, -1.0], (4000, 1)))
+    thin = cloud.thinned(0.05)
+    cubes = {}
+    for point in points:
+        cubes.setdefault(tuple(np.floor(point / 0.05)), []).append(point)
+    expected = np.array(sorted(np.mean(members, axis=0).tolist() for members in cubes.values()))
+    np.testing.assert_allclose(np.array(sorted(thin.points_m.tolist())), expected, atol=1e-12)
+    np.testing.assert_allclose(thin.normals, np.tile([0.0, 0.0, -1.0], (len(expected), 1)))
+    offset = np.array([0.3, 0.2, 1.0])
+    np.testing.assert_allclose(Cloud(points + offset, cloud.normals).thinned(0.05).points_m, thin.points_m + offset)
+
+
+def test_matches_are_the_nearest_within_reach(rng: np.random.Generator) -> None:
+    source, target = rng.uniform(size=(50, 3)), rng.uniform(size=(70, 3))
+    pose = se3.exp(rng.normal(size=6))
+    cloud = Cloud(target, target)
+    found = matched(source, cloud, KDTree(target), pose, 0.2)
+    distances = np.linalg.norm(se3.transform(pose, source)[:, None] - target, axis=2)
+    near = distances.min(axis=1) < 0.2
+    np.testing.assert_array_equal(found.points_m, source[near])
+    np.testing.assert_array_equal(found.partners.points_m, target[distances.argmin(axis=1)[near]])
+    assert found.fitness == near.mean()
+
+
+def test_plane_residuals_differentiate_by_the_right_perturbation(rng: np.random.Generator) -> None:
+    normals = rng.normal(size=(30, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    matches = Matches(rng.normal(size=(30, 3)), Cloud(rng.normal(size=(30, 3)), normals), 1.0)
+    pose = se3.exp(rng.normal(size=6))
+    _, jacobian = plane_residuals(matches, pose)
+    for axis in range(6):
+        step = 1e-6 * np.eye(6)[axis]
+        ahead, behind = (plane_residuals(matches, pose @ se3.exp(side))[0] for side in (step, -step))
+        np.testing.assert_allclose(jacobian[:, axis], (ahead - behind) / 2e-6, atol=1e-7)
+
+
+def test_information_is_true_where_residuals_are_independent_and_partners_true(rng: np.random.Generator) -> None:
+    """The formula is sound; real residuals are what it is not sound for."""
+    squares = []
+    for _ in range(300):
+        normals = rng.normal(size=(60, 3))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        points = rng.normal(0.0, 0.1, (60, 3)) + np.array([0.0, 0.0, 0.8])
+        noise = rng.normal(0.0, 0.001, (60, 1))
+        matches = Matches(points, Cloud(points + noise * normals, normals), 1.0)
+        residuals, jacobian = plane_residuals(matches, np.eye(4))
+        error = np.linalg.lstsq(jacobian, -residuals)[0]
+        after = residuals + jacobian @ error
+        squares.append(error @ scaled_information(after, np.ones(60), jacobian) @ error)
+    # 6 · (54 / 52) for a variance estimated from 54 degrees of freedom; standard error 0.21.
+    assert np.mean(squares) == pytest.approx(6.23, abs=0.65)
+
+
+def test_icp_stops_where_open3d_would(pair: Pair, rng: np.random.Generator) -> None:
+    import open3d as o3d
+
+    method = IcpRegistrar()
+    source, target = (Cloud.of(view) for view in pair)
+    begin = start(pair[0], pair[1], GeneralPrior(40.0, 0.03).between(*pair), rng)
+    fit = method.refine(source, target, begin.target_from_source)
+    assert fit is not None
+    voxel_m = method.voxels[-1] * max(source.size_m, target.size_m)
+    reach_m = method.reach * voxel_m
+    clouds = []
+    for cloud in (source.thinned(voxel_m), target.thinned(voxel_m)):
+        points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m))
+        points.normals = o3d.utility.Vector3dVector(cloud.normals)
+        clouds.append(points)
+    library = o3d.pipelines.registration
+    theirs = library.registration_icp(
+        clouds[0],
+        clouds[1],
+        reach_m,
+        fit.target_from_source,
+        library.TransformationEstimationPointToPlane(library.TukeyLoss(reach_m)),
+        library.ICPConvergenceCriteria(1e-9, 1e-9, 30),
+    )
+    assert degrees_between(theirs.transformation, fit.target_from_source) < 0.01
+    assert theirs.fitness == pytest.approx(fit.fitness, abs=0.005)
+
+
+def test_gicp_states_its_hessian_in_our_tangent(pair: Pair, rng: np.random.Generator) -> None:
+    method = GicpRegistrar(voxels=(1 / 20,))
+    source, target = pair
+    found = method.register(source, target, GeneralPrior(40.0, 0.03).between(source, target), rng=rng)
+    points, shapes = [], []
+    voxel_m = max(Cloud.of(view).size_m for view in pair) / 20
+    for view in pair:
+        cloud, _ = small_gicp.preprocess_points(view.points_m - view.centroid_m, voxel_m, method.neighbours)
+        points.append(cloud.points()[:, :3] + view.centroid_m)
+        shapes.append(np.array([cloud.cov(k)[:3, :3] for k in range(cloud.size())]))
+    pose = found.pose.mean
+    distances, partners = KDTree(points[1]).query(se3.transform(pose, points[0]))
+    near = distances < method.reach * voxel_m
+    turned = pose[:3, :3] @ shapes[0][near] @ pose[:3, :3].T
+    weights = np.linalg.inv(shapes[1][np.asarray(partners)[near]] + turned)
+
+    def cost(xi: Array) -> float:
+        gaps = points[1][np.asarray(partners)[near]] - se3.transform(pose @ se3.exp(xi), points[0][near])
+        return 0.5 * float(np.einsum("ni,nij,nj->", gaps, weights, gaps))
+
+    variance = 2.0 * cost(np.zeros(6)) / (np.sum(near) - 6)
+    assert found.information is not None
+    np.testing.assert_allclose(
+        found.information * variance,
+        second_derivative(cost),
+        rtol=1e-3,
+        atol=1e-4 * np.max(found.information) * variance,
+    )
+
+
+def test_kabsch_recovers_motions(rng: np.random.Generator) -> None:
+    poses = se3.exp(rng.normal(size=(40, 6)))
+    triangles = rng.normal(size=(40, 3, 3))
+    carried = triangles @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    np.testing.assert_allclose(kabsch(triangles, carried), poses, atol=1e-9)
+
+
+def test_kabsch_never_reflects(rng: np.random.Generator) -> None:
+    mirrored = rng.normal(size=(40, 5, 3))
+    poses = kabsch(mirrored, mirrored * [1.0, 1.0, -1.0])
+    np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1.0)
+
+
+def test_mutual_matches_are_each_others_nearest(rng: np.random.Generator) -> None:
+    source = rng.normal(size=(40, 33))
+    order = rng.permutation(40)
+    target = source[order] + 1e-3 * rng.normal(size=(40, 33))
+    found = mutual_matches(source, target)
+    np.testing.assert_array_equal(order[found[:, 1]], found[:, 0])
+    assert len(found) == 40
+
+
+def test_features_need_no_start(pair: Pair, rng: np.random.Generator) -> None:
+    """A prior that points the wrong way does not mislead a method that does not use it."""
+    source, target = pair
+    truth = POSES[1] @ se3.inverse(POSES[0])
+    wrong = Normal(truth @ se3.exp(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0])), source.centroid_m, 0.05, 0.005)
+    for method, tolerance_deg in ((FpfhRegistrar(), 8.0), (FpfhIcpRegistrar(), 1.0)):
+        found = method.register(source, target, wrong, rng=rng)
+        assert degrees_between(found.pose.mean, truth) < tolerance_deg
+    assert degrees_between(IcpRegistrar().register(source, target, wrong, rng=rng).pose.mean, truth) > 20.0
+
+
+def test_directions_that_nobody_saw_keep_the_spread_of_the_prior(pair: Pair, rng: np.random.Generator) -> None:
+    """A sphere says nothing of rotation about its centre."""
+    source, target = pair
+    centre = source.centroid_m
+    normals = rng.normal(size=(500, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    ball = centre + 0.05 * normals
+    residuals, jacobian = plane_residuals(Matches(ball, Cloud(ball, normals), 1.0), np.eye(4))
+    fit = Fit(np.eye(4), scaled_information(residuals, np.ones(500), jacobian), 1.0)
+    begin = start(source, target, Normal(np.eye(4), centre, 0.3, 0.01), rng)
+    at_centre = se3.adjoint(se3.translation(-centre))
+    covariance = at_centre @ posterior(source, target, begin, fit, 0.1).pose.covariance @ at_centre.T
+    np.testing.assert_allclose(covariance[:3, :3], begin.sigma_rad**2 * np.eye(3), atol=1e-2 * begin.sigma_rad**2)
+    assert np.all(np.sqrt(np.diag(covariance)[3:]) < 1e-5)
+
+
+def test_a_fit_of_few_matches_is_no_overlap(pair: Pair, rng: np.random.Generator) -> None:
+    begin = start(pair[0], pair[1], Normal(np.eye(4), pair[0].centroid_m, 0.1, 0.01), rng)
+    fit = IcpRegistrar().refine(Cloud.of(pair[0]), Cloud.of(pair[1]), se3.translation(np.array([0.0, 0.0, 0.5])))
+    assert fit is not None
+    assert posterior(pair[0], pair[1], begin, fit, min_fitness=0.1).outcome is Outcome.NO_OVERLAP
