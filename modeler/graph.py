@@ -72,7 +72,8 @@ def solve(graph: PoseGraph, guess: Mapping[int, Array], *, outlier_distance: flo
         values, inlier = _optimise(tree, loops, root, start, threshold=0.5 * outlier_distance**2)
         closures = [edge for edge, good in zip(loops, inlier, strict=True) if good]
         outliers = [edge for edge, good in zip(loops, inlier, strict=True) if not good]
-        trajectory = {frame: values.atPose3(frame).matrix() for frame in odometry} if closures else odometry
+        if closures:  # the gauge stands in the graph as a tight prior, in the result as what it means
+            trajectory = {frame: values.atPose3(frame).matrix() for frame in odometry} | {root: np.eye(4)}
     relative_covariance = network(trajectory, root, tree, closures)
     covariances = PoseCovariances(root, relative_covariance)
     return Solution(trajectory, covariances, odometry, tuple(outliers), relative_covariance)

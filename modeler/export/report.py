@@ -1,0 +1,192 @@
+"""`report.json`: what a run did, what it found and how far that is to be trusted."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Solution, Step
+
+_SCHEMA = 1
+_PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
+
+
+def _versions() -> dict[str, str]:
+    return {"python": platform.python_version(), **{name: metadata.version(name) for name in _PACKAGES}}
+
+
+@dataclass(frozen=True)
+class RunMeta:
+    """What a report says about the run besides its results."""
+
+    sequence: str
+    """Name or path of the sequence."""
+    seed: int
+    """Seed of every random number."""
+    prior: str
+    """Name of the prior."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Every other option that the results depend on, as JSON values."""
+    closure_expected: bool = False
+    """Whether the object is known to come back to its start, so that a run without closure is not to be trusted."""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Wall time in s by part of the program."""
+    versions: Mapping[str, str] = field(default_factory=_versions)
+    """Version by package."""
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """What became of one frame."""
+
+    id: int
+    """Frame number."""
+    timestamp: float
+    """Time of capture in s."""
+    points: int
+    """Number of surface points on the object."""
+    outcome: str
+    """"accepted", or why the frame was left out."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the frame is part of the model."""
+        return self.outcome == "accepted"
+
+
+def frame_record(step: Step) -> FrameRecord:
+    """Return what became of the frame of a step."""
+    points = 0 if step.view is None else len(step.view.points_m)
+    return FrameRecord(step.frame.index, float(step.frame.time_s), points, step.outcome)
+
+
+def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[str, Any]:
+    """Return the report after a step, in values that JSON holds: numbers that are not finite are None.
+
+    Args:
+        step: the latest.
+        frames: what became of every frame so far.
+        meta: everything else.
+    """
+    solution = step.solution
+    reasons = _shortcomings(step, frames, meta)
+    report = {
+        "schema": _SCHEMA,
+        "sequence": meta.sequence,
+        "seed": meta.seed,
+        "prior": meta.prior,
+        "settings": dict(meta.settings),
+        "versions": dict(meta.versions),
+        "seconds": dict(meta.seconds),
+        "complete": step.last,
+        "closed": any(edge.kind == "closure" for edge in _taking_part(step)),
+        "trustworthy": not reasons,
+        "reasons": reasons,
+        "frames": [vars(frame) for frame in frames],
+        "edges": [_edge(edge, solution) for edge in step.edges_so_far],
+        "poses": [
+            {"id": frame, "object_from_camera": pose, "covariance": solution.covariances[frame]}
+            for frame, pose in sorted(solution.trajectory.items())
+        ],
+    }
+    return _json(report)
+
+
+def posteriors_of(report: Mapping[str, Any]) -> dict[tuple[int, int], Posterior]:
+    """Return the posteriors in a report by (source, target), without samples: what a resumed run need not redo."""
+    return {(edge["source"], edge["target"]): _posterior(edge) for edge in report["edges"]}
+
+
+def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> list[str]:
+    """Return in words why the model is not to be trusted; empty where it is."""
+    reasons = [f"frame {frame.id} was left out: {frame.outcome}" for frame in frames if not frame.accepted]
+    if sum(frame.accepted for frame in frames) < 2:
+        reasons.append("fewer than two frames were accepted: there is nothing to align")
+    tried = [edge for edge in step.edges_so_far if edge.kind == "closure"]
+    if not any(edge.kind == "closure" for edge in _taking_part(step)):
+        if tried:
+            last = tried[-1]
+            pair = f"frame {last.source} on frame {last.target}"
+            reasons.append(f"none of {len(tried)} loop closures was accepted; the last, {pair}: {_reason(last, step)}")
+        elif meta.closure_expected:
+            reasons.append("the object never came back to an earlier view, so that no loop was closed")
+    if not step.last:
+        reasons.append("the run has not finished")
+    return reasons
+
+
+def _taking_part(step: Step) -> list[Edge]:
+    return [edge for edge in step.edges_so_far if edge.accepted and edge not in step.solution.outliers]
+
+
+def _reason(edge: Edge, step: Step) -> str:
+    return _OUTLIER if edge in step.solution.outliers else edge.reason
+
+
+_OUTLIER = "the optimisation left it out: all other edges contradict it"
+
+
+def _edge(edge: Edge, solution: Solution) -> dict[str, Any]:
+    posterior = edge.posterior
+    outlier = edge in solution.outliers
+    return {
+        "source": posterior.source,
+        "target": posterior.target,
+        "kind": edge.kind,
+        "accepted": edge.accepted and not outlier,
+        "outcome": posterior.outcome.label,
+        "reason": _OUTLIER if outlier else edge.reason,
+        "target_from_source": posterior.pose.mean,
+        "covariance": posterior.pose.covariance,
+        "information": posterior.information,
+        "effective_samples": posterior.effective_samples,
+        "pareto_k": posterior.pareto_k,
+        "log_evidence": posterior.log_evidence,
+        "overlap": posterior.overlap,
+        "seconds": posterior.seconds,
+    }
+
+
+def _posterior(edge: Mapping[str, Any]) -> Posterior:
+    information = edge["information"]
+    return Posterior(
+        source=edge["source"],
+        target=edge["target"],
+        pose=PoseGaussian(_matrix(edge["target_from_source"], 4), _matrix(edge["covariance"], 6)),
+        outcome=Outcome(edge["outcome"]),
+        overlap=_number(edge["overlap"]),
+        information=None if information is None else _matrix(information, 6),
+        effective_samples=_number(edge["effective_samples"]),
+        pareto_k=_number(edge["pareto_k"]),
+        log_evidence=_number(edge["log_evidence"]),
+        seconds=_number(edge["seconds"]),
+    )
+
+
+def _matrix(numbers: Sequence[float | None], size: int) -> Array:
+    return np.array([_number(number) for number in numbers]).reshape(size, size)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _json(value: Any) -> Any:
+    """Return a value as JSON holds it: matrices row by row, what is not finite as None."""
+    if isinstance(value, Mapping):
+        return {key: _json(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _json(value.ravel().tolist())
+    if isinstance(value, list | tuple):
+        return [_json(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return _json(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

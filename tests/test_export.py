@@ -1,0 +1,394 @@
+"""The run folder: what stands in it is whole, exact, and read by other programs as it was meant."""
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+import open3d as o3d
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from modeler import se3
+from modeler.export import RunFolder, RunMeta, export_mesh, g2o_text, posteriors_of, tum_text, write_atomically
+from modeler.export.ply import cloud_ply, mesh_ply
+from modeler.graph import PoseGraph, solve
+from modeler.types import (
+    Camera,
+    Edge,
+    Frame,
+    InputError,
+    ObjectModel,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    Segmentation,
+    Step,
+)
+
+META = RunMeta(sequence="box", seed=3, prior="table", settings={"every": 1}, seconds={"total": 1.5})
+FILES = {"trajectory.txt", "odometry.txt", "graph.g2o", "report.json", "cloud.ply", "model.ply"}
+
+
+def _model(*, coloured: bool = True) -> ObjectModel:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    normals = np.asarray(ball.vertices / 0.05)
+    rng = np.random.default_rng(0)
+    colours = rng.integers(0, 256, size=(len(normals), 3), dtype=np.uint8) if coloured else None
+    cloud = np.asarray(ball.vertices) + np.array([0.0, 0.0, 0.8])
+    return ObjectModel(cloud[::2], normals[::2], None if colours is None else colours[::2], cloud,
+                       np.asarray(ball.faces, dtype=np.int64), normals, colours)  # fmt: skip
+
+
+def _loaded(path: Path) -> Any:
+    """The one mesh in a file, as trimesh reads it (its types are too wide to be of use)."""
+    loaded = trimesh.load(path, process=False)
+    if isinstance(loaded, trimesh.Scene):
+        (loaded,) = loaded.geometry.values()
+    return loaded
+
+
+def _edge(target: int, source: int, rng: np.random.Generator, kind: str = "odometry", **changes: Any) -> Edge:
+    step = np.array([0.02, 0.4 * (source - target), 0.01, -0.3 * (source - target), 0.0, 0.05])
+    factor = rng.normal(size=(6, 6)) * 0.003 + 0.004 * np.eye(6)
+    pose = PoseGaussian(se3.exp(step + 0.005 * rng.normal(size=6)), factor @ factor.T)
+    posterior = Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.81, effective_samples=1234.5)
+    return Edge(replace(posterior, **changes), kind, True, "made up")
+
+
+def _steps(count: int = 4, *, closure: bool = True) -> list[Step]:
+    """A run of `count` frames numbered 3, 5, 7 …"""
+    rng = np.random.default_rng(1)
+    camera = Camera(4, 3, 500.0, 500.0, 1.5, 1.0)
+    graph, views, steps = PoseGraph(first=3), {}, []
+    for number in range(count):
+        index, last = 3 + 2 * number, number == count - 1
+        frame = Frame(index, 0.1 * index, np.full((3, 4), 0.8, dtype=np.float32), camera)
+        pixels = np.zeros((5, 2), dtype=np.int64)
+        view = RayImage(frame, None, 0.001, 0.001, np.ones((5, 3)), np.ones((5, 3)), pixels)
+        edges = [_edge(index - 2, index, rng)] if number else []
+        if last and closure:
+            edges.append(_edge(3, index, rng, "closure"))
+        graph, views = graph.plus(edges), {**views, index: view}
+        steps.append(
+            Step(
+                frame=frame,
+                segmentation=Segmentation(np.ones((3, 4), dtype=bool), None, Outcome.CONVERGED),
+                view=view,
+                posteriors=tuple(edge.posterior for edge in edges),
+                edges=tuple(edges),
+                outcome="accepted",
+                solution=solve(graph, {}),
+                model=_model(),
+                edges_so_far=graph.edges,
+                views=views,
+                last=last,
+            )
+        )
+    return steps
+
+
+def _strict(text: str) -> Any:
+    """Parse JSON as the standard has it: no NaN, no Infinity."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_trajectory_reads_back_to_the_last_digit() -> None:
+    rng = np.random.default_rng(2)
+    trajectory = {k: se3.exp(rng.normal(size=6)) for k in (9, 2, 4)}
+    text = tum_text(trajectory, {2: 1305031102.175304, 4: 1305031102.211214, 9: 1305031103.0})
+    lines = [np.array(line.split(" "), dtype=np.float64) for line in text.splitlines()]
+    assert [line[0] for line in lines] == [1305031102.175304, 1305031102.211214, 1305031103.0]
+    for frame, line in zip((2, 4, 9), lines, strict=True):
+        np.testing.assert_array_equal(line[1:4], trajectory[frame][:3, 3])
+        np.testing.assert_allclose(Rotation.from_quat(line[4:]).as_matrix(), trajectory[frame][:3, :3], atol=1e-15)
+        assert line[7] >= 0.0
+
+
+def test_graph_reads_back_in_gtsam_with_the_same_error(tmp_path: Path) -> None:
+    step = _steps(6)[-1]
+    path = tmp_path / "graph.g2o"
+    path.write_text(g2o_text(step.edges_so_far, step.solution))
+    factors, values = gtsam.readG2o(str(path), True)
+    assert factors.size() == len(step.edges_so_far) == 6
+    assert set(values.keys()) == set(step.solution.trajectory)
+    for frame, pose in step.solution.trajectory.items():
+        np.testing.assert_allclose(values.atPose3(frame).matrix(), pose, atol=1e-14)
+    # The error of every factor at poses well away from the optimum, against the definition.
+    rng = np.random.default_rng(4)
+    moved = {frame: pose @ se3.exp(0.05 * rng.normal(size=6)) for frame, pose in step.solution.trajectory.items()}
+    for frame, pose in moved.items():
+        values.update(frame, gtsam.Pose3(pose))
+    for number, edge in enumerate(step.edges_so_far):
+        xi = se3.log(se3.inverse(edge.posterior.pose.mean) @ se3.inverse(moved[edge.target]) @ moved[edge.source])
+        expected = 0.5 * xi @ np.linalg.solve(edge.posterior.pose.covariance, xi)
+        assert factors.at(number).error(values) == pytest.approx(expected, rel=1e-9)
+
+
+def test_graph_holds_only_edges_that_take_part() -> None:
+    step = _steps(4)[-1]
+    refused = replace(step.edges_so_far[-1], accepted=False)
+    outlier, other = _edge(3, 7, np.random.default_rng(0), "closure"), _edge(100, 101, np.random.default_rng(0))
+    solution = replace(step.solution, outliers=(outlier,))
+    text = g2o_text([*step.edges_so_far[:-1], refused, outlier, other], solution)
+    assert [line.split()[1:3] for line in text.splitlines() if line.startswith("EDGE")] == [
+        ["3", "5"], ["5", "7"], ["7", "9"]
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("coloured", [True, False])
+def test_ply_is_read_by_open3d_and_trimesh(tmp_path: Path, coloured: bool) -> None:
+    model = _model(coloured=coloured)
+    (tmp_path / "model.ply").write_bytes(mesh_ply(model))
+    (tmp_path / "cloud.ply").write_bytes(cloud_ply(model))
+
+    mesh = o3d.io.read_triangle_mesh(tmp_path / "model.ply")
+    np.testing.assert_allclose(np.asarray(mesh.vertices), model.vertices_m, atol=1e-7)
+    np.testing.assert_array_equal(np.asarray(mesh.triangles), model.triangles)
+    np.testing.assert_allclose(np.asarray(mesh.vertex_normals), model.vertex_normals, atol=1e-6)
+    assert mesh.has_vertex_colors() == coloured
+    theirs = _loaded(tmp_path / "model.ply")
+    np.testing.assert_allclose(theirs.vertices, model.vertices_m, atol=1e-7)
+    np.testing.assert_array_equal(theirs.faces, model.triangles)
+    np.testing.assert_allclose(theirs.vertex_normals, model.vertex_normals, atol=1e-6)
+
+    cloud = o3d.io.read_point_cloud(tmp_path / "cloud.ply")
+    np.testing.assert_allclose(np.asarray(cloud.points), model.points_m, atol=1e-7)
+    np.testing.assert_allclose(np.asarray(cloud.normals), model.normals, atol=1e-6)
+    if model.colours is not None and model.vertex_colours is not None:
+        np.testing.assert_array_equal(np.round(255.0 * np.asarray(cloud.colors)), model.colours)
+        np.testing.assert_array_equal(np.round(255.0 * np.asarray(mesh.vertex_colors)), model.vertex_colours)
+        np.testing.assert_array_equal(theirs.visual.vertex_colors[:, :3], model.vertex_colours)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb", "stl", "STL"])
+def test_exported_mesh_is_the_same_surface(tmp_path: Path, suffix: str) -> None:
+    model = _model()
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "model.ply").write_bytes(mesh_ply(model))
+    out = tmp_path / "new folder" / f"box.{suffix}"
+    export_mesh(run, out)
+    mesh = _loaded(out)
+    expected = model.vertices_m[model.triangles]
+    np.testing.assert_allclose(mesh.triangles, expected, atol=1e-6)  # same place, same order, same side out
+    if suffix.lower() != "stl":
+        np.testing.assert_allclose(mesh.vertex_normals, model.vertex_normals, atol=1e-5)
+        assert model.vertex_colours is not None
+        np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3], model.vertex_colours, atol=1)
+    assert [path.name for path in out.parent.iterdir()] == [out.name]
+
+
+def test_mesh_that_cannot_be_exported_is_said_in_one_line(tmp_path: Path) -> None:
+    empty = replace(_model(), triangles=np.zeros((0, 3), dtype=np.int64))
+    (tmp_path / "empty.ply").write_bytes(mesh_ply(empty))
+    (tmp_path / "broken.ply").write_bytes(mesh_ply(_model())[:3000])
+    (tmp_path / "good.ply").write_bytes(mesh_ply(_model()))
+    (tmp_path / "file").write_text("")
+    for source, out, words in (
+        ("missing", "a.obj", "no such mesh"),
+        (".", "a.obj", "no such mesh"),
+        ("empty.ply", "a.obj", "no triangles"),
+        ("broken.ply", "a.ply", "broken.ply"),
+        ("good.ply", "a.fbx", "unknown mesh format '.fbx'; use .ply, .obj, .glb, .stl"),
+        ("good.ply", "a", "unknown mesh format"),
+        ("good.ply", "file/a.obj", "cannot be made"),
+    ):
+        with pytest.raises(InputError, match=words) as caught:
+            export_mesh(tmp_path / source, tmp_path / out)
+        assert "\n" not in str(caught.value)
+    assert {path.name for path in tmp_path.iterdir()} == {"empty.ply", "broken.ply", "good.ply", "file"}
+
+
+def test_run_folder_is_complete_after_the_last_step(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path / "runs" / "box")
+    steps = _steps()
+    for step in steps:
+        run.write(step, META)
+        expected = FILES if step.last else FILES - {"cloud.ply", "model.ply"}
+        assert {path.name for path in run.path.iterdir()} == expected
+    solution = steps[-1].solution
+    for name, poses in (("trajectory.txt", solution.trajectory), ("odometry.txt", solution.odometry)):
+        lines = np.loadtxt(run.path / name)
+        np.testing.assert_allclose(lines[:, 0], [0.3, 0.5, 0.7, 0.9])
+        np.testing.assert_array_equal(lines[:, 1:4], np.stack([poses[frame][:3, 3] for frame in (3, 5, 7, 9)]))
+    np.testing.assert_array_equal(np.loadtxt(run.path / "trajectory.txt")[0, 1:], [0, 0, 0, 0, 0, 0, 1])
+
+
+def test_report_has_the_promised_schema(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path)
+    for step in _steps():
+        run.write(step, META)
+    report = _strict((tmp_path / "report.json").read_text())
+    assert report == run.report()
+    head = {key: report[key] for key in ("schema", "sequence", "seed", "prior", "seconds")}
+    assert head == {"schema": 1, "sequence": "box", "seed": 3, "prior": "table", "seconds": {"total": 1.5}}
+    assert {"modeler", "gtsam", "numpy", "python"} <= set(report["versions"])
+    assert report["frames"][1] == {"id": 5, "timestamp": 0.5, "points": 5, "outcome": "accepted"}
+    assert [edge["kind"] for edge in report["edges"]] == ["odometry"] * 3 + ["closure"]
+    edge, posterior = report["edges"][0], _steps()[1].posteriors[0]
+    assert {key: edge[key] for key in ("source", "target", "accepted", "outcome", "overlap", "effective_samples")} == {
+        "source": 5, "target": 3, "accepted": True, "outcome": "converged", "overlap": 0.81, "effective_samples": 1234.5
+    }  # fmt: skip
+    assert edge["log_evidence"] is None  # not known, and NaN is no JSON
+    assert edge["seconds"] is None
+    np.testing.assert_array_equal(np.reshape(edge["target_from_source"], (4, 4)), posterior.pose.mean)
+    np.testing.assert_array_equal(np.reshape(edge["covariance"], (6, 6)), posterior.pose.covariance)
+    assert [pose["id"] for pose in report["poses"]] == [3, 5, 7, 9]
+    for pose in report["poses"]:
+        np.linalg.cholesky(np.reshape(pose["covariance"], (6, 6)))
+        np.testing.assert_allclose(np.reshape(pose["object_from_camera"], (4, 4))[3], [0, 0, 0, 1])
+    assert (report["complete"], report["closed"], report["trustworthy"], report["reasons"]) == (True, True, True, [])
+
+
+def _spoilt(change: Callable[[Step], Step], meta: RunMeta, path: Path) -> dict[str, Any]:
+    run = RunFolder.open(path, overwrite=True)
+    return [run.write(change(step), meta) for step in _steps(closure=meta.closure_expected is False)][-1]
+
+
+def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
+    lost = "no overlap: The views share too little surface"
+    report = _spoilt(lambda step: replace(step, outcome=lost) if step.frame.index == 7 else step, META, tmp_path)
+    assert (report["trustworthy"], report["reasons"]) == (False, [f"frame 7 was left out: {lost}"])
+
+    report = _spoilt(lambda step: step, replace(META, closure_expected=True), tmp_path)
+    assert (report["trustworthy"], report["closed"]) == (False, False)
+    assert "no loop was closed" in report["reasons"][0]
+
+    def refuse(step: Step) -> Step:
+        edges = [replace(edge, accepted=edge.kind == "odometry", reason="it lies") for edge in step.edges_so_far]
+        return replace(step, edges_so_far=tuple(edges))
+
+    report = _spoilt(refuse, META, tmp_path)
+    assert report["reasons"] == ["none of 1 loop closures was accepted; the last, frame 9 on frame 3: it lies"]
+
+    def leave_out(step: Step) -> Step:
+        outliers = tuple(edge for edge in step.edges_so_far if edge.kind == "closure")
+        return replace(step, solution=replace(step.solution, outliers=outliers))
+
+    report = _spoilt(leave_out, META, tmp_path)
+    assert report["closed"] is False
+    assert report["edges"][-1]["accepted"] is False
+    assert "contradict" in report["edges"][-1]["reason"]
+    assert "contradict" in report["reasons"][0]
+
+
+def test_report_in_the_middle_of_a_run_says_so(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path)
+    report = [run.write(step, META) for step in _steps()[:2]][-1]
+    assert (report["complete"], report["trustworthy"]) == (False, False)
+    assert "the run has not finished" in report["reasons"]
+
+
+def test_posteriors_come_back_from_the_report_to_the_bit(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path)
+    step = _steps()[-1]
+    information = np.linalg.inv(step.edges_so_far[0].posterior.pose.covariance).astype(np.float64)
+    rich = replace(
+        step.edges_so_far[0].posterior,
+        information=information, pareto_k=0.31, log_evidence=-12.3, seconds=0.1, outcome=Outcome.AMBIGUOUS,
+    )  # fmt: skip
+    edges = (replace(step.edges_so_far[0], posterior=rich), *step.edges_so_far[1:])
+    run.write(replace(step, edges_so_far=edges), META)
+    back = posteriors_of(run.report())
+    assert set(back) == {(edge.source, edge.target) for edge in edges}
+    for edge in edges:
+        posterior = back[edge.source, edge.target]
+        np.testing.assert_array_equal(posterior.pose.mean, edge.posterior.pose.mean)
+        np.testing.assert_array_equal(posterior.pose.covariance, edge.posterior.pose.covariance)
+        assert posterior.outcome is edge.posterior.outcome
+        for name in ("overlap", "effective_samples", "pareto_k", "log_evidence", "seconds"):
+            np.testing.assert_equal(getattr(posterior, name), getattr(edge.posterior, name))
+    np.testing.assert_array_equal(back[5, 3].information, information)
+    assert back[7, 5].information is None
+
+
+def test_existing_run_is_not_written_over_unasked(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path)
+    for step in _steps():
+        run.write(step, META)
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / ".model.ply.1234.part").write_text("half")
+    before = (tmp_path / "report.json").read_bytes()
+    with pytest.raises(InputError, match=r"not empty; choose another --out, or give --overwrite or --resume") as caught:
+        RunFolder.open(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert (tmp_path / "report.json").read_bytes() == before
+    RunFolder.open(tmp_path, resume=True)
+    assert {path.name for path in tmp_path.iterdir()} == FILES | {"notes.txt"}
+    RunFolder.open(tmp_path, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_place_that_cannot_hold_a_run_is_said_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(InputError, match="choose another --out"):
+            RunFolder.open(path, overwrite=True)
+    with pytest.raises(InputError, match=r"is .* the folder of a run"):
+        RunFolder(tmp_path).report()
+    for content in ("{", "[]", '{"schema": 2}'):
+        (tmp_path / "report.json").write_text(content)
+        with pytest.raises(InputError, match="build again with --overwrite"):
+            RunFolder(tmp_path).report()
+
+
+def test_resumed_run_keeps_what_it_had_until_it_is_there_again(tmp_path: Path) -> None:
+    steps = _steps(5)
+    run = RunFolder.open(tmp_path)
+    for step in steps[:3]:
+        run.write(step, META)
+    before = (tmp_path / "report.json").read_bytes()
+    resumed = RunFolder.open(tmp_path, resume=True)
+    assert set(resumed.posteriors(META)) == {(5, 3), (7, 5)}
+    for step in steps[:2]:
+        resumed.write(step, META)
+        assert (tmp_path / "report.json").read_bytes() == before
+    resumed.write(steps[2], META)
+    assert (tmp_path / "report.json").read_bytes() == before  # the same results, to the bit
+    for step in steps[3:]:
+        resumed.write(step, META)
+    straight = RunFolder.open(tmp_path / "straight")
+    for step in steps:
+        straight.write(step, META)
+    for name in FILES:
+        assert (tmp_path / name).read_bytes() == (straight.path / name).read_bytes()
+
+
+def test_resuming_with_other_settings_is_refused(tmp_path: Path) -> None:
+    assert RunFolder.open(tmp_path, resume=True).posteriors(META) == {}
+    RunFolder.open(tmp_path).write(_steps()[0], META)
+    run = RunFolder.open(tmp_path, resume=True)
+    assert run.posteriors(META) == {}
+    for other in (replace(META, seed=4), replace(META, prior="general"), replace(META, settings={"every": 2})):
+        with pytest.raises(InputError, match="cannot resume"):
+            run.posteriors(other)
+
+
+def test_file_is_whole_whatever_happens_while_it_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "report.json"
+    write_atomically(path, "old")
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", fail)
+        with pytest.raises(InputError, match=r"report.json: cannot be written \(No space left on device\)"):
+            write_atomically(path, "new")
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", fail)
+        with pytest.raises(InputError, match="cannot be written"):
+            write_atomically(path, "new")
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
