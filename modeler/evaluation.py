@@ -1,0 +1,189 @@
+"""Pure metrics: how far estimates are from the truth, and whether they knew.
+
+Truth is `camera_from_model(k)`: the pose (4, 4) of the object's model in the camera at frame k. Motions are compared in
+the source camera, translations at the object's centroid: what a rotation about a distant camera moves there is counted,
+what the same error would move at the camera, where nothing is, is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+from scipy.spatial import KDTree
+
+from modeler import se3
+from modeler.types import Array, PoseGaussian
+
+LEVELS = (0.5, 0.9, 0.95)
+"""Nominal probabilities of the regions whose coverage is reported."""
+
+
+def true_motion(camera_from_model: Mapping[int, Array], target: int, source: int) -> Array:
+    """Return the true target_from_source (4, 4).
+
+    Args:
+        camera_from_model: (4, 4) by frame number.
+        target: frame number.
+        source: frame number.
+    """
+    return camera_from_model[target] @ se3.inverse(camera_from_model[source])
+
+
+def rotation_error_deg(estimate: Array, truth: Array) -> float:
+    """Return the angle in degrees between two motions or poses (4, 4)."""
+    return float(np.degrees(se3.rotation_angle(se3.inverse(truth) @ estimate)))
+
+
+def translation_error_m(estimate: Array, truth: Array, centroid_m: Array) -> float:
+    """Return how far apart in m two motions (4, 4) put the object's centroid.
+
+    Args:
+        estimate: target_from_source.
+        truth: target_from_source.
+        centroid_m: (3,) of the object, in the source camera.
+    """
+    ends = [se3.transform(motion, np.asarray(centroid_m)[None])[0] for motion in (estimate, truth)]
+    return float(np.linalg.norm(ends[0] - ends[1]))
+
+
+def nees(estimate: PoseGaussian, truth: Array, components: slice = slice(0, 6)) -> float:
+    """Return the normalised estimation error squared ξᵀ Σ⁻¹ ξ with truth = mean · Exp(ξ).
+
+    Over many estimates that are what they say it is χ² distributed with as many degrees of freedom as components.
+
+    Args:
+        estimate: mean and covariance.
+        truth: (4, 4).
+        components: of ξ; `slice(0, 3)` is the rotation alone, whatever the translation, `slice(3, 6)` the translation.
+    """
+    xi = se3.log(se3.inverse(estimate.mean) @ truth)[components]
+    return float(xi @ np.linalg.solve(estimate.covariance[components, components], xi))
+
+
+def coverage(nees_values: Iterable[float], degrees: int = 6, levels: Iterable[float] = LEVELS) -> dict[float, float]:
+    """Return by nominal probability the share (0..1) of truths that lay inside the region of that probability.
+
+    Args:
+        nees_values: one per estimate.
+        degrees: of freedom: components of each.
+        levels: nominal probabilities.
+    """
+    values = np.fromiter(nees_values, dtype=np.float64)
+    radii = {level: stats.chi2(degrees).ppf(level) for level in levels}
+    return {level: float(np.mean(values <= radius)) if len(values) else float("nan") for level, radius in radii.items()}
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """Errors of object_from_camera against the truth, both relative to the first frame."""
+
+    rotation_deg: Mapping[int, float]
+    """By frame number; the first frame's is zero."""
+    translation_m: Mapping[int, float]
+    """By frame number: how far the object's centroid, as that frame saw it, lands from where it belongs."""
+
+    @property
+    def max_rotation_deg(self) -> float:
+        """Return the largest rotation error."""
+        return max(self.rotation_deg.values())
+
+    @property
+    def max_translation_m(self) -> float:
+        """Return the largest translation error."""
+        return max(self.translation_m.values())
+
+
+def trajectory_errors(
+    trajectory: Mapping[int, Array], camera_from_model: Mapping[int, Array], centroid_m: Array
+) -> TrajectoryErrors:
+    """Compare a trajectory with the truth, aligned at its first frame.
+
+    Args:
+        trajectory: object_from_camera (4, 4) by frame number; the lowest is the first.
+        camera_from_model: (4, 4) by frame number, of those frames at least.
+        centroid_m: (3,) of the object, in the camera of the first frame.
+
+    Raises:
+        ValueError: where the trajectory is empty.
+    """
+    if not trajectory:
+        raise ValueError("an empty trajectory has no errors; check that a frame was accepted")
+    first = min(trajectory)
+    rotation_deg, translation_m = {}, {}
+    for frame in sorted(trajectory):
+        estimate = se3.inverse(trajectory[first]) @ trajectory[frame]
+        truth = true_motion(camera_from_model, first, frame)
+        seen_m = se3.transform(se3.inverse(truth), np.asarray(centroid_m)[None])[0]
+        rotation_deg[frame] = rotation_error_deg(estimate, truth)
+        translation_m[frame] = translation_error_m(estimate, truth, seen_m)
+    return TrajectoryErrors(rotation_deg, translation_m)
+
+
+@dataclass(frozen=True)
+class SurfaceErrors:
+    """Distances between a reconstructed and a true surface, both as dense points."""
+
+    accuracy_m: float
+    """Mean distance from the reconstruction to the truth."""
+    completeness_m: float
+    """Mean distance from the truth to the reconstruction."""
+    precision: float
+    """Share (0..1) of the reconstruction within the threshold of the truth."""
+    recall: float
+    """Share (0..1) of the truth within the threshold of the reconstruction."""
+
+    @property
+    def f_score(self) -> float:
+        """Return the harmonic mean of precision and recall."""
+        total = self.precision + self.recall
+        return 2.0 * self.precision * self.recall / total if total > 0.0 else 0.0
+
+
+def surface_errors(reconstruction_m: Array, truth_m: Array, threshold_m: float) -> SurfaceErrors:
+    """Compare two surfaces in the same frame.
+
+    Args:
+        reconstruction_m: points (n, 3), of a cloud or from `sample_surface`.
+        truth_m: points (m, 3).
+        threshold_m: distance within which a point counts as right.
+
+    Raises:
+        ValueError: where either has no points.
+    """
+    if not len(reconstruction_m) or not len(truth_m):
+        raise ValueError("a surface without points has no distance; sample both surfaces first")
+    to_truth_m, _ = KDTree(truth_m).query(reconstruction_m)
+    to_reconstruction_m, _ = KDTree(reconstruction_m).query(truth_m)
+    return SurfaceErrors(
+        accuracy_m=float(np.mean(to_truth_m)),
+        completeness_m=float(np.mean(to_reconstruction_m)),
+        precision=float(np.mean(to_truth_m <= threshold_m)),
+        recall=float(np.mean(to_reconstruction_m <= threshold_m)),
+    )
+
+
+def sample_surface(vertices_m: Array, triangles: npt.NDArray[np.int64], count: int, rng: np.random.Generator) -> Array:
+    """Return points (count, 3) drawn evenly over the area of a mesh.
+
+    Args:
+        vertices_m: (v, 3).
+        triangles: (t, 3) vertex numbers.
+        count: number of points.
+        rng: source of randomness.
+
+    Raises:
+        ValueError: where the mesh has no area.
+    """
+    a, b, c = np.moveaxis(vertices_m[triangles], 1, 0)
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    if not area.sum() > 0.0:
+        raise ValueError("a mesh without area has no surface to sample")
+    chosen = rng.choice(len(triangles), size=count, p=area / area.sum())
+    along, across = rng.random((2, count, 1))
+    fold = along + across > 1.0  # the far half of the parallelogram folds back onto the triangle
+    along, across = np.where(fold, 1.0 - along, along), np.where(fold, 1.0 - across, across)
+    return a[chosen] + along * (b - a)[chosen] + across * (c - a)[chosen]
