@@ -5,6 +5,7 @@ from modeler.export.g2o import g2o_text as g2o_text
 from modeler.export.mesh import export_mesh as export_mesh
 from modeler.export.ply import ply_bytes as ply_bytes
 from modeler.export.report import RunMeta as RunMeta
+from modeler.export.report import edge_record as edge_record
 from modeler.export.report import posteriors_of as posteriors_of
 from modeler.export.report import report_of as report_of
 from modeler.export.run_folder import RunFolder as RunFolder

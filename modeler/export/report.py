@@ -35,6 +35,8 @@ class RunMeta:
     """Every other option that the results depend on, as JSON values."""
     closure_expected: bool = False
     """Whether the object is known to come back to its start, so that a run without closure is not to be trusted."""
+    interrupted: bool = False
+    """Whether the user ended the run before its last frame."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time in s by part of the program."""
     versions: Mapping[str, str] = field(default_factory=_versions)
@@ -84,12 +86,12 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "settings": dict(meta.settings),
         "versions": dict(meta.versions),
         "seconds": dict(meta.seconds),
-        "complete": step.last,
+        "complete": step.last and not meta.interrupted,
         "closed": any(edge.kind == "closure" for edge in _taking_part(step)),
         "trustworthy": not reasons,
         "reasons": reasons,
         "frames": [vars(frame) for frame in frames],
-        "edges": [_edge(edge, solution) for edge in step.edges_so_far],
+        "edges": [edge_record(edge, solution) for edge in step.edges_so_far],
         "poses": [
             {"id": frame, "object_from_camera": pose, "covariance": solution.covariances[frame]}
             for frame, pose in sorted(solution.trajectory.items())
@@ -116,7 +118,9 @@ def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> l
             reasons.append(f"none of {len(tried)} loop closures was accepted; the last, {pair}: {_reason(last, step)}")
         elif meta.closure_expected:
             reasons.append("the object never came back to an earlier view, so that no loop was closed")
-    if not step.last:
+    if meta.interrupted:
+        reasons.append(f"the run was interrupted after frame {step.frame.index}")
+    elif not step.last:
         reasons.append("the run has not finished")
     return reasons
 
@@ -132,10 +136,16 @@ def _reason(edge: Edge, step: Step) -> str:
 _OUTLIER = "the optimisation left it out: all other edges contradict it"
 
 
-def _edge(edge: Edge, solution: Solution) -> dict[str, Any]:
+def edge_record(edge: Edge, solution: Solution) -> dict[str, Any]:
+    """Return an edge as the report has it, in values that JSON holds.
+
+    Args:
+        edge: as it was judged.
+        solution: the poses, which may contradict it.
+    """
     posterior = edge.posterior
     outlier = edge in solution.outliers
-    return {
+    record = {
         "source": posterior.source,
         "target": posterior.target,
         "kind": edge.kind,
@@ -151,6 +161,7 @@ def _edge(edge: Edge, solution: Solution) -> dict[str, Any]:
         "overlap": posterior.overlap,
         "seconds": posterior.seconds,
     }
+    return _json(record)
 
 
 def _posterior(edge: Mapping[str, Any]) -> Posterior:

@@ -1,0 +1,35 @@
+"""The command line: the composition root, the only module that sees everything.
+
+Each command is a frozen dataclass whose fields are its options; `run` returns the exit status. What is heavy is
+imported when a command runs, so that help appears at once.
+"""
+
+import sys
+from collections.abc import Sequence
+
+from modeler.cli.usage import parsed
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status: 0 done, 2 unusable input, 3 done but not trustworthy.
+
+    Args:
+        arguments: what follows the program's name; those of the process without it.
+    """
+    command = parsed(sys.argv[1:] if arguments is None else arguments)
+    from modeler.types import InputError
+
+    try:
+        return command.run()
+    except InputError as error:
+        print(f"modeler: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:
+        sys.stderr.close()  # whoever read our output has left; say nothing more
+        return 1
+    except KeyboardInterrupt:
+        print("modeler: interrupted", file=sys.stderr)
+        return INTERRUPTED

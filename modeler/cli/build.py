@@ -1,0 +1,47 @@
+"""`modeler build`: a sequence to a model."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from modeler.cli.options import FrameOptions, MethodOptions, ObjectOptions, PriorOptions
+
+
+@dataclass(frozen=True)
+class Build:
+    """Build the model of an object from a sequence: register its frames, close loops, fuse.
+
+    Ctrl-C ends the run with the frames so far, and makes the model from them.
+    """
+
+    sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SEQUENCE")]
+    """BOP scene folder: depth/, scene_camera.json, optionally rgb/, mask_visib/, sequence.json."""
+    out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
+    """Run folder to make: model.ply, cloud.ply, trajectory.txt, graph.g2o, report.json, recording.rrd and more."""
+    overwrite: bool = False
+    """Replace the results of an earlier run in the folder."""
+    resume: bool = False
+    """Go on with an interrupted run of the same options: pairs that it has registered are not registered again."""
+    view: bool = False
+    """Watch in the Rerun viewer."""
+    web: bool = False
+    """Watch in the browser, served on 127.0.0.1 only."""
+    prior: PriorOptions = field(default_factory=PriorOptions)
+    method: MethodOptions = field(default_factory=MethodOptions)
+    selection: FrameOptions = field(default_factory=FrameOptions)
+    where: ObjectOptions = field(default_factory=ObjectOptions)
+
+    def run(self) -> int:
+        """Build the model; status 3 where it is not to be trusted, as report.json then says."""
+        from modeler.cli.building import build
+
+        return build(self)
+
+    def settings(self) -> dict[str, object]:
+        """Return what the results depend on besides sequence, seed and the prior's name, as report.json records it."""
+        parts = asdict(self.prior) | asdict(self.method) | asdict(self.selection) | asdict(self.where)
+        return {name: value for name, value in parts.items() if name not in ("prior", "seed") and value is not None}

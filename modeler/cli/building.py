@@ -1,0 +1,80 @@
+"""What `modeler build` does once it is understood."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from modeler.cli import compose
+from modeler.cli.build import Build
+from modeler.cli.console import Console
+from modeler.cli.interrupt import Interrupt
+from modeler.cli.remembered import Remembered
+from modeler.export import RunFolder, RunMeta
+from modeler.types import InputError
+from sequences import AbstractSequence, frame_range
+from viz.stream import open_stream
+
+
+def build(options: Build) -> int:
+    """Run the loop into a run folder and return the exit status: 3 where the result is not to be trusted.
+
+    Raises:
+        InputError: where the input or the folder cannot be used.
+    """
+    if options.resume and options.overwrite:
+        raise InputError("--resume keeps what --overwrite deletes; give one of them")
+    began = time.perf_counter()
+    whole = compose.open_sequence(options.sequence)
+    frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
+    modeler = compose.modeler(whole, options.prior, options.method, options.where)
+    meta = RunMeta(
+        sequence=str(options.sequence),
+        seed=options.method.seed,
+        prior=options.prior.prior,
+        settings=options.settings(),
+        closure_expected=_comes_back(frames, modeler.closer.max_angle_deg),
+    )
+    known = RunFolder(options.out).posteriors(meta) if options.resume else {}
+    modeler = replace(modeler, registrar=Remembered(modeler.registrar, known))
+    scene = compose.scene(modeler, whole)
+    folder = RunFolder.open(options.out, overwrite=options.overwrite, resume=options.resume)
+    stream = open_stream(frames.name, save=folder.path / "recording.rrd", spawn=options.view, web=options.web)
+    seconds = {"scene": time.perf_counter() - began, "registration": 0.0, "total": 0.0}
+    report: Mapping[str, Any] = {}
+    try:
+        with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
+            for step in modeler.run(interrupt.until(frames), scene):
+                seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
+                seconds["total"] = time.perf_counter() - began
+                meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
+                report = folder.write(step, meta)
+                stream(step)
+                console(step)
+    finally:
+        stream.close()
+    _tell(report, options)
+    return 0 if report["trustworthy"] else 3
+
+
+def _comes_back(frames: AbstractSequence, reach_deg: float) -> bool:
+    """Return whether the sequence says that the object turns as far as its first view, or nearly."""
+    step_deg = (frames.motion or {}).get("step_deg")
+    if not isinstance(step_deg, int | float):
+        return False
+    return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
+
+
+def _tell(report: Mapping[str, Any], options: Build) -> None:
+    """Say on stderr what came out."""
+    accepted = sum(frame["outcome"] == "accepted" for frame in report["frames"])
+    loop = "loop closed" if report["closed"] else "no loop closed"
+    took = f"{report['seconds']['total']:.0f} s"
+    print(f"modeler: {accepted} of {len(report['frames'])} frames, {loop}, {took}: {options.out}", file=sys.stderr)
+    if report["reasons"]:
+        first, *others = report["reasons"]
+        more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
+        print(f"modeler: not to be trusted: {first}{more}", file=sys.stderr)

@@ -1,0 +1,76 @@
+"""Options to components."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import sequences
+from modeler import registration
+from modeler.cli.options import Method, MethodOptions, ObjectOptions, PriorOptions
+from modeler.closure import Closer
+from modeler.fusion import Fuser
+from modeler.pipeline import Modeler
+from modeler.priors import GeneralPrior, TablePrior
+from modeler.rays import Sensor
+from modeler.segmentation import Scene, Segmenter
+from modeler.types import AbstractPrior, AbstractRegistrar, InputError
+from sequences import AbstractSequence
+
+_SCENE_FRAMES = 15  # teach what stands still; more say little that is new
+
+
+def open_sequence(path: Path) -> AbstractSequence:
+    """Open the sequence in a folder."""
+    return sequences.open_sequence(path)
+
+
+def modeler(sequence: AbstractSequence, prior: PriorOptions, method: MethodOptions, where: ObjectOptions) -> Modeler:
+    """Return the loop with the parts asked for, its sensor as the sequence describes it, else the first Kinect's.
+
+    Raises:
+        InputError: where an option cannot be used.
+    """
+    if method.seed < 0:
+        raise InputError(f"--seed {method.seed} is negative; give a whole number from 0 on.")
+    noise = sequence.sensor()
+    return Modeler(
+        segmenter=Segmenter(roi=where.roi, max_depth_m=where.max_depth_m),
+        sensor=Sensor() if noise is None else Sensor(*noise),
+        prior=_prior(prior),
+        registrar=_registrar(method.method),
+        closer=Closer(),
+        fuser=Fuser(),
+        seed=method.seed,
+    )
+
+
+def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
+    """Return what frames spread over the whole sequence teach the segmenter."""
+    last = len(sequence) - 1
+    count = min(_SCENE_FRAMES, len(sequence))
+    spread = sorted({round(number * last / max(1, count - 1)) for number in range(count)})
+    return modeler.segmenter.scene([sequence.frame(sequence.indices[number]) for number in spread])
+
+
+def _prior(options: PriorOptions) -> AbstractPrior:
+    match options.prior:
+        case "general":
+            return GeneralPrior(**options.given("max_rotation_deg", "max_offset_m"))
+        case "table":
+            return TablePrior(**options.given("max_rotation_deg", "max_shift_m"))
+
+
+def _registrar(method: Method) -> AbstractRegistrar:
+    match method:
+        case "visibility":
+            return registration.VisibilityRegistrar()
+        case "paper":
+            return registration.PaperRegistrar()
+        case "icp":
+            return registration.IcpRegistrar()
+        case "gicp":
+            return registration.GicpRegistrar()
+        case "fpfh":
+            return registration.FpfhRegistrar()
+        case "fpfh-icp":
+            return registration.FpfhIcpRegistrar()

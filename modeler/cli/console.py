@@ -1,0 +1,51 @@
+"""What a run says on stderr while it runs: a bar where somebody watches, and one line for each frame left out."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from rich.console import Console as Terminal
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from modeler.types import Step
+
+
+class Console:
+    """A sink of steps, for a terminal; where stderr is none, only frames left out are told."""
+
+    def __init__(self, frames: int, address: str | None) -> None:
+        terminal = Terminal(stderr=True, highlight=False, soft_wrap=True)
+        columns = (
+            TextColumn("modeler:"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.description}"),
+        )
+        self._bar = Progress(*columns, console=terminal, disable=not terminal.is_terminal)
+        self._task = self._bar.add_task("frame by frame", total=frames)
+        self._address = address
+
+    def __enter__(self) -> Console:
+        """Show the bar."""
+        self._bar.start()
+        if self._address is not None:
+            self._say(f"watch at {self._address}")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the bar as it stands."""
+        self._bar.stop()
+
+    def __call__(self, step: Step) -> None:
+        """Tell of a step."""
+        loops = sum(edge.kind == "closure" and edge.accepted for edge in step.edges_so_far)
+        self._bar.update(self._task, advance=1, description=f"{len(step.views)} joined, {loops} loops closed")
+        if step.outcome != "accepted":
+            self._say(f"frame {step.frame.index} is left out: {step.outcome}")
+
+    def _say(self, text: str) -> None:
+        self._bar.console.print(f"modeler: {text}", markup=False)

@@ -1,0 +1,54 @@
+"""`modeler register`: one pair."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+
+
+@dataclass(frozen=True)
+class Register:
+    """Register two frames of a sequence and print target_from_source as a JSON edge.
+
+    The edge has the fields of an edge in report.json except `seconds`, which goes to stderr: same seed, same bytes.
+    """
+
+    sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SEQUENCE")]
+    """BOP scene folder."""
+    source: Annotated[tyro.conf.Positional[int], tyro.conf.arg(metavar="SOURCE")]
+    """Number of the frame whose points are carried over."""
+    target: Annotated[tyro.conf.Positional[int], tyro.conf.arg(metavar="TARGET")]
+    """Number of the frame to whose camera coordinates they are carried."""
+    prior: PriorOptions = field(default_factory=PriorOptions)
+    method: MethodOptions = field(default_factory=MethodOptions)
+    where: ObjectOptions = field(default_factory=ObjectOptions)
+
+    def run(self) -> int:
+        """Register the pair; status 3 where the result would not become an edge."""
+        from modeler.cli import compose
+        from modeler.export import edge_record
+        from modeler.types import Edge, InputError, Solution
+
+        sequence = compose.open_sequence(self.sequence)
+        modeler = compose.modeler(sequence, self.prior, self.method, self.where)
+        scene = compose.scene(modeler, sequence)
+        views = []
+        for index in (self.source, self.target):
+            segmentation, view = modeler.view(sequence.frame(index), scene)
+            if view is None:
+                outcome = segmentation.outcome
+                raise InputError(f"{self.sequence}: frame {index} has {outcome.label}. {outcome.advice}")
+            views.append(view)
+        posterior = modeler.register(*views)
+        edge = Edge(posterior, "odometry", posterior.usable, posterior.outcome.advice)
+        record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}
+        print(json.dumps(record, allow_nan=False))
+        print(f"modeler: {posterior.outcome.label} after {posterior.seconds:.2f} s", file=sys.stderr)
+        return 0 if posterior.usable else 3

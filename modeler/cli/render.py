@@ -1,0 +1,35 @@
+"""`modeler render`: synthetic sequences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a synthetic sequence, with its ground truth, from a recipe."""
+
+    recipe: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RECIPE")]
+    """Recipe in JSON or TOML, or the name of a built-in one: box, flashlight, tube and more."""
+    out: Annotated[Path, tyro.conf.arg(metavar="SEQUENCE")]
+    """BOP scene folder to make."""
+    seed: Annotated[
+        int | None, tyro.conf.arg(metavar="N"), tyro.conf.arg(help_behavior_hint="(default: the recipe's own)")
+    ] = None
+    """Seed of the camera's noise and of the object's motion."""
+
+    def run(self) -> int:
+        """Render the sequence."""
+        from modeler.types import InputError
+        from sequences.recipe import load_recipe
+        from sequences.renderer import render
+
+        recipe = load_recipe(self.recipe)
+        if self.seed is not None and self.seed < 0:
+            raise InputError(f"--seed {self.seed} is negative; give a whole number from 0 on")
+        render(recipe if self.seed is None else replace(recipe, seed=self.seed), self.out)
+        return 0

@@ -1,0 +1,28 @@
+"""`modeler view`: look at a recording."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class View:
+    """Open the recording of a run in the Rerun viewer."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """Run folder, as `modeler build` makes it."""
+    web: bool = False
+    """Serve the viewer in the browser, on 127.0.0.1 only, until Ctrl-C."""
+
+    def run(self) -> int:
+        """Open the viewer; in the browser, wait until the user is done."""
+        from viz import viewer
+
+        opened = viewer.view(self.run_folder, web=self.web)
+        if self.web:
+            print(f"modeler: open {opened.address} in a browser; Ctrl-C ends it", file=sys.stderr)
+            opened.wait()
+        return 0
