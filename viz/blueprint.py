@@ -70,12 +70,12 @@ def _object(first: RayImage | None) -> tuple[rrb.View, rrb.View]:
 
 def _pair(first: RayImage | None) -> rrb.Container:
     """Return the newest pair before and after alignment, one above the other."""
-    eye = None if first is None else _eye(first.centroid_m, 3.2 * _radius_m(first), _FROM_THE_SIDE)
+    eye = None if first is None else _eye(first.centroid_m, 3.7 * _radius_m(first), _FROM_THE_SIDE)
     before = [entities.PAIR_TARGET, entities.PAIR_BEFORE]
-    after = [entities.PAIR_TARGET, entities.PAIR_AFTER]
+    after = [entities.PAIR_TARGET, entities.PAIR_AFTER, entities.PAIR_AXES, entities.PAIR_DRAWS]
     return rrb.Vertical(
         _spatial("Before: target teal, source orange", entities.PAIR, before, eye),
-        _spatial("After alignment", entities.PAIR, after, eye),
+        _spatial("After, with the posterior's spread", entities.PAIR, after, eye),
     )
 
 

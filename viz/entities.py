@@ -19,6 +19,8 @@ PAIR: Final = "pair"
 PAIR_TARGET: Final = "pair/target"
 PAIR_BEFORE: Final = "pair/source_before"
 PAIR_AFTER: Final = "pair/source_after"
+PAIR_AXES: Final = "pair/mean_axes"
+PAIR_DRAWS: Final = "pair/posterior_draws"
 
 # The object frame.
 WORLD: Final = "world"
@@ -64,11 +66,12 @@ UNCERTAINTY_RGB: Final[Rgb] = (255, 225, 90)
 AXIS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((230, 70, 70), (80, 200, 80), (90, 130, 255))
 
 LEGEND_TEXT: Final = """\
-- **Pair**: new view orange, the view it is aligned to teal, in the latter's camera frame.
+- **Pair**: new view orange, the view it is aligned to teal, in the latter's camera frame. Dots are where the ends of
+the axes land under samples of the posterior.
 - **Poses**: a pyramid is the camera as the object saw it, the newest orange. Odometry edges are white, closures
 green, rejected ones red; violet is the chain without closure.
 - **Uncertainty**: yellow ellipsoids are the position within 1 sd (solid) and 3 sd (wire), discs at the axes' tips the
-rotation within 1 sd, larger than life by the factor written under the object.
+rotation within 1 sd, magnified by the factor written under the object.
 - **Readings**: white odometry, green closure, yellow the newest pose after optimisation. Sd along the worst axis;
 translation is that of the object's centre.
 """

@@ -39,7 +39,7 @@ class RerunStream:
         if not self.recording.is_enabled():
             return
         # Rerun takes half a second to import: only runs that record pay for it.
-        from viz import blueprint, clouds, images, poses, readings, uncertainty
+        from viz import blueprint, clouds, images, poses, readings, spread, uncertainty
 
         self.recording.set_time(entities.FRAME, sequence=step.frame.index)
         self.recording.set_time(entities.ELAPSED, duration=time.monotonic() - self.started_s)
@@ -48,6 +48,7 @@ class RerunStream:
         for path, archetype in itertools.chain(
             images.drawing(step),
             clouds.pair_drawing(step),
+            spread.drawing(step),
             clouds.model_drawing(step),
             poses.drawing(step),
             uncertainty.drawing(step),

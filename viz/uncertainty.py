@@ -78,7 +78,7 @@ def drawing(step: Step) -> Drawing:
 
 
 def magnification(edges: Sequence[Edge], distance_m: float) -> float:
-    """Return the factor 1, 2, 5, 10 … by which uncertainty is drawn larger than life.
+    """Return the factor 0.1, 0.2, 0.5, 1, 2 … 1000 by which uncertainty is drawn larger than life.
 
     It follows from the accepted odometry edges alone and never grows with more of them, so that the ellipsoids that
     loop closure makes smaller also look smaller.
@@ -93,10 +93,8 @@ def magnification(edges: Sequence[Edge], distance_m: float) -> float:
         return 1.0
     sigma_m = math.sqrt(max(9.0 * variances[0], sum(variances)))  # room for nine edges from the start
     wanted = _LARGEST_3_SIGMA * distance_m / (3.0 * sigma_m)
-    if wanted <= 1.0:
-        return 1.0
     decade = 10.0 ** math.floor(math.log10(wanted))
-    return min(max(factor * decade for factor in (1, 2, 5) if factor * decade <= wanted), 1000.0)
+    return min(max(max(factor * decade for factor in (1, 2, 5) if factor * decade <= wanted), 0.1), 1000.0)
 
 
 def ellipsoids(covariances: Array) -> tuple[Array, Array]:
