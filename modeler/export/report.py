@@ -107,7 +107,12 @@ def posteriors_of(report: Mapping[str, Any]) -> dict[tuple[int, int], Posterior]
 
 def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> list[str]:
     """Return in words why the model is not to be trusted; empty where it is."""
-    reasons = [f"frame {frame.id} was left out: {frame.outcome}" for frame in frames if not frame.accepted]
+    reasons = []
+    if meta.interrupted:
+        reasons.append(f"the run was interrupted after frame {step.frame.index}")
+    elif not step.last:
+        reasons.append("the run has not finished")
+    reasons += [f"frame {frame.id} was left out: {frame.outcome}" for frame in frames if not frame.accepted]
     if sum(frame.accepted for frame in frames) < 2:
         reasons.append("fewer than two frames were accepted: there is nothing to align")
     tried = [edge for edge in step.edges_so_far if edge.kind == "closure"]
@@ -118,10 +123,6 @@ def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> l
             reasons.append(f"none of {len(tried)} loop closures was accepted; the last, {pair}: {_reason(last, step)}")
         elif meta.closure_expected:
             reasons.append("the object never came back to an earlier view, so that no loop was closed")
-    if meta.interrupted:
-        reasons.append(f"the run was interrupted after frame {step.frame.index}")
-    elif not step.last:
-        reasons.append("the run has not finished")
     return reasons
 
 
