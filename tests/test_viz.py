@@ -5,9 +5,11 @@ from __future__ import annotations
 import io
 import logging
 import os
+import signal
 import socket
 import subprocess
 import sys
+import time
 import urllib.request
 from collections import defaultdict
 from dataclasses import replace
@@ -504,6 +506,23 @@ def test_a_recording_is_viewed_in_the_browser(run: list[Step], tmp_path: Path) -
     with urllib.request.urlopen(served.address, timeout=5.0) as page:
         assert b"<html" in page.read()
     served.stop()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp_path: Path, number: int) -> None:
+    record(tmp_path / "recording.rrd", run[:1])
+    program = (
+        "import sys, pathlib; from viz import viewer; served = viewer.view(pathlib.Path(sys.argv[1]), web=True);"
+        "print(served.process.pid, flush=True); served.wait()"
+    )
+    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as command:
+        assert command.stdout is not None
+        server = int(command.stdout.readline())
+        time.sleep(0.2)  # from the line to the wait
+        command.send_signal(number)
+        assert command.wait(timeout=10.0) == 0
+    with pytest.raises(ProcessLookupError):
+        os.kill(server, 0)
 
 
 def test_rerun_is_not_imported_before_it_is_needed() -> None:

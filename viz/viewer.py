@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -34,12 +35,14 @@ class Viewer:
     """Whether it outlives this process: a window does, a page in the browser does not."""
 
     def wait(self) -> None:
-        """Return when the viewer is closed or the user interrupts; end the server then."""
+        """Return when the viewer is closed, or end it when the user interrupts or terminates this process."""
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             self.process.wait()
         except KeyboardInterrupt:
             pass
         finally:
+            signal.signal(signal.SIGTERM, before)
             self.stop()
 
     def stop(self) -> None:
@@ -61,7 +64,7 @@ def start_window(recordings: Sequence[Path] = ()) -> Viewer:
         )
     port = _free_port()
     sink = _sink(port)
-    return Viewer(_start(["--port", str(port)], recordings, port=port, own_session=True), sink, sink, lasting=True)
+    return Viewer(_start(["--port", str(port)], recordings, port=port), sink, sink, lasting=True)
 
 
 def start_web(recordings: Sequence[Path] = ()) -> Viewer:
@@ -72,7 +75,7 @@ def start_web(recordings: Sequence[Path] = ()) -> Viewer:
     """
     port, page = _free_port(), _free_port()
     arguments = ["--serve-web", "--port", str(port), "--web-viewer-port", str(page)]
-    process = _start(arguments, recordings, port=page, own_session=False)
+    process = _start(arguments, recordings, port=page)
     address = f"http://{_HOST}:{page}?url={quote(_sink(port), safe='')}"
     served = Viewer(process, _sink(port), address, lasting=False)
     atexit.register(served.stop)  # also where an error ends the run
@@ -105,9 +108,7 @@ def reachable(sink: str) -> bool:
     return _listens(host.strip("[]"), int(port), patience_s=1.0)
 
 
-def _start(
-    arguments: list[str], recordings: Sequence[Path], *, port: int, own_session: bool
-) -> subprocess.Popen[bytes]:
+def _start(arguments: list[str], recordings: Sequence[Path], *, port: int) -> subprocess.Popen[bytes]:
     """Start the viewer's executable and return once it listens on `port`."""
     from rerun_cli import __main__ as cli
 
@@ -119,14 +120,14 @@ def _start(
         stdout=subprocess.DEVNULL,  # stdout is for data; the viewer chats
         stderr=subprocess.DEVNULL,
         env={**os.environ, "RERUN_APP_ONLY": "true"},
-        start_new_session=own_session,
+        start_new_session=True,  # Ctrl-C is for the run, which has more to send when it ends
     )
     deadline = time.monotonic() + _START_S
     while not _listens(_HOST, port, patience_s=0.2):
         if process.poll() is not None or time.monotonic() > deadline:
             process.kill()
             process.wait()
-            raise InputError("the Rerun viewer did not start; see why with: rerun --version, or leave it out")
+            raise InputError("the Rerun viewer did not start; start it by hand to see why: rerun")
         time.sleep(0.05)
     return process
 
