@@ -31,7 +31,7 @@ class Closer:
     """At most so many closures are tried for one frame; 0 = never close."""
     min_overlap: float = 0.4
     """Smallest overlap (0..1) of a closure."""
-    sigma_scale: float = 3.0
+    sigma_scale: float = 2.0
     """How many times the standard deviations of edges may understate their random errors."""
     drift_deg: float = 0.15
     """Systematic rotation error of an edge in degrees; along a chain it adds up."""

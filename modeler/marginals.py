@@ -71,9 +71,20 @@ def network(
     roots = _roots(trajectory, tree)
     around = [_row(paths[edge.source] - paths[edge.target], roots) for edge in loops]
     own = [_row(sign, _roots(trajectory, loops)) for sign in np.eye(len(loops))]
-    loop_rows = [np.concatenate(pair, axis=1) for pair in zip(around, own, strict=True)]
-    rows = np.concatenate([np.zeros((0, 6 * len(tree) + 6 * len(loops))), *loop_rows])
-    return RelativeCovariance(trajectory, paths, roots, np.asarray(np.linalg.qr(rows.T).Q, dtype=np.float64))
+    observed = np.zeros((6 * len(tree) + 6 * len(loops), 0))
+    for pair in zip(around, own, strict=True):
+        observed = np.concatenate([observed, _beyond(observed, np.concatenate(pair, axis=1).T)], axis=1)
+    return RelativeCovariance(trajectory, paths, roots, observed)
+
+
+def _beyond(basis: Array, columns: Array) -> Array:
+    """Return an orthonormal basis (n, 6) of what `columns` (n, 6) add to the span of an orthonormal `basis` (n, m).
+
+    Loop by loop, for the large QR of all loops at once lets BLAS threads fight over busy cores, a hundred times slower.
+    """
+    for _ in range(2):  # once loses digits where little is left; twice is enough
+        columns = np.asarray(np.linalg.qr(columns - basis @ (basis.T @ columns)).Q, dtype=np.float64)
+    return columns
 
 
 def _row(signs: Array, roots: Array) -> Array:
