@@ -1,0 +1,311 @@
+"""The contract of the command line: statuses, streams, files, and the same bytes for the same seed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from modeler import se3
+from modeler.cli import main
+from modeler.cli.interrupt import Interrupt
+from modeler.cli.options import PriorOptions
+from modeler.priors import GeneralPrior, TablePrior
+from sequences import bundled, open_sequence
+
+BOX = str(bundled("box"))
+FILES = {
+    "model.ply",
+    "cloud.ply",
+    "trajectory.txt",
+    "odometry.txt",
+    "graph.g2o",
+    "recording.rrd",
+    "report.json",
+}
+DOCUMENTED = """out prior seed resume overwrite every frames roi max-depth-m max-rotation-deg max-offset-m max-shift-m
+method view web"""
+QUICK = ("--prior", "table", "--method", "icp", "--frames", "0:3")
+
+
+@dataclasses.dataclass(frozen=True)
+class Ended:
+    status: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Ended]
+
+
+@pytest.fixture
+def run(capfd: pytest.CaptureFixture[str]) -> Run:
+    def run(*arguments: str | Path) -> Ended:
+        capfd.readouterr()
+        try:
+            status = main([str(argument) for argument in arguments])
+        except SystemExit as ending:
+            status = ending.code if isinstance(ending.code, int) else 1
+        said = capfd.readouterr()
+        return Ended(status, str(said.out), str(said.err))
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("built") / "run"
+    assert main(["build", BOX, "--out", str(folder), *QUICK]) == 0
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return what must not depend on when a run was made."""
+    return {name: (folder / name).read_bytes() for name in FILES - {"recording.rrd", "report.json"}}
+
+
+def report(folder: Path) -> dict:
+    return json.loads((folder / "report.json").read_bytes())
+
+
+# Help
+
+
+@pytest.mark.parametrize("command", ["build", "register", "render", "view", "export"])
+def test_every_command_has_help_on_stdout(run: Run, command: str) -> None:
+    assert re.search(rf"\b{command}\b", run("--help").out)
+    ended = run(command, "--help")
+    assert (ended.status, ended.err) == (0, "")
+    assert ended.out.startswith(f"usage: modeler {command}")
+
+
+@pytest.mark.parametrize("option", DOCUMENTED.split())
+def test_build_offers_what_is_documented(run: Run, option: str) -> None:
+    assert re.search(rf"^│ --{option}\b", run("build", "--help").out, re.MULTILINE)
+
+
+def test_help_imports_nothing_heavy() -> None:
+    heavy = ["gtsam", "matplotlib", "numba", "numpy", "open3d", "rerun", "scipy", "trimesh"]
+    script = f"""
+import sys
+from modeler.cli import main
+try:
+    main(["build", "--help"])
+except SystemExit:
+    sys.exit(", ".join(sorted(set({heavy}) & set(sys.modules))) or None)
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(PriorOptions) if field.name != "prior"])
+def test_defaults_told_in_help_are_those_of_the_priors(run: Run, name: str) -> None:
+    words = " ".join(run("build", "--help").out.replace("│", " ").split())
+    told = re.search(rf"--{name.replace('_', '-')} .*?\(default: (\S+)\)", words)
+    assert told is not None
+    priors = (GeneralPrior, TablePrior)
+    defaults = {field.default for prior in priors for field in dataclasses.fields(prior) if field.name == name}
+    assert {float(told[1])} == defaults
+
+
+# Wrong usage and unreadable input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ((), "Expected one of"),
+        (("frobnicate",), "frobnicate"),
+        (("build", BOX), "--out"),
+        (("build", BOX, "--out", "OUT", "--frob"), "--frob"),
+        (("build", BOX, "--out", "OUT", "--prior", "magic"), "'general', 'table'"),
+        (("build", BOX, "--out", "OUT", "--roi", "1", "2", "3"), "--roi"),
+        (("build", BOX, "--out", "OUT", "--every", "0"), "--every 0"),
+        (("build", BOX, "--out", "OUT", "--frames", "1-3"), "--frames '1-3'"),
+        (("build", BOX, "--out", "OUT", "--frames", "50:60"), "0 to 13"),
+        (("build", BOX, "--out", "OUT", "--seed", "-1"), "--seed -1"),
+        (("build", BOX, "--out", "OUT", "--prior", "table", "--max-offset-m", "1"), "--max-offset-m"),
+        (("build", BOX, "--out", "OUT", "--max-rotation-deg", "nan"), "--max-rotation-deg nan"),
+        (("build", BOX, "--out", "OUT", "--max-rotation-deg", "181"), "--max-rotation-deg 181"),
+        (("build", BOX, "--out", "OUT", "--resume", "--overwrite"), "--resume"),
+        (("build", "NOWHERE", "--out", "OUT"), "NOWHERE"),
+        (("register", BOX, "0", "99"), "no frame 99"),
+        (("register", BOX, "0", "1", "--max-depth-m", "0.1"), "too few points"),
+        (("render", "nothing", "--out", "OUT"), "box"),
+        (("view", "NOWHERE"), "NOWHERE"),
+        (("export", "NOWHERE", "--out", "OUT.glb"), "NOWHERE"),
+    ],
+)
+def test_unusable_input_gives_status_2_and_one_line(
+    run: Run, tmp_path: Path, arguments: tuple[str, ...], says: str
+) -> None:
+    places = {"OUT": "out", "OUT.glb": "out.glb", "NOWHERE": "NOWHERE"}
+    ended = run(*(tmp_path / places[argument] if argument in places else argument for argument in arguments))
+    assert (ended.status, ended.out) == (2, "")
+    assert re.fullmatch(r"modeler: .+\n", ended.err)
+    assert says in ended.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_console_script_ends_with_the_status() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-m", "modeler", "build", "/nowhere", "--out", "/nowhere/run"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr.count("\n") == 1
+
+
+# register
+
+
+def test_register_prints_one_edge_the_same_for_the_same_seed(run: Run) -> None:
+    ended = run("register", BOX, "1", "0", "--prior", "table", "--seed", "5")
+    assert ended.status == 0
+    edge = json.loads(ended.out)
+    assert (edge["source"], edge["target"], edge["kind"], edge["outcome"]) == (1, 0, "odometry", "converged")
+    assert "seconds" not in edge
+    truth = open_sequence(BOX).truth()
+    assert truth is not None
+    found = np.array(edge["target_from_source"]).reshape(4, 4)
+    error = se3.inverse(truth[0] @ se3.inverse(truth[1])) @ found
+    assert np.degrees(se3.rotation_angle(error)) < 2.0
+    covariance = np.array(edge["covariance"]).reshape(6, 6)
+    assert np.array_equal(covariance, covariance.T)
+    assert np.linalg.eigvalsh(covariance)[0] > 0.0
+    assert run("register", BOX, "1", "0", "--prior", "table", "--seed", "5").out == ended.out
+    assert run("register", BOX, "1", "0", "--prior", "table", "--seed", "6").out != ended.out
+
+
+def test_register_gives_the_edge_that_build_finds(run: Run, built: Path) -> None:
+    edge = json.loads(run("register", BOX, "1", "0", *QUICK[:4]).out)
+    found = report(built)["edges"][0]
+    for name in ("source", "target", "outcome", "target_from_source", "covariance", "overlap"):
+        assert edge[name] == found[name]
+
+
+# build
+
+
+def test_build_fills_a_run_folder(built: Path) -> None:
+    assert {path.name for path in built.iterdir()} == FILES
+    told = report(built)
+    assert (told["schema"], told["seed"], told["prior"]) == (1, 0, "table")
+    assert told["settings"] == {"method": "icp", "every": 1, "frames": "0:3"}
+    assert (told["complete"], told["trustworthy"], told["reasons"]) == (True, True, [])
+    assert [(frame["id"], frame["outcome"]) for frame in told["frames"]] == [(k, "accepted") for k in range(3)]
+    assert [(edge["source"], edge["target"], edge["accepted"]) for edge in told["edges"]] == [
+        (1, 0, True),
+        (2, 1, True),
+    ]
+    poses = np.array([pose["object_from_camera"] for pose in told["poses"]]).reshape(-1, 4, 4)
+    assert np.allclose(poses[0], np.eye(4), atol=1e-9)
+    assert told["seconds"]["total"] > told["seconds"]["registration"] > 0.0
+    assert len((built / "trajectory.txt").read_text().splitlines()) == 3
+    mesh = trimesh.load_mesh(built / "model.ply")
+    assert 0.1 < np.linalg.norm(mesh.extents) < 0.6
+    assert (built / "recording.rrd").stat().st_size > 100_000
+
+
+def test_build_says_nothing_on_stdout_and_one_line_on_stderr(run: Run, tmp_path: Path) -> None:
+    ended = run("build", BOX, "--out", tmp_path / "run", *QUICK[:-1], "0:2")
+    assert (ended.status, ended.out) == (0, "")
+    assert re.fullmatch(r"modeler: 2 of 2 frames, no loop closed, \d+ s: .*\n", ended.err)
+
+
+def test_same_seed_same_bytes_and_nothing_is_replaced_unasked(run: Run, built: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "model.ply").write_text("an earlier model")
+    (folder / "notes.txt").write_text("the user's own")
+    refused = run("build", BOX, "--out", folder, *QUICK)
+    assert refused.status == 2
+    assert (folder / "model.ply").read_text() == "an earlier model"
+    assert {path.name for path in folder.iterdir()} == {"model.ply", "notes.txt"}
+    assert run("build", BOX, "--out", folder, *QUICK, "--overwrite").status == 0
+    assert contents(folder) == contents(built)
+    assert (folder / "notes.txt").read_text() == "the user's own"
+
+
+def test_a_resumed_run_registers_only_what_is_missing(run: Run, built: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    cut = report(built)
+    cut["frames"], cut["edges"], cut["complete"] = cut["frames"][:2], cut["edges"][:1], False
+    cut["edges"][0]["seconds"] = 1234.5
+    (folder / "report.json").write_text(json.dumps(cut))
+    assert run("build", BOX, "--out", folder, *QUICK, "--seed", "1", "--resume").status == 2
+    assert run("build", BOX, "--out", folder, *QUICK, "--resume").status == 0
+    assert contents(folder) == contents(built)
+    assert [edge["seconds"] == 1234.5 for edge in report(folder)["edges"]] == [True, False]
+
+
+def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(run: Run, tmp_path: Path) -> None:
+    ended = run("build", BOX, "--out", tmp_path, *QUICK, "--max-depth-m", "0.1")
+    assert (ended.status, ended.out) == (3, "")
+    assert "frame 0 is left out: too few points" in ended.err
+    told = report(tmp_path)
+    assert not told["trustworthy"]
+    assert told["complete"]
+    assert sum("left out" in reason for reason in told["reasons"]) == 3
+    assert {path.name for path in tmp_path.iterdir()} == FILES - {"model.ply", "cloud.ply"}
+
+
+def test_ctrl_c_ends_the_frames_and_a_second_one_the_program() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    seen = []
+    with Interrupt() as interrupt:
+        for item in interrupt.until(range(5)):
+            seen.append(item)
+            if item == 1:
+                signal.raise_signal(signal.SIGINT)
+        assert (seen, interrupt.ended_early) == ([0, 1], True)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_after_the_last_frame_changes_nothing() -> None:
+    with Interrupt() as interrupt:
+        for item in interrupt.until(range(2)):
+            if item == 1:
+                signal.raise_signal(signal.SIGINT)
+    assert not interrupt.ended_early
+
+
+# export and render
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb", "stl"])
+def test_export_keeps_the_mesh(run: Run, built: Path, tmp_path: Path, suffix: str) -> None:
+    ended = run("export", built, "--out", tmp_path / f"box.{suffix}")
+    assert (ended.status, ended.out, ended.err) == (0, "", "")
+    mesh, original = (trimesh.load_mesh(path) for path in (tmp_path / f"box.{suffix}", built / "model.ply"))
+    assert len(mesh.faces) == len(original.faces)
+    assert np.allclose(mesh.bounds, original.bounds, atol=1e-5)
+
+
+def test_a_rendered_sequence_can_be_opened(run: Run, tmp_path: Path) -> None:
+    recipe = {
+        "name": "small",
+        "object": {"kind": "box", "size_m": [0.12, 0.2, 0.06]},
+        "trajectory": {"kind": "tabletop", "frames": 3},
+        "view": {"width": 96, "height": 72, "focal_px": 86.0},
+    }
+    path = tmp_path / "small.json"
+    path.write_text(json.dumps(recipe))
+    ended = run("render", path, "--out", tmp_path / "small", "--seed", "3")
+    assert (ended.status, ended.out) == (0, ""), ended.err
+    assert len(open_sequence(tmp_path / "small")) == 3
+    assert run("render", path, "--out", tmp_path / "small").status == 2
