@@ -1,0 +1,167 @@
+"""Views and their poses to one model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.fusion import cloud, grid, surface
+from modeler.fusion.stack import GREY, Stack, colours_at, posed, stack
+from modeler.kernels import fusion
+from modeler.types import Array, InputError, ObjectModel, RayImage
+
+LONELY = 6  # a point of the cloud with fewer neighbours within a few voxels is an outlier
+
+
+@dataclass(frozen=True)
+class Fuser:
+    """Merge views into a cloud and a mesh.
+
+    The mesh is the zero level of a truncated signed distance (Curless and Levoy 1996, "A volumetric method for building
+    complex models from range images") on voxels near the surface.
+    """
+
+    voxel_m: float | None = None
+    """Side of a voxel in m; None: what a pixel covers, or half the sensor's noise where that is more."""
+    truncation_m: float | None = None
+    """Half width of the band around the surface in m; None: three voxels and twice the sensor's noise."""
+    max_voxels: int = 192**3
+    """The voxels grow until the object's box holds no more than so many."""
+    preview_voxels: float = 2.0
+    """Spacing of the cloud of a preview, in voxels."""
+    min_cosine: float = 0.15
+    """Surface seen at a more grazing angle than this cosine (normal to ray) is not used."""
+    edge_weight: float = 0.1
+    """Weight of pixels next to a silhouette or a step in depth, against 1: they mix what is before and behind."""
+    margin_px: int = 2
+    """A pixel carves only as deep as all its neighbours within so many px, so that silhouettes are not eaten away."""
+    empty_weight: float = 0.3
+    """Weight of a view that sees through a place, against 1 for a view that sees surface there head-on."""
+    min_support: float = 0.1
+    """Mesh that is seen less is removed. A view counts 1 head-on, less at flat angles, `edge_weight` at silhouettes."""
+    closing: int = 3
+    """Gaps narrower than about twice so many voxels are closed; what nobody saw beyond stays open."""
+    fairing: int = 10
+    """Passes of smoothing the mesh without shrinking it."""
+    min_piece: float = 0.01
+    """Loose pieces of the mesh smaller than this share of the largest piece's area are removed."""
+
+    def preview(self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> ObjectModel:
+        """Return the merged cloud alone, one point a voxel, without a mesh: cheap enough for every frame.
+
+        Args:
+            views: by frame number; those without a pose are left out.
+            trajectory: object_from_camera (4, 4) by frame number.
+
+        Raises:
+            InputError: where no view with surface points has a pose.
+        """
+        pairs = posed(views, trajectory)
+        points, normals, colours = cloud.thinned(
+            np.concatenate([se3.transform(pose, view.points_m) for view, pose in pairs]),
+            np.concatenate([view.normals @ pose[:3, :3].T for view, pose in pairs]),
+            np.concatenate([colours_at(view) for view, _ in pairs]),
+            np.ones(sum(len(view.points_m) for view, _ in pairs)),
+            voxel_m=self.preview_voxels * self._voxel_m(pairs),
+            max_voxels=self.max_voxels,
+        )
+        coloured = any(view.frame.colour is not None for view, _ in pairs)
+        return ObjectModel(
+            points_m=points,
+            normals=normals,
+            colours=colours if coloured else None,
+            vertices_m=np.zeros((0, 3)),
+            triangles=np.zeros((0, 3), dtype=np.int64),
+            vertex_normals=np.zeros((0, 3)),
+            vertex_colours=np.zeros((0, 3), dtype=np.uint8) if coloured else None,
+        )
+
+    def fuse(self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> ObjectModel:
+        """Return cloud and mesh, made with care.
+
+        Space that a view saw empty is carved, what nobody saw stays open, and nothing but pixels of the object becomes
+        surface.
+
+        Args:
+            views: by frame number; those without a pose are left out.
+            trajectory: object_from_camera (4, 4) by frame number.
+
+        Raises:
+            InputError: where no view with surface points has a pose.
+        """
+        pairs = posed(views, trajectory)
+        noise_m = float(np.median([view.sigma_r_m for view, _ in pairs]))
+        voxel_m = self._voxel_m(pairs)
+        box = grid.around(
+            np.concatenate([se3.transform(pose, view.points_m) for view, pose in pairs]),
+            voxel_m=voxel_m,
+            border_m=self.truncation_m or 3.0 * voxel_m + 2.0 * noise_m,
+            max_voxels=self.max_voxels,
+        )
+        tau_m = self.truncation_m or 3.0 * box.voxel_m + 2.0 * noise_m
+        seen = stack(
+            pairs, box.corners_m, margin_px=self.margin_px, min_cosine=self.min_cosine, edge_weight=self.edge_weight
+        )
+        near_m = box.voxel_m + 2.0 * noise_m
+        vertices, triangles, vertex_colours = self._mesh(seen, box, tau_m=tau_m, near_m=near_m)
+
+        points, normals, colours = cloud.thinned(
+            seen.points_m, seen.normals, seen.colours, seen.weights, voxel_m=box.voxel_m, max_voxels=8 * self.max_voxels
+        )
+        support, emptiness, _ = _survey(seen, points, normals, tau_m=tau_m, near_m=near_m)
+        kept = (support > self.empty_weight * emptiness) & cloud.crowded(points, 2.0 * box.voxel_m, LONELY)
+        coloured = bool(seen.coloured.any())
+        return ObjectModel(
+            points_m=points[kept],
+            normals=normals[kept],
+            colours=colours[kept] if coloured else None,
+            vertices_m=vertices,
+            triangles=triangles,
+            vertex_normals=surface.normals_of(vertices, triangles),
+            vertex_colours=vertex_colours if coloured else None,
+        )
+
+    def _mesh(
+        self, seen: Stack, box: grid.Grid, *, tau_m: float, near_m: float
+    ) -> tuple[Array, surface.Triangles, npt.NDArray[np.uint8]]:
+        """Return vertices (v, 3), triangles (t, 3) and RGB (v, 3) of the surface that the views support."""
+        field = grid.measure(box, seen, tau_m=tau_m, empty_weight=self.empty_weight)
+        for _ in range(self.closing):
+            field = grid.filled(field)
+        vertices, triangles = surface.extracted(field)
+        normals = surface.normals_of(vertices, triangles)
+        support, _, colours = _survey(seen, vertices, normals, tau_m=tau_m, near_m=near_m)
+        kept = surface.closed(support > self.min_support, triangles, self.closing)
+        triangles = triangles[np.any(kept[triangles], axis=1)]
+        triangles = triangles[surface.large_pieces(vertices, triangles, self.min_piece)]
+        used, triangles = surface.compacted(triangles, len(vertices))
+        return surface.fair(vertices[used], triangles, self.fairing), triangles, colours[used]
+
+    def _voxel_m(self, pairs: list[tuple[RayImage, Array]]) -> float:
+        """Return the side of a voxel, before the box is known."""
+        if self.voxel_m is not None:
+            if not self.voxel_m > 0.0:
+                raise InputError(f"voxel size {self.voxel_m} m is not positive; give a length in m, or none")
+            return self.voxel_m
+        footprint_m = np.concatenate([view.points_m[:, 2] / view.frame.camera.fx for view, _ in pairs])
+        return max(float(np.median(footprint_m)), 0.5 * float(np.median([view.sigma_r_m for view, _ in pairs])))
+
+
+def _survey(
+    seen: Stack, points_m: Array, normals: Array, *, tau_m: float, near_m: float
+) -> tuple[Array, Array, npt.NDArray[np.uint8]]:
+    """Return how much the views support points (n, 3), how many see them empty, and the RGB (n, 3) they give them."""
+    support, emptiness, colours, share = fusion.survey(
+        np.ascontiguousarray(points_m),
+        np.ascontiguousarray(normals),
+        near_m,
+        tau_m,
+        *seen.lookup,
+        seen.colour,
+        seen.coloured,
+    )
+    return support, emptiness, np.rint(np.where(share[:, None] > 0.0, colours, GREY)).astype(np.uint8)

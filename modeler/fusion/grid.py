@@ -1,0 +1,94 @@
+"""The box of voxels around the object, and the signed distance in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.fusion.stack import Stack
+from modeler.kernels import fusion, isosurface
+from modeler.types import Array
+
+MOST = 15  # of the 26 neighbours of a voxel
+FAINT = 1e-3  # weight of a voxel that only its neighbours know
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Cubic voxels over a box of the object frame, whole blocks along each axis."""
+
+    origin_m: Array
+    """(3,) lowest corner."""
+    voxel_m: float
+    """Side of a voxel."""
+    blocks: npt.NDArray[np.int64]
+    """(3,) blocks of `fusion.SIDE` voxels along each axis."""
+
+    @property
+    def shape(self) -> npt.NDArray[np.int64]:
+        """(3,) voxels along each axis."""
+        return self.blocks * fusion.SIDE
+
+    @property
+    def corners_m(self) -> Array:
+        """(8, 3) corners of the box."""
+        size_m = self.shape * self.voxel_m
+        return self.origin_m + size_m * np.array([[c >> 2 & 1, c >> 1 & 1, c & 1] for c in range(8)])
+
+
+def around(points_m: Array, *, voxel_m: float, border_m: float, max_voxels: int) -> Grid:
+    """Return the grid around points (n, 3) and a border, with larger voxels where it would have too many.
+
+    Points far outside the bulk do not stretch the box: it ends half its size beyond the central 98 %.
+    """
+    low, high = np.quantile(points_m, [0.01, 0.99], axis=0)
+    slack = 0.5 * (high - low) + border_m
+    low = np.maximum(low - slack, points_m.min(axis=0)) - border_m
+    high = np.minimum(high + slack, points_m.max(axis=0)) + border_m
+    voxel_m = max(voxel_m, float(np.prod(high - low) / max_voxels) ** (1.0 / 3.0))
+    # One unknown voxel on each side lets the kernels look at neighbours without asking where the grid ends.
+    blocks = np.ceil((high - low) / voxel_m + 2.0).astype(np.int64) // fusion.SIDE + 1
+    origin = 0.5 * (low + high) - 0.5 * blocks * fusion.SIDE * voxel_m
+    return Grid(origin, voxel_m, blocks)
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """Signed distance to the surface on the voxels of a grid near the surface."""
+
+    grid: Grid
+    """The voxels."""
+    values_m: npt.NDArray[np.float32]
+    """(x, y, z) distance at voxel centres, positive outside."""
+    weights: npt.NDArray[np.float32]
+    """(x, y, z) weight; 0 = unknown."""
+    known: npt.NDArray[np.int64]
+    """(n, 3) voxels with a weight, in ascending order."""
+
+
+def measure(grid: Grid, views: Stack, *, tau_m: float, empty_weight: float) -> Field:
+    """Return the signed distance that the views measure, within ±`tau_m` around the surface."""
+    block_m = fusion.SIDE * grid.voxel_m
+    blocks = fusion.blocks_near(views.points_m, grid.origin_m, block_m, tau_m, grid.blocks)
+    distance, weight = fusion.integrate(blocks, grid.origin_m, grid.voxel_m, tau_m, empty_weight, *views.lookup)
+    x, y, z = (int(n) for n in grid.blocks)
+    values, weights = (np.zeros((x, y, z, fusion.SIDE, fusion.SIDE, fusion.SIDE), dtype=np.float32) for _ in range(2))
+    values[tuple(blocks.T)], weights[tuple(blocks.T)] = distance, weight
+    values = values.transpose(0, 3, 1, 4, 2, 5).reshape(grid.shape)
+    weights = weights.transpose(0, 3, 1, 4, 2, 5).reshape(grid.shape)
+    for axis in range(3):
+        np.moveaxis(weights, axis, 0)[[0, -1]] = 0.0
+    return Field(grid, values, weights, np.argwhere(weights > 0.0))
+
+
+def filled(field: Field) -> Field:
+    """Return the field with gaps of a few voxels closed: unknown voxels that most of their neighbours know."""
+    cells, means = isosurface.fill(field.values_m, field.weights, field.known, MOST)
+    if not len(cells):
+        return field
+    values, weights = field.values_m.copy(), field.weights.copy()
+    values[tuple(cells.T)] = means
+    weights[tuple(cells.T)] = FAINT
+    return Field(field.grid, values, weights, np.argwhere(weights > 0.0))

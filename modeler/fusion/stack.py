@@ -1,0 +1,204 @@
+"""The views cut to the object and laid side by side, as the kernels look them up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from modeler import se3
+from modeler.kernels import fusion
+from modeler.types import Array, BoolArray, InputError, RayImage
+
+GREY = 128  # colour of what no view with colour sees
+STEEPEST_RAD = 1.40  # a step between neighbouring pixels steeper than this (80°) is an edge, not a surface
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Views side by side; see `modeler.kernels.fusion` for how they are looked up. Points are in the object frame."""
+
+    index: npt.NDArray[np.int32]
+    """(f, h, w) number of the surface point at a pixel, -1 = none."""
+    free_m: npt.NDArray[np.float32]
+    """(f, h, w) depth up to which the space along a pixel was seen empty, 0 = nothing known."""
+    colour: npt.NDArray[np.uint8]
+    """(f, h, w, 3) RGB."""
+    coloured: BoolArray
+    """(f,) which views have colour."""
+    poses: Array
+    """(f, 3, 4) camera_from_object."""
+    lenses: Array
+    """(f, 4) fx, fy, cx, cy of the pixels as stacked."""
+    points_m: Array
+    """(n, 3) surface points."""
+    normals: Array
+    """(n, 3) unit normals."""
+    weights: Array
+    """(n,) 1 = seen head-on from the median distance, away from edges."""
+    colours: npt.NDArray[np.uint8]
+    """(n, 3) RGB of the points."""
+
+    @property
+    def lookup(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32], Array, Array, Array, Array, Array]:
+        """Arguments that every kernel shares."""
+        return self.index, self.free_m, self.poses, self.lenses, self.points_m, self.normals, self.weights
+
+
+def posed(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> list[tuple[RayImage, Array]]:
+    """Return the views that have a pose with object_from_camera, by ascending frame number.
+
+    Raises:
+        InputError: where no view has a pose, or none of them a surface point.
+    """
+    pairs = [(views[k], np.asarray(trajectory[k], dtype=np.float64)) for k in sorted(views) if k in trajectory]
+    if not any(len(view.points_m) for view, _ in pairs):
+        raise InputError("nothing to fuse: no view with surface points has a pose; check the masks and the trajectory")
+    return pairs
+
+
+def colours_at(view: RayImage) -> npt.NDArray[np.uint8]:
+    """Return the RGB (n, 3) of a view's surface points, grey where the view has no colour."""
+    return _sampled(view.frame.colour, view.pixels)
+
+
+def _sampled(colour: npt.NDArray[np.uint8] | None, pixels: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+    """Return the RGB (n, 3) of pixels (n, 2), grey without an image."""
+    if colour is None:
+        return np.full((len(pixels), 3), GREY, dtype=np.uint8)
+    return colour[pixels[:, 0], pixels[:, 1]]
+
+
+def _window(view: RayImage, camera_from_object: Array, corners_m: Array) -> tuple[slice, slice]:
+    """Return the rows and columns in which a box, given by its corners, is seen."""
+    camera = view.frame.camera
+    x, y, z = se3.transform(camera_from_object, corners_m).T
+    if np.any(z <= 0.0):  # the box reaches behind the camera
+        return slice(0, camera.height), slice(0, camera.width)
+    columns, rows = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    top, bottom = (int(n) for n in np.clip([np.floor(rows.min()), np.ceil(rows.max()) + 1.0], 0, camera.height))
+    left, right = (int(n) for n in np.clip([np.floor(columns.min()), np.ceil(columns.max()) + 1.0], 0, camera.width))
+    return slice(top, bottom), slice(left, right)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """One view cut to a window: images of the window, and all that was seen of the surface there."""
+
+    index: npt.NDArray[np.int32]
+    free_m: npt.NDArray[np.float32]
+    colour: npt.NDArray[np.uint8] | None
+    lens: Array
+    points_m: Array
+    normals: Array
+    pixels: npt.NDArray[np.int64]
+    weights: Array
+
+
+def _cut(view: RayImage, window: tuple[slice, slice], *, margin_px: int, min_cosine: float, edge_weight: float) -> _Cut:
+    """Cut a view to a window.
+
+    Where the view has no surface point, at silhouettes, on thin parts and at flat angles, small planes through the
+    measured depth stand in.
+    """
+    frame, camera = view.frame, view.frame.camera
+    corner = np.array([window[0].start, window[1].start])
+    depth_m = frame.depth_m[window]
+    measured = np.isfinite(depth_m) & (depth_m > 0.0)
+    mask = measured if frame.mask is None else measured & frame.mask[window]
+    lens = np.array([camera.fx, camera.fy, camera.cx - corner[1], camera.cy - corner[0]])
+
+    pixels = view.pixels - corner
+    inside = np.all((pixels >= 0) & (pixels < depth_m.shape), axis=1)
+    rest = mask.copy()
+    rest[tuple(pixels[inside].T)] = False
+    others = np.argwhere(rest)
+    points_m, normals = fusion.surfels(depth_m, others, mask, lens, view.sigma_r_m, np.tan(STEEPEST_RAD))
+    found = np.any(normals != 0.0, axis=1)
+    pixels = np.concatenate([pixels[inside], others[found]])
+    points_m = np.concatenate([view.points_m[inside], points_m[found]])
+    normals = np.concatenate([view.normals[inside], normals[found]])
+
+    # An edge is where a neighbour is no part of the object, or too far away for a surface in between.
+    far = maximum_filter(np.where(mask, depth_m, -np.inf), size=3)
+    near = minimum_filter(np.where(mask, depth_m, np.inf), size=3)
+    with np.errstate(invalid="ignore"):
+        step = far - near > 2.0 * depth_m / camera.fx * np.tan(STEEPEST_RAD) + 4.0 * view.sigma_r_m
+    edges = step | np.logical_not(minimum_filter(mask, size=3))
+    cosine = -np.sum(points_m * normals, axis=1) / np.linalg.norm(points_m, axis=1)
+    weights = cosine * np.where(edges[tuple(pixels.T)], edge_weight, 1.0)
+    kept = cosine >= min_cosine
+    pixels = pixels[kept]
+    index = np.full(depth_m.shape, -1, dtype=np.int32)
+    index[tuple(pixels.T)] = np.arange(len(pixels))
+    reach_m = minimum_filter(np.where(measured, depth_m, np.inf), size=2 * margin_px + 1, mode="nearest")
+    return _Cut(
+        index=index,
+        free_m=np.where(measured, reach_m, 0.0).astype(np.float32),
+        colour=None if frame.colour is None else frame.colour[window],
+        lens=lens,
+        points_m=points_m[kept],
+        normals=normals[kept],
+        pixels=pixels,
+        weights=weights[kept],
+    )
+
+
+def stack(
+    pairs: list[tuple[RayImage, Array]], corners_m: Array, *, margin_px: int, min_cosine: float, edge_weight: float
+) -> Stack:
+    """Lay views side by side.
+
+    Args:
+        pairs: views with object_from_camera.
+        corners_m: (8, 3) corners of the box of interest in the object frame.
+        margin_px: a pixel calls space empty only as far as all pixels within this distance do.
+        min_cosine: points seen at a flatter angle than this cosine are left out.
+        edge_weight: factor on the weight of pixels next to a silhouette or a step in depth.
+
+    Raises:
+        InputError: where no view sees anything of the object in the box.
+    """
+    cuts = [
+        _cut(
+            view,
+            _window(view, se3.inverse(pose), corners_m),
+            margin_px=margin_px,
+            min_cosine=min_cosine,
+            edge_weight=edge_weight,
+        )
+        for view, pose in pairs
+    ]
+    size = (len(cuts), *(max(cut.index.shape[axis] for cut in cuts) for axis in range(2)))
+    index, free_m = np.full(size, -1, dtype=np.int32), np.zeros(size, dtype=np.float32)
+    colour = np.zeros((*size, 3), dtype=np.uint8)
+    colours, count = [], 0
+    for number, cut in enumerate(cuts):
+        height, width = cut.index.shape
+        index[number, :height, :width] = np.where(cut.index >= 0, cut.index + count, -1)
+        free_m[number, :height, :width] = cut.free_m
+        if cut.colour is not None:
+            colour[number, :height, :width] = cut.colour
+        colours.append(_sampled(cut.colour, cut.pixels))
+        count += len(cut.points_m)
+    if count == 0:
+        raise InputError("nothing to fuse: the object is seen at flat angles only; check the masks and the trajectory")
+    points_m = np.concatenate([se3.transform(pose, cut.points_m) for cut, (_, pose) in zip(cuts, pairs, strict=True)])
+    # The noise of a triangulating camera grows with z².
+    depth_m = np.concatenate([cut.points_m[:, 2] for cut in cuts])
+    weights = np.concatenate([cut.weights for cut in cuts]) * (np.median(depth_m) / depth_m) ** 4
+    return Stack(
+        index=index,
+        free_m=free_m,
+        colour=colour,
+        coloured=np.array([cut.colour is not None for cut in cuts]),
+        poses=np.stack([se3.inverse(pose)[:3] for _, pose in pairs]),
+        lenses=np.stack([cut.lens for cut in cuts]),
+        points_m=points_m,
+        normals=np.concatenate([cut.normals @ pose[:3, :3].T for cut, (_, pose) in zip(cuts, pairs, strict=True)]),
+        weights=weights,
+        colours=np.concatenate(colours),
+    )

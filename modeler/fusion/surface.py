@@ -1,0 +1,104 @@
+"""From a signed distance to a mesh: extraction, what the views support, and tidying."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.csgraph import connected_components
+
+from modeler.fusion.grid import Field
+from modeler.kernels import isosurface
+from modeler.types import Array, BoolArray
+
+Triangles = npt.NDArray[np.int64]
+
+
+def extracted(field: Field) -> tuple[Array, Triangles]:
+    """Return vertices (v, 3) in m and triangles (t, 3) of the field's zero level."""
+    vertices, triangles = isosurface.extract(field.values_m, field.weights, field.known, isosurface.PIECES)
+    return field.grid.origin_m + (vertices + 0.5) * field.grid.voxel_m, triangles
+
+
+def normals_of(vertices_m: Array, triangles: Triangles) -> Array:
+    """Return unit normals (v, 3): the mean of the triangles around each vertex by area."""
+    corners = vertices_m[triangles]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sums = np.stack(
+        [
+            np.bincount(triangles.ravel(), weights=np.repeat(areas[:, c], 3), minlength=len(vertices_m))
+            for c in range(3)
+        ],
+        axis=1,
+    )
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    return np.where(lengths > 0.0, sums / np.maximum(lengths, 1e-300), [0.0, 0.0, 1.0])
+
+
+def areas_of(vertices_m: Array, triangles: Triangles) -> Array:
+    """Return the areas (t,) of triangles in m²."""
+    corners = vertices_m[triangles]
+    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+
+
+def large_pieces(vertices_m: Array, triangles: Triangles, min_share: float) -> BoolArray:
+    """Return which triangles (t,) belong to connected pieces with at least `min_share` of the largest piece's area."""
+    if not len(triangles):
+        return np.zeros(0, dtype=bool)
+    ones = np.ones(2 * len(triangles), dtype=bool)
+    pairs = np.concatenate([triangles[:, :2], triangles[:, 1:]])
+    links = coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(len(vertices_m), len(vertices_m)))
+    piece = connected_components(links, directed=False)[1][triangles[:, 0]]
+    area = np.bincount(piece, weights=areas_of(vertices_m, triangles))
+    return (area >= min_share * area.max())[piece]
+
+
+def rim(triangles: Triangles) -> npt.NDArray[np.int64]:
+    """Return the edges (e, 2) along open borders: those of one triangle only."""
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    keys = edges[:, 0] * (edges.max(initial=0) + 1) + edges[:, 1]
+    _, first, uses = np.unique(keys, return_index=True, return_counts=True)
+    return edges[first[uses == 1]]
+
+
+def closed(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
+    """Return which vertices (v,) are marked, or lie in gaps between marked ones up to twice `rings` wide."""
+    grown = marked.copy()
+    for _ in range(rings):
+        grown[triangles[np.any(grown[triangles], axis=1)]] = True
+    # What has grown towards an open border is taken back: the border counts as unmarked.
+    outside = ~grown
+    outside[rim(triangles)] = True
+    outside &= ~marked
+    for _ in range(rings):
+        outside[triangles[np.any(outside[triangles], axis=1)]] = True
+        outside &= ~marked
+    return ~outside
+
+
+def fair(vertices_m: Array, triangles: Triangles, passes: int) -> Array:
+    """Return vertices (v, 3) with ripples of a few edges' length taken out, without shrinking the mesh.
+
+    Each pass is a step towards the neighbours' mean and a slightly longer one back (Taubin 1995, "A signal processing
+    approach to fair surface design"). Vertices on open borders follow their neighbours on the border alone.
+    """
+    count = len(vertices_m)
+    border = rim(triangles)
+    on_border = np.zeros(count, dtype=bool)
+    on_border[border] = True
+    pairs = np.concatenate([triangles[:, :2], triangles[:, 1:], triangles[:, [2, 0]]])
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    pairs = np.concatenate([pairs[~on_border[pairs[:, 0]]], border, border[:, ::-1]])
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
+    links.data[:] = 1.0
+    mean = diags_array(1.0 / np.maximum(links.sum(axis=1), 1.0)) @ links
+    for step in [0.5, -0.53] * passes:
+        vertices_m = vertices_m + step * (mean @ vertices_m - vertices_m)
+    return vertices_m
+
+
+def compacted(triangles: Triangles, count: int) -> tuple[npt.NDArray[np.int64], Triangles]:
+    """Return which of `count` vertices the triangles use, in ascending order, and the triangles in numbers of those."""
+    used = np.zeros(count, dtype=bool)
+    used[triangles.ravel()] = True
+    return np.flatnonzero(used), (np.cumsum(used) - 1)[triangles]

@@ -1,0 +1,286 @@
+"""Kernels of fusion: signed distances on voxels, and what the views say of single points.
+
+Views lie side by side in stacks: `index` (f, h, w) holds the number of the surface point seen at a pixel, -1 where
+there is none; `free_m` (f, h, w) the depth up to which the space along the pixel is seen to be empty, 0 where nothing
+is known. `poses` (f, 3, 4) are camera_from_object and `lenses` (f, 4) are fx, fy, cx, cy of the stacked pixels. Points
+and normals are given in the object frame.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+SIDE = 4  # voxels along the side of a block
+AGREE = 0.3  # cosine between normals above which two votes speak of the same side of the object
+
+
+@njit(cache=True)
+def blocks_near(points, origin, block_m, reach_m, shape):
+    """Return the coordinates (b, 3) of the blocks of a grid that come within reach of a point, in ascending order.
+
+    Args:
+        points: (n, 3) in m.
+        origin: (3,) lowest corner of the grid in m.
+        block_m: side of a block.
+        reach_m: half the side of the cube around each point that must be covered.
+        shape: (3,) blocks along each axis.
+    """
+    touched = np.zeros((shape[0], shape[1], shape[2]), dtype=np.bool_)
+    low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
+    for i in range(len(points)):
+        for k in range(3):
+            low[k] = max(0, math.floor((points[i, k] - reach_m - origin[k]) / block_m))
+            high[k] = min(shape[k] - 1, math.floor((points[i, k] + reach_m - origin[k]) / block_m))
+        for x in range(low[0], high[0] + 1):
+            for y in range(low[1], high[1] + 1):
+                for z in range(low[2], high[2] + 1):
+                    touched[x, y, z] = True
+    blocks = np.empty((int(np.sum(touched)), 3), dtype=np.int64)
+    count = 0
+    for x in range(shape[0]):
+        for y in range(shape[1]):
+            for z in range(shape[2]):
+                if touched[x, y, z]:
+                    blocks[count, 0], blocks[count, 1], blocks[count, 2] = x, y, z
+                    count += 1
+    return blocks
+
+
+@njit(cache=True)
+def project(pose, lens, x, y, z):
+    """Return column, row (px) and depth (m) of a point of the object frame; depth <= 0 behind the camera."""
+    depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+    if depth <= 0.0:
+        return -1.0, -1.0, depth
+    u = lens[0] * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + lens[2]
+    v = lens[1] * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + lens[3]
+    return u, v, depth
+
+
+@njit(cache=True)
+def blend(seen, distance, weight, number, normals, emptiness, tau_m):
+    """Return signed distance and weight of a voxel from the votes of the views.
+
+    A view that sees a voxel in front of a surface knows that it is empty; one that sees it behind only supposes that it
+    is full. The nearest surface sets the side of the object that is spoken of, an opposing view that looks at the voxel
+    from the front takes over, and only votes for that side are averaged: so walls thinner than the band stay walls.
+    """
+    best, best_score = -1, 0.0
+    for k in range(seen):
+        score = weight[k] * (1.01 - abs(distance[k]) / tau_m)
+        if score > best_score:
+            best, best_score = k, score
+    if best < 0:
+        return tau_m, emptiness
+    if distance[best] < 0.0:
+        side, other, other_score = number[best], -1, 0.3 * best_score
+        for k in range(seen):
+            n = number[k]
+            cosine = (
+                normals[side, 0] * normals[n, 0] + normals[side, 1] * normals[n, 1] + normals[side, 2] * normals[n, 2]
+            )
+            score = weight[k] * (1.01 - abs(distance[k]) / tau_m)
+            if distance[k] > 0.0 and cosine < AGREE and score > other_score:
+                other, other_score = k, score
+        if other >= 0:
+            best = other
+    side = number[best]
+    total, value = emptiness, emptiness * tau_m
+    for k in range(seen):
+        n = number[k]
+        cosine = normals[side, 0] * normals[n, 0] + normals[side, 1] * normals[n, 1] + normals[side, 2] * normals[n, 2]
+        if cosine > AGREE:
+            total += weight[k]
+            value += weight[k] * distance[k]
+    return value / total, total
+
+
+@njit(cache=True, parallel=True)
+def integrate(blocks, origin, voxel_m, tau_m, empty_weight, index, free_m, poses, lenses, points, normals, weights):
+    """Return signed distance and weight of the voxels of some blocks, each (b, SIDE, SIDE, SIDE) float32.
+
+    The distance of a voxel to the surface a view sees along its ray is measured along the surface's normal, positive
+    outside, and kept within the band ±`tau_m`; beyond the band in front, the space seen empty votes with
+    `empty_weight`. Weight 0 = seen by nobody. Values sit at voxel centres: origin + (index + ½) voxel_m.
+
+    Args:
+        blocks: (b, 3) block coordinates.
+        origin: (3,) lowest corner of the grid in m.
+        voxel_m: side of a voxel.
+        tau_m: half width of the band.
+        empty_weight: weight of a view that sees the voxel empty, against 1 for a surface seen head-on.
+        index: (f, h, w) int32.
+        free_m: (f, h, w) float32.
+        poses: (f, 3, 4) camera_from_object.
+        lenses: (f, 4).
+        points: (n, 3).
+        normals: (n, 3).
+        weights: (n,).
+    """
+    frames, height, width = index.shape
+    values = np.zeros((len(blocks), SIDE**3), dtype=np.float32)
+    totals = np.zeros((len(blocks), SIDE**3), dtype=np.float32)
+    for b in prange(len(blocks)):
+        distance = np.empty((SIDE**3, frames))
+        weight = np.empty((SIDE**3, frames))
+        number = np.empty((SIDE**3, frames), dtype=np.int64)
+        seen = np.zeros(SIDE**3, dtype=np.int64)
+        emptiness = np.zeros(SIDE**3)
+        for f in range(frames):
+            pose, lens = poses[f], lenses[f]
+            for voxel in range(SIDE**3):
+                x = origin[0] + (blocks[b, 0] * SIDE + voxel // (SIDE * SIDE) + 0.5) * voxel_m
+                y = origin[1] + (blocks[b, 1] * SIDE + voxel // SIDE % SIDE + 0.5) * voxel_m
+                z = origin[2] + (blocks[b, 2] * SIDE + voxel % SIDE + 0.5) * voxel_m
+                u, v, depth = project(pose, lens, x, y, z)
+                if not (depth > 0.0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+                    continue
+                row, column = int(v + 0.5), int(u + 0.5)
+                n = index[f, row, column]
+                along = 2.0 * tau_m
+                if n >= 0:
+                    along = (
+                        normals[n, 0] * (x - points[n, 0])
+                        + normals[n, 1] * (y - points[n, 1])
+                        + normals[n, 2] * (z - points[n, 2])
+                    )
+                if abs(along) <= tau_m:
+                    k = seen[voxel]
+                    distance[voxel, k], number[voxel, k] = along, n
+                    # What lies behind a surface is a guess that fades with depth.
+                    weight[voxel, k] = weights[n] * min(1.0, 1.5 * (1.0 + along / tau_m) + 1e-3)
+                    seen[voxel] = k + 1
+                elif along > 0.0 and depth < free_m[f, row, column] - tau_m:
+                    emptiness[voxel] += empty_weight
+        for voxel in range(SIDE**3):
+            if seen[voxel] > 0 or emptiness[voxel] > 0.0:
+                values[b, voxel], totals[b, voxel] = blend(
+                    seen[voxel], distance[voxel], weight[voxel], number[voxel], normals, emptiness[voxel], tau_m
+                )
+    shape = (len(blocks), SIDE, SIDE, SIDE)
+    return values.reshape(shape), totals.reshape(shape)
+
+
+@njit(cache=True, parallel=True)
+def survey(
+    queries, directions, tolerance_m, tau_m, index, free_m, poses, lenses, points, normals, weights, colour, coloured
+):
+    """Return what the views say of oriented points: support (n,), emptiness (n,), and RGB (n, 3) with its weight (n,).
+
+    A view supports a point where it sees, along the same pixel, a surface within `tolerance_m` that faces the same way;
+    it calls the point empty where it sees past it. Colours are averaged over the supporting views, the frontal ones
+    first.
+
+    Args:
+        queries: (n, 3) in the object frame.
+        directions: (n, 3) unit normals.
+        tolerance_m: largest distance along the normal.
+        tau_m: how far in front of what a view sees a point must lie to be empty.
+        index: (f, h, w) int32.
+        free_m: (f, h, w) float32.
+        poses: (f, 3, 4) camera_from_object.
+        lenses: (f, 4).
+        points: (p, 3).
+        normals: (p, 3).
+        weights: (p,).
+        colour: (f, h, w, 3) uint8.
+        coloured: (f,) bool, which views have colour.
+    """
+    frames, height, width = index.shape
+    support, emptiness = np.zeros(len(queries)), np.zeros(len(queries))
+    sums, shares = np.zeros((len(queries), 3)), np.zeros(len(queries))
+    for q in prange(len(queries)):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        for f in range(frames):
+            u, v, depth = project(poses[f], lenses[f], x, y, z)
+            column, row = math.floor(u + 0.5), math.floor(v + 0.5)
+            if depth <= 0.0 or not (0 <= column < width and 0 <= row < height):
+                continue
+            n = index[f, row, column]
+            if depth < free_m[f, row, column] - tau_m:
+                emptiness[q] += 1.0
+            if n < 0:
+                continue
+            along = (
+                normals[n, 0] * (x - points[n, 0])
+                + normals[n, 1] * (y - points[n, 1])
+                + normals[n, 2] * (z - points[n, 2])
+            )
+            facing = (
+                normals[n, 0] * directions[q, 0] + normals[n, 1] * directions[q, 1] + normals[n, 2] * directions[q, 2]
+            )
+            if abs(along) > tolerance_m or facing < AGREE:
+                continue
+            support[q] += weights[n]
+            if not coloured[f]:
+                continue
+            left, top = math.floor(u), math.floor(v)
+            if left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
+                continue
+            share = weights[n] * weights[n] * weights[n] * weights[n]
+            right, bottom = u - left, v - top
+            shares[q] += share
+            for c in range(3):
+                sums[q, c] += share * (
+                    (1.0 - bottom) * ((1.0 - right) * colour[f, top, left, c] + right * colour[f, top, left + 1, c])
+                    + bottom * ((1.0 - right) * colour[f, top + 1, left, c] + right * colour[f, top + 1, left + 1, c])
+                )
+    for q in prange(len(queries)):
+        if shares[q] > 0.0:
+            for c in range(3):
+                sums[q, c] /= shares[q]
+    return support, emptiness, sums, shares
+
+
+@njit(cache=True)
+def surfels(depth_m, wanted, mask, lens, sigma_m, max_slope):
+    """Fit a small plane at pixels, fit for silhouettes and thin parts: where little is known it turns to the camera.
+
+    The neighbours are the object's pixels in a window of 5×5 that a surface no steeper than `max_slope` can reach. A
+    pixel with fewer than three of them hangs in the air and gets none.
+
+    Args:
+        depth_m: (h, w) z in m, NaN = missing.
+        wanted: (n, 2) row and column.
+        mask: (h, w) bool, object.
+        lens: (4,) fx, fy, cx, cy.
+        sigma_m: noise of z.
+        max_slope: tangent of the steepest angle between surface and image plane.
+
+    Returns:
+        Points (n, 3) and unit normals (n, 3) in camera coordinates; normals are 0 where there is none.
+    """
+    height, width = depth_m.shape
+    points, normals = np.zeros((len(wanted), 3)), np.zeros((len(wanted), 3))
+    for q in range(len(wanted)):
+        row, column = wanted[q, 0], wanted[q, 1]
+        z = depth_m[row, column]
+        if not z > 0.0:
+            continue
+        step_x, step_y = z / lens[0], z / lens[1]
+        sxx = sxy = syy = sxz = syz = 0.0
+        near = 0
+        for r in range(max(0, row - 2), min(height, row + 3)):
+            for c in range(max(0, column - 2), min(width, column + 3)):
+                if not mask[r, c] or (r == row and c == column):
+                    continue
+                x, y, dz = (c - column) * step_x, (r - row) * step_y, depth_m[r, c] - z
+                if not abs(dz) <= max_slope * math.sqrt(x * x + y * y) + 2.0 * sigma_m:
+                    continue
+                sxx, sxy, syy, sxz, syz = sxx + x * x, sxy + x * y, syy + y * y, sxz + x * dz, syz + y * dz
+                near += abs(r - row) <= 1 and abs(c - column) <= 1
+        if near < 3:
+            continue
+        # A slope of 1 costs as much as a misfit of one noise: with few neighbours the plane faces the camera.
+        ridge = sigma_m * sigma_m + 0.1 * step_x * step_x
+        sxx, syy = sxx + ridge, syy + ridge
+        determinant = sxx * syy - sxy * sxy
+        p, q_ = (syy * sxz - sxy * syz) / determinant, (sxx * syz - sxy * sxz) / determinant
+        w, h = (column - lens[2]) / lens[0], (row - lens[3]) / lens[1]
+        # With z = z0 + p dx + q dy over the pixel offsets, and x = w z: the tangents give the normal.
+        along = 1.0 + p * w + q_ * h
+        length = math.sqrt(p * p + q_ * q_ + along * along)
+        points[q, 0], points[q, 1], points[q, 2] = w * z, h * z, z
+        normals[q, 0], normals[q, 1], normals[q, 2] = p / length, q_ / length, -along / length
+    return points, normals

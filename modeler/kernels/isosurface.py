@@ -1,0 +1,203 @@
+"""Dual marching cubes: the zero level of a signed distance that is known in parts of a grid.
+
+A vertex lies in every cell for each piece of surface that crosses it, a quad around every grid edge that changes sign
+(Nielson 2004, "Dual marching cubes"). Quads need all four cells around their edge known, so the surface stays open
+where nobody looked. Corners of a cell are numbered 4 dx + 2 dy + dz; its edges 4 axis + 2 a + b, with a and b the
+offsets along the two other axes in ascending order.
+"""
+
+import numpy as np
+from numba import njit
+
+
+def _edge(first: int, second: int) -> int:
+    """Return the number of the edge between two neighbouring corners."""
+    axis = {4: 0, 2: 1, 1: 2}[first ^ second]
+    offsets = [(first >> 2) & 1, (first >> 1) & 1, first & 1]
+    del offsets[axis]
+    return 4 * axis + 2 * offsets[0] + offsets[1]
+
+
+def _pieces() -> np.ndarray:
+    """Return (256, 12) int8: which piece of surface crosses each edge of a cell, by its corners' signs; -1 = none.
+
+    Bit c of the case is set where corner c is inside. Two pieces meet in a face whose diagonals differ; there the
+    inside corners are joined, which keeps thin parts whole, and the choice rests on the face alone: neighbours agree.
+    """
+    faces = []
+    for axis in range(3):
+        one, two = 4 >> ((axis + 1) % 3), 4 >> ((axis + 2) % 3)
+        for level in (0, 4 >> axis):
+            faces.append([level, level | one, level | one | two, level | two])
+    table = np.full((256, 12), -1, dtype=np.int8)
+    for case in range(256):
+        links: dict[int, list[int]] = {}
+        for face in faces:
+            inside = [bool(case >> corner & 1) for corner in face]
+            edges = [_edge(face[k], face[(k + 1) % 4]) for k in range(4)]
+            crossed = [edges[k] for k in range(4) if inside[k] != inside[(k + 1) % 4]]
+            if (
+                len(crossed) == 4
+            ):  # join the inside: cut off the outside corners, each with the two edges that meet there
+                pairs = [(edges[k - 1], edges[k]) for k in range(4) if not inside[k]]
+            else:
+                pairs = [(crossed[0], crossed[1])] if crossed else []
+            for a, b in pairs:
+                links.setdefault(a, []).append(b)
+                links.setdefault(b, []).append(a)
+        piece = 0
+        for start in sorted(links):
+            if table[case, start] >= 0:
+                continue
+            waiting = [start]
+            while waiting:
+                edge = waiting.pop()
+                if table[case, edge] < 0:
+                    table[case, edge] = piece
+                    waiting.extend(links[edge])
+            piece += 1
+    return table
+
+
+PIECES = _pieces()
+
+
+@njit(cache=True)
+def fill(values, totals, cells, least):
+    """Return the unknown voxels (m, 3) with at least `least` known ones among their 26 neighbours, and the means (m,).
+
+    Args:
+        values: (x, y, z) float32.
+        totals: (x, y, z) float32, 0 = unknown; the outermost voxels are unknown.
+        cells: (n, 3) known voxels, in ascending order.
+        least: neighbours asked for; more than half of them keeps open borders where they are.
+    """
+    counts = np.zeros(values.shape, dtype=np.uint8)
+    sums = np.zeros(values.shape, dtype=np.float32)
+    for n in range(len(cells)):
+        i, j, k = cells[n, 0], cells[n, 1], cells[n, 2]
+        for di in range(-1, 2):
+            for dj in range(-1, 2):
+                for dk in range(-1, 2):
+                    if totals[i + di, j + dj, k + dk] == 0.0:
+                        counts[i + di, j + dj, k + dk] += 1
+                        sums[i + di, j + dj, k + dk] += values[i, j, k]
+    count = 0
+    filled = np.empty((np.sum(counts >= least), 3), dtype=np.int64)
+    means = np.empty(len(filled), dtype=np.float32)
+    for i in range(1, values.shape[0] - 1):
+        for j in range(1, values.shape[1] - 1):
+            for k in range(1, values.shape[2] - 1):
+                if counts[i, j, k] >= least:
+                    filled[count, 0], filled[count, 1], filled[count, 2] = i, j, k
+                    means[count] = sums[i, j, k] / counts[i, j, k]
+                    count += 1
+    return filled[:count], means[:count]
+
+
+@njit(cache=True)
+def extract(values, totals, cells, pieces):
+    """Return the zero level: vertices (v, 3) in voxels from the centre of voxel 0, and triangles (t, 3).
+
+    Triangles are counter-clockwise seen from where the distance is positive. Order follows `cells`.
+
+    Args:
+        values: (x, y, z) float32, negative inside.
+        totals: (x, y, z) float32, 0 = unknown; the outermost voxels are unknown.
+        cells: (n, 3) known voxels, in ascending order.
+        pieces: `PIECES`.
+    """
+    # First the vertices: one for each piece in each cell whose eight corners are known.
+    first = np.full(values.shape, -1, dtype=np.int32)
+    cases = np.zeros(values.shape, dtype=np.uint8)
+    count = 0
+    for n in range(len(cells)):
+        i, j, k = cells[n, 0], cells[n, 1], cells[n, 2]
+        case, known = 0, True
+        for c in range(8):
+            a, b, d = i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1)
+            if totals[a, b, d] == 0.0:
+                known = False
+                break
+            if values[a, b, d] < 0.0:
+                case |= 1 << c
+        if known and 0 < case < 255:
+            cases[i, j, k] = case
+            first[i, j, k] = count
+            count += np.max(pieces[case]) + 1
+    vertices = np.zeros((count, 3))
+    crossings = np.zeros(count)
+    quads = 0
+    for n in range(len(cells)):
+        i, j, k = cells[n, 0], cells[n, 1], cells[n, 2]
+        if first[i, j, k] < 0:
+            continue
+        for edge in range(12):
+            piece = pieces[cases[i, j, k], edge]
+            if piece < 0:
+                continue
+            axis, a, b = edge // 4, (edge >> 1) & 1, edge & 1
+            x, y, z = i, j, k
+            if axis == 0:
+                y, z = y + a, z + b
+            elif axis == 1:
+                x, z = x + a, z + b
+            else:
+                x, y = x + a, y + b
+            start = values[x, y, z]
+            stop = values[x + (axis == 0), y + (axis == 1), z + (axis == 2)]
+            share = start / (start - stop)
+            v = first[i, j, k] + piece
+            vertices[v, 0] += x + (share if axis == 0 else 0.0)
+            vertices[v, 1] += y + (share if axis == 1 else 0.0)
+            vertices[v, 2] += z + (share if axis == 2 else 0.0)
+            crossings[v] += 1.0
+            if a == 1 and b == 1:
+                quads += 1
+    for v in range(count):
+        for c in range(3):
+            vertices[v, c] /= crossings[v]
+
+    # Then a quad around every crossed edge: seen by the cell that has it as its last one, and its three neighbours.
+    triangles = np.empty((2 * quads, 3), dtype=np.int64)
+    corner = np.empty(4, dtype=np.int64)
+    count = 0
+    for n in range(len(cells)):
+        i, j, k = cells[n, 0], cells[n, 1], cells[n, 2]
+        if first[i, j, k] < 0:
+            continue
+        for axis in range(3):
+            if pieces[cases[i, j, k], 4 * axis + 3] < 0:
+                continue
+            x, y, z = i + (axis != 0), j + (axis != 1), k + (axis != 2)  # where the edge starts
+            known = True
+            for turn in range(4):  # the cells around the edge, counter-clockwise in the plane of the two other axes
+                one, two = (turn == 1 or turn == 2), turn >= 2
+                p, q, r = i, j, k
+                if axis == 0:
+                    q, r = q + one, r + two
+                elif axis == 1:
+                    p, r = p + one, r + two
+                else:
+                    p, q = p + one, q + two
+                if first[p, q, r] < 0:
+                    known = False
+                    break
+                edge = 4 * axis + 2 * (1 - one) + (1 - two)
+                corner[turn] = first[p, q, r] + pieces[cases[p, q, r], edge]
+            if not known:
+                continue
+            # x × z points against y, so the middle axis turns the other way round.
+            if (values[x, y, z] >= 0.0) != (axis == 1):
+                corner[1], corner[3] = corner[3], corner[1]
+            even, odd = 0.0, 0.0
+            for c in range(3):
+                even += (vertices[corner[0], c] - vertices[corner[2], c]) ** 2
+                odd += (vertices[corner[1], c] - vertices[corner[3], c]) ** 2
+            shift = 0 if even <= odd else 1  # cut along the shorter diagonal
+            for half in range(2):
+                triangles[count, 0] = corner[shift]
+                triangles[count, 1] = corner[(shift + 1 + half) % 4]
+                triangles[count, 2] = corner[(shift + 2 + half) % 4]
+                count += 1
+    return vertices, triangles[:count]
