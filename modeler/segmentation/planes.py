@@ -1,0 +1,216 @@
+"""The planes of a depth image, and which of them an object stands on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from modeler.segmentation.noise import DepthNoise
+from modeler.segmentation.plane_fit import fit_plane, heights, least_squares
+from modeler.types import Array, BoolArray, Plane
+
+Float32 = npt.NDArray[np.float32]
+
+_CELL_PX = 5
+_CELL_SHARE = 0.7  # of a cell's pixels that must have been measured
+_MAX_HYPOTHESES = 200
+_MOST_PLANES = 10
+_UPRIGHT = 0.2  # least upward (-y) part of the normal of a plane that faces up
+_SAME_DIRECTION = np.cos(np.radians(20.0))  # between the normals of a cell and of the plane that it is part of
+_LEVEL = np.cos(np.radians(2.0))
+_LEVEL_BONUS = 1.5  # on the votes for level planes
+_PARALLEL = np.cos(np.radians(5.0))
+_ABOVE_SHARE = 0.95  # of an object that lies above its support
+_REACH_SIZES = 1.5  # how far from its centre an object's surroundings go, in sizes of the object
+_LEAST_SEEN = 50  # points
+_MAX_GROUND = 6000  # points; more are no better, as their errors are correlated
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """The flat cells of an image."""
+
+    mean: Array
+    """(n, 3)."""
+    normal: Array
+    """(n, 3) towards the camera."""
+    count: Array
+    """(n,) points."""
+    tolerance_m: Array
+    """(n,)."""
+
+    @property
+    def weight(self) -> Array:
+        """Weights (n,) in least squares."""
+        return self.count / self.tolerance_m**2
+
+    def agree(self, at: Array, normals: Array) -> BoolArray:
+        """Return which cells (n,) are part of planes (m,) through points (m, 3) with normals (m, 3), as (n, m)."""
+        off = self.mean @ normals.T - np.einsum("mi,mi->m", at, normals)
+        return (np.abs(off) < self.tolerance_m[:, None]) & (self.normal @ normals.T > _SAME_DIRECTION)
+
+    def on(self, plane: Array, width: float) -> BoolArray:
+        """Return which cells (n,) are part of a plane (4,), within so many tolerances."""
+        near = np.abs(heights(self.mean, plane)) < width * self.tolerance_m
+        return near & (self.normal @ plane[:3] > _SAME_DIRECTION)
+
+
+def dominant_planes(
+    points: Float32, noise: DepthNoise, *, least_share: float = 0.006, prefer_level: bool = False
+) -> Array:
+    """Find the planes that cover most of an image, largest first.
+
+    Flat cells of the image propose planes, the cells vote, and the winner's cells are taken out. Nothing is random.
+
+    Args:
+        points: (h, w, 3) image of points in camera coordinates, m; NaN where nothing was measured.
+        noise: of the depth camera.
+        least_share: share of the image that a plane must cover.
+        prefer_level: once a plane that faces up is found, prefer others parallel to it: a small plate half hidden by
+            what stands on it is level, too.
+
+    Returns:
+        (k, 4) unit normals towards the camera and offsets.
+    """
+    cells = _flat_cells(points, noise)
+    least = least_share * points.shape[0] * points.shape[1]
+    free = np.ones(len(cells.mean), dtype=np.bool_)
+    level: Array | None = None
+    planes: list[Array] = []
+    while len(planes) < _MOST_PLANES and cells.count[free].sum() >= least:
+        plane = _largest(cells, free, level)
+        taken = free & cells.on(plane, 2.0)
+        if cells.count[taken].sum() < least:
+            break
+        planes.append(plane)
+        free &= ~taken
+        if prefer_level and level is None and upright(plane[None])[0]:
+            level = plane[:3]
+    return np.array(planes).reshape(-1, 4)
+
+
+def choose_support(planes: Array, body: Float32, ground: Float32, noise: DepthNoise) -> Array | None:
+    """Choose the plane that an object stands on.
+
+    That is the highest plane with almost all of the object above it that is seen near the object and not far below it.
+    Planes parallel to the first that faces up in the image go before others that face up, and those before the rest: a
+    carton does not stand on the wall behind it.
+
+    Args:
+        planes: (k, 4) normals and offsets, largest first.
+        body: (n, 3) points of the object.
+        ground: (m, 3) points near the object and not of it.
+        noise: of the depth camera.
+
+    Returns:
+        (4,) normal and offset, or None where nothing holds the object.
+    """
+    if len(body) == 0:
+        return None
+    size = extent(body)[1]
+    body = body[:: 1 + len(body) // _MAX_GROUND]
+    tolerance = noise.tolerance_m(body[:, 2])
+    facing = upright(planes)
+    rank = facing.astype(np.int64)
+    if facing.any():
+        rank += facing & (planes[:, :3] @ planes[facing.argmax(), :3] > _PARALLEL)
+    best, found = (-1, 0.0), None
+    for plane, grade in zip(planes, rank, strict=True):
+        height = heights(body, plane)
+        seen = np.count_nonzero(np.abs(heights(ground, plane)) < np.median(tolerance))
+        holds = np.mean(height > -tolerance) > _ABOVE_SHARE and np.percentile(height, 5) < 0.5 * size
+        merit = (int(grade), -float(np.median(height)))
+        if seen >= _LEAST_SEEN and holds and merit > best:
+            best, found = merit, plane
+    return found
+
+
+def fit_beside(ground: Float32, body: Float32, *, guess: Array, noise: DepthNoise) -> Plane | None:
+    """Fit the support of an object.
+
+    Args:
+        ground: (m, 3) points near the object and not of it.
+        body: (n, 3) points of the object.
+        guess: (4,) the support, roughly.
+        noise: of the depth camera.
+    """
+    ground = ground[np.abs(heights(ground, guess)) < noise.tolerance_m(ground[:, 2])]
+    points = ground[:: 1 + len(ground) // _MAX_GROUND].astype(np.float64)
+    centre = extent(body)[0]
+    foot = centre - guess[:3] * float(heights(centre, guess))
+    return fit_plane(points, sigma_m=noise.sigma_m(points[:, 2]), guess=guess, foot_m=foot)
+
+
+def surroundings(points: Float32, found: BoolArray) -> BoolArray:
+    """Return the pixels (h, w) near an object and not of it, where its support may be seen.
+
+    Args:
+        points: (h, w, 3) image of points.
+        found: (h, w) the object.
+    """
+    body = points[found & np.isfinite(points[..., 2])]
+    if len(body) == 0:
+        return np.zeros_like(found)
+    centre, size = extent(body)
+    square = np.zeros(found.shape, dtype=np.float32)
+    for axis in range(3):
+        square += (points[..., axis] - np.float32(centre[axis])) ** 2
+    beside: BoolArray = np.logical_not(ndimage.binary_dilation(found, iterations=2))
+    return beside & (square < (_REACH_SIZES * size) ** 2)
+
+
+def extent(points: Float32) -> tuple[Array, float]:
+    """Return the median (3,) of points (n, 3) and the length of the box that holds most of them."""
+    low, centre, high = np.percentile(points, [5.0, 50.0, 95.0], axis=0).astype(np.float64)
+    return centre, float(np.linalg.norm(high - low))
+
+
+def upright(planes: Array) -> BoolArray:
+    """Return which planes (k, 4) face up in the image."""
+    return -planes[:, 1] > _UPRIGHT
+
+
+def _largest(cells: _Cells, free: BoolArray, level: Array | None) -> Array:
+    """Return the plane (4,) that most of the free cells are part of; planes normal to `level` (3,) get a bonus."""
+    tried = np.flatnonzero(free)
+    tried = tried[:: 1 + len(tried) // _MAX_HYPOTHESES]
+    normals = [cells.normal[tried]] + ([] if level is None else [np.tile(level, (len(tried), 1))])
+    agree = np.concatenate([cells.agree(cells.mean[tried], normal) for normal in normals], axis=1) & free[:, None]
+    merit = cells.count @ agree
+    merit[len(tried) :] *= _LEVEL_BONUS
+    best = int(merit.argmax())
+    first = inlier = agree[:, best]
+    plane = np.append(cells.normal[tried[best % len(tried)]], np.inf)
+    for _ in range(4):
+        if np.count_nonzero(inlier) < 3:
+            break
+        plane = least_squares(cells.mean[inlier], cells.weight[inlier])
+        inlier = free & cells.on(plane, 1.0)
+    if level is not None and best >= len(tried) and plane[:3] @ level < _LEVEL:
+        # What stands on it tilted the fit: keep it level.
+        plane = np.append(level, -float(np.average(cells.mean[first] @ level, weights=cells.weight[first])))
+    return plane
+
+
+def _flat_cells(points: Float32, noise: DepthNoise) -> _Cells:
+    """Return the flat cells of an image of points (h, w, 3)."""
+    rows, columns = points.shape[0] // _CELL_PX, points.shape[1] // _CELL_PX
+    block = points[: rows * _CELL_PX, : columns * _CELL_PX].reshape(rows, _CELL_PX, columns, _CELL_PX, 3)
+    block = block.swapaxes(1, 2).reshape(rows * columns, _CELL_PX**2, 3)
+    finite = np.isfinite(block[..., 2])
+    kept = finite.sum(axis=1) >= _CELL_SHARE * _CELL_PX**2
+    block, finite = block[kept].astype(np.float64), finite[kept]
+    count = finite.sum(axis=1).astype(np.float64)
+    block[~finite] = 0.0
+    mean = block.sum(axis=1) / count[:, None]
+    centred = (block - mean[:, None]) * finite[..., None]
+    values, vectors = np.linalg.eigh(centred.swapaxes(1, 2) @ centred / count[:, None, None])
+    flat = np.sqrt(np.maximum(values[:, 0], 0.0)) < noise.tolerance_m(mean[:, 2])
+    normal = vectors[flat, :, 0]
+    normal *= np.where(np.einsum("ni,ni->n", normal, mean[flat]) > 0.0, -1.0, 1.0)[:, None]
+    return _Cells(mean[flat], normal, count[flat], noise.tolerance_m(mean[flat, 2]))
