@@ -1,0 +1,31 @@
+"""Which frames of a sequence are registered with each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import final
+
+
+@final
+@dataclass(frozen=True)
+class Pairing:
+    """Which frames are registered with each other."""
+
+    offsets: tuple[int, ...] = (1,)
+    """How many frames lie between source and target, in the order of the sequence; each offset is a table."""
+    both_ways: bool = False
+    """Register each pair in both directions, not only the later frame to the earlier."""
+    closed: bool = False
+    """The sequence is a full turn: its last frame is followed by its first."""
+
+    def pairs(self, indices: Sequence[int]) -> Iterator[tuple[int, int, int]]:
+        """Yield source, target and offset of every pair of these frame numbers."""
+        count = len(indices)
+        for offset in self.offsets:
+            for position in range(count if self.closed else count - offset):
+                target, source = indices[position], indices[(position + offset) % count]
+                if source != target:
+                    yield source, target, offset
+                    if self.both_ways:
+                        yield target, source, offset

@@ -1,0 +1,250 @@
+"""Experiments: which pairs are tried, what is told of them, and what is written."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tabletop
+from PIL import Image
+
+from modeler import se3
+from modeler.experiment import Experiment, Pairing, Trial, evaluate, sparse, summaries
+from modeler.priors import GeneralPrior
+from modeler.types import (
+    AbstractMotion,
+    AbstractPrior,
+    AbstractRegistrar,
+    Array,
+    Frame,
+    InputError,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+)
+from viz.figures import rotation_errors
+
+BODY = tabletop.Box((0.05, 0.08, 0.035))
+POSES = dict(enumerate(tabletop.turntable(24)[2:6]))
+SIGMAS = np.repeat([0.01, 0.002], 3)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A box turned in front of the camera by 15° a frame."""
+
+    name: str = "box"
+    known: bool = True
+    lost: int | None = None
+    indices: tuple[int, ...] = tuple(POSES)
+
+    def frame(self, index: int) -> Frame:
+        frame = tabletop.view(BODY, POSES[index], index).frame
+        return replace(frame, mask=np.zeros_like(frame.mask)) if index == self.lost else frame
+
+    def truth(self) -> Mapping[int, Array] | None:
+        return POSES if self.known else None
+
+    def sensor(self) -> tuple[float, float] | None:
+        return 0.002, 0.001
+
+
+@dataclass(frozen=True)
+class Oracle(AbstractRegistrar):
+    """Knows the truth, and is off by an error of the size it states."""
+
+    off_rad: float = 0.0
+
+    def register(
+        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+    ) -> Posterior:
+        truth = POSES[target.index] @ se3.inverse(POSES[source.index])
+        error = se3.exp(rng.normal(size=6) * SIGMAS) @ se3.exp(np.array([self.off_rad, 0, 0, 0, 0, 0]))
+        pose = PoseGaussian(truth @ se3.inverse(error), np.diag(SIGMAS**2))
+        return Posterior(source.index, target.index, pose, Outcome.CONVERGED, 0.5, seconds=0.25)
+
+
+class Refusing(AbstractPrior):
+    """Lacks what it needs."""
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+        raise InputError("no robot was seen")
+
+
+def experiment(**changes: object) -> Experiment:
+    methods = {"good": Oracle(), "bad": Oracle(off_rad=0.6)}
+    return replace(Experiment(methods, GeneralPrior(), pairing=Pairing(offsets=(1, 2))), **changes)
+
+
+@pytest.mark.parametrize(
+    ("pairing", "pairs"),
+    [
+        (Pairing(), [(3, 1, 1), (7, 3, 1)]),
+        (Pairing(offsets=(2,)), [(7, 1, 2)]),
+        (Pairing(offsets=(1, 2)), [(3, 1, 1), (7, 3, 1), (7, 1, 2)]),
+        (Pairing(both_ways=True), [(3, 1, 1), (1, 3, 1), (7, 3, 1), (3, 7, 1)]),
+        (Pairing(closed=True), [(3, 1, 1), (7, 3, 1), (1, 7, 1)]),
+        (Pairing(offsets=(3, 5)), []),
+    ],
+)
+def test_pairs_frames_at_an_offset_of_the_sequence(pairing: Pairing, pairs: list[tuple[int, int, int]]) -> None:
+    assert list(pairing.pairs((1, 3, 7))) == pairs
+
+
+def test_pairs_of_the_dragon_protocol_are_thirty_a_step() -> None:
+    pairs = list(Pairing(offsets=(1, 2, 3, 4), both_ways=True, closed=True).pairs(range(15)))
+    assert len(set(pairs)) == 4 * 30
+
+
+def test_tries_every_pair_by_every_method_and_knows_how_many() -> None:
+    trials = list(experiment().trials(Recording()))
+    assert len(trials) == experiment().size(Recording()) == 10
+    assert [(t.method, t.offset, t.source, t.target) for t in trials[:3]] == [
+        ("good", 1, 1, 0),
+        ("bad", 1, 1, 0),
+        ("good", 1, 2, 1),
+    ]
+
+
+def test_measures_errors_in_the_units_that_it_says() -> None:
+    for trial in experiment().trials(Recording()):
+        assert trial.rotation_deg == pytest.approx(15.0 * trial.offset)
+        assert trial.sigma_deg == pytest.approx(np.degrees(0.01 * np.sqrt(3)))
+        assert (trial.overlap, trial.seconds, trial.outcome, trial.usable) == (0.5, 0.25, "converged", True)
+        if trial.method == "bad":
+            assert trial.rotation_error_deg == pytest.approx(np.degrees(0.6), abs=5.0)
+            assert trial.nees > 1000.0
+        else:
+            assert trial.rotation_error_deg < 3.0
+            assert trial.nees < 30.0
+
+
+def test_same_seed_gives_the_same_trials() -> None:
+    first, again = (list(experiment(points=80).trials(Recording())) for _ in range(2))
+    assert first == again
+    assert first != list(experiment(points=80, seed=1).trials(Recording()))
+
+
+def test_tells_of_views_without_an_object_and_goes_on() -> None:
+    trials = list(experiment(pairing=Pairing()).trials(Recording(lost=1)))
+    lost = [t for t in trials if 1 in (t.source, t.target)]
+    assert len(lost) == 4
+    assert {t.outcome for t in lost} == {"too few points"}
+    assert not any(t.usable or math.isfinite(t.rotation_error_deg) for t in lost)
+    assert all(t.usable for t in trials if t not in lost)
+
+
+def test_tells_where_the_prior_does_not_apply() -> None:
+    trials = list(experiment(prior=Refusing()).trials(Recording()))
+    assert {(t.outcome, t.usable) for t in trials} == {("no robot was seen", False)}
+
+
+def test_sparse_keeps_so_many_pixels_of_the_object_and_all_of_the_rest() -> None:
+    frame = tabletop.view(BODY, POSES[0], 0).frame
+    assert frame.mask is not None
+    thin = sparse(frame, 50, np.random.default_rng(0))
+    measured = np.isfinite(thin.depth_m)
+    assert np.sum(measured & frame.mask) == 50
+    np.testing.assert_array_equal(measured[~frame.mask], np.isfinite(frame.depth_m)[~frame.mask])
+    np.testing.assert_array_equal(thin.depth_m[measured], frame.depth_m[measured])
+    np.testing.assert_array_equal(sparse(frame, 10**6, np.random.default_rng(0)).depth_m, frame.depth_m)
+
+
+def test_sparse_experiments_give_methods_few_points() -> None:
+    seen: list[int] = []
+
+    class Counting(AbstractRegistrar):
+        def register(
+            self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        ) -> Posterior:
+            seen.extend([len(source.points_m), len(target.points_m)])
+            return Oracle().register(source, target, motion, rng=rng)
+
+    list(experiment(methods={"counting": Counting()}, points=80).trials(Recording()))
+    assert 0 < max(seen) <= 80
+
+
+def trial(error_deg: float, *, nees: float = 5.0, usable: bool = True) -> Trial:
+    return Trial("box", "icp", 1, 1, 0, "converged", usable, 25.0, error_deg, 2.0, nees, 1.0, 0.5, 0.1)
+
+
+def test_summaries_count_failures_and_leave_them_out_of_quantiles() -> None:
+    failed = Trial("box", "icp", 1, 3, 2, "too few points", usable=False)
+    errors = [1.0, 2.0, 3.0, 4.0, 50.0]
+    (row,) = summaries([*(trial(e) for e in errors), trial(5.0, nees=900.0, usable=False), failed], success_deg=16.2)
+    assert (row.pairs, row.usable, row.successes) == (7, 5, 5)
+    assert row.rotation_error_deg == (2.25, 3.5, 4.75, 50.0)
+    assert row.nees == pytest.approx((5 * 5.0 + 900.0) / 6)
+    assert row.inside_95 == pytest.approx(5 / 6)
+
+
+def test_summaries_of_failures_alone_have_no_quantiles() -> None:
+    (row,) = summaries([Trial("box", "icp", 1, 1, 0, "too few points", usable=False)], success_deg=16.2)
+    assert row.successes == 0
+    assert all(math.isnan(value) for value in (*row.rotation_error_deg, row.nees, row.inside_95, row.seconds))
+
+
+def run(out: Path, *recordings: Recording) -> list[Trial]:
+    told: list[Trial] = []
+    evaluate(recordings or [Recording()], experiment(), out, draw=rotation_errors, told=told.append)
+    return told
+
+
+def test_writes_json_csv_and_a_figure(tmp_path: Path) -> None:
+    told = run(tmp_path / "new" / "folder", Recording(), Recording(name="with a lost frame", lost=1))
+    folder = tmp_path / "new" / "folder"
+    assert sorted(p.name for p in folder.iterdir()) == ["results.csv", "results.json", "rotation_errors.png"]
+    results = json.loads((folder / "results.json").read_text())
+    assert results["schema"] == 1
+    assert results["pairing"] == {"offsets": [1, 2], "both_ways": False, "closed": False}
+    assert len(results["trials"]) == len(told) == 20
+    assert len(results["summaries"]) == 8
+    table = list(csv.DictReader(io.StringIO((folder / "results.csv").read_text())))
+    assert len(table) == 20
+    for row, record, one in zip(table, results["trials"], told, strict=True):
+        assert row["method"] == record["method"] == one.method
+        if math.isfinite(one.rotation_error_deg):
+            assert float(row["rotation_error_deg"]) == record["rotation_error_deg"] == one.rotation_error_deg
+        else:
+            assert row["rotation_error_deg"] == ""
+            assert record["rotation_error_deg"] is None
+    with Image.open(folder / "rotation_errors.png") as picture:
+        assert min(picture.size) > 300
+
+
+def test_same_seed_writes_the_same_files(tmp_path: Path) -> None:
+    for name in ("first", "again"):
+        run(tmp_path / name)
+    for file in ("results.json", "results.csv", "rotation_errors.png"):
+        assert (tmp_path / "first" / file).read_bytes() == (tmp_path / "again" / file).read_bytes()
+
+
+def test_refuses_sequences_without_truth_before_it_begins(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"dark: has no ground truth.*scene_gt\.json"):
+        run(tmp_path / "out", Recording(), Recording(name="dark", known=False))
+    assert not (tmp_path / "out").exists()
+
+
+def test_refuses_two_sequences_of_one_name(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="two sequences are called 'box'"):
+        run(tmp_path / "out", Recording(), Recording())
+
+
+def test_refuses_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="--out"):
+        run(tmp_path / "file" / "out")
+
+
+@pytest.mark.parametrize("trials", [[], [trial(0.0)], [trial(math.nan)], [trial(1e-9), trial(180.0, usable=False)]])
+def test_figures_survive_what_a_log_axis_does_not_hold(trials: list[Trial]) -> None:
+    with Image.open(io.BytesIO(rotation_errors(trials))) as picture:
+        assert picture.format == "PNG"
