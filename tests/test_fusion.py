@@ -1,0 +1,461 @@
+"""Fusion: laws of the kernels, and what a fused model owes to the views."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numba
+import numpy as np
+import open3d as o3d
+import pytest
+import tabletop
+import trimesh
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import KDTree
+
+from modeler import se3
+from modeler.fusion import Fuser, surface
+from modeler.kernels import fusion, isosurface, thinning
+from modeler.rays import Sensor
+from modeler.types import Frame, InputError, ObjectModel, RayImage
+from sequences.bop import BopSequence
+
+BALL = tabletop.Sphere(0.06)
+BRICK = tabletop.Box((0.07, 0.05, 0.04))
+PLATE = tabletop.Box((0.06, 0.0025, 0.05))
+POSES = tabletop.turntable(14)
+VOXEL_M = 0.0025
+FUSER = Fuser(voxel_m=VOXEL_M)
+
+
+def fused(body, *, rng=None, fuser=FUSER, object_from_model=None):
+    return fuser.fuse(tabletop.views(body, POSES, rng), tabletop.trajectory(POSES, object_from_model))
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return fused(BALL)
+
+
+@pytest.fixture(scope="module")
+def brick():
+    return fused(BRICK)
+
+
+def on_surface(model: ObjectModel, count: int = 20000):
+    """Return points drawn evenly on a mesh."""
+    rng = np.random.default_rng(1)
+    area = surface.areas_of(model.vertices_m, model.triangles)
+    chosen = model.triangles[rng.choice(len(area), size=count, p=area / area.sum())]
+    share = rng.dirichlet(np.ones(3), size=count)
+    return np.einsum("nk,nkc->nc", share, model.vertices_m[chosen])
+
+
+def edge_uses(triangles):
+    """Return how often each edge of a mesh occurs in each direction, as two counts (e, 2)."""
+    directed = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges, number = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
+    forward = directed[:, 0] < directed[:, 1]
+    return np.stack([np.bincount(number[forward == side], minlength=len(edges)) for side in (True, False)], axis=1)
+
+
+def same(one: ObjectModel, other: ObjectModel) -> bool:
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in vars(one))
+
+
+# The kernels.
+
+
+def test_thinning_puts_points_of_one_voxel_together(rng):
+    points, weights = rng.uniform(0.0, 0.1, (500, 3)), rng.uniform(0.1, 1.0, 500)
+    cells, count = thinning.thin(points, np.zeros(3), 0.02, np.array([5, 5, 4]))
+    voxels = np.floor(points / 0.02).astype(int)
+    outside = voxels[:, 2] >= 4
+    assert np.array_equal(cells == -1, outside)
+    kept, numbers = voxels[~outside], cells[~outside]
+    assert count == len(np.unique(kept, axis=0)) == numbers.max() + 1
+    assert len(np.unique(np.column_stack([kept, numbers]), axis=0)) == count
+    sums, totals = thinning.average(cells, count, weights, points)
+    for cell in range(count):
+        mine = cells == cell
+        np.testing.assert_allclose(sums[cell], weights[mine] @ points[mine])
+        np.testing.assert_allclose(totals[cell], weights[mine].sum())
+
+
+def test_crowd_counts_the_points_in_the_cells_around(rng):
+    points = rng.uniform(0.0, 0.1, (200, 3))
+    cells = np.floor(points / 0.01).astype(int)
+    expected = [(np.abs(cells - cell).max(axis=1) <= 1).sum() for cell in cells]
+    assert np.array_equal(thinning.crowd(points, np.zeros(3), 0.01, np.array([10, 10, 10])), expected)
+
+
+def test_blocks_near_are_those_that_a_cube_around_a_point_touches(rng):
+    points, shape, reach_m = rng.uniform(0.0, 1.0, (20, 3)), np.array([9, 10, 11]), 0.03
+    found = fusion.blocks_near(points, np.zeros(3), 0.1, reach_m, shape)
+    blocks = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), axis=-1).reshape(-1, 3)
+    gap = np.maximum(blocks * 0.1 - points[:, None], points[:, None] - (blocks + 1) * 0.1).max(axis=2)
+    assert np.array_equal(found, blocks[(gap <= reach_m).any(axis=0)])
+
+
+def test_surfels_of_a_plane_lie_in_it():
+    camera = tabletop.CAMERA
+    w, h = camera.rays()
+    normal = np.array([0.4, -0.3, -0.8]) / np.linalg.norm([0.4, -0.3, -0.8])
+    depth_m = (normal @ [0.0, 0.0, 0.8]) / (w * normal[0] + h * normal[1] + normal[2])
+    mask = np.ones(depth_m.shape, dtype=bool)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    points, normals = fusion.surfels(depth_m.astype(np.float32), np.argwhere(mask), mask, lens, 1e-5, 5.0)
+    np.testing.assert_allclose((points - [0.0, 0.0, 0.8]) @ normal, 0.0, atol=1e-6)
+    assert np.degrees(np.arccos((normals @ normal).clip(-1, 1))).max() < 1.5  # it leans to the camera a little
+
+
+def test_a_pixel_that_hangs_in_the_air_has_no_surfel():
+    depth_m = np.full((9, 9), 0.8, dtype=np.float32)
+    depth_m[4, 4] = 0.75
+    _, normals = fusion.surfels(
+        depth_m, np.array([[4, 4], [2, 2]]), depth_m > 0, np.array([200.0, 200.0, 4.0, 4.0]), 1e-3, 5.0
+    )
+    assert np.array_equal(np.any(normals != 0.0, axis=1), [False, True])
+
+
+def naive_integrate(voxels, tau_m, empty_weight, views):
+    """Twin of `fusion.integrate` for single voxels (n, 3)."""
+    index, free_m, poses, lenses, points, normals, weights = views
+    values, totals = np.zeros(len(voxels)), np.zeros(len(voxels))
+    for number, voxel in enumerate(voxels):
+        votes, emptiness = [], 0.0
+        for f in range(len(index)):
+            x, y, z = poses[f, :, :3] @ voxel + poses[f, :, 3]
+            column = round(lenses[f, 0] * x / z + lenses[f, 2])
+            row = round(lenses[f, 1] * y / z + lenses[f, 3])
+            if not (0 <= row < index.shape[1] and 0 <= column < index.shape[2]):
+                continue
+            n = index[f, row, column]
+            along = normals[n] @ (voxel - points[n]) if n >= 0 else 2 * tau_m
+            if abs(along) <= tau_m:
+                votes.append((along, weights[n] * min(1.0, 1.5 * (1 + along / tau_m) + 1e-3), normals[n]))
+            elif along > 0 and z < free_m[f, row, column] - tau_m:
+                emptiness += empty_weight
+        if not votes:
+            values[number], totals[number] = (tau_m, emptiness) if emptiness else (0.0, 0.0)
+            continue
+        score = [weight * (1.01 - abs(along) / tau_m) for along, weight, _ in votes]
+        best = int(np.argmax(score))
+        if votes[best][0] < 0:
+            facing = [normal @ votes[best][2] for _, _, normal in votes]
+            rival = [
+                s if votes[k][0] > 0 and facing[k] < fusion.AGREE and s > 0.3 * score[best] else 0
+                for k, s in enumerate(score)
+            ]
+            best = int(np.argmax(rival)) if max(rival) > 0 else best
+        heard = [(along, weight) for along, weight, normal in votes if normal @ votes[best][2] > fusion.AGREE]
+        totals[number] = emptiness + sum(weight for _, weight in heard)
+        values[number] = (emptiness * tau_m + sum(along * weight for along, weight in heard)) / totals[number]
+    return values, totals
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_integration_is_its_twin(seed):
+    rng = np.random.default_rng(seed)
+    frames, height, width, count = 6, 12, 14, 150
+    poses = np.stack(
+        [
+            (se3.translation(np.array([0, 0, 0.5])) @ se3.exp(rng.normal(0, 1, 6) * [1, 1, 1, 0, 0, 0]))[:3]
+            for _ in range(frames)
+        ]
+    )
+    normals = rng.normal(size=(count, 3))
+    views = (
+        rng.integers(-1, count, (frames, height, width)).astype(np.int32),
+        rng.uniform(0.4, 0.7, (frames, height, width)).astype(np.float32),
+        poses,
+        np.tile([150.0, 160.0, 6.5, 5.5], (frames, 1)),
+        rng.uniform(-0.02, 0.02, (count, 3)),
+        normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        rng.uniform(0.01, 1.0, count),
+    )
+    blocks = rng.permutation(np.stack(np.meshgrid(*[np.arange(2)] * 3), axis=-1).reshape(-1, 3))
+    origin, voxel_m, tau_m = np.full(3, -0.02), 0.04 / (2 * fusion.SIDE), 0.015
+    values, totals = fusion.integrate(blocks, origin, voxel_m, tau_m, 0.3, *views)
+    inner = np.stack(np.meshgrid(*[np.arange(fusion.SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    voxels = origin + ((blocks[:, None] * fusion.SIDE + inner).reshape(-1, 3) + 0.5) * voxel_m
+    expected_values, expected_totals = naive_integrate(voxels, tau_m, 0.3, views)
+    assert 0.0 < (expected_totals > 0.0).mean() <= 1.0
+    np.testing.assert_allclose(totals.ravel(), expected_totals, rtol=1e-5)
+    np.testing.assert_allclose(values.ravel(), expected_values, rtol=1e-4, atol=1e-8)
+
+
+# The zero level.
+
+
+def level_of(values):
+    weights = np.zeros(values.shape, dtype=np.float32)
+    weights[1:-1, 1:-1, 1:-1] = 1.0
+    return isosurface.extract(values.astype(np.float32), weights, np.argwhere(weights > 0), isosurface.PIECES)
+
+
+def test_every_crossed_edge_of_a_cell_belongs_to_one_piece_of_at_least_three():
+    for case, pieces in enumerate(isosurface.PIECES):
+        for edge, piece in enumerate(pieces):
+            axis, a, b = edge // 4, edge >> 1 & 1, edge & 1
+            start = int(np.insert([a, b], axis, 0) @ [4, 2, 1])
+            crossed = (case >> start & 1) != (case >> (start + [4, 2, 1][axis]) & 1)
+            assert (piece >= 0) == crossed
+        assert all((pieces == piece).sum() >= 3 for piece in range(pieces.max() + 1))
+
+
+def test_the_zero_level_of_a_ball_is_a_sphere_seen_from_outside():
+    grid = np.stack(np.meshgrid(*[np.arange(40.0)] * 3, indexing="ij"), axis=-1)
+    vertices, triangles = level_of(np.linalg.norm(grid - 19.3, axis=-1) - 12.4)
+    assert np.abs(np.linalg.norm(vertices - 19.3, axis=1) - 12.4).max() < 0.05
+    assert np.array_equal(edge_uses(triangles), np.ones((len(triangles) * 3 // 2, 2)))  # closed, one orientation
+    corners = vertices[triangles]
+    volume = np.linalg.det(corners).sum() / 6.0
+    assert volume == pytest.approx(4.0 / 3.0 * np.pi * 12.4**3, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_zero_level_of_any_field_is_closed_inside_the_grid(seed):
+    rng = np.random.default_rng(seed)
+    values = gaussian_filter(rng.normal(size=(24, 24, 24)), 1.0)
+    values[[1, 2, -2, -3]] = values[:, [1, 2, -2, -3]] = values[:, :, [1, 2, -2, -3]] = 1.0
+    _, triangles = level_of(values)
+    uses = edge_uses(triangles)
+    assert len(triangles) > 1000
+    assert np.array_equal(uses[:, 0], uses[:, 1])
+
+
+def test_the_zero_level_stays_open_where_nothing_is_known():
+    values = np.broadcast_to(np.arange(16.0) - 7.5, (16, 16, 16)).astype(np.float32)
+    weights = np.zeros(values.shape, dtype=np.float32)
+    weights[2:9, 3:13, 1:15] = 1.0
+    vertices, triangles = isosurface.extract(values, weights, np.argwhere(weights > 0), isosurface.PIECES)
+    assert np.allclose(vertices[:, 2], 7.5)
+    used = vertices[np.unique(triangles)]
+    assert np.array_equal(used.min(axis=0), [2.5, 3.5, 7.5])
+    assert np.array_equal(used.max(axis=0), [7.5, 11.5, 7.5])
+
+
+def test_gaps_are_filled_but_borders_do_not_grow():
+    values = np.zeros((14, 14, 14), dtype=np.float32) + 0.5
+    weights = np.zeros_like(values)
+    weights[2:12, 2:12, 2:12] = 1.0
+    weights[6, 6, 6] = 0.0
+    cells, means = isosurface.fill(values, weights, np.argwhere(weights > 0), 15)
+    assert np.array_equal(cells, [[6, 6, 6]])
+    assert means == pytest.approx([0.5])
+
+
+# The model.
+
+
+def test_the_mesh_is_the_surface_that_was_seen(ball, brick):
+    for body, model in ((BALL, ball), (BRICK, brick)):
+        off = np.abs(body.distance(on_surface(model)))
+        assert np.quantile(off, 0.95) < 0.25 * VOXEL_M
+        assert off.max() < 1.5 * VOXEL_M
+        seen = tabletop.visible(body, POSES)
+        assert (KDTree(on_surface(model, 60000)).query(seen)[0] < VOXEL_M).mean() > 0.97
+
+
+def test_the_mesh_is_a_clean_one(ball, brick):
+    for model in (ball, brick):
+        uses = edge_uses(model.triangles)
+        assert uses.max() == 1  # one orientation, no edge of three triangles
+        assert np.array_equal(np.unique(model.triangles), np.arange(len(model.vertices_m)))
+        assert np.isfinite(model.vertices_m).all()
+        np.testing.assert_allclose(np.linalg.norm(model.vertex_normals, axis=1), 1.0)
+
+
+def test_normals_point_outwards(ball):
+    outwards = ball.vertices_m / np.linalg.norm(ball.vertices_m, axis=1, keepdims=True)
+    assert np.quantile(np.sum(ball.vertex_normals * outwards, axis=1), 0.02) > 0.9
+    outwards = ball.points_m / np.linalg.norm(ball.points_m, axis=1, keepdims=True)
+    assert np.sum(ball.normals * outwards, axis=1).min() > 0.9
+
+
+def test_there_is_no_table_and_the_unseen_bottom_is_open(brick):
+    x, y, z = brick.vertices_m.T
+    assert z.min() > -BRICK.depth_m - 1.5 * VOXEL_M
+    under = (np.abs(x) < 0.06) & (np.abs(y) < 0.04) & (z < -0.02)
+    assert not under.any()
+    assert np.abs(BRICK.distance(brick.points_m)).max() < VOXEL_M
+
+
+def test_fusing_averages_the_noise_of_the_views(rng):
+    model = fused(BRICK, rng=rng)
+    mesh, cloud = (BRICK.distance(points) for points in (on_surface(model), model.points_m))
+    assert np.sqrt(np.mean(mesh**2)) < 0.5e-3  # half of a pixel's noise
+    assert np.sqrt(np.mean(cloud**2)) < 1e-3
+
+
+def test_a_plate_thinner_than_the_band_keeps_both_sides():
+    model = fused(PLATE)
+    points = on_surface(model)
+    middle = (np.abs(points[:, 0]) < 0.05) & (np.abs(points[:, 2]) < 0.04)
+    for side in (-1.0, 1.0):
+        face = points[middle & (points[:, 1] * side > 0.0), 1] * side
+        assert len(face) > 5000
+        assert face.mean() == pytest.approx(PLATE.half_m[1], abs=0.1 * VOXEL_M)
+
+
+def haunted(ghost_depth_m: float = 0.77) -> dict[int, RayImage]:
+    """Return views of the ball; in the first one a patch that is not there hangs beside it, as part of the object."""
+    views = tabletop.views(BALL, POSES)
+    frame = views[0].frame
+    assert frame.mask is not None
+    depth_m, mask = frame.depth_m.copy(), frame.mask.copy()
+    depth_m[60:72, 121:133], mask[60:72, 121:133] = ghost_depth_m, True
+    ghostly = replace(frame, depth_m=depth_m, mask=mask)
+    pixels, normals = np.argwhere(mask), np.tile([0.0, 0.0, -1.0], (mask.sum(), 1))
+    normals[frame.mask[tuple(pixels.T)]] = views[0].normals
+    return views | {0: tabletop.seen(ghostly, normals, views[0].sigma_r_m)}
+
+
+def test_what_other_views_see_through_is_carved(ball):
+    trajectory = tabletop.trajectory(POSES)
+    blind = replace(FUSER, empty_weight=0.0).fuse(haunted(), trajectory)
+    assert BALL.distance(blind.vertices_m).max() > 0.02
+    carved = FUSER.fuse(haunted(), trajectory)
+    assert BALL.distance(carved.vertices_m).max() < 1.5 * VOXEL_M
+    assert BALL.distance(carved.points_m).max() < 1.5 * VOXEL_M
+
+
+def test_colours_are_those_of_the_surface(brick):
+    assert brick.vertex_colours is not None
+    assert brick.colours is not None
+    for points, colours in ((brick.vertices_m, brick.vertex_colours), (brick.points_m, brick.colours)):
+        top = (np.abs(points[:, 0]) < 0.05) & (np.abs(points[:, 1]) < 0.03) & (points[:, 2] > 0.03)
+        assert top.sum() > 100
+        assert np.abs(colours[top].astype(int) - [128, 128, 228]).max() <= 2
+
+
+def test_without_colour_the_model_has_none(ball):
+    views = {
+        k: replace(view, frame=replace(view.frame, colour=None)) for k, view in tabletop.views(BALL, POSES).items()
+    }
+    model = FUSER.fuse(views, tabletop.trajectory(POSES))
+    assert model.colours is None
+    assert model.vertex_colours is None
+    assert np.array_equal(model.vertices_m, ball.vertices_m)
+    assert FUSER.preview(views, tabletop.trajectory(POSES)).colours is None
+
+
+def test_the_model_moves_with_the_object_frame(ball):
+    object_from_model = se3.exp(np.array([0.4, -0.7, 0.3, 0.1, -0.2, 0.5]))
+    moved = fused(BALL, object_from_model=object_from_model)
+    back = se3.transform(se3.inverse(object_from_model), on_surface(moved))
+    assert np.quantile(np.abs(BALL.distance(back)), 0.95) < 0.25 * VOXEL_M
+    assert np.quantile(KDTree(on_surface(ball, 60000)).query(back)[0], 0.99) < VOXEL_M
+
+
+def test_neither_order_nor_threads_change_a_bit(ball):
+    views, trajectory = tabletop.views(BALL, POSES), tabletop.trajectory(POSES)
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        again = FUSER.fuse(dict(reversed(views.items())), dict(reversed(trajectory.items())))
+    finally:
+        numba.set_num_threads(threads)
+    assert same(ball, again)
+
+
+def test_views_without_a_pose_are_left_out():
+    views, trajectory = tabletop.views(BALL, POSES[:4]), tabletop.trajectory(POSES[:3])
+    for method in (FUSER.fuse, FUSER.preview):
+        assert same(method(views, trajectory), method({k: views[k] for k in range(3)}, trajectory))
+
+
+def test_a_view_that_looks_elsewhere_changes_nothing_and_one_of_nothing_neither():
+    views, trajectory = tabletop.views(BALL, POSES[:3]), tabletop.trajectory(POSES[:3])
+    frame = replace(views[0].frame, mask=np.zeros_like(views[0].frame.mask))
+    blank = tabletop.seen(frame, np.zeros((0, 3)), views[0].sigma_r_m)
+    away = trajectory[0] @ se3.exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))
+    model = FUSER.fuse(views | {7: blank}, trajectory | {7: away})
+    assert same(model, FUSER.fuse(views, trajectory))
+
+
+def test_a_handful_of_pixels_is_no_reason_to_fail():
+    view = tabletop.views(BALL, POSES)[0]
+    assert view.frame.mask is not None
+    mask = np.zeros_like(view.frame.mask)
+    mask[tuple(view.pixels[100:103].T)] = True
+    few = tabletop.seen(replace(view.frame, mask=mask), view.normals[100:103], view.sigma_r_m)
+    model = FUSER.fuse({0: few}, {0: np.eye(4)})
+    assert model.triangles.shape == (len(model.triangles), 3)
+    assert np.isfinite(model.vertices_m).all()
+    assert len(FUSER.preview({0: few}, {0: np.eye(4)}).points_m) > 0
+
+
+def test_input_that_cannot_be_fused_is_refused():
+    views, trajectory = tabletop.views(BALL, POSES[:2]), tabletop.trajectory(POSES[:2])
+    for method in (FUSER.fuse, FUSER.preview):
+        with pytest.raises(InputError, match="nothing to fuse"):
+            method(views, {})
+        with pytest.raises(InputError, match="nothing to fuse"):
+            method({}, trajectory)
+    with pytest.raises(InputError, match="voxel size"):
+        Fuser(voxel_m=0.0).fuse(views, trajectory)
+
+
+def test_the_voxels_follow_the_pixels_and_stay_within_their_number(ball):
+    views, trajectory = tabletop.views(BALL, POSES), tabletop.trajectory(POSES)
+
+    def spacing(model):
+        return np.median(np.linalg.norm(np.diff(model.vertices_m[model.triangles], axis=1), axis=2))
+
+    pixel_m = tabletop.DISTANCE_M / tabletop.CAMERA.fx
+    assert spacing(Fuser().fuse(views, trajectory)) / spacing(ball) == pytest.approx(pixel_m / VOXEL_M, rel=0.1)
+    assert len(replace(FUSER, max_voxels=20**3).fuse(views, trajectory).vertices_m) < 0.3 * len(ball.vertices_m)
+
+
+def test_a_preview_is_the_cloud_alone_one_point_a_voxel():
+    views, trajectory = tabletop.views(BRICK, POSES), tabletop.trajectory(POSES)
+    model = FUSER.preview(views, trajectory)
+    assert model.triangles.shape == (0, 3)
+    assert np.abs(BRICK.distance(model.points_m)).max() < 2.0 * VOXEL_M
+    np.testing.assert_allclose(np.linalg.norm(model.normals, axis=1), 1.0)
+    low = np.concatenate([se3.transform(trajectory[k], view.points_m) for k, view in views.items()]).min(axis=0)
+    cells = np.floor((model.points_m - low) / (2.0 * VOXEL_M) + 1e-9).astype(int)
+    assert len(np.unique(cells, axis=0)) == len(cells)
+
+
+# Rendered sequences with the noise and the flaws of a depth camera.
+
+
+def tensor(values, kind):
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(values, dtype=kind))
+
+
+@pytest.mark.parametrize("name", ["flashlight", "tube"])
+def test_bundled_objects_are_fused_within_3_mm(name):
+    sequence = BopSequence(Path(__file__).parents[1] / "sequences" / "bundled" / name)
+    truth, noise = sequence.truth(), sequence.sensor()
+    assert truth is not None
+    assert noise is not None
+    sensor = Sensor(*noise)
+    frames = {frame.index: frame for frame in sequence}
+    model = Fuser().fuse(
+        {k: sensor.ray_image(frame) for k, frame in frames.items()}, {k: se3.inverse(pose) for k, pose in truth.items()}
+    )
+    mesh = trimesh.load_mesh(sequence.model_path, process=False)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(tensor(mesh.vertices, np.float32), tensor(mesh.faces, np.uint32))
+    points = on_surface(model, 50000)
+    precision = (scene.compute_distance(tensor(points, np.float32)).numpy() < 3e-3).mean()
+    seen = np.concatenate([true_points(frame, truth[k], scene) for k, frame in frames.items()])
+    recall = (KDTree(points).query(seen)[0] < 3e-3).mean()
+    assert precision > 0.99
+    assert recall > 0.99
+
+
+def true_points(frame: Frame, camera_from_model, scene):
+    """Return the points (n, 3) of the true surface at the object's measured pixels, in the model frame."""
+    assert frame.mask is not None
+    seen = frame.mask & np.isfinite(frame.depth_m)
+    w, h = (side[seen] for side in frame.camera.rays())
+    model_from_camera = se3.inverse(camera_from_model)
+    along = np.stack([w, h, np.ones_like(w)], axis=1) @ model_from_camera[:3, :3].T
+    rays = np.concatenate([np.broadcast_to(model_from_camera[:3, 3], along.shape), along], axis=1)
+    distance = scene.cast_rays(tensor(rays, np.float32))["t_hit"].numpy()
+    hit = np.isfinite(distance)
+    return rays[hit, :3] + distance[hit, None] * rays[hit, 3:]
