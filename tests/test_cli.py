@@ -80,7 +80,7 @@ def report(folder: Path) -> dict:
 # Help
 
 
-@pytest.mark.parametrize("command", ["build", "register", "render", "view", "export"])
+@pytest.mark.parametrize("command", ["build", "register", "evaluate", "render", "view", "export"])
 def test_every_command_has_help_on_stdout(run: Run, command: str) -> None:
     assert re.search(rf"\b{command}\b", run("--help").out)
     ended = run(command, "--help")
@@ -140,6 +140,10 @@ def test_defaults_told_in_help_are_those_of_the_priors(run: Run, name: str) -> N
         (("build", "NOWHERE", "--out", "OUT"), "NOWHERE"),
         (("register", BOX, "0", "99"), "no frame 99"),
         (("register", BOX, "0", "1", "--max-depth-m", "0.1"), "too few points"),
+        (("evaluate", "--out", "OUT"), "no sequence"),
+        (("evaluate", BOX, "--out", "OUT", "--methods", "icp,magic"), "'magic'"),
+        (("evaluate", BOX, "--out", "OUT", "--offsets", "0"), "--offsets 0"),
+        (("evaluate", BOX, "--out", "OUT", "--points", "0"), "--points 0"),
         (("render", "nothing", "--out", "OUT"), "box"),
         (("view", "NOWHERE"), "NOWHERE"),
         (("export", "NOWHERE", "--out", "OUT.glb"), "NOWHERE"),
@@ -284,7 +288,17 @@ def test_ctrl_c_after_the_last_frame_changes_nothing() -> None:
     assert not interrupt.ended_early
 
 
-# export and render
+# evaluate, export and render
+
+
+def test_evaluate_writes_errors_and_prints_a_table(run: Run, tmp_path: Path) -> None:
+    ended = run("evaluate", BOX, "--out", tmp_path, "--methods", "icp,gicp", "--frames", "0:3", "--prior", "table")
+    assert (ended.status, ended.err) == (0, "")
+    rows = ended.out.splitlines()
+    assert [row.split()[:5] for row in rows[1:]] == [["box", name, "1", "2", "2"] for name in ("icp", "gicp")]
+    assert len({len(row) for row in rows}) == 1
+    assert {path.name for path in tmp_path.iterdir()} == {"results.json", "results.csv", "rotation_errors.png"}
+    assert len(json.loads((tmp_path / "results.json").read_bytes())["trials"]) == 4
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "glb", "stl"])

@@ -24,24 +24,40 @@ def open_sequence(path: Path) -> AbstractSequence:
     return sequences.open_sequence(path)
 
 
-def modeler(sequence: AbstractSequence, prior: PriorOptions, method: MethodOptions, where: ObjectOptions) -> Modeler:
+def modeler(
+    sequence: AbstractSequence, prior_options: PriorOptions, method: MethodOptions, where: ObjectOptions
+) -> Modeler:
     """Return the loop with the parts asked for, its sensor as the sequence describes it, else the first Kinect's.
 
     Raises:
         InputError: where an option cannot be used.
     """
-    if method.seed < 0:
-        raise InputError(f"--seed {method.seed} is negative; give a whole number from 0 on.")
     noise = sequence.sensor()
     return Modeler(
-        segmenter=Segmenter(roi=where.roi, max_depth_m=where.max_depth_m),
+        segmenter=segmenter(where),
         sensor=Sensor() if noise is None else Sensor(*noise),
-        prior=_prior(prior),
-        registrar=_registrar(method.method),
+        prior=prior(prior_options),
+        registrar=registrar(method.method),
         closer=Closer(),
         fuser=Fuser(),
-        seed=method.seed,
+        seed=seed(method.seed),
     )
+
+
+def segmenter(options: ObjectOptions) -> Segmenter:
+    """Return the segmenter with the limits asked for."""
+    return Segmenter(roi=options.roi, max_depth_m=options.max_depth_m)
+
+
+def seed(given: int) -> int:
+    """Return a seed that generators take.
+
+    Raises:
+        InputError: where it is none.
+    """
+    if given < 0:
+        raise InputError(f"--seed {given} is negative; give a whole number from 0 on")
+    return given
 
 
 def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
@@ -52,7 +68,12 @@ def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
     return modeler.segmenter.scene([sequence.frame(sequence.indices[number]) for number in spread])
 
 
-def _prior(options: PriorOptions) -> AbstractPrior:
+def prior(options: PriorOptions) -> AbstractPrior:
+    """Return the prior asked for.
+
+    Raises:
+        InputError: where a parameter cannot be used.
+    """
     match options.prior:
         case "general":
             return GeneralPrior(**options.given("max_rotation_deg", "max_offset_m"))
@@ -60,7 +81,8 @@ def _prior(options: PriorOptions) -> AbstractPrior:
             return TablePrior(**options.given("max_rotation_deg", "max_shift_m"))
 
 
-def _registrar(method: Method) -> AbstractRegistrar:
+def registrar(method: Method) -> AbstractRegistrar:
+    """Return the registration method of a name."""
     match method:
         case "visibility":
             return registration.VisibilityRegistrar()

@@ -10,21 +10,26 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from modeler.types import Step
 
 
+def bar() -> Progress:
+    """Return a progress bar on stderr, which shows nothing where that is no terminal."""
+    terminal = Terminal(stderr=True, highlight=False, soft_wrap=True)
+    columns = (
+        TextColumn("modeler:"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+    )
+    return Progress(*columns, console=terminal, disable=not terminal.is_terminal)
+
+
 class Console:
     """A sink of steps, for a terminal; where stderr is none, only frames left out are told."""
 
     def __init__(self, frames: int, address: str | None) -> None:
-        terminal = Terminal(stderr=True, highlight=False, soft_wrap=True)
-        columns = (
-            TextColumn("modeler:"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.description}"),
-        )
-        self._bar = Progress(*columns, console=terminal, disable=not terminal.is_terminal)
-        self._task = self._bar.add_task("frame by frame", total=frames)
+        self._bar = bar()
+        self._task = self._bar.add_task("", total=frames)
         self._address = address
 
     def __enter__(self) -> Console:

@@ -24,12 +24,10 @@ class Render:
 
     def run(self) -> int:
         """Render the sequence."""
-        from modeler.types import InputError
+        from modeler.cli.compose import seed
         from sequences.recipe import load_recipe
         from sequences.renderer import render
 
         recipe = load_recipe(self.recipe)
-        if self.seed is not None and self.seed < 0:
-            raise InputError(f"--seed {self.seed} is negative; give a whole number from 0 on")
-        render(recipe if self.seed is None else replace(recipe, seed=self.seed), self.out)
+        render(recipe if self.seed is None else replace(recipe, seed=seed(self.seed)), self.out)
         return 0

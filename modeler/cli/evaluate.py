@@ -1,0 +1,45 @@
+"""`modeler evaluate`: methods against ground truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, get_args
+
+import tyro
+
+from modeler.cli.options import FrameOptions, Method, ObjectOptions, PriorOptions
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Register pairs of frames whose true motion is known, by several methods, and tell how far off they are.
+
+    Writes results.json, results.csv and rotation_errors.png (box plots), and prints a table.
+    """
+
+    sequences: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SEQUENCE...")]
+    """BOP scene folders with scene_gt.json."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
+    """Folder for the results; those of an earlier evaluation are replaced at the end."""
+    methods: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ",".join(get_args(Method))
+    """Methods to compare."""
+    offsets: Annotated[str, tyro.conf.arg(metavar="N,...")] = "1"
+    """Compare frames so many apart; each is a table of its own."""
+    both_ways: bool = False
+    """Register each pair in both directions, not only the later frame to the earlier."""
+    closed: bool = False
+    """Take the sequence for a full turn: its last frame is followed by its first."""
+    points: Annotated[int | None, tyro.conf.arg(metavar="N"), tyro.conf.arg(help_behavior_hint="(default: all)")] = None
+    """Keep so many of the object's pixels, drawn at random: very sparse clouds."""
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Same seed, same machine, same errors."""
+    prior: PriorOptions = field(default_factory=PriorOptions)
+    selection: FrameOptions = field(default_factory=FrameOptions)
+    where: ObjectOptions = field(default_factory=ObjectOptions)
+
+    def run(self) -> int:
+        """Run the experiment."""
+        from modeler.cli.evaluating import evaluate
+
+        return evaluate(self)

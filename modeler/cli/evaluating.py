@@ -1,0 +1,94 @@
+"""What `modeler evaluate` does once it is understood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import get_args
+
+from modeler import experiment
+from modeler.cli import compose
+from modeler.cli.console import bar
+from modeler.cli.evaluate import Evaluate
+from modeler.cli.options import Method
+from modeler.experiment import Experiment, Pairing, Summary
+from modeler.types import AbstractRegistrar, InputError
+from sequences import frame_range
+from viz import figures
+
+
+def evaluate(options: Evaluate) -> int:
+    """Run the experiment, write its results and print a table.
+
+    Raises:
+        InputError: where an option, a sequence or the folder cannot be used.
+    """
+    if not options.sequences:
+        raise InputError("no sequence to evaluate; name at least one folder")
+    if options.points is not None and options.points < 1:
+        raise InputError(f"--points {options.points} leaves nothing; give a whole number from 1 on")
+    plan = Experiment(
+        methods=_methods(options.methods),
+        prior=compose.prior(options.prior),
+        pairing=Pairing(_offsets(options.offsets), both_ways=options.both_ways, closed=options.closed),
+        segmenter=compose.segmenter(options.where),
+        points=options.points,
+        seed=compose.seed(options.seed),
+    )
+    kept = frame_range(options.selection.frames)
+    recorded = [compose.open_sequence(path).select(options.selection.every, kept) for path in options.sequences]
+    with bar() as progress:
+        task = progress.add_task("", total=sum(plan.size(sequence) for sequence in recorded))
+        rows = experiment.evaluate(
+            recorded,
+            plan,
+            options.out,
+            draw=figures.rotation_errors,
+            told=lambda trial: progress.update(task, advance=1, description=f"{trial.sequence}, {trial.method}"),
+        )
+    print(table(rows))
+    return 0
+
+
+def table(rows: Sequence[Summary]) -> str:
+    """Return summaries as text in columns."""
+    heading = ("sequence", "method", "apart", "pairs", "usable", "right", "rot deg", "75 %", "max", "mm", "NEES", "s")
+    cells = [
+        (
+            row.sequence,
+            row.method,
+            str(row.offset),
+            str(row.pairs),
+            str(row.usable),
+            str(row.successes),
+            *(f"{value:.2f}" for value in row.rotation_error_deg[1:]),
+            f"{row.translation_error_mm:.2f}",
+            f"{row.median_nees:.1f}",
+            f"{row.seconds:.2f}",
+        )
+        for row in rows
+    ]
+    widths = [max(map(len, column)) for column in zip(heading, *cells, strict=True)]
+    return "\n".join(
+        "  ".join(
+            f"{cell:<{width}}" if number < 2 else f"{cell:>{width}}" for number, (cell, width) in enumerate(pairs)
+        )
+        for pairs in (list(zip(line, widths, strict=True)) for line in (heading, *cells))
+    )
+
+
+def _methods(names: str) -> dict[str, AbstractRegistrar]:
+    """Return registrars by name from a list with commas."""
+    known: dict[str, Method] = {name: name for name in get_args(Method)}
+    chosen = [name.strip() for name in names.split(",")]
+    for name in chosen:
+        if name not in known:
+            raise InputError(f"--methods {names}: there is no method {name!r}; there are {', '.join(known)}")
+    return {name: compose.registrar(known[name]) for name in chosen}
+
+
+def _offsets(text: str) -> tuple[int, ...]:
+    """Return whole numbers from a list with commas."""
+    offsets = text.split(",")
+    if not all(offset.strip().isdecimal() and int(offset) > 0 for offset in offsets):
+        raise InputError(f"--offsets {text} is no list of whole numbers from 1 on; write for instance 1,2,3")
+    return tuple(dict.fromkeys(int(offset) for offset in offsets))
