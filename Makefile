@@ -7,7 +7,6 @@
 BIN := .venv/bin
 
 .PHONY: setup demo test calibrate bench
-.DELETE_ON_ERROR:
 
 setup: .venv/.installed
 
@@ -17,8 +16,11 @@ setup: .venv/.installed
 demo: setup
 	$(BIN)/modeler build sequences/bundled/box --prior table --out runs/demo --overwrite
 	@echo
-	@echo "The mesh:      runs/demo/model.ply      (MeshLab, Blender, or: $(BIN)/modeler export runs/demo --out box.glb)"
-	@echo "The recording: runs/demo/recording.rrd  (look at it with: $(BIN)/modeler view runs/demo)"
+	@echo "The mesh is runs/demo/model.ply (any mesh viewer opens it); in another format:"
+	@echo "    $(BIN)/modeler export runs/demo --out runs/demo/box.glb"
+	@echo "The recording is runs/demo/recording.rrd; look at it with:"
+	@echo "    $(BIN)/modeler view runs/demo          (in a window)"
+	@echo "    $(BIN)/modeler view runs/demo --web    (in the browser)"
 
 test: setup
 	$(BIN)/ruff check
