@@ -14,7 +14,9 @@ from scipy.spatial import KDTree
 
 from modeler import se3
 from modeler.fusion import Fuser, surface
+from modeler.fusion.stack import posed, spread, stack
 from modeler.kernels import fusion, isosurface, thinning
+from modeler.kernels.surfels import surfels
 from modeler.rays import Sensor
 from modeler.types import Frame, InputError, ObjectModel, RayImage
 from sequences.bop import BopSequence
@@ -103,7 +105,7 @@ def test_surfels_of_a_plane_lie_in_it():
     depth_m = (normal @ [0.0, 0.0, 0.8]) / (w * normal[0] + h * normal[1] + normal[2])
     mask = np.ones(depth_m.shape, dtype=bool)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    points, normals = fusion.surfels(depth_m.astype(np.float32), np.argwhere(mask), mask, lens, 1e-5, 5.0)
+    points, normals = surfels(depth_m.astype(np.float32), np.argwhere(mask), mask, lens, 1e-5, 5.0)
     np.testing.assert_allclose((points - [0.0, 0.0, 0.8]) @ normal, 0.0, atol=1e-6)
     assert np.degrees(np.arccos((normals @ normal).clip(-1, 1))).max() < 1.5  # it leans to the camera a little
 
@@ -111,7 +113,7 @@ def test_surfels_of_a_plane_lie_in_it():
 def test_a_pixel_that_hangs_in_the_air_has_no_surfel():
     depth_m = np.full((9, 9), 0.8, dtype=np.float32)
     depth_m[4, 4] = 0.75
-    _, normals = fusion.surfels(
+    _, normals = surfels(
         depth_m, np.array([[4, 4], [2, 2]]), depth_m > 0, np.array([200.0, 200.0, 4.0, 4.0]), 1e-3, 5.0
     )
     assert np.array_equal(np.any(normals != 0.0, axis=1), [False, True])
@@ -286,6 +288,31 @@ def test_fusing_averages_the_noise_of_the_views(rng):
     mesh, cloud = (BRICK.distance(points) for points in (on_surface(model), model.points_m))
     assert np.sqrt(np.mean(mesh**2)) < 0.5e-3  # half of a pixel's noise
     assert np.sqrt(np.mean(cloud**2)) < 1e-3
+
+
+def disagreement_m(views, trajectory):
+    pairs = posed(views, trajectory)
+    corners = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
+    found = spread(stack(pairs, corners, margin_px=2, min_cosine=0.15, edge_weight=0.1), 0.02)
+    return float("nan") if found is None else found
+
+
+def test_views_disagree_by_their_noise_and_the_error_of_their_poses(rng):
+    trajectory = tabletop.trajectory(POSES)
+    exact, noisy = tabletop.views(BRICK, POSES), tabletop.views(BRICK, POSES, rng)
+    assert disagreement_m(exact, trajectory) < 1e-4
+    # Two pixels with 1 mm along the ray each: less by the cosine along the normal.
+    assert 0.4e-3 < disagreement_m(noisy, trajectory) < np.sqrt(2.0) * 1e-3
+    off = {k: se3.translation(rng.normal(0.0, 3e-3, 3)) @ pose for k, pose in trajectory.items()}
+    assert 2e-3 < disagreement_m(exact, off) < 6e-3
+    assert np.isnan(disagreement_m({0: exact[0]}, trajectory))  # nobody to disagree with
+
+
+def test_surface_survives_poses_that_are_off_by_more_than_the_noise(rng):
+    off = {k: se3.translation(rng.normal(0.0, 3e-3, 3)) @ pose for k, pose in tabletop.trajectory(POSES).items()}
+    model = FUSER.fuse(tabletop.views(BALL, POSES), off)
+    seen = tabletop.visible(BALL, POSES)
+    assert (KDTree(on_surface(model, 60000)).query(seen)[0] < 6e-3).mean() > 0.95
 
 
 def test_a_plate_thinner_than_the_band_keeps_both_sides():

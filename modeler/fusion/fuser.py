@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.fusion import cloud, grid, surface
-from modeler.fusion.stack import GREY, Stack, colours_at, posed, stack
+from modeler.fusion.stack import GREY, Stack, colours_at, posed, spread, stack
 from modeler.kernels import fusion
 from modeler.types import Array, InputError, ObjectModel, RayImage
 
@@ -28,7 +28,7 @@ class Fuser:
     voxel_m: float | None = None
     """Side of a voxel in m; None: what a pixel covers, or half the sensor's noise where that is more."""
     truncation_m: float | None = None
-    """Half width of the band around the surface in m; None: three voxels and twice the sensor's noise."""
+    """Half width of the band around the surface in m; None: three voxels and twice what the views disagree by."""
     max_voxels: int = 192**3
     """The voxels grow until the object's box holds no more than so many."""
     preview_voxels: float = 2.0
@@ -102,11 +102,14 @@ class Fuser:
             border_m=self.truncation_m or 3.0 * voxel_m + 2.0 * noise_m,
             max_voxels=self.max_voxels,
         )
-        tau_m = self.truncation_m or 3.0 * box.voxel_m + 2.0 * noise_m
         seen = stack(
             pairs, box.corners_m, margin_px=self.margin_px, min_cosine=self.min_cosine, edge_weight=self.edge_weight
         )
-        near_m = box.voxel_m + 2.0 * noise_m
+        # Where poses are off, the band must be wide enough for the views to meet in it.
+        limit_m = 0.05 * float(np.linalg.norm(box.shape)) * box.voxel_m
+        spread_m = spread(seen, limit_m) or noise_m
+        tau_m = self.truncation_m or 3.0 * box.voxel_m + 2.0 * spread_m
+        near_m = box.voxel_m + 2.0 * spread_m
         vertices, triangles, vertex_colours = self._mesh(seen, box, tau_m=tau_m, near_m=near_m)
 
         points, normals, colours = cloud.thinned(

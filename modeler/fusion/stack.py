@@ -11,8 +11,10 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from modeler import se3
 from modeler.kernels import fusion
+from modeler.kernels.surfels import surfels
 from modeler.types import Array, BoolArray, InputError, RayImage
 
+WITNESSES = 20000  # points asked for how well the views agree
 GREY = 128  # colour of what no view with colour sees
 STEEPEST_RAD = 1.40  # a step between neighbouring pixels steeper than this (80°) is an edge, not a surface
 
@@ -41,6 +43,8 @@ class Stack:
     """(n,) 1 = seen head-on from the median distance, away from edges."""
     colours: npt.NDArray[np.uint8]
     """(n, 3) RGB of the points."""
+    views: npt.NDArray[np.int64]
+    """(n,) which view each point is of."""
 
     @property
     def lookup(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32], Array, Array, Array, Array, Array]:
@@ -116,7 +120,7 @@ def _cut(view: RayImage, window: tuple[slice, slice], *, margin_px: int, min_cos
     rest = mask.copy()
     rest[tuple(pixels[inside].T)] = False
     others = np.argwhere(rest)
-    points_m, normals = fusion.surfels(depth_m, others, mask, lens, view.sigma_r_m, np.tan(STEEPEST_RAD))
+    points_m, normals = surfels(depth_m, others, mask, lens, view.sigma_r_m, np.tan(STEEPEST_RAD))
     found = np.any(normals != 0.0, axis=1)
     pixels = np.concatenate([pixels[inside], others[found]])
     points_m = np.concatenate([view.points_m[inside], points_m[found]])
@@ -201,4 +205,22 @@ def stack(
         normals=np.concatenate([cut.normals @ pose[:3, :3].T for cut, (_, pose) in zip(cuts, pairs, strict=True)]),
         weights=weights,
         colours=np.concatenate(colours),
+        views=np.repeat(np.arange(len(cuts)), [len(cut.points_m) for cut in cuts]),
     )
+
+
+def spread(views: Stack, limit_m: float) -> float | None:
+    """Return by how much views disagree about where the surface is, in m: a robust standard deviation.
+
+    It holds the noise of both views and the error of their poses. None where no two views see the same surface.
+
+    Args:
+        views: the views.
+        limit_m: disagreements beyond this are two surfaces.
+    """
+    chosen = np.arange(0, len(views.points_m), max(1, len(views.points_m) // WITNESSES))
+    distance_m = fusion.disagreements(
+        chosen, views.views[chosen], limit_m, views.index, views.poses, views.lenses, views.points_m, views.normals
+    )
+    found = np.isfinite(distance_m)
+    return 1.4826 * float(np.median(np.abs(distance_m[found]))) if found.any() else None
