@@ -1,6 +1,6 @@
 """Compiled functions: arrays in, arrays out; no package types, no hidden randomness."""
 
-import numba
+from numba.core import config
 
 # OpenMP is thread-safe (pairs may be registered from several threads) and Open3D needs libgomp anyway.
-numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
+config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore[reportAttributeAccessIssue]
