@@ -73,24 +73,24 @@ def without_specks(mask: BoolArray, least_share: float) -> BoolArray:
 
 
 def edge_of(seen: BoolArray) -> BoolArray:
-    """Return the pixels (h, w) at the edge of what is seen: the image's, and that of bands the sensor leaves blind."""
-    edge = np.zeros_like(seen)
-    edge[_end_rows(seen)], edge[:, _end_rows(seen.T)] = True, True
-    return edge & seen
+    """Return the pixels (h, w) at the edge of what the camera sees, at which things may be cut off.
 
-
-def cut_px(mask: BoolArray, seen: BoolArray) -> int:
-    """Return over how many pixels a mask (h, w) is cut off by the edge of what the camera sees (h, w).
-
-    Only where the mask ends is it cut off: it may reach over the line where a background without measurements begins.
+    That is the edge of the image and of bands that the sensor leaves blind. Where a background without measurements
+    begins is another such line, but what reaches over it is not cut off.
     """
-    cut = 0
-    for part, whole in ((mask, seen), (mask.T, seen.T)):
-        filled = np.flatnonzero(part.any(axis=1))
-        if len(filled):
-            ends = np.unique(filled[[0, -1]])
-            cut += int(np.count_nonzero(part[ends[np.isin(ends, _end_rows(whole))]]))
-    return cut
+    return _outermost(seen) | _outermost(seen.T).T
+
+
+def _outermost(seen: BoolArray) -> BoolArray:
+    """Return pixels (h, w) of the first and last row, and those, with none beyond, of the first and last well seen."""
+    edge = np.zeros_like(seen)
+    rows = np.flatnonzero(seen.mean(axis=1) > _SEEN_SHARE)
+    if len(rows):
+        beyond = np.pad(seen, ((1, 1), (0, 0)))
+        edge[rows[0]] = ~beyond[rows[0]]
+        edge[rows[-1]] |= ~beyond[rows[-1] + 2]
+    edge[[0, -1]] = True
+    return edge & seen
 
 
 def _label(mask: BoolArray, structure: BoolArray | None = None) -> Labels:
@@ -98,9 +98,3 @@ def _label(mask: BoolArray, structure: BoolArray | None = None) -> Labels:
     labels = np.zeros(mask.shape, dtype=np.int32)
     ndimage.label(mask, structure=structure, output=labels)
     return labels
-
-
-def _end_rows(seen: BoolArray) -> npt.NDArray[np.intp]:
-    """Return the first and last row of an image (h, w), and the first and last of which a good part was measured."""
-    rows = np.flatnonzero(seen.mean(axis=1) > _SEEN_SHARE)
-    return np.unique(np.concatenate([[0, len(seen) - 1], rows[[0, -1]] if len(rows) else []])).astype(np.intp)

@@ -29,7 +29,7 @@ class Layers:
     """What a few frames of a still camera show, thinned."""
 
     points: Float32
-    """(h, w, 3) the backdrop: the farthest surface that several frames agree on, in camera coordinates."""
+    """(h, w, 3) the backdrop: the farthest surface that frames agree on, in camera coordinates."""
     front: Float32
     """(h, w, 3) what typically comes in front of it; the backdrop where nothing does."""
     rays: Float32
@@ -74,12 +74,14 @@ def take_apart(depths_m: Sequence[Float32], camera: Camera, noise: DepthNoise) -
     agree = np.abs(stack - reference) < noise.tolerance_m(reference)
     agreeing = agree.sum(axis=0)
     back = np.where(agree, stack, np.float32(0.0)).sum(axis=0) / np.maximum(agreeing, 1).astype(np.float32)
-    back[agreeing < (2 if frames > _FEW_FRAMES else 1)] = np.nan
+    back[agreeing == 0] = np.nan
+    believed = 2 if frames > _FEW_FRAMES else 1
     nearer = (stack < back - noise.tolerance_m(back)).sum(axis=0)
     share = (nearer / np.maximum(readings, 1)).astype(np.float32)
-    often = (share >= _MOVED_SHARE) & (nearer >= (2 if frames > _FEW_FRAMES else 1))
+    often = (share >= _MOVED_SHARE) & (nearer >= believed)
     moved: BoolArray = np.asarray(ndimage.binary_opening(often, np.ones((3, 3))), dtype=np.bool_)
     front = np.where(moved, np.take_along_axis(stack, (nearer // 2)[None], axis=0)[0], back)
-    still = np.isfinite(back) & (agreeing >= _STILL_SHARE * readings) & ~moved
+    back[agreeing < min(2, frames - 1)] = np.nan
+    still = (agreeing >= np.maximum(believed, _STILL_SHARE * readings)) & ~moved
     back, front, rays = (point_image(depth, camera, stride=stride) for depth in (back, front, np.ones_like(back)))
     return Layers(back, front, rays, moved, still, share)

@@ -78,7 +78,7 @@ def dominant_planes(
         (k, 4) unit normals towards the camera and offsets.
     """
     cells = _flat_cells(points, noise)
-    least = least_share * points.shape[0] * points.shape[1]
+    least = max(1.0, least_share * points.shape[0] * points.shape[1])
     free = np.ones(len(cells.mean), dtype=np.bool_)
     level: Array | None = None
     planes: list[Array] = []

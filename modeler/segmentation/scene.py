@@ -19,6 +19,7 @@ Float32 = npt.NDArray[np.float32]
 
 _CARRIED_SHARE = 0.2  # of a pile that stands on its upper plane, for that to be a support and not a lid
 _NEIGHBOUR_SIZES = 0.5  # how far from what moves most, in its sizes, its other parts move
+_RIVAL = 0.3  # of the merit of all that moves: from here on something else may be the object
 _PARALLEL = np.cos(np.radians(6.0))
 _WALL_BORDER_SHARE = 0.03  # of the image's edge that lies on a plane which runs out of the image
 _IN_FRONT_SHARE = 0.9  # of the object that a wall has in front of it
@@ -41,7 +42,7 @@ class Scene:
     areas_m2: tuple[float, float] | None = None
     """Least and greatest area that the object showed to the camera."""
     sure: bool = True
-    """Whether there is no doubt about what the support is."""
+    """Whether there is no doubt about which thing is the object and which plane its support."""
     still: bool = False
     """Whether camera and scenery stand still, so that the scene holds for other frames."""
 
@@ -55,11 +56,10 @@ def learn(layers: Layers, allowed: BoolArray, noise: DepthNoise, *, least_points
         noise: of the depth camera.
         least_points: pixels of the thinned image below which a motion says nothing.
     """
-    found = _moving_object(layers, allowed)
+    found, sure = _moving_object(layers, allowed)
     moves = bool(np.count_nonzero(found) >= least_points)
     planes = dominant_planes(layers.points, noise, prefer_level=moves)
     guess: Array | None = None
-    sure = True
     if moves:
         ground = layers.points[layers.still & surroundings(layers.front, found)]
         guess = choose_support(planes, layers.front[found], ground, noise)
@@ -77,17 +77,22 @@ def learn(layers: Layers, allowed: BoolArray, noise: DepthNoise, *, least_points
     return Scene(plane, still, _scenery(layers, found, planes, guess, noise), zone, sure=sure)
 
 
-def _moving_object(layers: Layers, allowed: BoolArray) -> BoolArray:
-    """Return the pixels (h, w) of what moves most, nearest and most centrally, and of what moves next to it."""
+def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]:
+    """Find what moves most, nearest and most centrally, and what moves next to it.
+
+    Returns:
+        Its pixels (h, w), and whether nothing else moves nearly as much.
+    """
     depth = layers.front[..., 2]
     labels = pieces(depth, layers.moved & allowed)
     merit = _central(labels, depth, layers.share)
     if merit.max() <= 0.0:
-        return np.zeros_like(layers.moved)
+        return np.zeros_like(layers.moved), True
     low, high = np.percentile(layers.front[labels == int(merit.argmax())], [2.0, 98.0], axis=0)
     margin = _NEIGHBOUR_SIZES * float(np.linalg.norm(high - low))
     near = ((layers.front > low - margin) & (layers.front < high + margin)).all(axis=-1)
-    return layers.moved & allowed & near
+    elsewhere = _central(np.where(near, 0, labels), depth, layers.share).sum()
+    return layers.moved & allowed & near, bool(elsewhere < _RIVAL * merit.sum())
 
 
 def _standing_object(

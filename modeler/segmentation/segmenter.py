@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.segmentation.clusters import cut_px
+from modeler.segmentation.clusters import edge_of
 from modeler.segmentation.finder import Found, find
 from modeler.segmentation.layers import planning_stride, point_image, take_apart
 from modeler.segmentation.noise import DepthNoise
@@ -75,9 +75,10 @@ class Segmenter:
         if not looks:
             return scene
         boxes = np.array([np.percentile(_points(frame)[look.mask], [0.5, 99.5], axis=0) for frame, look in looks])
-        areas = [look.area_m2 for _, look in looks]
+        areas, rivals = [look.area_m2 for _, look in looks], [look.rival for _, look in looks]
         zone = np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
-        return replace(scene, zone_m=zone, areas_m2=(min(areas), max(areas)))
+        sure = scene.sure and float(np.median(rivals)) < _RIVAL
+        return replace(scene, zone_m=zone, areas_m2=(min(areas), max(areas)), sure=sure)
 
     def segment(self, frame: Frame, scene: Scene) -> Segmentation:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
@@ -98,7 +99,7 @@ class Segmenter:
         sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < _RIVAL
         if scene.areas_m2 is not None:
             sure &= scene.areas_m2[0] / _AREA_FACTOR < found.area_m2 < scene.areas_m2[1] * _AREA_FACTOR
-        sure &= cut_px(found.mask, frame.depth_m > 0.0) < _CUT_SHARE * np.sqrt(count)
+        sure &= np.count_nonzero(found.mask & edge_of(frame.depth_m > 0.0)) < _CUT_SHARE * np.sqrt(count)
         return Segmentation(found.mask, scene.plane, Outcome.CONVERGED if sure else Outcome.UNSURE_MASK)
 
     def _learn(self, frames: Sequence[Frame]) -> Scene:

@@ -1,0 +1,358 @@
+"""Frames without masks: what is found, what is left out, and what is admitted not to be known."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from modeler.segmentation import Scene, Segmenter
+from modeler.segmentation.clusters import edge_of, mixed_pixels, pieces, voxel_clusters, without_specks
+from modeler.types import Camera, Frame, InputError, Outcome
+from sequences.bop import BopSequence
+
+CAMERA = Camera(width=240, height=180, fx=220.0, fy=220.0, cx=119.5, cy=89.5)
+BUNDLED = Path(__file__).parents[1] / "sequences" / "bundled"
+REAL = Path(__file__).parents[2] / "shared" / "data"
+OBJECT = 1
+
+
+class World:
+    """Boxes in a frame whose z axis points up from the table, before a camera that looks down at its origin."""
+
+    def __init__(self, tilt_deg=35.0, distance_m=0.8, turn_deg=0.0):
+        tilt = np.radians(tilt_deg)
+        down = np.array([[1.0, 0.0, 0.0], [0.0, -np.sin(tilt), -np.cos(tilt)], [0.0, np.cos(tilt), -np.sin(tilt)]])
+        turn = Rotation.from_rotvec([0.0, 0.0, np.radians(turn_deg)]).as_matrix()
+        self.camera_from_table = down @ turn
+        self.origin_m = np.array([0.0, 0.0, distance_m])
+        self.boxes = []
+
+    def box(self, centre_m, half_m, *, turn_deg=0.0, label=0):
+        """Return the world with a box more."""
+        turn = Rotation.from_rotvec([0.0, 0.0, np.radians(turn_deg)]).as_matrix()
+        self.boxes.append((np.array(centre_m), np.array(half_m), turn, label))
+        return self
+
+    def table(self):
+        """Return the world with a table whose top is z = 0."""
+        return self.box((0.0, 0.0, -0.01), (0.6, 0.45, 0.01))
+
+    def frame(self, index, rng, sigma_m=0.001):
+        """Return a frame without a mask, and the object's true pixels."""
+        w, h = CAMERA.rays()
+        rays = np.stack([w, h, np.ones_like(w)], axis=-1).reshape(-1, 3)
+        depth, labels = np.full(len(rays), np.inf), np.zeros(len(rays), dtype=int)
+        for centre, half, turn, label in self.boxes:
+            box_from_camera = turn.T @ self.camera_from_table.T
+            eye = box_from_camera @ -self.origin_m - turn.T @ centre
+            along = rays @ box_from_camera.T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                one, two = (-half - eye) / along, (half - eye) / along
+            enter, leave = np.fmin(one, two).max(axis=1), np.fmax(one, two).min(axis=1)
+            nearer = (enter <= leave) & (enter > 0.0) & (enter < depth)
+            depth[nearer], labels[nearer] = enter[nearer], label
+        depth[np.isinf(depth)] = np.nan
+        image = (depth + rng.normal(0.0, sigma_m, len(depth))).reshape(w.shape).astype(np.float32)
+        return Frame(index, float(index), image, CAMERA), (labels == OBJECT).reshape(w.shape)
+
+
+def turned(count, rng, surround=lambda world, k: world, **camera):
+    """Return frames and true masks of a box that turns by 25 degrees and shifts a little on a table."""
+    views = []
+    for k in range(count):
+        world = (
+            World(**camera)
+            .table()
+            .box((0.01 * (k % 3), -0.01 * (k % 2), 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
+        )
+        views.append(surround(world, k).frame(k, rng))
+    return [frame for frame, _ in views], [mask for _, mask in views]
+
+
+def iou(found, true):
+    return np.count_nonzero(found & true) / np.count_nonzero(found | true)
+
+
+def bare(frames):
+    return [replace(frame, mask=None) for frame in frames]
+
+
+def judge(frames, masks, *, least=0.95, **fields):
+    """Check that every frame is segmented well and surely, and return the segmentations."""
+    segmenter = Segmenter(**fields)
+    scene = segmenter.scene(frames)
+    found = [segmenter.segment(frame, scene) for frame in frames]
+    for one, mask in zip(found, masks, strict=True):
+        assert iou(one.mask, mask) > least
+        assert one.outcome is Outcome.CONVERGED
+    return found
+
+
+def test_a_turned_box_on_a_table_is_found_and_its_table_too(rng):
+    frames, masks = turned(6, rng)
+    world = World()
+    for one in judge(frames, masks):
+        assert one.plane is not None
+        assert np.arccos(one.plane.normal @ world.camera_from_table[:, 2]) < 2.0 * one.plane.sigma_tilt_rad
+        assert abs(one.plane.height_m(world.origin_m[None])[0]) < 2.0 * one.plane.sigma_offset_m
+        assert not one.mask[np.isnan(frames[0].depth_m)].any()
+
+
+def test_wall_clutter_and_a_passer_by_are_not_the_object(rng):
+    def surround(world, k):
+        world.box((0.0, 0.42, 0.3), (1.0, 0.01, 0.5))  # a wall
+        world.box((0.25, 0.1, 0.04), (0.04, 0.04, 0.04))  # something that stands about
+        return world.box((-0.4, 0.3, 0.2), (0.06, 0.02, 0.2)) if k in (2, 3) else world
+
+    judge(*turned(8, rng, surround))
+
+
+def test_what_stands_on_a_turntable_does_not_include_the_turntable(rng):
+    frames, masks = [], []
+    for k in range(6):
+        world = World().table().box((0.0, 0.0, 0.045), (0.08, 0.08, 0.045)).box((0.0, 0.0, 0.095), (0.14, 0.14, 0.005))
+        world.box((0.0, 0.0, 0.15), (0.05, 0.03, 0.05), turn_deg=30.0 * k, label=OBJECT)
+        frame, mask = world.frame(k, rng)
+        frames.append(frame)
+        masks.append(mask)
+    world = World()
+    for one in judge(frames, masks):
+        assert one.plane is not None
+        plate = world.origin_m + 0.1 * world.camera_from_table[:, 2]
+        assert abs(one.plane.height_m(plate[None])[0]) < 3.0 * one.plane.sigma_offset_m
+
+
+def test_one_frame_is_enough_on_a_bare_table(rng):
+    frames, masks = turned(3, rng)
+    segmenter = Segmenter()
+    for frame, mask in zip(frames, masks, strict=True):
+        alone = segmenter.segment(frame, segmenter.scene([frame]))
+        assert iou(alone.mask, mask) > 0.95
+        assert alone.outcome is Outcome.CONVERGED
+        unknown = segmenter.segment(frame, Scene())
+        np.testing.assert_array_equal(unknown.mask, alone.mask)
+
+
+def test_a_moving_camera_is_noticed(rng):
+    views = [
+        World(tilt_deg=30.0 + 5.0 * k, turn_deg=30.0 * k)
+        .table()
+        .box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), label=OBJECT)
+        for k in range(4)
+    ]
+    shots = [view.frame(k, rng) for k, view in enumerate(views)]
+    found = judge([frame for frame, _ in shots], [mask for _, mask in shots])
+    assert found[0].plane is not None
+    assert found[3].plane is not None
+    assert np.arccos(found[0].plane.normal @ found[3].plane.normal) > np.radians(10.0)
+
+
+def test_a_camera_that_was_pushed_after_the_scene_was_learnt_is_noticed(rng):
+    frames, _ = turned(4, rng)
+    pushed, mask = World(tilt_deg=45.0).table().box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), label=OBJECT).frame(9, rng)
+    segmenter = Segmenter()
+    assert iou(segmenter.segment(pushed, segmenter.scene(frames)).mask, mask) > 0.95
+
+
+def test_own_masks_are_kept_within_region_and_depth(rng):
+    frames, masks = turned(3, rng)
+    framed = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
+    segmenter = Segmenter()
+    scene = segmenter.scene(framed)
+    for frame, mask in zip(framed, masks, strict=True):
+        one = segmenter.segment(frame, scene)
+        np.testing.assert_array_equal(one.mask, mask)
+        assert one.outcome is Outcome.CONVERGED
+        assert one.plane is not None
+        assert np.arccos(one.plane.normal @ World().camera_from_table[:, 2]) < 2.0 * one.plane.sigma_tilt_rad
+    left = Segmenter(roi=(0, 0, 120, 180)).segment(framed[0], scene)
+    np.testing.assert_array_equal(left.mask, masks[0] & (np.arange(240) < 120))
+    depth = float(np.median(frames[0].depth_m[masks[0]]))
+    near = Segmenter(max_depth_m=depth).segment(framed[0], scene)
+    np.testing.assert_array_equal(near.mask, masks[0] & ~(frames[0].depth_m > np.float32(depth)))
+
+
+def test_a_masked_object_before_nothing_has_no_plane(rng):
+    frame, mask = World().box((0.0, 0.0, 0.0), (0.06, 0.06, 0.06), label=OBJECT).frame(0, rng)
+    one = Segmenter().segment(replace(frame, mask=mask), Scene())
+    assert one.plane is None
+    assert one.outcome is Outcome.CONVERGED
+
+
+def test_of_two_things_that_turn_neither_is_surely_the_object_but_a_region_helps(rng):
+    frames, masks = [], []
+    for k in range(5):
+        world = World().table().box((0.16, 0.0, 0.06), (0.05, 0.03, 0.06), turn_deg=20.0 * k)
+        frame, mask = world.box((-0.16, 0.0, 0.06), (0.05, 0.03, 0.06), turn_deg=25.0 * k, label=OBJECT).frame(k, rng)
+        frames.append(frame)
+        masks.append(mask)
+    segmenter = Segmenter()
+    scene = segmenter.scene(frames)
+    assert all(segmenter.segment(frame, scene).outcome is Outcome.UNSURE_MASK for frame in frames)
+    for one in judge(frames, masks, roi=(0, 0, 120, 180)):
+        assert not one.mask[:, 120:].any()
+
+
+def test_beyond_the_greatest_depth_is_no_object(rng):
+    frames, masks = turned(4, rng, lambda world, k: world.box((0.1, 0.3, 0.1), (0.1, 0.03, 0.1), turn_deg=30.0 * k))
+    for one, frame in zip(judge(frames, masks, max_depth_m=0.85), frames, strict=True):
+        assert not np.any(one.mask & (frame.depth_m > 0.85))
+
+
+def test_an_object_cut_off_by_the_image_is_unsure(rng):
+    frames = [
+        World().table().box((0.42, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k).frame(k, rng)[0]
+        for k in range(4)
+    ]
+    segmenter = Segmenter()
+    scene = segmenter.scene(frames)
+    assert all(segmenter.segment(frame, scene).outcome is Outcome.UNSURE_MASK for frame in frames)
+
+
+def test_an_object_that_grows_is_unsure_and_one_that_is_gone_has_too_few_points(rng):
+    frames, _ = turned(5, rng)
+    segmenter = Segmenter()
+    scene = segmenter.scene(frames)
+    large, _ = World().table().box((0.0, 0.0, 0.15), (0.15, 0.1, 0.15)).frame(7, rng)
+    assert segmenter.segment(large, scene).outcome is Outcome.UNSURE_MASK
+    empty, _ = World().table().frame(8, rng)
+    gone = segmenter.segment(empty, scene)
+    assert gone.outcome is Outcome.TOO_FEW_POINTS
+    assert gone.plane is not None
+
+
+def test_hopeless_frames_have_an_outcome_and_no_exception(rng):
+    shape = (CAMERA.height, CAMERA.width)
+    wall = Frame(1, 1.0, np.full(shape, 0.5, dtype=np.float32), CAMERA)
+    nothing = Frame(0, 0.0, np.full(shape, np.nan, dtype=np.float32), CAMERA)
+    zeros = Frame(2, 2.0, np.zeros(shape, dtype=np.float32), CAMERA)
+    noise = Frame(3, 3.0, rng.uniform(0.3, 3.0, shape).astype(np.float32), CAMERA)
+    blind = replace(nothing, mask=np.ones(shape, dtype=np.bool_))
+    odd = Frame(4, 4.0, np.full((37, 53), 0.7, dtype=np.float32), Camera(53, 37, 50.0, 50.0, 26.0, 18.0))
+    segmenter = Segmenter()
+    frames, _ = turned(3, rng)
+    hopeless = [wall, nothing, zeros, noise, blind, odd]
+    for known in ([], [nothing], [nothing] * 3, [wall] * 3, [wall, nothing, noise], frames, [odd, *frames]):
+        scene = segmenter.scene(known)
+        for frame in hopeless:
+            one = segmenter.segment(frame, scene)
+            assert one.mask.shape == frame.depth_m.shape
+            assert one.outcome in (Outcome.TOO_FEW_POINTS, Outcome.UNSURE_MASK)
+    outside = Segmenter(roi=(1000, 1000, 1100, 1100))
+    assert outside.segment(frames[0], outside.scene(frames)).outcome is Outcome.TOO_FEW_POINTS
+
+
+def test_the_same_frames_give_the_same_masks(rng):
+    frames, _ = turned(4, rng)
+    segmenter = Segmenter()
+    scenes = segmenter.scene(frames), segmenter.scene(frames)
+    one, two = ([segmenter.segment(frame, scene) for frame in frames] for scene in scenes)
+    for first, second in zip(one, two, strict=True):
+        np.testing.assert_array_equal(first.mask, second.mask)
+        assert first.plane is not None
+        assert second.plane is not None
+        np.testing.assert_array_equal(first.plane.normal, second.plane.normal)
+
+
+@pytest.mark.parametrize("fields", [{"roi": (5, 5, 5, 9)}, {"roi": (-1, 0, 5, 9)}, {"max_depth_m": 0.0}])
+def test_bad_parameters_are_refused_in_one_line(fields):
+    with pytest.raises(InputError, match="give") as error:
+        Segmenter(**fields)
+    assert "\n" not in str(error.value)
+
+
+def test_mixed_pixels_against_a_naive_twin(rng):
+    depth = rng.choice([0.5, 0.6, 0.7, np.nan], (20, 30)).astype(np.float32)
+    tolerance = np.full_like(depth, 0.05)
+    fast = mixed_pixels(depth, tolerance_m=tolerance, pixel_m=np.full_like(depth, 0.001))
+    for row in range(20):
+        for column in range(30):
+            around = depth[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
+            here = depth[row, column]
+            assert fast[row, column] == (np.any(here - around > 0.05) and np.any(around - here > 0.05))
+
+
+def test_pieces_end_at_jumps_and_clusters_at_gaps():
+    depth = np.full((4, 9), 0.5, dtype=np.float32)
+    depth[:, 5:] = 0.6
+    labels = pieces(depth, np.ones(depth.shape, dtype=np.bool_))
+    assert set(np.unique(labels[:, :4])) == {labels[0, 0]}
+    assert labels[0, 0] != labels[0, 8]
+    line = np.full((75, 3), 0.01)
+    line[:, 0] = np.r_[np.linspace(0.0, 0.1, 50), np.linspace(0.15, 0.2, 25)]
+    near, far = (
+        voxel_clusters(line, low_m=np.zeros(3), high_m=np.full(3, 0.21), gap_m=gap_m) for gap_m in (0.06, 0.01)
+    )
+    assert len(np.unique(near)) == 1
+    assert len(np.unique(far)) == 2
+
+
+def test_specks_go():
+    mask = np.zeros((30, 40), dtype=np.bool_)
+    mask[10:20, 10:20], mask[25, 30], mask[3:5, 3:5] = True, True, True
+    assert without_specks(mask, 0.05).sum() == 100
+
+
+def test_the_edge_of_what_is_seen():
+    seen = np.zeros((30, 40), dtype=np.bool_)
+    seen[10:, 8:] = True  # a band that the sensor leaves blind, and a table before nothing
+    seen[5:10, 20:25] = True  # something on the table that rises over its end
+    edge = edge_of(seen)
+    assert edge[10:, 8].all()
+    assert edge[10, 9:20].all()
+    assert edge[-1, 8:].all()
+    assert not edge[10, 20:25].any()
+    assert not edge[5:10].any()
+    assert not edge[11:-1, 9:-1].any()
+
+
+@pytest.mark.parametrize("name", ["box", "flashlight", "tube"])
+def test_rendered_sequences_without_their_masks(name):
+    frames = list(BopSequence(BUNDLED / name))
+    segmenter = Segmenter()
+    scene = segmenter.scene(bare(frames)[:: max(1, len(frames) // 12)])
+    for frame in frames:
+        assert frame.mask is not None
+        one = segmenter.segment(replace(frame, mask=None), scene)
+        assert iou(one.mask, frame.mask & np.isfinite(frame.depth_m)) >= 0.97
+        assert one.outcome is Outcome.CONVERGED
+
+
+@pytest.mark.parametrize("name", ["box", "flashlight", "tube"])
+def test_table_of_rendered_sequences(name):
+    """The model turns about the table's normal, so that its axis is the same in every frame."""
+    truth = json.loads((BUNDLED / name / "scene_gt.json").read_text())
+    turns = np.array([np.reshape(truth[key][0]["cam_R_m2c"], (3, 3)) for key in sorted(truth, key=int)])
+    steps = Rotation.from_matrix(turns[1:] @ turns[:-1].transpose(0, 2, 1)).as_rotvec()
+    normal = steps.sum(axis=0) / np.linalg.norm(steps.sum(axis=0))
+    for frame in list(BopSequence(BUNDLED / name))[::5]:
+        plane = Segmenter().segment(frame, Scene()).plane
+        assert plane is not None
+        assert np.arccos(min(1.0, abs(plane.normal @ normal))) < 2.0 * plane.sigma_tilt_rad
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="the real sequences are not here")
+@pytest.mark.parametrize(
+    ("name", "pixels", "object_px"),
+    [
+        ("cap", (16000, 21000), (300, 230)),
+        ("kleenex", (11000, 16500), (315, 260)),
+        ("castard", (38000, 75000), (345, 250)),
+        ("dog_upright", (19000, 27000), (350, 200)),
+    ],
+)
+def test_real_sequences(name, pixels, object_px):
+    """Sizes and places are those of masks that were looked at, frame by frame."""
+    frames = [frame for frame in BopSequence(REAL / name)]
+    segmenter = Segmenter()
+    picks = np.unique(np.linspace(0, len(frames) - 1, 12).round().astype(int))
+    scene = segmenter.scene([frames[k] for k in picks])
+    assert scene.plane is not None
+    for frame in frames:
+        one = segmenter.segment(frame, scene)
+        assert one.outcome is Outcome.CONVERGED
+        assert pixels[0] < np.count_nonzero(one.mask) < pixels[1]
+        assert np.abs(np.argwhere(one.mask).mean(axis=0)[::-1] - object_px).max() < 60.0
