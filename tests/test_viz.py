@@ -455,6 +455,20 @@ def test_a_viewer_that_dies_does_not_stop_the_run(run: list[Step], tmp_path: Pat
     assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
 
 
+def test_a_viewer_that_freezes_does_not_stop_the_run(
+    run: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("viz.stream._PATIENCE_S", 0.5)
+    monkeypatch.setattr("viz.viewer._STOP_S", 0.2)
+    stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
+    stream(run[0])
+    stream.viewers[0].process.send_signal(signal.SIGSTOP)
+    for step in run[1:]:
+        stream(step)
+    stream.close()
+    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
+
+
 def closed_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

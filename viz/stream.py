@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 import logging
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from modeler.types import InputError, Step
 from viz import entities, viewer
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     import rerun as rr
 
 _log = logging.getLogger(__name__)
+
+_PATIENCE_S: Final = 5.0  # with a viewer, at the end, until it has taken what it was sent
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +63,17 @@ class RerunStream:
     def close(self) -> None:
         """Complete the recording. A window stays open with what it was sent; a page in the browser ends."""
         try:
-            self.recording.flush(timeout_sec=10.0)
-        except RuntimeError as error:  # the viewer is gone; the file is written all the same
+            self.recording.flush(timeout_sec=_PATIENCE_S)
+        except RuntimeError as error:
             _log.info("the viewer did not receive everything: %s", error)
-        self.recording.disconnect()
+        # Disconnecting completes the file, but first takes leave of the viewers, and for ever of one that is frozen.
+        leave = threading.Thread(target=self.recording.disconnect, daemon=True)
+        leave.start()
+        leave.join(_PATIENCE_S)
         for own in self.viewers:
-            if not own.lasting:
+            if leave.is_alive() or not own.lasting:
                 own.stop()
+        leave.join(_PATIENCE_S)
 
 
 def open_stream(
@@ -90,14 +97,14 @@ def open_stream(
 
     from viz import blueprint, clouds, images, readings
 
+    listens = connect is not None and viewer.reachable(connect)
     sinks: list[rr.FileSink | rr.GrpcSink] = [] if save is None else [_file_sink(save)]
     viewers = _own_viewers(spawn=spawn, web=web)
     sinks += [rr.GrpcSink(own.sink) for own in viewers]
-    if connect is not None:
-        if viewer.reachable(connect):
-            sinks.append(rr.GrpcSink(connect))
-        else:
-            _log.warning("--connect %s: no viewer listens there; the run goes on without it", connect)
+    if listens:
+        sinks.append(rr.GrpcSink(connect))
+    elif connect is not None:
+        _log.warning("--connect %s: no viewer listens there; the run goes on without it", connect)
     recording = rr.RecordingStream(entities.APPLICATION, default_enabled=bool(sinks))
     if sinks:
         recording.set_sinks(*sinks)

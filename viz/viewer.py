@@ -19,6 +19,7 @@ from modeler.types import InputError
 
 _HOST: Final = "127.0.0.1"
 _START_S: Final = 20.0
+_STOP_S: Final = 3.0
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,13 @@ class Viewer:
             self.stop()
 
     def stop(self) -> None:
-        """End the viewer."""
-        if self.process.poll() is None:
-            self.process.terminate()
-        self.process.wait()
+        """End the viewer, by force where it does not answer."""
+        self.process.terminate()
+        try:
+            self.process.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
 
 
 def start_window(recordings: Sequence[Path] = ()) -> Viewer:
