@@ -13,12 +13,14 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
+from modeler.experiment import sparse_view
 from modeler.priors import GeneralPrior
 from modeler.registration import FpfhIcpRegistrar, FpfhRegistrar, GicpRegistrar, IcpRegistrar
 from modeler.registration.clouds import (
     Cloud,
     Fit,
     Matches,
+    cube_edges_m,
     matched,
     plane_residuals,
     posterior,
@@ -192,7 +194,7 @@ def test_icp_stops_where_open3d_would(pair: Pair, rng: np.random.Generator) -> N
     begin = start(pair[0], pair[1], GeneralPrior(40.0, 0.03).between(*pair), rng)
     fit = method.refine(source, target, begin.target_from_source)
     assert fit is not None
-    voxel_m = method.voxels[-1] * max(source.size_m, target.size_m)
+    voxel_m = cube_edges_m(source, target, method.voxels)[-1]
     reach_m = method.reach * voxel_m
     clouds = []
     for cloud in (source.thinned(voxel_m), target.thinned(voxel_m)):
@@ -296,3 +298,24 @@ def test_a_fit_of_few_matches_is_no_overlap(pair: Pair, rng: np.random.Generator
     fit = IcpRegistrar().refine(Cloud.of(pair[0]), Cloud.of(pair[1]), se3.translation(np.array([0.0, 0.0, 0.5])))
     assert fit is not None
     assert posterior(pair[0], pair[1], begin, fit, min_fitness=0.1).outcome is Outcome.NO_OVERLAP
+
+
+def test_thinning_is_not_finer_than_the_points(rng: np.random.Generator) -> None:
+    down, across = 0.01 * np.indices((30, 30), dtype=np.float64).reshape(2, -1)
+    grid = Cloud(np.stack([across, down, np.ones(900)], axis=1), np.tile([0.0, 0.0, -1.0], (900, 1)))
+    assert grid.spacing_m == pytest.approx(0.01)
+    assert grid.size_m == pytest.approx(2.0 * np.sqrt(2.0 * (900 - 1) / 12.0) * 0.01)
+    halves = Cloud(0.5 * grid.points_m, grid.normals)
+    assert cube_edges_m(grid, halves, (1 / 2, 1 / 50, 1 / 100)) == pytest.approx([grid.size_m / 2, 0.01])
+
+
+def test_sparse_clouds_are_registered_by_the_levels_that_they_allow(pair: Pair, rng: np.random.Generator) -> None:
+    truth = POSES[1] @ se3.inverse(POSES[0])
+    few = [sparse_view(view, 80, rng) for view in pair]
+    for method in (IcpRegistrar(), GicpRegistrar()):
+        found = method.register(few[0], few[1], Normal(truth, few[0].centroid_m, 0.05, 0.005), rng=rng)
+        assert found.usable
+        assert degrees_between(found.pose.mean, truth) < 6.0
+    fewest = [sparse_view(view, 11, rng) for view in pair]
+    found = IcpRegistrar().register(fewest[0], fewest[1], Normal(truth, few[0].centroid_m, 0.05, 0.005), rng=rng)
+    assert found.outcome is Outcome.TOO_FEW_POINTS

@@ -16,8 +16,9 @@ import tabletop
 from PIL import Image
 
 from modeler import se3
-from modeler.experiment import Experiment, Pairing, Trial, evaluate, sparse, summaries
+from modeler.experiment import Experiment, Pairing, Trial, evaluate, sparse_frame, sparse_view, summaries
 from modeler.priors import GeneralPrior
+from modeler.rays import Sensor
 from modeler.types import (
     AbstractMotion,
     AbstractPrior,
@@ -147,29 +148,47 @@ def test_tells_where_the_prior_does_not_apply() -> None:
     assert {(t.outcome, t.usable) for t in trials} == {("no robot was seen", False)}
 
 
-def test_sparse_keeps_so_many_pixels_of_the_object_and_all_of_the_rest() -> None:
+def test_sparse_frames_keep_so_many_pixels_of_the_object_and_all_of_the_rest() -> None:
     frame = tabletop.view(BODY, POSES[0], 0).frame
     assert frame.mask is not None
-    thin = sparse(frame, 50, np.random.default_rng(0))
+    thin = sparse_frame(frame, 50, np.random.default_rng(0))
     measured = np.isfinite(thin.depth_m)
     assert np.sum(measured & frame.mask) == 50
     np.testing.assert_array_equal(measured[~frame.mask], np.isfinite(frame.depth_m)[~frame.mask])
     np.testing.assert_array_equal(thin.depth_m[measured], frame.depth_m[measured])
-    np.testing.assert_array_equal(sparse(frame, 10**6, np.random.default_rng(0)).depth_m, frame.depth_m)
+    np.testing.assert_array_equal(sparse_frame(frame, 10**6, np.random.default_rng(0)).depth_m, frame.depth_m)
 
 
-def test_sparse_experiments_give_methods_few_points() -> None:
-    seen: list[int] = []
+def test_sparse_views_keep_so_many_points_and_what_belongs_to_them() -> None:
+    view = Sensor().ray_image(tabletop.view(BODY, POSES[0], 0).frame)
+    thin = sparse_view(view, 50, np.random.default_rng(0))
+    assert [len(a) for a in (thin.points_m, thin.normals, thin.pixels, thin.layers["sigma_m"])] == [50] * 4
+    at = [int(np.flatnonzero(np.all(view.pixels == pixel, axis=1))[0]) for pixel in thin.pixels]
+    np.testing.assert_array_equal(thin.points_m, view.points_m[at])
+    np.testing.assert_array_equal(thin.normals, view.normals[at])
+    np.testing.assert_array_equal(thin.layers["sigma_m"], view.layers["sigma_m"][at])
+    assert thin.layers["cells"] is view.layers["cells"]
+    np.testing.assert_array_equal(sparse_view(view, 10**6, np.random.default_rng(0)).points_m, view.points_m)
 
+
+@pytest.mark.parametrize("sparse", [{"points": 80}, {"pixels": 800}])
+def test_sparse_experiments_give_methods_few_points(sparse: Mapping[str, int]) -> None:
     class Counting(AbstractRegistrar):
+        def __init__(self) -> None:
+            self.seen: list[int] = []
+
         def register(
             self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
         ) -> Posterior:
-            seen.extend([len(source.points_m), len(target.points_m)])
+            self.seen.extend([len(source.points_m), len(target.points_m)])
             return Oracle().register(source, target, motion, rng=rng)
 
-    list(experiment(methods={"counting": Counting()}, points=80).trials(Recording()))
-    assert 0 < max(seen) <= 80
+    dense, thin = Counting(), Counting()
+    list(experiment(methods={"dense": dense}).trials(Recording()))
+    list(experiment(methods={"thin": thin}, **sparse).trials(Recording()))
+    assert 0 < max(thin.seen) <= 0.5 * min(dense.seen)
+    if "points" in sparse:
+        assert set(thin.seen) == {80}
 
 
 def trial(error_deg: float, *, nees: float = 5.0, usable: bool = True) -> Trial:

@@ -7,4 +7,5 @@ from modeler.experiment.tables import summaries as summaries
 from modeler.experiment.trials import Experiment as Experiment
 from modeler.experiment.trials import Recorded as Recorded
 from modeler.experiment.trials import Trial as Trial
-from modeler.experiment.trials import sparse as sparse
+from modeler.experiment.trials import sparse_frame as sparse_frame
+from modeler.experiment.trials import sparse_view as sparse_view

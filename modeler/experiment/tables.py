@@ -90,6 +90,7 @@ def results_json(experiment: Experiment, trials: Sequence[Trial], rows: Sequence
         "methods": {name: repr(method) for name, method in experiment.methods.items()},
         "pairing": asdict(experiment.pairing),
         "points": experiment.points,
+        "pixels": experiment.pixels,
         "success_deg": experiment.success_deg,
         "summaries": [_finite(asdict(row)) for row in rows],
         "trials": [_finite(asdict(trial)) for trial in trials],

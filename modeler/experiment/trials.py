@@ -94,7 +94,12 @@ class Experiment:
     segmenter: Segmenter = field(default_factory=Segmenter)
     """Finds the object in frames without masks."""
     points: int | None = None
-    """Object pixels of each frame whose depth is kept, drawn at random; None = all (paper: very sparse clouds)."""
+    """Surface points of each view that are kept, drawn at random; None = all (paper: very sparse clouds).
+
+    What the images show of empty space stays.
+    """
+    pixels: int | None = None
+    """Object pixels of each frame whose depth is kept, drawn at random; None = all. The mask stays."""
     success_deg: float = 16.2
     """Rotation error below which a registration counts as right (Jian and Vemuri 2011)."""
     seed: int = 0
@@ -142,9 +147,11 @@ class Experiment:
                 yield index, found.outcome
                 continue
             frame = replace(frame, mask=found.mask)
-            if self.points is not None:
-                frame = sparse(frame, self.points, np.random.default_rng([self.seed, index, _SPARSE_STREAM]))
-            yield index, sensor.ray_image(frame, found.plane)
+            rng = np.random.default_rng([self.seed, index, _SPARSE_STREAM])
+            if self.pixels is not None:
+                frame = sparse_frame(frame, self.pixels, rng)
+            view = sensor.ray_image(frame, found.plane)
+            yield index, view if self.points is None else sparse_view(view, self.points, rng)
 
     def _trial(
         self,
@@ -186,7 +193,7 @@ def _judged(blank: Trial, posterior: Posterior, truth: Array, centroid_m: Array)
     )
 
 
-def sparse(frame: Frame, count: int, rng: np.random.Generator) -> Frame:
+def sparse_frame(frame: Frame, count: int, rng: np.random.Generator) -> Frame:
     """Return a frame whose mask keeps the depth of at most `count` of its pixels; the others have no measurement.
 
     Args:
@@ -200,3 +207,19 @@ def sparse(frame: Frame, count: int, rng: np.random.Generator) -> Frame:
     depth_m = frame.depth_m.copy()
     depth_m.flat[dropped] = np.nan
     return replace(frame, depth_m=depth_m)
+
+
+def sparse_view(view: RayImage, count: int, rng: np.random.Generator) -> RayImage:
+    """Return a view with at most `count` of its surface points; its images stay whole.
+
+    Args:
+        view: a frame made ready.
+        count: points to keep.
+        rng: chooses them.
+    """
+    total = len(view.points_m)
+    kept = np.sort(rng.permutation(total)[:count])
+    layers = {name: layer[kept] if layer.shape == (total,) else layer for name, layer in view.layers.items()}
+    return replace(
+        view, points_m=view.points_m[kept], normals=view.normals[kept], pixels=view.pixels[kept], layers=layers
+    )

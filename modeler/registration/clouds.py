@@ -6,6 +6,7 @@ use the centre, to start from, and the spread, for directions that the surfaces 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -16,6 +17,7 @@ from modeler import se3
 from modeler.types import AbstractMotion, Array, Outcome, PoseGaussian, Posterior, RayImage
 
 _START_SAMPLES = 1000
+_SPACING_POINTS = 400
 _OPEN_SPREAD_RAD = np.pi / 2  # rotations spread wider than this have no centre to speak of
 _SMALLEST_SIGMA = 1e-6  # rad or m: keeps covariances positive definite where prior or residuals vanish
 
@@ -40,6 +42,13 @@ class Cloud:
         """Twice the root mean square distance of the points from their centroid."""
         return 2.0 * float(np.sqrt(np.sum(np.var(self.points_m, axis=0))))
 
+    @property
+    def spacing_m(self) -> float:
+        """Median distance of a point to its nearest neighbour, judged by a few hundred points."""
+        some = self.points_m[:: 1 + len(self.points_m) // _SPACING_POINTS]
+        distances, _ = KDTree(self.points_m).query(some, k=2)
+        return float(np.median(distances[:, 1]))
+
     def thinned(self, voxel_m: float) -> Cloud:
         """Return the mean point and normal of each occupied cube of edge `voxel_m`, on a grid about the centroid."""
         cubes = np.floor((self.points_m - self.points_m.mean(axis=0)) / voxel_m).astype(np.int64)
@@ -51,6 +60,12 @@ class Cloud:
         np.add.at(normals, cube, self.normals)
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         return Cloud(points / count[:, None], normals / np.maximum(lengths, np.finfo(float).tiny))
+
+
+def cube_edges_m(source: Cloud, target: Cloud, shares: Sequence[float]) -> list[float]:
+    """Return the edges of thinning cubes that are given shares of the larger object, but not finer than the points."""
+    size_m, spacing_m = max(source.size_m, target.size_m), max(source.spacing_m, target.spacing_m)
+    return list(dict.fromkeys(max(share * size_m, spacing_m) for share in shares))
 
 
 @final

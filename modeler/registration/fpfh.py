@@ -11,7 +11,16 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.registration.clouds import Cloud, Fit, matched, plane_residuals, posterior, scaled_information, start
+from modeler.registration.clouds import (
+    Cloud,
+    Fit,
+    cube_edges_m,
+    matched,
+    plane_residuals,
+    posterior,
+    scaled_information,
+    start,
+)
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
 
 _DRAW = 3  # correspondences that fix a motion
@@ -43,7 +52,7 @@ class FpfhRegistrar(AbstractRegistrar):
     """Draws end once a better motion would have turned up with this probability."""
     scored_points: int = 400
     """Points of the source, drawn at random, by which motions are compared."""
-    min_points: int = 20
+    min_points: int = 12
     """Fewest points a side after thinning."""
     min_fitness: float = 0.1
     """Smallest share of matched points that counts as overlap."""
@@ -69,7 +78,7 @@ class FpfhRegistrar(AbstractRegistrar):
         """
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return None
-        voxel_m = self.voxel * max(source.size_m, target.size_m)
+        (voxel_m,) = cube_edges_m(source, target, (self.voxel,))
         source, target = source.thinned(voxel_m), target.thinned(voxel_m)
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return None

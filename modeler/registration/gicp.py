@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from modeler import se3
-from modeler.registration.clouds import Fit, posterior, residual_variance, start
+from modeler.registration.clouds import Cloud, Fit, cube_edges_m, posterior, residual_variance, start
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
 
 _STEP = 1e-6  # rad and m: a smaller step ends a level
@@ -32,8 +32,8 @@ class GicpRegistrar(AbstractRegistrar):
     """Points from which the shape of a neighbourhood is taken."""
     iterations: int = 60
     """At most so many steps a level."""
-    min_points: int = 20
-    """Fewest points a side at the coarsest level."""
+    min_points: int = 12
+    """Fewest points a side; levels that thinning leaves with fewer are passed over."""
     min_fitness: float = 0.1
     """Smallest share of matched points that counts as overlap."""
 
@@ -57,14 +57,13 @@ class GicpRegistrar(AbstractRegistrar):
         target_from_centred = se3.translation(target.centroid_m)
         pose = se3.inverse(target_from_centred) @ target_from_source @ source_from_centred
         centred = source.points_m - source.centroid_m, target.points_m - target.centroid_m
-        size_m = 2.0 * float(np.sqrt(max(np.mean(np.sum(points**2, axis=1)) for points in centred)))
-        information, fitness = np.zeros((6, 6)), 0.0
-        for voxel_m in (float(voxel * size_m) for voxel in self.voxels):
+        information, fitness = None, 0.0
+        for voxel_m in cube_edges_m(Cloud.of(source), Cloud.of(target), self.voxels):
             (thin_source, _), (thin_target, tree) = (
                 small_gicp.preprocess_points(points, voxel_m, self.neighbours) for points in centred
             )
             if min(thin_source.size(), thin_target.size()) < self.min_points:
-                return None
+                continue
             result = small_gicp.align(
                 thin_target,
                 thin_source,
@@ -79,6 +78,8 @@ class GicpRegistrar(AbstractRegistrar):
             )
             pose, fitness = result.T_target_source, result.num_inliers / thin_source.size()
             information = result.H / residual_variance(2.0 * result.error, result.num_inliers)
+        if information is None:
+            return None
         centred_from_source = se3.inverse(source_from_centred)
         adjoint = se3.adjoint(centred_from_source)
         return Fit(target_from_centred @ pose @ centred_from_source, adjoint.T @ information @ adjoint, fitness)

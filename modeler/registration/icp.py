@@ -10,7 +10,16 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.registration.clouds import Cloud, Fit, matched, plane_residuals, posterior, scaled_information, start
+from modeler.registration.clouds import (
+    Cloud,
+    Fit,
+    cube_edges_m,
+    matched,
+    plane_residuals,
+    posterior,
+    scaled_information,
+    start,
+)
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
 
 _STEP = 1e-6  # rad and m: a smaller step ends a level
@@ -32,8 +41,8 @@ class IcpRegistrar(AbstractRegistrar):
     """Largest distance of partners, in cubes; a pair so far from plane to point has no weight left."""
     iterations: int = 60
     """At most so many steps a level."""
-    min_points: int = 20
-    """Fewest points a side at the coarsest level."""
+    min_points: int = 12
+    """Fewest points a side."""
     min_fitness: float = 0.1
     """Smallest share of matched points that counts as overlap."""
 
@@ -48,16 +57,18 @@ class IcpRegistrar(AbstractRegistrar):
         return replace(found, seconds=time.perf_counter() - began)
 
     def refine(self, source: Cloud, target: Cloud, target_from_source: Array) -> Fit | None:
-        """Return the local optimum nearest to a pose (4, 4); None where too few points are left to match."""
+        """Return the local optimum nearest to a pose (4, 4); None where too few points are left to match.
+
+        Levels that thinning leaves with too few points are passed over.
+        """
+        fit = None
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return None
-        size_m = max(source.size_m, target.size_m)
-        fit = Fit(target_from_source, np.zeros((6, 6)), 0.0)
-        for voxel_m in np.array(self.voxels) * size_m:
+        for voxel_m in cube_edges_m(source, target, self.voxels):
             thin = source.thinned(voxel_m), target.thinned(voxel_m)
-            if min(len(cloud.points_m) for cloud in thin) < self.min_points:
-                return None
-            fit = self._level(*thin, fit.target_from_source, self.reach * voxel_m)
+            if min(len(cloud.points_m) for cloud in thin) >= self.min_points:
+                pose = target_from_source if fit is None else fit.target_from_source
+                fit = self._level(*thin, pose, self.reach * voxel_m)
         return fit
 
     def _level(self, source: Cloud, target: Cloud, pose: Array, reach_m: float) -> Fit:
