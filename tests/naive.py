@@ -48,17 +48,19 @@ def paper_density(point_b, a_from_b, ranges_m, intrinsics, noise):
 
 def visibility(pose, points, cells, intrinsics, model):
     """Log-likelihood of one pose: every point judged in turn, as `kernels.visibility` documents it."""
-    blur, silhouette_px, dead_px, clearance_m, low, high, hidden, worst, bend = model
+    blur, silhouette_px, dead_px, clearance_m, low, high, hidden, worst, bend, unmeasured = model
     fx, fy, cx, cy = intrinsics
     total = 0.0
     for point in points:
         position = pose[:3, :3] @ point[:3] + pose[:3, 3]
         normal = pose[:3, :3] @ point[3:6]
-        if position[2] <= 0:
-            continue
+        facing = -normal @ position / np.linalg.norm(position)
+        faces = np.clip((facing - low) / (high - low), 0, 1)
         column = int(np.floor(fx * position[0] / position[2] + cx + 0.5))
         row = int(np.floor(fy * position[1] / position[2] + cy + 0.5))
-        if not (0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]):
+        inside = position[2] > 0 and 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]
+        if not inside or cells[row, column, planes.KIND] == planes.MISSING:
+            total += unmeasured * faces
             continue
         cell = cells[row, column].astype(np.float64)
         if cell[planes.KIND] == planes.BACKGROUND:
@@ -69,10 +71,8 @@ def visibility(pose, points, cells, intrinsics, model):
             continue
         plane = cell[: planes.PLANE_Z + 1]
         in_front = (1 - plane @ position) / np.linalg.norm(plane)
-        facing = -normal @ position / np.linalg.norm(position)
         agreement = -normal @ plane / np.linalg.norm(plane)
         square = in_front**2 / (point[6] + cell[planes.SIGMA] ** 2 + blur**2)
-        faces = np.clip((facing - low) / (high - low), 0, 1)
         match = 0.5 - 0.5 * square - bend * (1 - agreement)
         seen = np.log((1 - hidden) * np.exp(max(match, -700)) + hidden)
         if in_front > 0 and match < np.log(hidden):

@@ -94,7 +94,7 @@ def test_visibility_equals_its_twin(seed):
     normals = rng.normal(size=(40, 3)) - [0, 0, 1.5]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = np.hstack([random_points(rng, 40), normals, rng.uniform(1e-7, 1e-4, (40, 1))])
-    model = np.array([0.004, 1.5, 1.5, 0.006, 0.1, 0.35, 0.3, 10.0, 2.0])
+    model = np.array([0.004, 1.5, 1.5, 0.006, 0.1, 0.35, 0.3, 10.0, 2.0, -1.2])
     poses = np.stack([random_pose(rng, 0.3) for _ in range(20)])
     got = visibility.log_likelihoods(rows(poses), points, cells, INTRINSICS, model)
     want = [naive.visibility(pose, points, cells, INTRINSICS, model) for pose in poses]
@@ -107,7 +107,7 @@ def test_verdicts_follow_from_where_a_point_lies():
     cells[..., planes.SIGMA], cells[..., planes.DEPTH], cells[..., planes.KIND] = 0.001, 0.8, planes.SURFACE
     cells[:, 15:, planes.KIND], cells[:, 15:, planes.DEPTH] = planes.BACKGROUND, 2.0
     cells[:, 15:, planes.SILHOUETTE] = np.arange(1, 6)
-    model = np.array([0.001, 1.0, 1.5, 0.006, 0.1, 0.35, 0.3, 10.0, 2.0])
+    model = np.array([0.001, 1.0, 1.5, 0.006, 0.1, 0.35, 0.3, 10.0, 2.0, -1.2])
     towards, away = [0.0, 0.0, -1.0], [0.0, 0.0, 1.0]
     cases = [
         ([0.0, 0.0, 0.8], towards, visibility.MATCHED),

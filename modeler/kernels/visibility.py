@@ -43,12 +43,20 @@ def place(pose, point, intrinsics, shape):
 
 
 @numba.njit(cache=True, inline="always")
+def facing_cosine(pose, point, x, y, z):
+    """Return the cosine between a carried point's normal and the direction to the camera."""
+    mx = pose[0] * point[3] + pose[1] * point[4] + pose[2] * point[5]
+    my = pose[4] * point[3] + pose[5] * point[4] + pose[6] * point[5]
+    mz = pose[8] * point[3] + pose[9] * point[4] + pose[10] * point[5]
+    return -(mx * x + my * y + mz * z) / math.sqrt(x * x + y * y + z * z)
+
+
+@numba.njit(cache=True, inline="always")
 def against_surface(pose, point, x, y, z, cell):
     """Compare a carried point with the plane measured at its pixel.
 
     Returns:
-        (distance in front of the plane in m, cosine between the carried normal and the direction to the camera,
-        cosine between the two normals).
+        (distance in front of the plane in m, cosine between the two normals).
     """
     mx = pose[0] * point[3] + pose[1] * point[4] + pose[2] * point[5]
     my = pose[4] * point[3] + pose[5] * point[4] + pose[6] * point[5]
@@ -56,9 +64,7 @@ def against_surface(pose, point, x, y, z, cell):
     plane_x, plane_y, plane_z = np.float64(cell[PLANE_X]), np.float64(cell[PLANE_Y]), np.float64(cell[PLANE_Z])
     scale = 1.0 / math.sqrt(plane_x * plane_x + plane_y * plane_y + plane_z * plane_z)
     in_front = (1.0 - plane_x * x - plane_y * y - plane_z * z) * scale
-    facing = -(mx * x + my * y + mz * z) / math.sqrt(x * x + y * y + z * z)
-    agreement = -(mx * plane_x + my * plane_y + mz * plane_z) * scale
-    return in_front, facing, agreement
+    return in_front, -(mx * plane_x + my * plane_y + mz * plane_z) * scale
 
 
 @numba.njit(cache=True, parallel=True)
@@ -66,22 +72,22 @@ def log_likelihoods(poses, points, cells, intrinsics, model):
     """Return the log-likelihood of each pose, summed over the points of one view looked up in the other.
 
     A point that faces the other camera should lie on the surface measured there, but for a share that something
-    hides; one that faces away should lie behind it; none may lie where the camera saw nothing. Scores are
-    normalised so that a point that matches within its noise and a hidden one both count 0 on average: turning
-    surface out of sight neither pays nor costs.
+    hides or the camera missed; one that faces away should lie behind it; none may lie where the camera saw
+    nothing. Scores are normalised so that a point that matches within its noise and a hidden one both count 0 on
+    average: turning surface out of sight neither pays nor costs.
 
     Args:
         poses: (m, 12) rows of the 3×4 matrices that carry the points into the other camera.
         points: (n, 7) position in m, unit normal, variance along the normal in m².
         cells: (h, w, 8) of the other view, see `planes`.
         intrinsics: (4,) fx, fy, cx, cy in px of the other view.
-        model: (9,) extra noise of the surfaces in m; standard deviation and dead zone of the silhouette in px;
+        model: (10,) extra noise of the surfaces in m; standard deviation and dead zone of the silhouette in px;
             clearance in m from which a background is behind; the cosines at which a point begins to face the camera
             and fully does; share of hidden points; most that one point may cost; weight of a disagreement of
-            normals.
+            normals; gain (negative) of a point that should be seen where nothing was measured.
     """
     shape = cells.shape
-    blur_m, silhouette_px, dead_px, clearance_m, low, high, hidden, worst, bend = model
+    blur_m, silhouette_px, dead_px, clearance_m, low, high, hidden, worst, bend, unmeasured = model
     blur = blur_m * blur_m
     log_hidden, matched = math.log(hidden), 1.0 - hidden
     result = np.empty(poses.shape[0])
@@ -91,7 +97,8 @@ def log_likelihoods(poses, points, cells, intrinsics, model):
         for j in range(points.shape[0]):
             point = points[j]
             row, column, x, y, z = place(pose, point, intrinsics, shape)
-            if row < 0:
+            if row < 0 or cells[row, column, KIND] == MISSING:
+                total += unmeasured * min(max((facing_cosine(pose, point, x, y, z) - low) / (high - low), 0.0), 1.0)
                 continue
             cell = cells[row, column]
             kind = cell[KIND]
@@ -101,10 +108,10 @@ def log_likelihoods(poses, points, cells, intrinsics, model):
                     beyond /= silhouette_px
                     total -= min(0.5 * beyond * beyond, worst)
             elif kind == SURFACE:
-                in_front, facing, agreement = against_surface(pose, point, x, y, z, cell)
+                in_front, agreement = against_surface(pose, point, x, y, z, cell)
                 spread = np.float64(cell[SIGMA])
                 square = in_front * in_front / (point[6] + spread * spread + blur)
-                faces = min(max((facing - low) / (high - low), 0.0), 1.0)
+                faces = min(max((facing_cosine(pose, point, x, y, z) - low) / (high - low), 0.0), 1.0)
                 if faces > 0.0:
                     match = 0.5 - 0.5 * square - bend * (1.0 - agreement)
                     if in_front > 0.0 and match < log_hidden:
@@ -123,7 +130,7 @@ def log_likelihoods(poses, points, cells, intrinsics, model):
 def classify(pose, points, cells, intrinsics, model):
     """Return the verdict (n,) on each point under one pose (12,); arguments as for `log_likelihoods`."""
     shape = cells.shape
-    blur_m, _, dead_px, clearance_m, low, high, _, _, _ = model
+    blur_m, _, dead_px, clearance_m, low, high, _, _, _, _ = model
     verdicts = np.zeros(points.shape[0], dtype=np.int8)
     for j in range(points.shape[0]):
         row, column, x, y, z = place(pose, points[j], intrinsics, shape)
@@ -136,12 +143,39 @@ def classify(pose, points, cells, intrinsics, model):
             if cell[SILHOUETTE] > dead_px and z < cell[DEPTH] - clearance_m:
                 verdicts[j] = IN_EMPTY_SPACE
         elif cell[KIND] == SURFACE:
-            in_front, facing, _ = against_surface(pose, points[j], x, y, z, cell)
+            in_front, _ = against_surface(pose, points[j], x, y, z, cell)
             sigma = math.sqrt(points[j, 6] + cell[SIGMA] * cell[SIGMA] + blur_m * blur_m)
             if in_front > 4.0 * sigma:
                 verdicts[j] = IN_FRONT
-            elif facing > 0.5 * (low + high):
+            elif facing_cosine(pose, points[j], x, y, z) > 0.5 * (low + high):
                 verdicts[j] = MATCHED if in_front > -4.0 * sigma else BEHIND
             else:
                 verdicts[j] = HIDDEN
     return verdicts
+
+
+@numba.njit(cache=True)
+def matched_residuals(pose, points, cells, intrinsics, model):
+    """Return what surface noise explains the matched points under one pose (12,): arguments as for `log_likelihoods`.
+
+    Returns:
+        (k,) squared distance from the surface, less the variances of point and plane, in m², of the points that match.
+    """
+    shape = cells.shape
+    low, high = model[4], model[5]
+    squares = np.empty(points.shape[0])
+    count = 0
+    for j in range(points.shape[0]):
+        row, column, x, y, z = place(pose, points[j], intrinsics, shape)
+        if row < 0 or cells[row, column, KIND] != SURFACE:
+            continue
+        cell = cells[row, column]
+        if facing_cosine(pose, points[j], x, y, z) < 0.5 * (low + high):
+            continue
+        in_front, _ = against_surface(pose, points[j], x, y, z, cell)
+        spread = np.float64(cell[SIGMA])
+        known = points[j, 6] + spread * spread
+        if in_front * in_front < 16.0 * (known + model[0] * model[0]):
+            squares[count] = in_front * in_front - known
+            count += 1
+    return squares[:count]

@@ -9,6 +9,7 @@ from modeler import se3
 from modeler.types import AbstractMotion, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
+Level = Callable[[Array], LogLikelihood]  # from the samples so far, (n, 4, 4), the next likelihood
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,8 +22,8 @@ class Population:
     """(n,) under the last level."""
     log_evidence: float
     """Log of the mean likelihood under the prior."""
-    ancestors: int
-    """Number of distinct samples that the last weighting left."""
+    effective_samples: float
+    """Kish's effective size, with samples that no move has parted since the last weighting counted as one."""
     acceptance: float
     """Share of moves taken in the last round."""
     pareto_k: float
@@ -33,34 +34,37 @@ class Population:
 class AnnealedSampler:
     """Sequential Monte Carlo: weight, resample, move; temperatures bridge the steps where weights would collapse."""
 
-    initial: int = 4000
+    initial: int = 3000
     """Samples drawn from the prior."""
-    particles: int = 1000
+    particles: int = 500
     """Samples kept from the first weighting on."""
-    moves: int = 3
+    moves: int = 2
     """Rounds of moves after a weighting."""
-    final_moves: int = 6
-    """Rounds of moves after the last one."""
+    final_particles: int = 1000
+    """Samples of the result."""
+    final_moves: int = 4
+    """Rounds of moves after the last weighting."""
     min_share: float = 0.4
     """Least effective share of the samples that a weighting may leave; with less, the step is cut."""
 
     def run(
-        self, motion: AbstractMotion, levels: Sequence[LogLikelihood], centre_m: Array, rng: np.random.Generator
+        self, motion: AbstractMotion, levels: Sequence[Level], centre_m: Array, rng: np.random.Generator
     ) -> Population:
         """Return samples of motion × last level.
 
         Args:
             motion: where to start.
-            levels: log-likelihoods from the bluntest to the one wanted.
+            levels: makers of log-likelihoods, from the bluntest to the one wanted; each is shown the samples so far.
             centre_m: (3,) point of the source about which moves turn.
             rng: source of all randomness.
         """
         poses = motion.sample(self.initial, rng)
         prior = motion.log_density(poses)
         before = np.zeros(len(poses))
-        evidence, worst_tail, ancestors, acceptance = 0.0, -np.inf, 0, 0.0
-        for number, level in enumerate(levels):
-            previous = levels[number - 1] if number else None
+        evidence, worst_tail, acceptance = 0.0, -np.inf, 0.0
+        previous = None
+        for number, make in enumerate(levels):
+            level = make(poses)
             after = level(poses)
             reached = 0.0
             while reached < 1.0:
@@ -70,15 +74,15 @@ class AnnealedSampler:
                 evidence += _log_mean_exp(log_weights)
                 worst_tail = max(worst_tail, pareto_tail(log_weights))
                 reached += step
-                chosen = _resample(log_weights, self.particles, rng)
-                ancestors = len(np.unique(chosen))
+                last = number == len(levels) - 1 and reached >= 1.0
+                chosen = _resample(log_weights, self.final_particles if last else self.particles, rng)
                 poses, prior, before, after = poses[chosen], prior[chosen], before[chosen], after[chosen]
                 blend = _Blend(motion, previous, level, reached)
-                last = number == len(levels) - 1 and reached >= 1.0
                 for _ in range(self.final_moves if last else self.moves):
                     acceptance = _move(poses, (prior, before, after), blend=blend, centre_m=centre_m, rng=rng)
-            before = after
-        return Population(poses, before, evidence, ancestors, acceptance, worst_tail)
+            before, previous = after, level
+        _, copies = np.unique(poses[:, :3, 3], axis=0, return_counts=True)
+        return Population(poses, before, evidence, len(poses) ** 2 / float(np.sum(copies**2)), acceptance, worst_tail)
 
 
 @dataclass(frozen=True, eq=False)

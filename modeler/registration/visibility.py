@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -22,16 +23,14 @@ class VisibilityRegistrar(AbstractRegistrar):
 
     points: int = 300
     """Surface points taken from each view."""
-    effective_points: float = 60.0
+    effective_points: float = 40.0
     """Number of independent measurements that the points of both views together are worth."""
     blurs_m: tuple[float, ...] = (0.016, 0.008, 0.004, 0.002, 0.001, 0.0)
-    """Blur of the surfaces at each level of the annealing; the last is the likelihood itself."""
-    trusts: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-    """Weight of each level: a blurred likelihood ranks distant modes badly, so it may only lean, not decide."""
-    surface_noise: float = 0.25
-    """Error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
-    surface_detail: float = 0.0015
-    """Error of local planes on a curved surface, as a share of the object's size."""
+    """Blur of the surfaces at each level of the annealing; at the last, the noise of the surfaces is inferred."""
+    surface_noise: float = 0.1
+    """Least error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
+    surface_detail: float = 0.003
+    """Least error of local planes on a curved surface, as a share of the object's size."""
     hidden_share: float = 0.3
     """Share of points that face the other camera and are hidden by another part of the object."""
     worst: float = 10.0
@@ -44,6 +43,8 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Fewer surface points than this in a view are not registered."""
     min_overlap: float = 0.2
     """Least share of the surface that both should see and do."""
+    min_effective: float = 100.0
+    """With fewer effective samples the result is called degenerate."""
     max_sigma_deg: float = 10.0
     """Rotation less sure than this is called ambiguous."""
 
@@ -55,7 +56,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS)
         pair = Pair(self, source, target, seed=int(rng.integers(2**32)))
-        levels = [pair.level(blur_m, trust) for blur_m, trust in zip(self.blurs_m, self.trusts, strict=True)]
+        levels = [partial(pair.level, blur_m) for blur_m in self.blurs_m[:-1]] + [pair.last_level]
         population = self.sampler.run(motion, levels, source.centroid_m, rng)
         weights = np.full(len(population.poses), 1.0 / len(population.poses))
         pose = weighted_gaussian(population.poses, weights, source.centroid_m)
@@ -68,7 +69,7 @@ class VisibilityRegistrar(AbstractRegistrar):
             overlap=overlap,
             samples=population.poses,
             weights=weights,
-            effective_samples=float(population.ancestors),
+            effective_samples=population.effective_samples,
             pareto_k=population.pareto_k,
             log_evidence=population.log_evidence,
             seconds=time.perf_counter() - started,
@@ -77,7 +78,7 @@ class VisibilityRegistrar(AbstractRegistrar):
     def _outcome(self, population: Population, pose: PoseGaussian, overlap: float) -> Outcome:
         if overlap < self.min_overlap:
             return Outcome.NO_OVERLAP
-        if population.ancestors < 0.1 * self.sampler.particles or population.acceptance < 0.01:
+        if population.effective_samples < self.min_effective:
             return Outcome.DEGENERATE
         sigma_rad = np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])
         return Outcome.AMBIGUOUS if sigma_rad > np.deg2rad(self.max_sigma_deg) else Outcome.CONVERGED
@@ -95,13 +96,13 @@ class Pair:
         self._surface_m = method.surface_detail * float(np.mean(sizes_m))
         self._weight = method.effective_points / sum(len(points) for points in self._points)
 
-    def level(self, blur_m: float, trust: float = 1.0) -> LogLikelihood:
-        """Return `trust` × the tempered log-likelihood of poses (n, 4, 4), the surfaces blurred by `blur_m`."""
+    def level(self, blur_m: float, _: Array) -> LogLikelihood:
+        """Return the tempered log-likelihood of poses (n, 4, 4), the surfaces blurred by `blur_m`."""
         share = 1 if blur_m < 0.003 else 2 if blur_m < 0.006 else 4  # blunt comparisons need fewer points
         source, target = self._views
         of_source, of_target = (np.ascontiguousarray(points[::share]) for points in self._points)
         in_target, in_source = self._model(target, blur_m), self._model(source, blur_m)
-        weight = self._weight * share * trust
+        weight = self._weight * share
 
         def log_likelihood(target_from_source: Array) -> Array:
             forward = rows(target_from_source)
@@ -112,6 +113,34 @@ class Pair:
             )
 
         return log_likelihood
+
+    def last_level(self, poses: Array) -> LogLikelihood:
+        """Return the log-likelihood with the noise of these surfaces, as the samples so far show it."""
+        return self.level(self._surface_noise_m(poses), poses)
+
+    def _surface_noise_m(self, poses: Array) -> float:
+        """Return the standard deviation in m of matching surfaces' distance, beyond their pixels' noise.
+
+        It holds what smoothing does to curved surfaces, the sensor's noise that neighbours share, and what is left of
+        the samples' own spread: a nuisance parameter, at its most likely value given the samples.
+        """
+        blur_m = self._method.blurs_m[-2]
+        source, target = self._views
+        variances = []
+        for pose in poses[:: max(len(poses) // 20, 1)]:
+            squares = [
+                kernel.matched_residuals(
+                    rows(motion[None])[0], points, view.layers["cells"], intrinsics(view), self._model(view, blur_m)
+                )
+                for motion, points, view in (
+                    (pose, self._points[0], target),
+                    (se3.inverse(pose), self._points[1], source),
+                )
+            ]
+            matched = np.concatenate(squares)
+            if len(matched) > 20:
+                variances.append(np.mean(matched))
+        return float(np.sqrt(max(np.median(variances), 0.0))) if variances else blur_m
 
     def overlap(self, target_from_source: Array) -> float:
         """Return the share of points that should be seen by both cameras and are."""
@@ -148,8 +177,19 @@ class Pair:
                 method.hidden_share,
                 method.worst,
                 method.bend,
+                np.log(max(method.hidden_share, 1.0 - measured_share(other))),
             ]
         )
+
+
+def measured_share(view: RayImage) -> float:
+    """Return the share of pixels around the surface points that carry a measurement: low for very sparse images."""
+    rows_, columns = view.pixels[:: max(len(view.pixels) // 500, 1)].T
+    height, width = view.frame.depth_m.shape
+    steps = np.arange(-2, 3)
+    near_rows = np.clip(rows_[:, None, None] + steps[:, None], 0, height - 1)
+    near_columns = np.clip(columns[:, None, None] + steps, 0, width - 1)
+    return float(np.mean(view.frame.depth_m[near_rows, near_columns] > 0))
 
 
 def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> Array:
