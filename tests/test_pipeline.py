@@ -16,7 +16,7 @@ from modeler.closure import Closer
 from modeler.fusion import Fuser
 from modeler.pipeline import ACCEPTED, Modeler
 from modeler.rays import Sensor
-from modeler.segmentation import Scene, Segmenter
+from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import (
     AbstractMotion,
     AbstractPrior,
@@ -207,3 +207,15 @@ def test_same_seed_same_bits_side_by_side_or_one_after_the_other() -> None:
     assert one.model is not None
     assert other.model is not None
     assert np.array_equal(one.model.vertices_m, other.model.vertices_m)
+
+
+@pytest.mark.parametrize(("frames", "told"), [(1, 1), (3, 3), (15, 15), (16, 15), (1000, 15)])
+def test_a_scene_is_told_by_few_frames_spread_over_the_sequence(frames: int, told: int) -> None:
+    indices = range(7, 7 + 2 * frames, 2)
+    chosen = telling(indices)
+    assert len(chosen) == len(set(chosen)) == told
+    assert set(chosen) <= set(indices)
+    assert chosen[0] == indices[0]
+    assert chosen[-1] == indices[-1] or frames == 1
+    gaps = np.diff(chosen)
+    assert np.ptp(gaps) <= 2 if len(gaps) else told == 1

@@ -12,11 +12,9 @@ from modeler.fusion import Fuser
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
-from modeler.segmentation import Scene, Segmenter
+from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import AbstractPrior, AbstractRegistrar, InputError
 from sequences import AbstractSequence
-
-_SCENE_FRAMES = 15  # teach what stands still; more say little that is new
 
 
 def open_sequence(path: Path) -> AbstractSequence:
@@ -62,10 +60,7 @@ def seed(given: int) -> int:
 
 def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
     """Return what frames spread over the whole sequence teach the segmenter."""
-    last = len(sequence) - 1
-    count = min(_SCENE_FRAMES, len(sequence))
-    spread = sorted({round(number * last / max(1, count - 1)) for number in range(count)})
-    return modeler.segmenter.scene([sequence.frame(sequence.indices[number]) for number in spread])
+    return modeler.segmenter.scene([sequence.frame(index) for index in telling(sequence.indices)])
 
 
 def prior(options: PriorOptions) -> AbstractPrior:

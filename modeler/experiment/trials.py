@@ -12,10 +12,9 @@ import numpy as np
 from modeler.evaluation import nees, rotation_error_deg, translation_error_m, true_motion
 from modeler.experiment.pairing import Pairing
 from modeler.rays import Sensor
-from modeler.segmentation import Segmenter
+from modeler.segmentation import Segmenter, telling
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Frame, InputError, Outcome, Posterior, RayImage
 
-_SCENE_FRAMES = 15  # teach the segmenter what stands still
 _SPARSE_STREAM = 1  # the random stream that thins frame k is [seed, k, this]; pairs draw from [seed, source, target]
 
 
@@ -138,8 +137,7 @@ class Experiment:
         """Yield the views by frame number, or why there is none."""
         noise = recorded.sensor()
         sensor = Sensor() if noise is None else Sensor(*noise)
-        chosen = np.unique(np.linspace(0, len(indices) - 1, min(_SCENE_FRAMES, len(indices))).round().astype(int))
-        scene = self.segmenter.scene([recorded.frame(indices[k]) for k in chosen])
+        scene = self.segmenter.scene([recorded.frame(index) for index in telling(indices)])
         for index in indices:
             frame = recorded.frame(index)
             found = self.segmenter.segment(frame, scene)

@@ -2,7 +2,7 @@
 
 from modeler.segmentation.noise import DepthNoise
 from modeler.segmentation.plane_fit import fit_plane
-from modeler.segmentation.scene import Scene
+from modeler.segmentation.scene import Scene, telling
 from modeler.segmentation.segmenter import Segmenter
 
-__all__ = ["DepthNoise", "Scene", "Segmenter", "fit_plane"]
+__all__ = ["DepthNoise", "Scene", "Segmenter", "fit_plane", "telling"]

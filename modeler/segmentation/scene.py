@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -45,6 +46,12 @@ class Scene:
     """Whether there is no doubt about which thing is the object and which plane its support."""
     still: bool = False
     """Whether camera and scenery stand still, so that the scene holds for other frames."""
+
+
+def telling(indices: Sequence[int], *, count: int = 15) -> tuple[int, ...]:
+    """Return the numbers of at most `count` frames, evenly spread over a sequence, that tell what its scene is."""
+    places = np.linspace(0, len(indices) - 1, min(count, len(indices))).round()
+    return tuple(indices[place] for place in places.astype(np.int64).tolist())
 
 
 def learn(layers: Layers, allowed: BoolArray, noise: DepthNoise, *, least_points: float) -> Scene:
