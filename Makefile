@@ -33,4 +33,4 @@ calibrate: setup
 	$(BIN)/pytest -m slow --timeout 0
 
 bench: setup
-	$(BIN)/python -m benchmarks
+	$(BIN)/python tests/bench.py

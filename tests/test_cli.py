@@ -19,6 +19,7 @@ from modeler import se3
 from modeler.cli import main
 from modeler.cli.interrupt import Interrupt
 from modeler.cli.options import PriorOptions
+from modeler.cli.usage import parsed
 from modeler.priors import GeneralPrior, TablePrior
 from sequences import bundled, open_sequence
 
@@ -115,6 +116,18 @@ def test_defaults_told_in_help_are_those_of_the_priors(run: Run, name: str) -> N
     priors = (GeneralPrior, TablePrior)
     defaults = {field.default for prior in priors for field in dataclasses.fields(prior) if field.name == name}
     assert {float(told[1])} == defaults
+
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+
+
+@pytest.mark.parametrize("line", re.findall(r"^    modeler ([^#\n]*)", README, re.MULTILINE))
+def test_commands_of_the_readme_are_understood(line: str) -> None:
+    assert parsed(line.split()).run.__doc__
+
+
+def test_the_readme_names_every_file_of_a_run_folder() -> None:
+    assert {name for name in re.findall(r"`(\w+\.\w+)`", README) if name in FILES} == FILES
 
 
 # Wrong usage and unreadable input
