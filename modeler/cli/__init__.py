@@ -4,6 +4,7 @@ Each command is a frozen dataclass whose fields are its options; `run` returns t
 imported when a command runs, so that help appears at once.
 """
 
+import logging
 import sys
 from collections.abc import Sequence
 
@@ -19,6 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: what follows the program's name; those of the process without it.
     """
+    logging.basicConfig(level=logging.WARNING, format="modeler: %(message)s")  # to stderr
     command = parsed(sys.argv[1:] if arguments is None else arguments)
     from modeler.types import InputError
 
