@@ -64,6 +64,22 @@ def nees(estimate: PoseGaussian, truth: Array, components: slice = slice(0, 6)) 
     return float(xi @ np.linalg.solve(estimate.covariance[components, components], xi))
 
 
+def about(estimate: PoseGaussian, point_m: Array) -> PoseGaussian:
+    """Return a motion's Gaussian in source coordinates shifted to a point, along the camera's axes.
+
+    Its ξ then turns about that point and moves it, so that rotation and translation hardly mix at the object's
+    centroid; `truth @ se3.translation(point_m)` is the truth to compare with. The NEES of all six stays the same.
+
+    Args:
+        estimate: target_from_source.
+        point_m: (3,) in the source camera.
+    """
+    point_m = np.asarray(point_m, dtype=np.float64)
+    to_point = se3.adjoint(se3.translation(-point_m))
+    covariance = to_point @ estimate.covariance @ to_point.T
+    return PoseGaussian(estimate.mean @ se3.translation(point_m), 0.5 * (covariance + covariance.T))
+
+
 def coverage(nees_values: Iterable[float], degrees: int = 6, levels: Iterable[float] = LEVELS) -> dict[float, float]:
     """Return by nominal probability the share (0..1) of truths that lay inside the region of that probability.
 
@@ -73,8 +89,10 @@ def coverage(nees_values: Iterable[float], degrees: int = 6, levels: Iterable[fl
         levels: nominal probabilities.
     """
     values = np.fromiter(nees_values, dtype=np.float64)
-    radii = {level: stats.chi2(degrees).ppf(level) for level in levels}
-    return {level: float(np.mean(values <= radius)) if len(values) else float("nan") for level, radius in radii.items()}
+    nominal = tuple(levels)
+    radii = stats.chi2(degrees).ppf(nominal)
+    shares = [float(np.mean(values <= radius)) if len(values) else float("nan") for radius in radii]
+    return dict(zip(nominal, shares, strict=True))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from scipy import stats
 from modeler import se3
 from modeler.evaluation import (
     LEVELS,
+    about,
     coverage,
     nees,
     rotation_error_deg,
@@ -94,6 +95,22 @@ def test_nees_is_in_units_of_the_covariance() -> None:
     assert nees(gaussian.inverse(), se3.inverse(truth)) == pytest.approx(nees(gaussian, truth))
     overconfident = PoseGaussian(gaussian.mean, gaussian.covariance / 100.0)
     assert nees(overconfident, truth) == pytest.approx(600.0)
+
+
+def test_about_a_point_turns_about_it_and_keeps_the_nees() -> None:
+    rng = np.random.default_rng(8)
+    gaussian = _random_gaussian(rng)
+    truth = gaussian.mean @ se3.exp(0.05 * rng.normal(size=6))
+    shifted, there = about(gaussian, CENTROID_M), truth @ se3.translation(CENTROID_M)
+    assert nees(shifted, there) == pytest.approx(nees(gaussian, truth))
+    assert nees(shifted, there, slice(0, 3)) == pytest.approx(nees(gaussian, truth, slice(0, 3)))
+    # An object that turns about its own centroid stays there; in the camera its translation looks uncertain.
+    xi = rng.normal(size=(20000, 6)) * np.repeat([0.02, 1e-4], 3)
+    draws = se3.translation(CENTROID_M) @ se3.exp(xi) @ se3.translation(-CENTROID_M)
+    _, covariance = se3.mean(draws, np.ones(len(draws)))
+    sigmas = np.sqrt(np.diag(about(PoseGaussian(np.eye(4), covariance), CENTROID_M).covariance))
+    assert np.sqrt(covariance[3, 3]) > 0.01
+    np.testing.assert_allclose(sigmas, np.repeat([0.02, 1e-4], 3), rtol=0.05)
 
 
 def test_coverage_counts() -> None:

@@ -1,0 +1,137 @@
+"""The study of calibration: its design, what it makes of posteriors known to be true or false, and that it runs."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibration.__main__ import panels, run
+from calibration.study import CONTROL, MEASURES, OURS, OUTSIDE, SPECIMENS, Condition, Study, Trial, judged, staged
+from calibration.tables import rows, text
+
+from modeler import se3
+from modeler.evaluation import rotation_error_deg, true_motion
+from modeler.priors import TablePrior
+from modeler.registration import IcpRegistrar, VisibilityRegistrar
+from modeler.registration.annealing import AnnealedSampler
+from modeler.types import Outcome, PoseGaussian, Posterior
+from sequences.recipe import builtin_recipes, load_recipe
+from sequences.renderer import RenderedSequence
+from viz.calibration import coverage_curves
+
+BLANK = Trial("tuning", "n-fold", "box", "usual", "table", OURS, 1, 0, outcome=OUTSIDE)
+CENTROID_M = np.array([0.05, -0.02, 0.8])
+
+
+def _posterior(pose: PoseGaussian, outcome: Outcome = Outcome.CONVERGED) -> Posterior:
+    return Posterior(source=1, target=0, pose=pose, outcome=outcome, overlap=1.0)
+
+
+def _drawn(count: int, claim: float) -> list[Trial]:
+    """Trials whose covariances claim standard deviations that are `claim` times the true ones."""
+    rng = np.random.default_rng(0)
+    trials = []
+    for _ in range(count):
+        factor = 0.02 * (0.4 * rng.normal(size=(6, 6)) + np.eye(6))
+        mean = se3.exp(rng.normal(size=6))
+        truth = mean @ se3.exp(factor @ rng.normal(size=6))
+        pose = PoseGaussian(mean, claim**2 * factor @ factor.T)
+        trials.append(judged(BLANK, _posterior(pose), truth, CENTROID_M))
+    return trials
+
+
+def test_the_design_is_as_wide_as_promised() -> None:
+    study = Study()
+    assert study.pairs >= 300
+    assert len(study.specimens) >= 10
+    assert {specimen.recipe for specimen in SPECIMENS} <= set(builtin_recipes())
+    assert len({specimen.recipe for specimen in SPECIMENS}) == len(SPECIMENS)
+    for half in ("tuning", "held-out"):
+        symmetries = {specimen.symmetry for specimen in SPECIMENS if specimen.half == half}
+        assert symmetries == {"asymmetric", "near-symmetric", "n-fold", "revolution"}
+    for values in zip(*((c.distance_m, c.noise, c.step_deg) for c in study.conditions), strict=True):
+        assert len(set(values)) >= 3
+
+
+@pytest.mark.parametrize("name", [specimen.recipe for specimen in SPECIMENS])
+def test_staging_changes_what_the_condition_says(name: str) -> None:
+    recipe = load_recipe(name)
+    usual, other = (
+        RenderedSequence(staged(recipe, condition, frames=4, seed=7))
+        for condition in (Condition(), Condition(distance_m=1.1, noise=2.0, step_deg=40.0))
+    )
+    turns_deg = [
+        rotation_error_deg(np.eye(4), true_motion(other.truth(), frame, frame + 1)) for frame in other.indices[:-1]
+    ]
+    assert np.mean(turns_deg) == pytest.approx(40.0, abs=10.0)
+    nearer_m, farther_m = (float(np.mean([pose[2, 3] for pose in s.truth().values()])) for s in (usual, other))
+    assert farther_m - nearer_m == pytest.approx(0.3, abs=0.05)
+    # Noise along the ray grows with the square of the distance.
+    assert other.sensor()[1] / usual.sensor()[1] == pytest.approx(2.0 * (1.1 / 0.8) ** 2, rel=0.02)
+    assert not np.allclose(usual.truth()[0], RenderedSequence(staged(recipe, Condition(), frames=4, seed=8)).truth()[0])
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_an_error_along_one_axis_counts_there(axis: int) -> None:
+    sigmas = np.array([0.01, 0.02, 0.03, 0.001, 0.002, 0.003])
+    xi = np.zeros(6)
+    xi[axis] = 2.0 * sigmas[axis]
+    mean = se3.exp(np.random.default_rng(1).normal(size=6))
+    to_centroid = se3.translation(CENTROID_M)
+    truth = mean @ to_centroid @ se3.exp(xi) @ se3.inverse(to_centroid)
+    to_camera = se3.adjoint(to_centroid)
+    pose = PoseGaussian(mean, to_camera @ np.diag(sigmas**2) @ to_camera.T)
+    trial = judged(BLANK, _posterior(pose), truth, CENTROID_M)
+    parts = {"pose", "rotation" if axis < 3 else "translation", list(MEASURES)[3 + axis]}
+    for name, square in trial.nees.items():
+        assert square == pytest.approx(4.0 if name in parts else 0.0, abs=1e-6)
+
+
+def test_true_covariances_are_found_true_and_false_ones_false() -> None:
+    count = 1000
+    for measure in rows(_drawn(count, claim=1.0), "all")[0].measures.values():
+        assert measure.mean_nees == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / count))
+        for level, share in measure.coverage.items():
+            assert share == pytest.approx(level, abs=4.0 * np.sqrt(level * (1.0 - level) / count))
+    too_sure = rows(_drawn(200, claim=0.1), "all")[0].measures["pose"]
+    assert too_sure.mean_nees > 80.0
+    assert too_sure.coverage[0.95] < 0.05
+    too_modest = rows(_drawn(200, claim=10.0), "all")[0].measures["pose"]
+    assert too_modest.mean_nees < 0.012
+    assert too_modest.coverage[0.5] == 1.0
+
+
+def test_only_answers_that_are_given_are_judged() -> None:
+    lost = judged(BLANK, _posterior(PoseGaussian(np.eye(4), np.eye(6)), Outcome.NO_OVERLAP), np.eye(4), CENTROID_M)
+    (row,) = rows([BLANK, BLANK, lost, *_drawn(20, claim=1.0)], "all")
+    assert (row.pairs, row.outside, row.refused, row.judged) == (23, 2, 1, 20)
+    assert row.measures == rows(_drawn(20, claim=1.0), "all")[0].measures
+    (empty,) = rows([BLANK], "all")
+    assert np.isnan(empty.measures["pose"].mean_nees)
+    assert OURS in text([BLANK])
+    assert coverage_curves(panels([BLANK])).startswith(b"\x89PNG")
+
+
+def test_a_study_runs_and_repeats_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    quick = AnnealedSampler(initial=1000, particles=300, moves=1, final_particles=300, final_moves=2)
+    small = Study(
+        specimens=SPECIMENS[:1],
+        conditions=(Condition(),),
+        frames=3,
+        priors={"table": TablePrior()},
+        methods={OURS: VisibilityRegistrar(points=100, sampler=quick), CONTROL: IcpRegistrar()},
+    )
+    trials = run(small, tmp_path)
+    assert [(trial.source, trial.method) for trial in trials] == [(1, OURS), (1, CONTROL), (2, OURS), (2, CONTROL)]
+    ours, control = rows(trials, "all")
+    assert (ours.judged, control.judged) == (2, 2)
+    assert control.measures["pose"].mean_nees > 5.0 * ours.measures["pose"].mean_nees
+    assert "TUNING HALF" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["calibration.csv", "calibration.json", "coverage.png"]
+    assert json.loads((tmp_path / "calibration.json").read_text())["rows"][0]["judged"] == 2
+    with (tmp_path / "calibration.csv").open() as file:
+        written = list(csv.DictReader(file))
+    assert [float(line["nees_pose"]) for line in written] == [trial.nees["pose"] for trial in trials]
+    assert list(replace(small, frames=2).trials(SPECIMENS[0])) == trials[:2]
