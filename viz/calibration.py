@@ -81,6 +81,7 @@ def _draw(axis: Axes, panel: Panel) -> None:
     axis.set_title(panel.title, fontsize=10, loc="left")
     axis.set_aspect("equal")
     axis.set_xlim(0.0, 1.0)
+    axis.set_xticks([0.0, 0.25, 0.5, 0.75, 0.9])  # none at the end, where it would run into the next panel's
     axis.set_ylim(-0.01, 1.01)
     axis.plot([0.0, 1.0], [0.0, 1.0], color="#444444", linewidth=0.8)
     count = len(panel.curves[0].nees) if panel.curves else 0
