@@ -30,6 +30,10 @@ class Outcome(enum.Enum):
     AMBIGUOUS = "ambiguous", "Several poses explain the images; add a prior (table, turntable) or more views."
     DEGENERATE = "degenerate", "Too few distinct samples carry the weight; raise the number of samples."
     NO_OVERLAP = "no overlap", "The views share too little surface; use a smaller step between frames."
+    AT_LIMIT = (
+        "at the prior's limit",
+        "The motion may be larger than the prior allows; raise --max-rotation-deg, --max-offset-m or --max-shift-m.",
+    )
     TOO_FEW_POINTS = "too few points", "The object covers too few pixels; check the mask, --roi and --max-depth-m."
     UNSURE_MASK = "unsure mask", "The object is hard to tell from its surroundings; give --roi, --max-depth-m or masks."
     NO_PLANE = "no plane", "No support plane was found; use --prior general or show more of the table."

@@ -73,7 +73,7 @@ def visibility(pose, points, cells, intrinsics, model):
         in_front = (1 - plane @ position) / np.linalg.norm(plane)
         agreement = -normal @ plane / np.linalg.norm(plane)
         square = in_front**2 / (point[6] + cell[planes.SIGMA] ** 2 + blur**2)
-        match = 0.5 - 0.5 * square - bend * (1 - agreement)
+        match = 0.5 + point[7] - 0.5 * square - bend * (1 - agreement)
         seen = np.log((1 - hidden) * np.exp(max(match, -700)) + hidden)
         if in_front > 0 and match < np.log(hidden):
             seen = max(match, -worst)

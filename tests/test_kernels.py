@@ -93,7 +93,7 @@ def test_visibility_equals_its_twin(seed):
     cells = random_cells(rng)
     normals = rng.normal(size=(40, 3)) - [0, 0, 1.5]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points = np.hstack([random_points(rng, 40), normals, rng.uniform(1e-7, 1e-4, (40, 1))])
+    points = np.hstack([random_points(rng, 40), normals, rng.uniform(1e-7, 1e-4, (40, 1)), rng.uniform(0, 1, (40, 1))])
     model = np.array([0.004, 1.5, 1.5, 0.006, 0.1, 0.35, 0.3, 10.0, 2.0, -1.2])
     poses = np.stack([random_pose(rng, 0.3) for _ in range(20)])
     got = visibility.log_likelihoods(rows(poses), points, cells, INTRINSICS, model)
@@ -118,7 +118,7 @@ def test_verdicts_follow_from_where_a_point_lies():
         ([0.17, 0.0, 0.8], towards, visibility.IN_EMPTY_SPACE),
         ([5.0, 0.0, 0.8], towards, visibility.UNKNOWN),
     ]
-    points = np.array([[*position, *normal, 1e-6] for position, normal, _ in cases])
+    points = np.array([[*position, *normal, 1e-6, 0.0] for position, normal, _ in cases])
     verdicts = visibility.classify(rows(np.eye(4)[None])[0], points, cells, INTRINSICS, model)
     assert verdicts.tolist() == [want for *_, want in cases]
 

@@ -73,12 +73,13 @@ def log_likelihoods(poses, points, cells, intrinsics, model):
 
     A point that faces the other camera should lie on the surface measured there, but for a share that something
     hides or the camera missed; one that faces away should lie behind it; none may lie where the camera saw
-    nothing. Scores are normalised so that a point that matches within its noise and a hidden one both count 0 on
-    average: turning surface out of sight neither pays nor costs.
+    nothing. Scores are normalised so that on smooth surface, which goes on as anyone would guess, a point that
+    matches within its noise and a hidden one both count 0 on average: turning it out of sight neither pays nor
+    costs. Where the surface has relief a match is a coincidence, and counts as one.
 
     Args:
         poses: (m, 12) rows of the 3×4 matrices that carry the points into the other camera.
-        points: (n, 7) position in m, unit normal, variance along the normal in m².
+        points: (n, 8) position in m, unit normal, variance along the normal in m², gain of a match (nats).
         cells: (h, w, 8) of the other view, see `planes`.
         intrinsics: (4,) fx, fy, cx, cy in px of the other view.
         model: (10,) extra noise of the surfaces in m; standard deviation and dead zone of the silhouette in px;
@@ -113,7 +114,7 @@ def log_likelihoods(poses, points, cells, intrinsics, model):
                 square = in_front * in_front / (point[6] + spread * spread + blur)
                 faces = min(max((facing_cosine(pose, point, x, y, z) - low) / (high - low), 0.0), 1.0)
                 if faces > 0.0:
-                    match = 0.5 - 0.5 * square - bend * (1.0 - agreement)
+                    match = 0.5 + point[7] - 0.5 * square - bend * (1.0 - agreement)
                     if in_front > 0.0 and match < log_hidden:
                         total += faces * max(match, -worst)  # in front of what was measured: nothing can hide it
                     elif match < -30.0:

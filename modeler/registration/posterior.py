@@ -3,7 +3,7 @@
 import numpy as np
 
 from modeler import se3
-from modeler.types import Array, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import AbstractMotion, Array, Outcome, PoseGaussian, Posterior, RayImage
 
 
 def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaussian:
@@ -23,6 +23,17 @@ def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaus
     floor = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)  # keeps the covariance of a single sample positive definite
     covariance = to_camera @ (covariance + floor) @ to_camera.T
     return PoseGaussian(mean @ se3.translation(-centre_m), 0.5 * (covariance + covariance.T))
+
+
+def share_at_limit(motion: AbstractMotion, poses: Array, centre_m: Array, rng: np.random.Generator) -> float:
+    """Return the share of motions (n, 4, 4) that a small step, about 1° and 1 mm, takes out of the prior's support.
+
+    A posterior that leans on the end of its prior is cut off there, and what it would have found beyond is not known.
+    The steps turn about `centre_m` (3,), a point of the source.
+    """
+    nudges = se3.exp(rng.normal(size=(len(poses), 6)) * np.repeat([np.radians(1.0), 0.001], 3))
+    nudged = poses @ se3.translation(centre_m) @ nudges @ se3.translation(-centre_m)
+    return float(np.mean(~np.isfinite(motion.log_density(nudged))))
 
 
 def failed(source: RayImage, target: RayImage, outcome: Outcome) -> Posterior:

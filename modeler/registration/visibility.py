@@ -9,7 +9,8 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import visibility as kernel
 from modeler.registration.annealing import AnnealedSampler, LogLikelihood, Population
-from modeler.registration.posterior import failed, intrinsics, rows, weighted_gaussian
+from modeler.registration.posterior import failed, intrinsics, rows, share_at_limit, weighted_gaussian
+from modeler.registration.surface import measured_share, relief_m, spread_points
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, PoseGaussian, Posterior, RayImage
 
 
@@ -33,6 +34,12 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Least error of local planes on a curved surface, as a share of the object's size."""
     hidden_share: float = 0.3
     """Share of points that face the other camera and are hidden by another part of the object."""
+    max_gain: float = 1.5
+    """Most that the match of one point may gain for the relief of the surface around it (nats)."""
+    relief_reaches: tuple[float, ...] = (0.1, 0.2)
+    """Radii of the surroundings that a point's height is predicted from, as shares of the object's size."""
+    relief_noise: float = 0.5
+    """Noise of the surfaces that relief stands out from, as a share of the sensor's range noise."""
     worst: float = 10.0
     """Most that one point may cost (nats)."""
     bend: float = 2.0
@@ -41,8 +48,10 @@ class VisibilityRegistrar(AbstractRegistrar):
     """How the posterior is explored."""
     min_points: int = 60
     """Fewer surface points than this in a view are not registered."""
-    min_overlap: float = 0.2
+    min_overlap: float = 0.35
     """Least share of the surface that both should see and do."""
+    max_at_limit: float = 0.2
+    """With a larger share of the samples at the end of the prior, the motion may lie beyond it."""
     min_effective: float = 100.0
     """With fewer effective samples the result is called degenerate."""
     max_sigma_deg: float = 10.0
@@ -61,11 +70,12 @@ class VisibilityRegistrar(AbstractRegistrar):
         weights = np.full(len(population.poses), 1.0 / len(population.poses))
         pose = weighted_gaussian(population.poses, weights, source.centroid_m)
         overlap = pair.overlap(pose.mean)
+        at_limit = share_at_limit(motion, population.poses, source.centroid_m, rng)
         return Posterior(
             source=source.index,
             target=target.index,
             pose=pose,
-            outcome=self._outcome(population, pose, overlap),
+            outcome=self._outcome(population, pose, overlap, at_limit=at_limit),
             overlap=overlap,
             samples=population.poses,
             weights=weights,
@@ -75,7 +85,9 @@ class VisibilityRegistrar(AbstractRegistrar):
             seconds=time.perf_counter() - started,
         )
 
-    def _outcome(self, population: Population, pose: PoseGaussian, overlap: float) -> Outcome:
+    def _outcome(self, population: Population, pose: PoseGaussian, overlap: float, *, at_limit: float) -> Outcome:
+        if at_limit > self.max_at_limit:
+            return Outcome.AT_LIMIT
         if overlap < self.min_overlap:
             return Outcome.NO_OVERLAP
         if population.effective_samples < self.min_effective:
@@ -91,10 +103,23 @@ class Pair:
         rng = np.random.default_rng(seed)
         self._method = method
         self._views = source, target
-        self._points = tuple(spread_points(view, method.points, rng) for view in (source, target))
-        sizes_m = [np.sqrt(np.sum(np.var(view.points_m, axis=0))) for view in (source, target)]
+        sizes_m = [np.sqrt(np.sum(np.var(view.points_m, axis=0))) for view in self._views]
         self._surface_m = method.surface_detail * float(np.mean(sizes_m))
+        self._points = tuple(self._drawn(view, rng) for view in self._views)
         self._weight = method.effective_points / sum(len(points) for points in self._points)
+
+    def _drawn(self, view: RayImage, rng: np.random.Generator) -> Array:
+        """Return points (n, 8) of a view with the gain of a match.
+
+        A match is worth what it says beyond what the surroundings said already: the log of the ratio of the two
+        Gaussians' widths, ½ log(1 + relief² / noise²). The blurred levels keep it, as a lead to where matches are.
+        """
+        points = spread_points(view, self._method.points, rng)
+        noise = 2.0 * points[:, 6] + self._surface_m**2 + (self._method.relief_noise * view.sigma_r_m) ** 2
+        relief = relief_m(view, points, self._method.relief_reaches)
+        excess = np.maximum(relief**2 - noise, 0.0)
+        points[:, 7] = np.minimum(0.5 * np.log1p(excess / noise), self._method.max_gain)
+        return points
 
     def level(self, blur_m: float, _: Array) -> LogLikelihood:
         """Return the tempered log-likelihood of poses (n, 4, 4), the surfaces blurred by `blur_m`."""
@@ -180,29 +205,3 @@ class Pair:
                 np.log(max(method.hidden_share, 1.0 - measured_share(other))),
             ]
         )
-
-
-def measured_share(view: RayImage) -> float:
-    """Return the share of pixels around the surface points that carry a measurement: low for very sparse images."""
-    rows_, columns = view.pixels[:: max(len(view.pixels) // 500, 1)].T
-    height, width = view.frame.depth_m.shape
-    steps = np.arange(-2, 3)
-    near_rows = np.clip(rows_[:, None, None] + steps[:, None], 0, height - 1)
-    near_columns = np.clip(columns[:, None, None] + steps, 0, width - 1)
-    return float(np.mean(view.frame.depth_m[near_rows, near_columns] > 0))
-
-
-def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> Array:
-    """Return `count` surface points, or all if fewer, evenly spread over the image.
-
-    Returns:
-        (n, 7): position in m, unit normal, variance along the normal in m².
-    """
-    total = len(view.points_m)
-    stride = max(total / count, 1.0)
-    picks = np.arange(min(count, total)) * stride + rng.random() * stride
-    chosen = np.minimum(picks.astype(np.int64), total - 1)
-    variance = np.asarray(view.layers["sigma_m"], dtype=np.float64)[chosen, None] ** 2
-    points = np.hstack([view.points_m[chosen], view.normals[chosen], variance])
-    # In random order, so that every stride through them is again spread over the object.
-    return points[rng.permutation(len(points))]
