@@ -42,10 +42,11 @@ class Sensor:
         # Object pixels that carry no depth still hide what is behind them: the silhouette is the whole mask's.
         outline = mask if frame.mask is None else frame.mask
         cells[..., planes.SILHOUETTE] = planes.silhouette_distance(outline, self.max_silhouette_px)
-        rows, columns = np.nonzero(
-            (cells[..., planes.KIND] == planes.SURFACE) & (cells[..., planes.COSINE] > self.min_cosine)
-        )
+        rows, columns = np.nonzero(cells[..., planes.KIND] == planes.SURFACE)
         points_m, normals = surface_points(cells, rows, columns, intrinsics)
+        cosine = -np.sum(points_m * normals, axis=1) / np.linalg.norm(points_m, axis=1)
+        frontal = cosine > self.min_cosine
+        rows, columns, points_m, normals = rows[frontal], columns[frontal], points_m[frontal], normals[frontal]
         return RayImage(
             frame=frame,
             plane=plane,
@@ -54,7 +55,7 @@ class Sensor:
             points_m=points_m,
             normals=normals,
             pixels=np.stack([rows, columns], axis=1),
-            layers={"cells": cells, "sigma_m": cells[rows, columns, planes.SIGMA].astype(np.float64)},
+            layers={"cells": cells, "variance_m2": cells[rows, columns, planes.VARIANCE].astype(np.float64)},
         )
 
     def _ball(self, frame: Frame, mask: np.ndarray) -> tuple[float, int]:
@@ -83,8 +84,8 @@ class Sensor:
 def surface_points(cells: np.ndarray, rows: np.ndarray, columns: np.ndarray, intrinsics: Array) -> tuple[Array, Array]:
     """Return the points (n, 3) in m where pixels' rays meet their local planes, and the planes' normals (n, 3)."""
     fx, fy, cx, cy = intrinsics
-    plane = cells[rows, columns, planes.PLANE_X : planes.PLANE_Z + 1].astype(np.float64)
+    normals = cells[rows, columns, : planes.NORMAL_Z + 1].astype(np.float64)
+    distance_m = cells[rows, columns, planes.DISTANCE].astype(np.float64)
     rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones(len(rows))], axis=1)
-    points_m = rays / np.sum(plane * rays, axis=1, keepdims=True)
-    normals = -plane / np.linalg.norm(plane, axis=1, keepdims=True)
-    return points_m, normals
+    points_m = rays * (-distance_m / np.sum(normals * rays, axis=1))[:, None]
+    return points_m, normals / np.linalg.norm(normals, axis=1, keepdims=True)

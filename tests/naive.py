@@ -46,9 +46,9 @@ def paper_density(point_b, a_from_b, ranges_m, intrinsics, noise):
     return k2 * total
 
 
-def visibility(pose, points, cells, intrinsics, model):
+def visibility(pose, points, cells, intrinsics, model, hidden):
     """Log-likelihood of one pose: every point judged in turn, as `kernels.visibility` documents it."""
-    blur, silhouette_px, dead_px, clearance_m, low, high, hidden, worst, bend, unmeasured = model
+    blur, silhouette_px, dead_px, clearance_m, low, high, worst, bend, unmeasured = model
     fx, fy, cx, cy = intrinsics
     total = 0.0
     for point in points:
@@ -69,10 +69,10 @@ def visibility(pose, points, cells, intrinsics, model):
                 total -= min(0.5 * beyond**2, worst)
         if cell[planes.KIND] != planes.SURFACE:
             continue
-        plane = cell[: planes.PLANE_Z + 1]
-        in_front = (1 - plane @ position) / np.linalg.norm(plane)
-        agreement = -normal @ plane / np.linalg.norm(plane)
-        square = in_front**2 / (point[6] + cell[planes.SIGMA] ** 2 + blur**2)
+        plane = cell[: planes.NORMAL_Z + 1]
+        in_front = plane @ position + cell[planes.DISTANCE]
+        agreement = normal @ plane
+        square = in_front**2 / (point[6] + cell[planes.VARIANCE] + blur**2)
         match = 0.5 + point[7] - 0.5 * square - bend * (1 - agreement)
         seen = np.log((1 - hidden) * np.exp(max(match, -700)) + hidden)
         if in_front > 0 and match < np.log(hidden):

@@ -162,11 +162,11 @@ def test_sparse_frames_keep_so_many_pixels_of_the_object_and_all_of_the_rest() -
 def test_sparse_views_keep_so_many_points_and_what_belongs_to_them() -> None:
     view = Sensor().ray_image(tabletop.view(BODY, POSES[0], 0).frame)
     thin = sparse_view(view, 50, np.random.default_rng(0))
-    assert [len(a) for a in (thin.points_m, thin.normals, thin.pixels, thin.layers["sigma_m"])] == [50] * 4
+    assert [len(a) for a in (thin.points_m, thin.normals, thin.pixels, thin.layers["variance_m2"])] == [50] * 4
     at = [int(np.flatnonzero(np.all(view.pixels == pixel, axis=1))[0]) for pixel in thin.pixels]
     np.testing.assert_array_equal(thin.points_m, view.points_m[at])
     np.testing.assert_array_equal(thin.normals, view.normals[at])
-    np.testing.assert_array_equal(thin.layers["sigma_m"], view.layers["sigma_m"][at])
+    np.testing.assert_array_equal(thin.layers["variance_m2"], view.layers["variance_m2"][at])
     assert thin.layers["cells"] is view.layers["cells"]
     np.testing.assert_array_equal(sparse_view(view, 10**6, np.random.default_rng(0)).points_m, view.points_m)
 

@@ -75,39 +75,55 @@ def test_a_point_in_front_of_every_pixel_rejects_the_sample(rng):
 def random_cells(rng):
     cells = np.zeros((*SHAPE, planes.CELL_SIZE), dtype=np.float32)
     depth = rng.uniform(0.7, 0.9, SHAPE)
-    tilt = rng.normal(0, 0.8, (*SHAPE, 2))
-    cells[..., :2] = tilt
-    w = (np.arange(SHAPE[1]) - INTRINSICS[2]) / INTRINSICS[0]
-    h = ((np.arange(SHAPE[0]) - INTRINSICS[3]) / INTRINSICS[1])[:, None]
-    cells[..., planes.PLANE_Z] = 1 / depth - tilt[..., 0] * w - tilt[..., 1] * h
-    cells[..., planes.SIGMA] = rng.uniform(0.0005, 0.01, SHAPE)
+    normals = rng.normal(0, 0.5, (*SHAPE, 3)) - [0, 0, 1.5]
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    w = np.broadcast_to((np.arange(SHAPE[1]) - INTRINSICS[2]) / INTRINSICS[0], SHAPE)
+    h = np.broadcast_to(((np.arange(SHAPE[0]) - INTRINSICS[3]) / INTRINSICS[1])[:, None], SHAPE)
+    cells[..., : planes.NORMAL_Z + 1] = normals
+    cells[..., planes.DISTANCE] = -depth * np.sum(normals * np.stack([w, h, np.ones(SHAPE)], axis=-1), axis=-1)
+    cells[..., planes.VARIANCE] = rng.uniform(0.0005, 0.01, SHAPE) ** 2
     cells[..., planes.DEPTH] = depth
     cells[..., planes.KIND] = rng.choice(4, SHAPE, p=[0.1, 0.6, 0.1, 0.2])
     cells[..., planes.SILHOUETTE] = rng.uniform(0, 6, SHAPE)
     return cells
 
 
+IMAGE = np.array([*INTRINSICS, SHAPE[1], SHAPE[0]])
+MODEL = np.array([0.004, 1.5, 1.5, 0.006, 0.1, 0.35, 10.0, 2.0, -1.2])
+HIDDEN = 0.3
+
+
 @pytest.mark.parametrize("seed", range(10))
-def test_visibility_equals_its_twin(seed):
+def test_visibility_is_within_its_bound_of_its_twin(seed):
     rng = np.random.default_rng(seed)
     cells = random_cells(rng)
     normals = rng.normal(size=(40, 3)) - [0, 0, 1.5]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points = np.hstack([random_points(rng, 40), normals, rng.uniform(1e-7, 1e-4, (40, 1)), rng.uniform(0, 1, (40, 1))])
-    model = np.array([0.004, 1.5, 1.5, 0.006, 0.1, 0.35, 0.3, 10.0, 2.0, -1.2])
+    points = np.hstack(
+        [random_points(rng, 40), normals, rng.uniform(1e-7, 1e-4, (40, 1)), rng.uniform(0, 1.5, (40, 1))]
+    )
     poses = np.stack([random_pose(rng, 0.3) for _ in range(20)])
-    got = visibility.log_likelihoods(rows(poses), points, cells, INTRINSICS, model)
-    want = [naive.visibility(pose, points, cells, INTRINSICS, model) for pose in poses]
-    np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-9)
+    columns, table = np.ascontiguousarray(points.T), visibility.match_table(HIDDEN)
+    flat = cells.reshape(-1, planes.CELL_SIZE)
+    got = visibility.log_likelihoods(rows(poses), columns, flat, IMAGE, MODEL, table)
+    want = [naive.visibility(pose, points, cells, INTRINSICS, MODEL, HIDDEN) for pose in poses]
+    np.testing.assert_allclose(got, want, rtol=0, atol=4e-6 * len(points))
+
+
+@pytest.mark.parametrize("hidden", [0.05, 0.3, 0.6])
+def test_the_table_of_matches_errs_by_less_than_stated(hidden):
+    match = np.linspace(visibility.TABLE_LOW, visibility.TABLE_HIGH, 100_001)
+    nodes = np.linspace(visibility.TABLE_LOW, visibility.TABLE_HIGH, visibility.TABLE_STEPS + 1)
+    exact = np.log((1 - hidden) * np.exp(match) + hidden)
+    np.testing.assert_allclose(np.interp(match, nodes, visibility.match_table(hidden)), exact, rtol=0, atol=4e-6)
 
 
 def test_verdicts_follow_from_where_a_point_lies():
     cells = np.zeros((*SHAPE, planes.CELL_SIZE), dtype=np.float32)
-    cells[..., planes.PLANE_Z] = 1 / 0.8
-    cells[..., planes.SIGMA], cells[..., planes.DEPTH], cells[..., planes.KIND] = 0.001, 0.8, planes.SURFACE
+    cells[..., planes.NORMAL_Z], cells[..., planes.DISTANCE] = -1.0, 0.8
+    cells[..., planes.VARIANCE], cells[..., planes.DEPTH], cells[..., planes.KIND] = 1e-6, 0.8, planes.SURFACE
     cells[:, 15:, planes.KIND], cells[:, 15:, planes.DEPTH] = planes.BACKGROUND, 2.0
     cells[:, 15:, planes.SILHOUETTE] = np.arange(1, 6)
-    model = np.array([0.001, 1.0, 1.5, 0.006, 0.1, 0.35, 0.3, 10.0, 2.0, -1.2])
     towards, away = [0.0, 0.0, -1.0], [0.0, 0.0, 1.0]
     cases = [
         ([0.0, 0.0, 0.8], towards, visibility.MATCHED),
@@ -117,9 +133,12 @@ def test_verdicts_follow_from_where_a_point_lies():
         ([0.0, 0.0, 0.75], away, visibility.IN_FRONT),
         ([0.17, 0.0, 0.8], towards, visibility.IN_EMPTY_SPACE),
         ([5.0, 0.0, 0.8], towards, visibility.UNKNOWN),
+        ([0.0, 0.0, -0.8], towards, visibility.UNKNOWN),
     ]
-    points = np.array([[*position, *normal, 1e-6, 0.0] for position, normal, _ in cases])
-    verdicts = visibility.classify(rows(np.eye(4)[None])[0], points, cells, INTRINSICS, model)
+    points = np.array([[*position, *normal, 1e-6, 0.0] for position, normal, _ in cases]).T.copy()
+    model = np.array([0.001, *MODEL[1:]])
+    flat = cells.reshape(-1, planes.CELL_SIZE)
+    verdicts = visibility.classify(rows(np.eye(4)[None])[0], points, flat, IMAGE, model)
     assert verdicts.tolist() == [want for *_, want in cases]
 
 
@@ -130,11 +149,12 @@ def test_local_planes_are_least_squares_in_inverse_depth(rng):
     mask[2:14, 3:17] = True
     radius_m = 0.09
     cells = planes.local_planes(depth_m.astype(np.float32), mask, INTRINSICS, radius_m, 4, 1e-6)
-    fitted = np.argwhere(cells[..., planes.SIGMA] > 0)
+    fitted = np.argwhere(cells[..., planes.VARIANCE] > 0)
     assert len(fitted) > 60
     for pixel in fitted[::5]:
         want = naive.local_plane(np.where(mask, depth_m, 0).astype(np.float32), mask, INTRINSICS, pixel, radius_m)
-        np.testing.assert_allclose(cells[(*pixel, slice(0, 3))], want, rtol=2e-3, atol=2e-4)
+        got = -cells[(*pixel, slice(0, 3))] / cells[(*pixel, planes.DISTANCE)]
+        np.testing.assert_allclose(got, want, rtol=2e-3, atol=2e-4)
 
 
 def test_a_noise_free_plane_is_found_whatever_its_tilt():
@@ -147,7 +167,8 @@ def test_a_noise_free_plane_is_found_whatever_its_tilt():
     cells = planes.local_planes(depth_m.astype(np.float32), mask, intrinsics, 0.04, 6, 1e-6)
     inner = cells[20:44, 20:44]
     assert (inner[..., planes.KIND] == planes.SURFACE).all()
-    np.testing.assert_allclose(inner[..., :3], np.broadcast_to(plane, (24, 24, 3)), atol=1e-3)
+    got = -inner[..., :3] / inner[..., planes.DISTANCE, None]
+    np.testing.assert_allclose(got, np.broadcast_to(plane, (24, 24, 3)), atol=1e-3)
 
 
 def test_silhouette_distance_is_euclidean_within_the_chamfer_error(rng):

@@ -6,12 +6,12 @@ import numba
 import numpy as np
 
 # Columns of a cell, the 32 bytes a likelihood reads for one pixel (float32).
-PLANE_X, PLANE_Y, PLANE_Z = 0, 1, 2  # N with N · p = 1 on the plane, in 1/m
-SIGMA = 3  # standard deviation of the plane's distance at the pixel, m
-KIND = 4  # one of the four below
-DEPTH = 5  # measured z, m
-SILHOUETTE = 6  # distance of a pixel outside the object from its silhouette, px
-COSINE = 7  # between the normal and the direction to the camera
+NORMAL_X, NORMAL_Y, NORMAL_Z = 0, 1, 2  # unit normal n of the local plane, towards the camera
+DISTANCE = 3  # of the plane from the camera, m: n · p + distance is how far p lies in front of it
+VARIANCE = 4  # of that distance at the pixel, m²
+KIND = 5  # one of the four below
+DEPTH = 6  # measured z, m
+SILHOUETTE = 7  # distance of a pixel outside the object from its silhouette, px
 CELL_SIZE = 8
 
 MISSING, SURFACE, RAGGED, BACKGROUND = 0.0, 1.0, 2.0, 3.0  # RAGGED: object, but no plane to be trusted
@@ -121,15 +121,14 @@ def local_planes(depth_m, mask, intrinsics, radius_m, max_radius_px, sigma_inver
             along = inverse0 + offset
             if along <= 0.0:
                 continue
-            cosine = along / (norm * math.sqrt(1.0 + w0 * w0 + h0 * h0))
             residual = sbb - offset * sb - slope_x * sxb - slope_y * syb
             spread = max(residual / max(n - 3.0, 1.0), sigma_inverse * sigma_inverse)
-            cells[row, column, PLANE_X] = plane_x
-            cells[row, column, PLANE_Y] = plane_y
-            cells[row, column, PLANE_Z] = plane_z
+            cells[row, column, NORMAL_X] = -plane_x / norm
+            cells[row, column, NORMAL_Y] = -plane_y / norm
+            cells[row, column, NORMAL_Z] = -plane_z / norm
+            cells[row, column, DISTANCE] = 1.0 / norm
             # The distance of a point from the plane is (1 - N · p) / |N|: its noise is z times that of 1/z over |N|.
-            cells[row, column, SIGMA] = z * math.sqrt(spread * leverage) / norm
-            cells[row, column, COSINE] = cosine
+            cells[row, column, VARIANCE] = z * z * spread * leverage / (norm * norm)
             # A lopsided neighbourhood is the rim of a silhouette or a fold: its plane leans on one side only.
             if n >= 8.0 and leverage * n < 1.6:
                 cells[row, column, KIND] = SURFACE

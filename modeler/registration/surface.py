@@ -28,7 +28,7 @@ def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> Array
     stride = max(total / count, 1.0)
     picks = np.arange(min(count, total)) * stride + rng.random() * stride
     chosen = np.minimum(picks.astype(np.int64), total - 1)
-    variance = np.asarray(view.layers["sigma_m"], dtype=np.float64)[chosen, None] ** 2
+    variance = np.asarray(view.layers["variance_m2"], dtype=np.float64)[chosen, None]
     points = np.hstack([view.points_m[chosen], view.normals[chosen], variance, np.zeros((len(chosen), 1))])
     # In random order, so that every stride through them is again spread over the object.
     return points[rng.permutation(len(points))]

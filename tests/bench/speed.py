@@ -165,7 +165,7 @@ def _counted(work: Callable[[], object]) -> tuple[int, float, float]:
         began = time.perf_counter()
         result = kernel(poses, points, *rest)
         spent_s += time.perf_counter() - began
-        count += len(poses) * len(points)
+        count += len(poses) * points.shape[1]
         return result
 
     with patch.object(visibility, "log_likelihoods", counting):
