@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from modeler import se3
-from modeler.kernels import paper, planes, visibility
-from modeler.registration.posterior import rows
+from modeler.kernels import moves, paper, planes, visibility
+from modeler.registration.posterior import matrices, rows
 
 INTRINSICS = np.array([40.0, 42.0, 9.3, 7.1])
 SHAPE = (16, 20)
@@ -140,6 +140,18 @@ def test_verdicts_follow_from_where_a_point_lies():
     flat = cells.reshape(-1, planes.CELL_SIZE)
     verdicts = visibility.classify(rows(np.eye(4)[None])[0], points, flat, IMAGE, model)
     assert verdicts.tolist() == [want for *_, want in cases]
+
+
+@pytest.mark.parametrize("angle_rad", [1e-9, 1e-3, 0.5, 1.8])
+def test_proposals_are_steps_along_differences(rng, angle_rad):
+    first, second, moving = (np.stack([random_pose(rng, angle_rad) for _ in range(200)]) for _ in range(3))
+    scales, jitter = rng.uniform(0.1, 1.0, 200), rng.normal(0, 1e-3, (200, 6))
+    centre_m = np.array([0.05, -0.02, 0.8])
+    there, back = se3.translation(centre_m), se3.translation(-centre_m)
+    step = scales[:, None] * se3.log(back @ se3.inverse(first) @ second @ there) + jitter
+    want = moving @ there @ se3.exp(step) @ back
+    got = moves.propose(rows(moving), rows(first), rows(second), scales, jitter, centre_m)
+    np.testing.assert_allclose(matrices(got), want, atol=1e-9)
 
 
 def test_local_planes_are_least_squares_in_inverse_depth(rng):

@@ -86,16 +86,11 @@ class TableMotion(AbstractMotion):
 
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of motions (n, 4, 4); -inf outside."""
-        rotation = target_from_source[:, :3, :3]
-        carried = rotation @ self.normal
-        cosine = carried @ self.normal
-        tilt_rad = np.arctan2(np.linalg.norm(np.cross(self.normal, carried), axis=1), cosine)
+        axes = np.vstack([plane_basis(self.normal), self.normal])
+        rotation = axes @ target_from_source[:, :3, :3] @ axes.T
+        tilt_rad = np.arctan2(np.hypot(rotation[:, 0, 2], rotation[:, 1, 2]), rotation[:, 2, 2])
         # What is left of the rotation once the tilt is undone turns about the normal.
-        first, second = plane_basis(self.normal)
-        turn_rad = np.arctan2(
-            (rotation @ first) @ second - (rotation @ second) @ first,
-            (rotation @ first) @ first + (rotation @ second) @ second,
-        )
+        turn_rad = np.arctan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1])
         offset_m = centroid_offset(target_from_source, self.source_centroid_m, self.target_centroid_m)
         height_m = offset_m @ self.normal
         inside = (np.abs(turn_rad) <= self.max_rotation_rad) & (

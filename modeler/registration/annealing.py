@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from modeler import se3
+from modeler.kernels.moves import propose
+from modeler.registration.posterior import matrices, rows
 from modeler.types import AbstractMotion, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
@@ -122,15 +123,15 @@ def _move(
     count = len(poses)
     order = rng.permutation(count)
     halves = order[: count // 2], order[count // 2 :]
-    from_centre, to_centre = se3.translation(centre_m), se3.translation(-centre_m)
     taken = 0
     for moving, still in (halves, halves[::-1]):
         first, second = rng.choice(still, len(moving)), rng.choice(still, len(moving))
-        difference = se3.log(to_centre @ se3.inverse(poses[first]) @ poses[second] @ from_centre)
         # 2.38 / √(2 d) is the best scale for a Gaussian in d = 6 dimensions; shorter ones serve curved posteriors.
-        scale = 0.69 * rng.choice([1.0, 0.5, 0.25, 0.1], (len(moving), 1))
+        scales = 0.69 * rng.choice([1.0, 0.5, 0.25, 0.1], len(moving))
         jitter = rng.normal(size=(len(moving), 6)) * np.repeat([1e-4, 1e-5], 3)
-        proposed = poses[moving] @ from_centre @ se3.exp(scale * difference + jitter) @ to_centre
+        proposed = matrices(
+            propose(rows(poses[moving]), rows(poses[first]), rows(poses[second]), scales, jitter, centre_m)
+        )
         fresh = blend.evaluate(proposed)
         gain = blend.log_density(fresh) - blend.log_density((state[0][moving], state[1][moving], state[2][moving]))
         accept = np.log(rng.random(len(moving))) < gain

@@ -47,6 +47,14 @@ def rows(poses: Array) -> Array:
     return np.ascontiguousarray(poses[:, :3].reshape(len(poses), 12))
 
 
+def matrices(poses: Array) -> Array:
+    """Return motions (n, 4, 4) of their upper three rows (n, 12)."""
+    full = np.zeros((len(poses), 4, 4))
+    full[:, :3] = poses.reshape(-1, 3, 4)
+    full[:, 3, 3] = 1.0
+    return full
+
+
 def intrinsics(view: RayImage) -> Array:
     """Return fx, fy, cx, cy (4,) in px of a view's camera."""
     camera = view.frame.camera
