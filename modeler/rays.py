@@ -36,9 +36,10 @@ class Sensor:
         seen = np.isfinite(frame.depth_m) & (frame.depth_m > 0)
         mask = seen if frame.mask is None else seen & frame.mask
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        radius_m, reach_px = self._ball(frame, mask)
         depth_m = np.ascontiguousarray(frame.depth_m, dtype=np.float32)
-        cells = planes.local_planes(depth_m, mask, intrinsics, radius_m, reach_px, self._sigma_inverse(frame, mask))
+        cells = planes.local_planes(
+            depth_m, mask, intrinsics, self._ball(frame, mask), self._sigma_inverse(frame, mask)
+        )
         # Object pixels that carry no depth still hide what is behind them: the silhouette is the whole mask's.
         outline = mask if frame.mask is None else frame.mask
         cells[..., planes.SILHOUETTE] = planes.silhouette_distance(outline, self.max_silhouette_px)
@@ -58,11 +59,11 @@ class Sensor:
             layers={"cells": cells, "variance_m2": cells[rows, columns, planes.VARIANCE].astype(np.float64)},
         )
 
-    def _ball(self, frame: Frame, mask: np.ndarray) -> tuple[float, int]:
-        """Return the radius in m of the smoothing ball, and in px at the object's nearest point."""
+    def _ball(self, frame: Frame, mask: np.ndarray) -> tuple[float, int, int]:
+        """Return the radius in m of the smoothing ball, in px at the nearest point, and the step between its pixels."""
         rows, columns = np.nonzero(mask)
         if rows.size == 0:
-            return 0.01, 1
+            return 0.01, 1, 1
         depth_m = frame.depth_m[rows, columns]
         middle_m = float(np.median(depth_m))
         metres_per_px = middle_m / frame.camera.fx
@@ -71,7 +72,10 @@ class Sensor:
         sparse_px = np.sqrt(self.min_neighbours / (np.pi * max(density, 0.01)))
         radius_m = max(self.smoothing * extent_m, sparse_px * metres_per_px)
         nearest_m = float(np.percentile(depth_m, 2))
-        return radius_m, int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, 16))
+        reach_px = int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, 16))
+        # Every second pixel in a row is enough where a wide window holds many.
+        enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours
+        return radius_m, reach_px, 2 if reach_px > 4 and enough else 1
 
     def _sigma_inverse(self, frame: Frame, mask: np.ndarray) -> float:
         """Return the least noise of inverse depth (1/m) that a plane's residuals are taken to show."""

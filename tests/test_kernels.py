@@ -160,7 +160,7 @@ def test_local_planes_are_least_squares_in_inverse_depth(rng):
     mask = np.zeros(SHAPE, dtype=bool)
     mask[2:14, 3:17] = True
     radius_m = 0.09
-    cells = planes.local_planes(depth_m.astype(np.float32), mask, INTRINSICS, radius_m, 4, 1e-6)
+    cells = planes.local_planes(depth_m.astype(np.float32), mask, INTRINSICS, (radius_m, 4, 1), 1e-6)
     fitted = np.argwhere(cells[..., planes.VARIANCE] > 0)
     assert len(fitted) > 60
     for pixel in fitted[::5]:
@@ -176,7 +176,7 @@ def test_a_noise_free_plane_is_found_whatever_its_tilt():
     depth_m = 1 / (plane[0] * w[None, :] + plane[1] * w[:, None] + plane[2])
     mask = np.ones((64, 64), dtype=bool)
     intrinsics = np.array([100.0, 100.0, 31.5, 31.5])
-    cells = planes.local_planes(depth_m.astype(np.float32), mask, intrinsics, 0.04, 6, 1e-6)
+    cells = planes.local_planes(depth_m.astype(np.float32), mask, intrinsics, (0.04, 6, 2), 1e-6)
     inner = cells[20:44, 20:44]
     assert (inner[..., planes.KIND] == planes.SURFACE).all()
     got = -inner[..., :3] / inner[..., planes.DISTANCE, None]

@@ -44,7 +44,7 @@ def solve_symmetric_3(a00, a01, a02, a11, a12, a22, b0, b1, b2):
 
 
 @numba.njit(cache=True, parallel=True)
-def local_planes(depth_m, mask, intrinsics, radius_m, max_radius_px, sigma_inverse):
+def local_planes(depth_m, mask, intrinsics, ball, sigma_inverse):
     """Fit a plane to every object pixel's neighbours within a ball.
 
     A plane is linear in inverse depth over the image (1/z = N · (w, h, 1)), and the noise of a triangulating camera
@@ -55,8 +55,7 @@ def local_planes(depth_m, mask, intrinsics, radius_m, max_radius_px, sigma_inver
         depth_m: (h, w) z in m, NaN = missing.
         mask: (h, w) bool, object.
         intrinsics: (4,) fx, fy, cx, cy in px.
-        radius_m: radius of the ball.
-        max_radius_px: largest half-width of the window.
+        ball: radius in m; largest half-width of its window in px; step between the pixels that are read.
         sigma_inverse: sensor noise of 1/z, in 1/m.
 
     Returns:
@@ -64,6 +63,7 @@ def local_planes(depth_m, mask, intrinsics, radius_m, max_radius_px, sigma_inver
     """
     height, width = depth_m.shape
     fx, fy, cx, cy = intrinsics
+    radius_m, max_radius_px, stride = ball
     cells = np.zeros((height, width, CELL_SIZE), dtype=np.float32)
     for row in numba.prange(height):
         for column in range(width):
@@ -77,7 +77,6 @@ def local_planes(depth_m, mask, intrinsics, radius_m, max_radius_px, sigma_inver
             cells[row, column, KIND] = RAGGED
             w0, h0 = (column - cx) / fx, (row - cy) / fy
             reach = min(math.ceil(radius_m * max(fx, fy) / z), max_radius_px)
-            stride = 1 if reach <= 4 else 2
             n = swx = swy = sxx = sxy = syy = sb = sxb = syb = sbb = 0.0
             inverse0 = 1.0 / z
             for dr in range(-reach, reach + 1, stride):

@@ -1,0 +1,102 @@
+"""What the default method must do beyond the contract: honest outcomes, and robustness to what cameras do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from modeler.evaluation import nees, rotation_error_deg, true_motion
+from modeler.priors import GeneralPrior, TablePrior
+from modeler.rays import Sensor
+from modeler.registration import VisibilityRegistrar
+from modeler.registration.surface import relief_m, spread_points
+from modeler.segmentation import Scene, Segmenter
+from modeler.types import Camera, Frame, Outcome
+from sequences import bundled, open_sequence
+
+
+@pytest.fixture(scope="module")
+def flashlight():
+    """The first two frames of the flashlight with their plane, the sensor, and the true motion from 1 to 0."""
+    sequence = open_sequence(bundled("flashlight"))
+    frames = [sequence.frame(index) for index in (0, 1)]
+    plane = Segmenter().segment(frames[0], Scene()).plane
+    truth, sensor = sequence.truth(), sequence.sensor()
+    assert truth is not None
+    assert sensor is not None
+    return frames, plane, Sensor(*sensor), true_motion(truth, target=0, source=1)
+
+
+def occluded(frame, rng):
+    """A rod held before the object."""
+    depth_m, mask = frame.depth_m.copy(), frame.mask.copy()
+    middle = int(np.median(np.nonzero(mask)[1])) + rng.integers(-10, 10)
+    depth_m[:, middle - 6 : middle + 6], mask[:, middle - 6 : middle + 6] = 0.5, False
+    return replace(frame, depth_m=depth_m, mask=mask)
+
+
+def sparse(frame, rng):
+    """Nine of ten pixels without a measurement."""
+    return replace(frame, depth_m=np.where(rng.random(frame.depth_m.shape) < 0.9, np.nan, frame.depth_m))
+
+
+def greedy(frame, rng):
+    """A segmentation that takes a few rows of the table along."""
+    del rng
+    rows, columns = np.nonzero(frame.mask)
+    mask = frame.mask.copy()
+    mask[rows.max() - 2 : rows.max() + 4, columns.min() : columns.max()] = True
+    return replace(frame, mask=mask & np.isfinite(frame.depth_m))
+
+
+@pytest.mark.parametrize("harm", [occluded, sparse, greedy])
+def test_harmed_images_cost_accuracy_not_honesty(flashlight, harm, rng):
+    frames, plane, sensor, truth = flashlight
+    target, source = (sensor.ray_image(harm(frame, rng), plane) for frame in frames)
+    posterior = VisibilityRegistrar().register(source, target, TablePrior().between(source, target), rng=rng)
+    assert posterior.usable
+    assert rotation_error_deg(posterior.pose.mean, truth) < 3.0
+    assert nees(posterior.pose, truth) < 22.5  # χ²₆ at 0.999
+
+
+def test_a_motion_beyond_the_prior_is_not_passed_off_as_one_within(flashlight, rng):
+    frames, plane, sensor, _ = flashlight
+    target, source = (sensor.ray_image(frame, plane) for frame in frames)
+    motion = TablePrior(max_rotation_deg=12.0).between(source, target)  # the object turned by 24°
+    posterior = VisibilityRegistrar().register(source, target, motion, rng=rng)
+    assert posterior.outcome is Outcome.AT_LIMIT
+    assert not posterior.usable
+
+
+def test_surfaces_that_share_nothing_do_not_overlap(flashlight, rng):
+    frames, plane, sensor, _ = flashlight
+    target = sensor.ray_image(frames[0], plane)
+    w, h = frames[1].camera.rays()
+    ball = (w - 0.02) ** 2 + (h - 0.02) ** 2 < 0.05**2
+    depth_m = np.where(ball, 0.75 - np.sqrt(np.maximum(0.05**2 - (w - 0.02) ** 2 - (h - 0.02) ** 2, 0)), np.nan)
+    other = replace(frames[1], depth_m=depth_m.astype(np.float32), mask=ball)
+    source = sensor.ray_image(other, plane)
+    posterior = VisibilityRegistrar().register(source, target, GeneralPrior().between(source, target), rng=rng)
+    assert not posterior.usable or posterior.overlap < 0.8
+
+
+def surface_view(depth_m):
+    """A view of a surface over the whole of a small image."""
+    height, width = depth_m.shape
+    camera = Camera(width, height, 200.0, 200.0, (width - 1) / 2, (height - 1) / 2)
+    return Sensor(sigma_wh=0.001, sigma_r_m=0.0005).ray_image(Frame(0, 0.0, depth_m.astype(np.float32), camera))
+
+
+def test_only_surface_that_does_not_go_on_smoothly_has_relief(rng):
+    w = (np.arange(120) - 59.5) / 200.0
+    x, y = 0.6 * w[None, :], 0.6 * w[:, None]
+    plane = 0.6 + 0.3 * x + 0.0 * y
+    cylinder = 0.6 - np.sqrt(np.maximum(0.3**2 - x**2, 0)) + 0.3 + 0.0 * y
+    waves = plane + 0.004 * np.sin(x / 0.006) * np.sin(y / 0.006)
+    reliefs = []
+    for depth_m in (plane, cylinder, waves):
+        view = surface_view(depth_m)
+        reliefs.append(np.median(relief_m(view, spread_points(view, 300, rng), (0.1, 0.2))))
+    assert reliefs[0] < 5e-5
+    assert reliefs[1] < 2e-4
+    assert reliefs[2] > 1e-3
