@@ -73,7 +73,7 @@ def visibility(pose, points, cells, intrinsics, model, hidden):
         in_front = plane @ position + cell[planes.DISTANCE]
         agreement = normal @ plane
         square = in_front**2 / (point[6] + cell[planes.VARIANCE] + blur**2)
-        match = 0.5 - 0.5 * square - bend * (1 - agreement)
+        match = 0.5 + point[7] - 0.5 * square - bend * (1 - agreement)
         seen = np.log((1 - hidden) * np.exp(max(match, -700)) + hidden)
         if in_front > 0 and match < np.log(hidden):
             seen = max(match, -worst)

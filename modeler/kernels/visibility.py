@@ -23,7 +23,7 @@ from modeler.kernels.planes import (
 UNKNOWN, MATCHED, BEHIND, IN_FRONT, HIDDEN, IN_EMPTY_SPACE = 0, 1, 2, 3, 4, 5
 
 # Rows of the points handed in, and of what `carry` makes of them.
-VARIANCE_M2 = 6
+VARIANCE_M2, GAIN = 6, 7
 X, Y, Z, FACING_X, FACING_Y, FACING_Z, FACES = 0, 1, 2, 3, 4, 5, 6
 
 # Nodes of the table of log((1 - hidden) exp(match) + hidden); below the first it is log(hidden) within 3e-6.
@@ -49,7 +49,7 @@ def carry(pose, points, intrinsics, facing, carried, pixels):
 
     Args:
         pose: (12,) rows of the 3×4 matrix.
-        points: (7, n) position in m, unit normal, variance along the normal in m².
+        points: (8, n) position in m, unit normal, variance along the normal in m², gain of a match (nats).
         intrinsics: (6,) fx, fy, cx, cy, width and height of the other image in px.
         facing: (2,) cosines at which a point begins to face the camera and fully does.
         carried: (7, n) out: position, normal, how much the point faces the camera (0..1).
@@ -113,7 +113,7 @@ def score(points, carried, pixels, cells, model, table):
                     + carried[FACING_Y, j] * cell[NORMAL_Y]
                     + carried[FACING_Z, j] * cell[NORMAL_Z]
                 )
-                match = 0.5 - half_square - bend * (1.0 - agreement)
+                match = 0.5 + points[GAIN, j] - half_square - bend * (1.0 - agreement)
                 if in_front > 0.0 and match < log_hidden:
                     total += faces * max(match, -worst)  # in front of what was measured: nothing can hide it
                 elif match <= TABLE_LOW:
@@ -137,14 +137,15 @@ def log_likelihoods(poses, points, cells, intrinsics, model, table):
 
     A point that faces the other camera should lie on the surface measured there, but for a share that something
     hides or the camera missed; one that faces away should lie behind it; none may lie where the camera saw
-    nothing. Scores are normalised so that a point that matches within its noise and a hidden one both count 0 on
-    average: turning surface out of sight neither pays nor costs.
+    nothing. Scores are normalised so that on smooth surface, which goes on as anyone would guess, a point that
+    matches within its noise and a hidden one both count 0 on average: turning it out of sight neither pays nor
+    costs. Where the surface has relief a match is a coincidence, and counts as one.
 
     The table's interpolation errs by less than 4e-6 a point.
 
     Args:
         poses: (m, 12) rows of the 3×4 matrices that carry the points into the other camera.
-        points: (7, n) position in m, unit normal, variance along the normal in m².
+        points: (8, n) position in m, unit normal, variance along the normal in m², gain of a match (nats).
         cells: (h · w, 8) of the other view, see `planes`.
         intrinsics: (6,) fx, fy, cx, cy, width and height in px of the other view.
         model: (9,) extra noise of the surfaces in m; standard deviation and dead zone of the silhouette in px;

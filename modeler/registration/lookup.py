@@ -16,7 +16,7 @@ class Lookup:
     """One direction of the comparison of two views: p(points of one | image of the other, pose)."""
 
     points: Array
-    """(n, 7) position in m, unit normal, variance along the normal in m²."""
+    """(n, 8) position in m, unit normal, variance along the normal in m², gain of a match (nats)."""
     image: RayImage
     """The view in which the points are looked up."""
     surface_m: float

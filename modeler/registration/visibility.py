@@ -10,7 +10,7 @@ from modeler.registration.annealing import AnnealedSampler, Level, Population
 from modeler.registration.lookup import Lookup
 from modeler.registration.pair import Pair
 from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
-from modeler.registration.surface import measured_share, spread_points
+from modeler.registration.surface import measured_share, relief_m, spread_points
 from modeler.types import AbstractMotion, AbstractRegistrar, Outcome, PoseGaussian, Posterior, RayImage
 
 
@@ -34,6 +34,12 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Least error of local planes on a curved surface, as a share of the object's size."""
     hidden_share: float = 0.3
     """Share of points that face the other camera and are hidden by another part of the object."""
+    max_gain: float = 1.5
+    """Most that the match of one point may gain for the relief of the surface around it (nats)."""
+    relief_reaches: tuple[float, ...] = (0.1, 0.2)
+    """Radii of the surroundings that a point's height is predicted from, as shares of the object's size."""
+    relief_noise: float = 0.5
+    """Noise of the surfaces that relief stands out from, as a share of the sensor's range noise."""
     worst: float = 10.0
     """Most that one point may cost (nats)."""
     bend: float = 2.0
@@ -88,11 +94,20 @@ class VisibilityRegistrar(AbstractRegistrar):
         )
 
     def _lookup(self, view: RayImage, image: RayImage, size_m: float, rng: np.random.Generator) -> Lookup:
-        """Return points of a view to be looked up in another's image."""
+        """Return points of a view to be looked up in another's image.
+
+        A match is worth what it says beyond what the surroundings said already: the log of the ratio of the two
+        Gaussians' widths, ½ log(1 + relief² / noise²). The blurred levels keep it, as a lead to where matches are.
+        """
+        points = spread_points(view, self.points, rng)
+        detail_m = self.surface_detail * size_m
+        noise = 2.0 * points[:, 6] + detail_m**2 + (self.relief_noise * view.sigma_r_m) ** 2
+        excess = np.maximum(relief_m(view, points, self.relief_reaches) ** 2 - noise, 0.0)
+        points[:, 7] = np.minimum(0.5 * np.log1p(excess / noise), self.max_gain)
         return Lookup(
-            spread_points(view, self.points, rng),
+            points,
             image,
-            surface_m=float(np.hypot(self.surface_detail * size_m, self.surface_noise * image.sigma_r_m)),
+            surface_m=float(np.hypot(detail_m, self.surface_noise * image.sigma_r_m)),
             hidden_share=self.hidden_share,
             worst=self.worst,
             bend=self.bend,
