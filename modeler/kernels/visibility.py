@@ -139,7 +139,7 @@ def log_likelihoods(poses, points, cells, intrinsics, model, table):
     hides or the camera missed; one that faces away should lie behind it; none may lie where the camera saw
     nothing. Scores are normalised so that on smooth surface, which goes on as anyone would guess, a point that
     matches within its noise and a hidden one both count 0 on average: turning it out of sight neither pays nor
-    costs. Where the surface has relief a match is a coincidence, and counts as one.
+    costs. Where a gain is given, a match counts so much more.
 
     The table's interpolation errs by less than 4e-6 a point.
 

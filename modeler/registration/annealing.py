@@ -1,7 +1,7 @@
 """An annealed sampler on SE(3): from a prior, through ever sharper likelihoods, to samples of the posterior."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,6 +47,10 @@ class AnnealedSampler:
     """Rounds of moves after the last weighting."""
     min_share: float = 0.4
     """Least effective share of the samples that a weighting may leave; with less, the step is cut."""
+
+    def thorough(self) -> "AnnealedSampler":
+        """Return a sampler that looks four times as hard."""
+        return replace(self, initial=4 * self.initial, particles=4 * self.particles)
 
     def run(
         self, motion: AbstractMotion, levels: Sequence[Level], centre_m: Array, rng: np.random.Generator

@@ -30,9 +30,13 @@ class Lookup:
     measured_share: float
     """Share of pixels around the surface that carry a measurement."""
 
-    def at(self, blur_m: float, stride: int) -> Callable[[Array], Array]:
-        """Return the log-likelihood (m,) of poses (m, 12) over every `stride`-th point, the surfaces blurred."""
+    def at(self, blur_m: float, stride: int, *, lead: bool) -> Callable[[Array], Array]:
+        """Return the log-likelihood (m,) of poses (m, 12) over every `stride`-th point, the surfaces blurred.
+
+        With `lead`, matches gain what their surface's relief is worth; without, it is the likelihood itself.
+        """
         columns = np.ascontiguousarray(self.points[::stride].T)
+        columns[kernel.GAIN] *= lead
         table = kernel.match_table(self.hidden_share)
         model = self._model(blur_m)
         return lambda poses: kernel.log_likelihoods(poses, columns, self._cells, self._intrinsics, model, table)

@@ -25,12 +25,16 @@ class Pair:
     effective_points: float
     """Number of independent measurements that the points of both views together are worth."""
 
-    def level(self, blur_m: float, _: Array) -> LogLikelihood:
-        """Return the tempered log-likelihood of poses (n, 4, 4), the surfaces blurred by `blur_m`."""
+    def level(self, blur_m: float, _: Array, *, lead: bool = True) -> LogLikelihood:
+        """Return the tempered log-likelihood of poses (n, 4, 4), the surfaces blurred by `blur_m`.
+
+        With `lead` it leans towards poses where surface with relief matches, so that blurred levels do not settle for
+        the many poses that merely contradict nothing.
+        """
         stride = 1 if blur_m < 0.003 else 2 if blur_m < 0.006 else 4  # blunt comparisons need fewer points
         weight = stride * self.effective_points / (len(self.forward.points) + len(self.backward.points))
 
-        forward, backward = self.forward.at(blur_m, stride), self.backward.at(blur_m, stride)
+        forward, backward = self.forward.at(blur_m, stride, lead=lead), self.backward.at(blur_m, stride, lead=lead)
 
         def log_likelihood(target_from_source: Array) -> Array:
             there, back = rows(target_from_source), rows(se3.inverse(target_from_source))

@@ -1,7 +1,7 @@
 """Registration by what each view should see of the other's surface; the default method."""
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -38,7 +38,7 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Most that the match of one point may gain for the relief of the surface around it (nats)."""
     relief_reaches: tuple[float, ...] = (0.1, 0.2)
     """Radii of the surroundings that a point's height is predicted from, as shares of the object's size."""
-    relief_noise: float = 0.5
+    relief_noise: float = 1.0
     """Noise of the surfaces that relief stands out from, as a share of the sensor's range noise."""
     worst: float = 10.0
     """Most that one point may cost (nats)."""
@@ -65,9 +65,19 @@ class VisibilityRegistrar(AbstractRegistrar):
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS)
         pair = self.pair(source, target, rng)
+        posterior = self._explored(pair, self.sampler, motion, rng=rng)
+        if not posterior.usable:  # a mode may have been missed: look once more, and harder
+            posterior = self._explored(pair, self.sampler.thorough(), motion, rng=rng)
+        return replace(posterior, seconds=time.perf_counter() - started)
+
+    def _explored(
+        self, pair: Pair, sampler: AnnealedSampler, motion: AbstractMotion, *, rng: np.random.Generator
+    ) -> Posterior:
+        """Return the posterior that one run of a sampler finds."""
+        source, target = pair.backward.image, pair.forward.image
         levels: list[Level] = [partial(pair.level, blur_m) for blur_m in self.blurs_m]
-        levels.append(lambda poses: pair.level(pair.surface_noise_m(poses, self.blurs_m[-1]), poses))
-        population = self.sampler.run(motion, levels, source.centroid_m, rng)
+        levels.append(lambda poses: pair.level(pair.surface_noise_m(poses, self.blurs_m[-1]), poses, lead=False))
+        population = sampler.run(motion, levels, source.centroid_m, rng)
         weights = np.full(len(population.poses), 1.0 / len(population.poses))
         pose = weighted_gaussian(population.poses, weights, source.centroid_m)
         overlap = pair.overlap(pose.mean)
@@ -83,7 +93,6 @@ class VisibilityRegistrar(AbstractRegistrar):
             effective_samples=population.effective_samples,
             pareto_k=population.pareto_k,
             log_evidence=population.log_evidence,
-            seconds=time.perf_counter() - started,
         )
 
     def pair(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> Pair:
@@ -97,7 +106,8 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return points of a view to be looked up in another's image.
 
         A match is worth what it says beyond what the surroundings said already: the log of the ratio of the two
-        Gaussians' widths, ½ log(1 + relief² / noise²). The blurred levels keep it, as a lead to where matches are.
+        Gaussians' widths, ½ log(1 + relief² / noise²). It leads the blurred levels; the last goes without, for on round
+        objects it would count as knowledge of the spin what is only less surface in common.
         """
         points = spread_points(view, self.points, rng)
         detail_m = self.surface_detail * size_m
