@@ -31,7 +31,7 @@ class Evaluate:
     closed: bool = False
     """Take the sequence for a full turn: its last frame is followed by its first."""
     points: Annotated[int | None, tyro.conf.arg(metavar="N"), tyro.conf.arg(help_behavior_hint="(default: all)")] = None
-    """Keep so many of the object's pixels, drawn at random: very sparse clouds."""
+    """Keep so many of the object's surface points a view, drawn at random: very sparse clouds."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Same seed, same machine, same errors."""
     prior: PriorOptions = field(default_factory=PriorOptions)
