@@ -19,14 +19,10 @@ class Population:
 
     poses: Array
     """(n, 4, 4)."""
-    log_likelihoods: Array
-    """(n,) under the last level."""
     log_evidence: float
     """Log of the mean likelihood under the prior."""
     effective_samples: float
     """Kish's effective size, with samples that no move has parted since the last weighting counted as one."""
-    acceptance: float
-    """Share of moves taken in the last round."""
     pareto_k: float
     """Largest tail index of the weights over all weightings."""
 
@@ -66,7 +62,7 @@ class AnnealedSampler:
         poses = motion.sample(self.initial, rng)
         prior = motion.log_density(poses)
         before = np.zeros(len(poses))
-        evidence, worst_tail, acceptance = 0.0, -np.inf, 0.0
+        evidence, worst_tail = 0.0, -np.inf
         previous = None
         for number, make in enumerate(levels):
             level = make(poses)
@@ -84,10 +80,10 @@ class AnnealedSampler:
                 poses, prior, before, after = poses[chosen], prior[chosen], before[chosen], after[chosen]
                 blend = _Blend(motion, previous, level, reached)
                 for _ in range(self.final_moves if last else self.moves):
-                    acceptance = _move(poses, (prior, before, after), blend=blend, centre_m=centre_m, rng=rng)
+                    _move(poses, (prior, before, after), blend=blend, centre_m=centre_m, rng=rng)
             before, previous = after, level
         _, copies = np.unique(poses[:, :3, 3], axis=0, return_counts=True)
-        return Population(poses, before, evidence, len(poses) ** 2 / float(np.sum(copies**2)), acceptance, worst_tail)
+        return Population(poses, evidence, len(poses) ** 2 / float(np.sum(copies**2)), worst_tail)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +114,7 @@ class _Blend:
 
 def _move(
     poses: Array, state: tuple[Array, Array, Array], *, blend: _Blend, centre_m: Array, rng: np.random.Generator
-) -> float:
+) -> None:
     """Move every sample once, in place, by Metropolis steps along differences of other samples.
 
     Each half of the population moves along differences within the other half (differential evolution), so steps
@@ -127,7 +123,6 @@ def _move(
     count = len(poses)
     order = rng.permutation(count)
     halves = order[: count // 2], order[count // 2 :]
-    taken = 0
     for moving, still in (halves, halves[::-1]):
         first, second = rng.choice(still, len(moving)), rng.choice(still, len(moving))
         # 2.38 / √(2 d) is the best scale for a Gaussian in d = 6 dimensions; shorter ones serve curved posteriors.
@@ -143,8 +138,6 @@ def _move(
         poses[winners] = proposed[accept]
         for values, new in zip(state, fresh, strict=True):
             values[winners] = new[accept]
-        taken += len(winners)
-    return taken / count
 
 
 def effective_samples(log_weights: Array) -> float:

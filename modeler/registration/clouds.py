@@ -6,8 +6,9 @@ use the centre, to start from, and the spread, for directions that the surfaces 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -183,6 +184,29 @@ class Fit:
     """(6, 6) about ξ, from the surfaces alone; may be singular."""
     fitness: float
     """Share of the source's points that have a partner."""
+
+
+def registered(
+    views: tuple[RayImage, RayImage],
+    motion: AbstractMotion,
+    rng: np.random.Generator,
+    *,
+    min_fitness: float,
+    fit: Callable[[Array], Fit | None],
+) -> Posterior:
+    """Return what a method finds from the prior's centre, as a posterior with its time.
+
+    Args:
+        views: source and target.
+        motion: the prior, for where to start.
+        rng: source of the prior's samples.
+        min_fitness: smallest share of matched points that counts as overlap.
+        fit: the method, from a start (4, 4); None where too few points are left.
+    """
+    began = time.perf_counter()
+    begin = start(*views, motion, rng)
+    found = posterior(*views, begin, fit(begin.target_from_source), min_fitness)
+    return replace(found, seconds=time.perf_counter() - began)
 
 
 def posterior(source: RayImage, target: RayImage, begin: Start, fit: Fit | None, min_fitness: float) -> Posterior:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -17,9 +16,8 @@ from modeler.registration.clouds import (
     cube_edges_m,
     matched,
     plane_residuals,
-    posterior,
+    registered,
     scaled_information,
-    start,
 )
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
 
@@ -61,11 +59,14 @@ class FpfhRegistrar(AbstractRegistrar):
         self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the motion that most feature matches agree with, and the residual-scaled inverse Hessian there."""
-        began = time.perf_counter()
-        begin = start(source, target, motion, rng)
-        fit = self.search(Cloud.of(source), Cloud.of(target), begin.target_from_source, rng)
-        found = posterior(source, target, begin, fit, self.min_fitness)
-        return replace(found, seconds=time.perf_counter() - began)
+        clouds = Cloud.of(source), Cloud.of(target)
+        return registered(
+            (source, target),
+            motion,
+            rng,
+            min_fitness=self.min_fitness,
+            fit=lambda begin: self.search(*clouds, begin, rng),
+        )
 
     def search(self, source: Cloud, target: Cloud, otherwise: Array, rng: np.random.Generator) -> Fit | None:
         """Return the motion that most feature matches agree with; None where too few points are left to match.

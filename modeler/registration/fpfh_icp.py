@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
 
-from modeler.registration.clouds import Cloud, posterior, start
+from modeler.registration.clouds import Cloud, Fit, registered
 from modeler.registration.fpfh import FpfhRegistrar
 from modeler.registration.icp import IcpRegistrar
-from modeler.types import AbstractMotion, AbstractRegistrar, Posterior, RayImage
+from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
 
 
 @final
@@ -28,11 +27,10 @@ class FpfhIcpRegistrar(AbstractRegistrar):
         self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the local optimum nearest to the feature matches' motion, with its residual-scaled inverse Hessian."""
-        began = time.perf_counter()
-        begin = start(source, target, motion, rng)
         clouds = Cloud.of(source), Cloud.of(target)
-        fit = self.fpfh.search(*clouds, begin.target_from_source, rng)
-        if fit is not None:
-            fit = self.icp.refine(*clouds, fit.target_from_source)
-        found = posterior(source, target, begin, fit, self.icp.min_fitness)
-        return replace(found, seconds=time.perf_counter() - began)
+
+        def fit(begin: Array) -> Fit | None:
+            coarse = self.fpfh.search(*clouds, begin, rng)
+            return None if coarse is None else self.icp.refine(*clouds, coarse.target_from_source)
+
+        return registered((source, target), motion, rng, min_fitness=self.icp.min_fitness, fit=fit)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
 from modeler import se3
-from modeler.registration.clouds import Cloud, Fit, cube_edges_m, posterior, residual_variance, start
+from modeler.registration.clouds import Cloud, Fit, cube_edges_m, registered, residual_variance
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
 
 _STEP = 1e-6  # rad and m: a smaller step ends a level
@@ -41,11 +40,13 @@ class GicpRegistrar(AbstractRegistrar):
         self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the local optimum nearest to the prior's centre, with its residual-scaled inverse Hessian."""
-        began = time.perf_counter()
-        begin = start(source, target, motion, rng)
-        fit = self._fit(source, target, begin.target_from_source)
-        found = posterior(source, target, begin, fit, self.min_fitness)
-        return replace(found, seconds=time.perf_counter() - began)
+        return registered(
+            (source, target),
+            motion,
+            rng,
+            min_fitness=self.min_fitness,
+            fit=lambda begin: self._fit(source, target, begin),
+        )
 
     def _fit(self, source: RayImage, target: RayImage, target_from_source: Array) -> Fit | None:
         import small_gicp  # slow to load, and only needed here

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -16,9 +15,8 @@ from modeler.registration.clouds import (
     cube_edges_m,
     matched,
     plane_residuals,
-    posterior,
+    registered,
     scaled_information,
-    start,
 )
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
 
@@ -50,11 +48,10 @@ class IcpRegistrar(AbstractRegistrar):
         self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the local optimum nearest to the prior's centre, with its residual-scaled inverse Hessian."""
-        began = time.perf_counter()
-        begin = start(source, target, motion, rng)
-        fit = self.refine(Cloud.of(source), Cloud.of(target), begin.target_from_source)
-        found = posterior(source, target, begin, fit, self.min_fitness)
-        return replace(found, seconds=time.perf_counter() - began)
+        clouds = Cloud.of(source), Cloud.of(target)
+        return registered(
+            (source, target), motion, rng, min_fitness=self.min_fitness, fit=lambda begin: self.refine(*clouds, begin)
+        )
 
     def refine(self, source: Cloud, target: Cloud, target_from_source: Array) -> Fit | None:
         """Return the local optimum nearest to a pose (4, 4); None where too few points are left to match.
