@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import enum
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -171,6 +171,14 @@ class AbstractMotion(ABC):
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of motions (n, 4, 4) with respect to the uniform measure; -inf outside."""
 
+    def log_evidence(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of what is independently known, the part of a motion that belongs in an edge.
+
+        All of the density where it is evidence; where it only proposes, 0 within its support and -inf outside.
+        """
+        log_density = self.log_density(target_from_source)
+        return log_density if self.evidence else np.where(np.isfinite(log_density), 0.0, -np.inf)
+
 
 class AbstractPrior(ABC):
     """A nonvisual-information model: parameters with units that say what motions are possible between two views."""
@@ -182,6 +190,17 @@ class AbstractPrior(ABC):
         Raises:
             InputError: where the views lack what the prior needs (a table, say).
         """
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
+        """Return the prior with what the sequence taught it so far (a common axis, a pace); itself by default.
+
+        What is learnt from images only proposes: they count in their own edges.
+
+        Args:
+            solution: the poses so far.
+            edges: every edge judged so far, in order.
+        """
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +215,16 @@ class PoseGaussian:
     def inverse(self) -> PoseGaussian:
         """Return the Gaussian of the inverse motion."""
         return PoseGaussian(se3.inverse(self.mean), se3.inverse_covariance(self.mean, self.covariance))
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """One of several separate places where a posterior has its mass."""
+
+    weight: float
+    """Share (0..1) of the mass."""
+    pose: PoseGaussian
+    """target_from_source: mean and covariance of this part alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +245,8 @@ class Posterior:
     """(n, 4, 4) samples of target_from_source; empty where the method draws none."""
     weights: Array = field(default_factory=lambda: np.zeros(0))
     """(n,) weights of the samples, summing to 1."""
+    modes: tuple[Mode, ...] = ()
+    """The separate modes, heaviest first, whose weights sum to 1; empty where there is but one, or none are told."""
     information: Array | None = None
     """(6, 6) information about ξ from the images alone, without the prior; None where not known."""
     effective_samples: float = float("nan")
