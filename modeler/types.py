@@ -191,6 +191,14 @@ class AbstractPrior(ABC):
             InputError: where the views lack what the prior needs (a table, say).
         """
 
+    def grown(self, steps: float) -> AbstractPrior:
+        """Return the prior with limits that hold for a motion of several steps, as after lost frames; itself by default.
+
+        Args:
+            steps: at least 1, how many steps the motion may be made of.
+        """
+        return self
+
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
         """Return the prior with what the sequence taught it so far (a common axis, a pace); itself by default.
 

@@ -1,6 +1,6 @@
 """Nothing known but that the views are neighbours (paper, section IV: the general prior)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,11 @@ class GeneralPrior(AbstractPrior):
     def between(self, source: RayImage, target: RayImage) -> "GeneralMotion":
         """Return the density of target_from_source."""
         return GeneralMotion(source.centroid_m, target.centroid_m, np.deg2rad(self.max_rotation_deg), self.max_offset_m)
+
+    def grown(self, steps: float) -> "GeneralPrior":
+        """Return the prior whose limits hold for several steps."""
+        rotation_deg, offset_m = grown_limits(self.max_rotation_deg, self.max_offset_m, steps)
+        return replace(self, max_rotation_deg=rotation_deg, max_offset_m=offset_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +58,17 @@ class GeneralMotion(AbstractMotion):
         rotations = 8.0 * np.pi * (self.max_rotation_rad - np.sin(self.max_rotation_rad))
         offsets = 4.0 / 3.0 * np.pi * self.max_offset_m**3
         return np.where(inside, -np.log(rotations * offsets), -np.inf)
+
+
+def grown_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -> tuple[float, float]:
+    """Return the limits of rotation in degrees and of the centroids' offset in m for so many steps (at least 1).
+
+    The centroid of what is seen lies before the middle of the object, so that a turn by θ parts two of them by a chord
+    of 2 sin(θ/2): the offset grows as that does, and no more once the far side is seen.
+    """
+    rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, 180.0))
+    chord = np.sin(np.radians(rotation_deg) / 2.0) / np.sin(np.radians(max_rotation_deg) / 2.0)
+    return rotation_deg, float(max(chord, 1.0)) * max_offset_m
 
 
 def directions(count: int, rng: np.random.Generator) -> Array:

@@ -1,11 +1,11 @@
 """The object stays on its support: it turns about the plane's normal and shifts in the plane (paper, section IV)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from modeler import se3
-from modeler.priors.general import centroid_offset
+from modeler.priors.general import centroid_offset, grown_limits
 from modeler.types import AbstractMotion, AbstractPrior, Array, InputError, RayImage
 
 
@@ -52,6 +52,11 @@ class TablePrior(AbstractPrior):
             sigma_tilt_rad=float(sigma_tilt_rad),
             sigma_height_m=float(sigma_height_m),
         )
+
+    def grown(self, steps: float) -> "TablePrior":
+        """Return the prior whose limits hold for several steps; what ties the motion to the plane stays."""
+        rotation_deg, shift_m = grown_limits(self.max_rotation_deg, self.max_shift_m, steps)
+        return replace(self, max_rotation_deg=rotation_deg, max_shift_m=shift_m)
 
 
 @dataclass(frozen=True, eq=False)
