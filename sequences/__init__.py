@@ -7,15 +7,10 @@ from sequences.base import AbstractSequence as AbstractSequence
 from sequences.base import frame_range as frame_range
 from sequences.bop import BopSequence as BopSequence
 from sequences.bop_writer import write_bop as write_bop
-
-
-def open_sequence(path: str | Path) -> AbstractSequence:
-    """Open the sequence in a folder.
-
-    Raises:
-        InputError: where the folder does not hold a readable sequence.
-    """
-    return BopSequence(Path(path))
+from sequences.given import Given as Given
+from sequences.recognise import open_sequence as open_sequence
+from sequences.survey import Survey as Survey
+from sequences.survey import survey as survey
 
 
 def bundled(name: str) -> Path:

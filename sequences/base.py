@@ -65,6 +65,21 @@ class AbstractSequence(ABC):
     def model_path(self) -> Path | None:
         """The true surface as a mesh in m, in the model frame of `truth()`; None where it is not known."""
 
+    @property
+    def layout(self) -> str:
+        """What the sequence is stored as, in words."""
+        return "frames in memory"
+
+    @property
+    def depth_unit(self) -> str:
+        """What one unit of stored depth is, and who says so, in words."""
+        return "m"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the reader assumed, or left out, that somebody should know; a sentence each."""
+        return ()
+
     def __len__(self) -> int:
         """Return the number of frames."""
         return len(self.indices)
@@ -146,6 +161,21 @@ class SelectedSequence(AbstractSequence):
     def model_path(self) -> Path | None:
         """The true surface as a mesh in m; None where it is not known."""
         return self.whole.model_path
+
+    @property
+    def layout(self) -> str:
+        """What the sequence is stored as."""
+        return self.whole.layout
+
+    @property
+    def depth_unit(self) -> str:
+        """What one unit of stored depth is."""
+        return self.whole.depth_unit
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the reader assumed, or left out."""
+        return self.whole.notes
 
 
 def frame_range(text: str) -> slice:

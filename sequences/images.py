@@ -14,6 +14,7 @@ from modeler.types import BoolArray, InputError
 MAX_PIXELS = 50_000_000
 """Larger pictures are refused before they are decoded: no depth camera makes them, decompression bombs do."""
 
+_KINDS = {"L": "an 8-bit picture", "P": "an 8-bit picture", "RGB": "a colour picture", "RGBA": "a colour picture"}
 _BROKEN = (OSError, SyntaxError, ValueError, EOFError, MemoryError, struct.error, zlib.error)
 
 
@@ -37,16 +38,33 @@ def _open(path: Path, formats: tuple[str, ...]) -> Image.Image:
         raise InputError(f"{path}: is not a readable {wanted} picture ({why}); replace it.") from None
 
 
+def picture_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) of a PNG as its header says.
+
+    Raises:
+        InputError: where the file is missing or no picture.
+    """
+    try:
+        with Image.open(path, formats=("PNG", "TIFF")) as picture:
+            return picture.size
+    except _BROKEN as error:
+        raise InputError(f"{path}: is not a readable picture ({type(error).__name__}); replace it.") from None
+
+
 def read_depth(path: Path) -> npt.NDArray[np.uint16]:
-    """Return a 16-bit PNG (h, w) in raw units; 0 = no measurement.
+    """Return a 16-bit PNG or TIFF (h, w) in raw units; 0 = no measurement.
 
     Raises:
         InputError: where the file is missing, broken, too large or not 16-bit greyscale.
     """
-    picture = _open(path, ("PNG",))
+    picture = _open(path, ("PNG", "TIFF"))
     if picture.mode not in ("I;16", "I;16B", "I"):
-        raise InputError(f"{path}: is a picture of mode {picture.mode}; depth must be a 16-bit greyscale PNG.")
-    return np.asarray(picture).astype(np.uint16)
+        kind = _KINDS.get(picture.mode, f"of mode {picture.mode}")
+        raise InputError(f"{path}: is {kind}; depth must be a 16-bit greyscale picture, one unit a step.")
+    pixels = np.asarray(picture)
+    if picture.mode == "I" and (pixels.min(initial=0) < 0 or pixels.max(initial=0) > np.iinfo(np.uint16).max):
+        raise InputError(f"{path}: holds values beyond 16 bits; depth must be a 16-bit greyscale picture.")
+    return pixels.astype(np.uint16)
 
 
 def read_mask(path: Path) -> BoolArray:
@@ -61,12 +79,12 @@ def read_mask(path: Path) -> BoolArray:
 
 
 def read_colour(path: Path) -> npt.NDArray[np.uint8]:
-    """Return a PNG or JPEG as RGB (h, w, 3).
+    """Return a PNG, JPEG or TIFF, in colour or grey, as RGB (h, w, 3).
 
     Raises:
         InputError: where the file is missing, broken or too large.
     """
-    picture = _open(path, ("PNG", "JPEG"))
+    picture = _open(path, ("PNG", "JPEG", "TIFF"))
     if picture.mode.startswith("I"):  # 16-bit grey, which Pillow would clip rather than scale
         grey = (np.asarray(picture).astype(np.uint32) >> 8).astype(np.uint8)
         return np.repeat(grey[:, :, None], 3, axis=2)

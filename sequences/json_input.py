@@ -13,6 +13,9 @@ import numpy as np
 
 from modeler.types import Array, InputError
 
+MAX_BYTES = 64_000_000
+"""Larger text is refused."""
+
 
 @final
 @dataclass(frozen=True)
@@ -47,8 +50,9 @@ class Node:
         """Return the entries of an object whose keys are frame numbers."""
         found: dict[int, Node] = {}
         for key, node in self.items().items():
-            if not (key.isascii() and key.isdigit()):
-                raise InputError(f'{self.path}: key {json.dumps(key)} is not a frame number; use keys such as "0".')
+            if not (key.isascii() and key.isdigit() and len(key) <= 9):
+                shown = json.dumps(key if len(key) <= 40 else key[:37] + "...")
+                raise InputError(f'{self.path}: key {shown} is not a frame number; use keys such as "0".')
             found[int(key)] = node
         return found
 
@@ -109,14 +113,7 @@ def read_tree(path: Path) -> Node:
         InputError: where the file is missing or is not JSON or TOML.
     """
     kind = "TOML" if path.suffix == ".toml" else "JSON"
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the path.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not UTF-8 text (byte {error.start}); save it as {kind}.") from None
+    text = read_text(path, kind)
     try:
         return Node(tomllib.loads(text) if kind == "TOML" else json.loads(text), path)
     except json.JSONDecodeError as error:
@@ -124,3 +121,28 @@ def read_tree(path: Path) -> Node:
     except (ValueError, RecursionError) as error:
         why = " ".join(str(error).split())
     raise InputError(f"{path}: is not valid {kind} ({why}); correct it there.")
+
+
+def read_text(path: Path, kind: str = "text") -> str:
+    """Return what a file of at most 64 MB says.
+
+    Args:
+        path: the file.
+        kind: what it should be, for messages.
+
+    Raises:
+        InputError: where it is missing, larger, or not UTF-8.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the path.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
+    if len(content) > MAX_BYTES:
+        raise InputError(f"{path}: is larger than {MAX_BYTES // 1_000_000} MB; {kind} of a sequence is not.")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not UTF-8 text (byte {error.start}); save it as {kind}.") from None

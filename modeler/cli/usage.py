@@ -11,14 +11,18 @@ from typing import Annotated
 import tyro
 
 from modeler.cli.build import Build
+from modeler.cli.convert import Convert
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
+from modeler.cli.info import Info
 from modeler.cli.register import Register
 from modeler.cli.render import Render
 from modeler.cli.view import View
 
 Command = (
     Annotated[Build, tyro.conf.subcommand("build")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
+    | Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Register, tyro.conf.subcommand("register")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Render, tyro.conf.subcommand("render")]
@@ -36,7 +40,7 @@ _HELP_INDENT = " " * 8  # deeper than what went wrong stands the help of an opti
 _DESCRIPTION = "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr."
 
 
-def parsed(arguments: Sequence[str]) -> Build | Register | Evaluate | Render | View | Export:
+def parsed(arguments: Sequence[str]) -> Build | Info | Convert | Register | Evaluate | Render | View | Export:
     """Return the command that the arguments (after the program's name) ask for.
 
     Raises:

@@ -1,0 +1,84 @@
+"""What `modeler convert` does once it is understood."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from modeler import se3
+from modeler.cli.convert import Convert
+from modeler.export import RunFolder
+from modeler.export.files import write_atomically
+from modeler.export.tum import tum_text
+from modeler.types import InputError
+from sequences import AbstractSequence, frame_range, open_sequence, survey, write_bop
+from sequences.bop_entries import pose_entry
+
+UNITS_MM = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 10.0)
+"""Depth is written in the finest of these in which it fits into 16 bits."""
+
+
+def convert(options: Convert) -> int:
+    """Write an input as a BOP scene folder, or the poses of a run.
+
+    Raises:
+        InputError: where the input cannot be used or the output cannot be written.
+    """
+    if (options.input / "report.json").is_file():
+        return _poses(options.input, options.out)
+    whole = open_sequence(options.input, options.said.given())
+    sequence = whole.select(options.selection.every, frame_range(options.selection.frames))
+    found = survey(sequence)
+    unit_mm = next((unit for unit in UNITS_MM if found.farthest_m * 1000.0 < 65535.0 * unit), UNITS_MM[-1])
+    write_bop(
+        options.out,
+        sequence,
+        sequence.truth(),
+        _meta(sequence),
+        depth_scale_mm=unit_mm,
+        files={path.name: path.read_bytes() for path in (sequence.robot_path, sequence.model_path) if path is not None},
+    )
+    print(f"modeler: {len(sequence)} frames of a {sequence.layout}: {options.out}", file=sys.stderr)
+    for note in sequence.notes:
+        print(f"modeler: {note}", file=sys.stderr)
+    return 0
+
+
+def _meta(sequence: AbstractSequence) -> dict[str, object]:
+    """Return the entries of `sequence.json`."""
+    meta: dict[str, object] = {"name": sequence.name}
+    noise, motion = sequence.sensor(), sequence.motion
+    if noise is not None:
+        meta["sensor"] = {"sigma_wh": noise[0], "sigma_r_m": noise[1]}
+    if motion is not None:
+        meta["motion"] = dict(motion)
+    return meta
+
+
+def _poses(run: Path, out: Path) -> int:
+    """Write the poses of a run as BOP's scene_gt.json, with the object frame as model frame, or as TUM lines.
+
+    Raises:
+        InputError: where the report cannot be read or the file's ending says neither.
+    """
+    report = RunFolder(run).report()
+    try:
+        poses = {int(entry["id"]): np.reshape(entry["object_from_camera"], (4, 4)) for entry in report["poses"]}
+        times_s = {int(frame["id"]): float(frame["timestamp"]) for frame in report["frames"]}
+        missing = poses.keys() - times_s.keys()
+    except (KeyError, TypeError, ValueError):
+        missing, poses, times_s = {-1}, {}, {}
+    if missing:
+        raise InputError(f"{run / 'report.json'}: lacks poses or frames; build again with --overwrite")
+    if out.suffix == ".json":
+        entries = (f' "{index}": {json.dumps([pose_entry(se3.inverse(pose))])}' for index, pose in poses.items())
+        write_atomically(out, "{\n" + ",\n".join(entries) + "\n}\n")
+    elif out.suffix == ".txt":
+        write_atomically(out, tum_text(poses, times_s))
+    else:
+        raise InputError(f"{out}: poses are written as scene_gt.json (BOP) or .txt (TUM); give --out such a name.")
+    print(f"modeler: {len(poses)} poses: {out}", file=sys.stderr)
+    return 0

@@ -1,0 +1,31 @@
+"""`modeler info`: what an input holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from modeler.cli.input_options import InputOptions
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what was found at a path: format, frames, resolution, depth, intrinsics, masks, colour, what is missing.
+
+    Every frame is read once, so that what is said is true of the whole input.
+    """
+
+    input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
+    """A sequence in any format that is read; the format is told from the path."""
+    json: bool = False
+    """Print a JSON object instead of lines."""
+    said: InputOptions = field(default_factory=InputOptions)
+
+    def run(self) -> int:
+        """Print what was found; status 2 where the input cannot be used."""
+        from modeler.cli.informing import inform
+
+        return inform(self)

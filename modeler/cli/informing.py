@@ -1,0 +1,85 @@
+"""What `modeler info` does once it is understood."""
+
+from __future__ import annotations
+
+import json
+
+from modeler.cli.info import Info
+from modeler.types import Camera
+from sequences import AbstractSequence, Survey, open_sequence, survey
+from sequences.base import span
+
+
+def inform(options: Info) -> int:
+    """Print what an input holds.
+
+    Raises:
+        InputError: where it cannot be used.
+    """
+    sequence = open_sequence(options.input, options.said.given())
+    found = survey(sequence)
+    if options.json:
+        print(json.dumps(record(sequence, found), allow_nan=False))
+    else:
+        print("\n".join(f"{what:14}{said}" for what, said in rows(sequence, found)))
+    return 0
+
+
+def record(sequence: AbstractSequence, found: Survey) -> dict[str, object]:
+    """Return what was found as JSON has it."""
+    camera, sensor, motion = found.cameras[0], sequence.sensor(), sequence.motion
+    return {
+        "name": sequence.name,
+        "format": sequence.layout,
+        "frames": list(found.indices),
+        "seconds": found.times_s[-1] - found.times_s[0],
+        "resolution": [camera.width, camera.height],
+        "intrinsics": [[c.fx, c.fy, c.cx, c.cy] for c in found.cameras],
+        "depth_unit": sequence.depth_unit,
+        "depth_m": dict(zip(("1%", "50%", "99%"), found.range_m, strict=True)),
+        "measured": found.measured,
+        "masks": found.masks,
+        "colour": found.colours,
+        "ground_truth": found.truths,
+        "sensor": None if sensor is None else {"sigma_wh": sensor[0], "sigma_r_m": sensor[1]},
+        "motion": None if motion is None else dict(motion),
+        "missing": list(found.missing),
+        "notes": list(sequence.notes),
+    }
+
+
+def rows(sequence: AbstractSequence, found: Survey) -> list[tuple[str, str]]:
+    """Return what was found as (what, in words)."""
+    total, camera = len(found.indices), found.cameras[0]
+    low, middle, high = found.range_m
+    sensor, motion = sequence.sensor(), sequence.motion
+    timed = (
+        f", {found.times_s[-1] - found.times_s[0]:.3g} s" if found.times_s != tuple(map(float, found.indices)) else ""
+    )
+    lines = [
+        ("sequence", sequence.name),
+        ("format", sequence.layout),
+        ("frames", span(found.indices) + timed),
+        ("resolution", f"{camera.width} x {camera.height}"),
+        ("intrinsics", _intrinsics(found.cameras)),
+        ("depth unit", sequence.depth_unit),
+        (
+            "depth range",
+            f"{low:.3f} to {high:.3f} m, median {middle:.3f} m; {found.measured:.0%} of the pixels measured",
+        ),
+        ("masks", f"{found.masks} of {total}"),
+        ("colour", f"{found.colours} of {total}"),
+        ("ground truth", f"{found.truths} of {total}"),
+    ]
+    if sensor is not None:
+        lines.append(("sensor noise", f"{sensor[0]:.3g} across (w, h), {sensor[1] * 1000.0:.3g} mm along the ray"))
+    if motion is not None:
+        lines.append(("motion", ", ".join(f"{key} {value}" for key, value in motion.items())))
+    lines += [("missing", what) for what in found.missing]
+    return lines + [("note", note) for note in sequence.notes]
+
+
+def _intrinsics(cameras: tuple[Camera, ...]) -> str:
+    first = cameras[0]
+    words = f"fx {first.fx:.2f}, fy {first.fy:.2f}, cx {first.cx:.2f}, cy {first.cy:.2f} px"
+    return words if len(cameras) == 1 else f"{words} in the first frame; {len(cameras)} different ones"

@@ -1,0 +1,41 @@
+"""What a person can say of an input that does not say it itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from sequences import Given
+
+
+def _default(text: str) -> object:
+    return tyro.conf.arg(help_behavior_hint=f"(default: {text})")
+
+
+@dataclass(frozen=True)
+class InputOptions:
+    """What counts more than what the input says."""
+
+    intrinsics: Annotated[
+        tuple[float, float, float, float] | None, tyro.conf.arg(metavar="FX FY CX CY"), _default("as the input says")
+    ] = None
+    """Intrinsics of the depth camera in px."""
+    depth_scale_mm: Annotated[float | None, tyro.conf.arg(metavar="MM"), _default("as the input says")] = None
+    """Millimetres per unit of stored depth."""
+    depth_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), _default("the only one")] = None
+    """Topic of the depth images in a ROS bag."""
+    colour_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), _default("the one aligned to depth")] = None
+    """Topic of the colour images in a ROS bag."""
+
+    def given(self) -> Given:
+        """Return them as readers take them.
+
+        Raises:
+            InputError: where one cannot be.
+        """
+        from sequences import Given
+
+        return Given(self.intrinsics, self.depth_scale_mm, self.depth_topic, self.colour_topic)

@@ -1,0 +1,124 @@
+"""Sequences of depth pictures in a folder, whatever tells which pictures belong together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.types import Array, Camera, Frame, InputError
+from sequences.base import span
+from sequences.given import Intrinsics
+from sequences.images import read_colour, read_depth, read_mask
+from sequences.recording import AbstractRecording
+
+
+@final
+@dataclass(frozen=True)
+class Shot:
+    """The pictures of one frame."""
+
+    time_s: float
+    """Time of capture in s."""
+    depth: Path
+    """16-bit picture."""
+    colour: Path | None = None
+    """Colour aligned to depth."""
+    mask: Path | None = None
+    """Not black = object."""
+
+
+@final
+@dataclass(frozen=True)
+class PictureSequence(AbstractRecording):
+    """Pictures in folders with one camera for all of them."""
+
+    shots: Mapping[int, Shot]
+    """By frame number, ascending."""
+    intrinsics: Intrinsics
+    """fx, fy, cx, cy in px."""
+    depth_scale_mm: float
+    """Millimetres per unit of depth."""
+    what: str
+    """The layout in words."""
+    unit_source: str
+    """Who says what the unit is."""
+    poses: Mapping[int, Array] | None = None
+    """True camera_from_model (4, 4) in m by frame number."""
+    remarks: tuple[str, ...] = ()
+    """What the reader assumed or left out."""
+
+    def __post_init__(self) -> None:
+        """Check `sequence.json`.
+
+        Raises:
+            InputError: where it cannot be used.
+        """
+        _ = self.name, self.sensor(), self.motion
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Frame numbers, ascending."""
+        return tuple(self.shots)
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`, depth in m and NaN where nothing was measured."""
+        shot = self.shots.get(index)
+        if shot is None:
+            raise InputError(f"{self.path}: has no frame {index}; its frames are {span(self.indices)}.")
+        raw = read_depth(shot.depth)
+        check_size(shot.depth, raw.shape, self._size)
+        mask = None if shot.mask is None else read_mask(shot.mask)
+        colour = None if shot.colour is None else read_colour(shot.colour)
+        if shot.mask is not None and mask is not None:
+            check_size(shot.mask, mask.shape, self._size)
+        if shot.colour is not None and colour is not None:
+            check_size(shot.colour, colour.shape[:2], self._size)
+        camera = Camera(raw.shape[1], raw.shape[0], *self.intrinsics)
+        return Frame(index, shot.time_s, metres(raw, self.depth_scale_mm), camera, mask, colour)
+
+    def truth(self) -> dict[int, Array] | None:
+        """Return the true camera_from_model (4, 4), in m, by frame number; None where it is not known."""
+        return dict(self.poses) if self.poses else None
+
+    @property
+    def layout(self) -> str:
+        """What the sequence is stored as."""
+        return self.what
+
+    @property
+    def depth_unit(self) -> str:
+        """What one unit of stored depth is."""
+        return f"{self.depth_scale_mm:g} mm ({self.unit_source})"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the reader assumed, or left out."""
+        return self.remarks
+
+    @cached_property
+    def _size(self) -> tuple[int, ...]:
+        return read_depth(self.shots[self.indices[0]].depth).shape
+
+
+def metres(raw: npt.NDArray[np.uint16], scale_mm: float) -> npt.NDArray[np.float32]:
+    """Return depth (h, w) in m of raw units; 0 becomes NaN."""
+    return np.where(raw == 0, np.float32(np.nan), (raw * (scale_mm / 1000.0)).astype(np.float32))
+
+
+def check_size(path: Path, found: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    """Refuse a picture of another size than the first depth image, each (h, w).
+
+    Raises:
+        InputError: where it is.
+    """
+    if found != expected:
+        raise InputError(
+            f"{path}: is {found[1]} x {found[0]} pixels where the first depth image is {expected[1]} x {expected[0]}; "
+            "all pictures of a sequence must have one size, colour and masks aligned to depth."
+        )

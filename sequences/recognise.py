@@ -1,0 +1,58 @@
+"""From a path to the reader of what lies there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from modeler.types import InputError
+from sequences.base import AbstractSequence
+from sequences.bop import BopSequence
+from sequences.colour_depth import COLOUR_FOLDERS, open_colour_depth
+from sequences.folders import entries
+from sequences.given import Given
+from sequences.tum import open_tum
+
+FORMATS = "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder"
+
+
+def open_sequence(path: str | Path, given: Given | None = None) -> AbstractSequence:
+    """Open the sequence at a path; what it is stored as is told from the path.
+
+    Args:
+        path: a folder or a file.
+        given: what a person says of it.
+
+    Raises:
+        InputError: where it does not hold a readable sequence.
+    """
+    path, given = Path(path), given or Given()
+    try:
+        return _open(path, given)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
+
+
+def _open(path: Path, given: Given) -> AbstractSequence:
+    if not path.exists():
+        raise InputError(f"{path}: no such folder or file; give {FORMATS}.")
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder; a file of this kind holds no sequence, give {FORMATS}.")
+    if (path / "scene_camera.json").exists():
+        return BopSequence(path, given)
+    if (path / "depth.txt").exists():
+        return open_tum(path, given)
+    if (path / "depth").is_dir():
+        return open_colour_depth(path, given)
+    raise InputError(f"{path}: {_advice(path)}")
+
+
+def _advice(path: Path) -> str:
+    """Return what is wrong with a folder that holds no depth."""
+    inner = [entry.name for entry in entries(path) if entry.is_dir()]
+    scenes = [name for name in inner if any((path / name / mark).exists() for mark in ("depth", "depth.txt"))]
+    if scenes:
+        more = ", ..." if len(scenes) > 3 else ""
+        return f"holds {len(scenes)} sequences; give one of them: {', '.join(scenes[:3])}{more}."
+    if any(name in COLOUR_FOLDERS for name in inner):
+        return "holds colour but no depth images; only depth can be registered, put it into depth/."
+    return f"holds no depth images; give {FORMATS}."

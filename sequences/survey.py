@@ -1,0 +1,137 @@
+"""A look at every frame before it is used: what a sequence holds, what is missing, and what cannot be true."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from modeler.types import Camera, Frame, InputError
+from sequences.base import AbstractSequence, span
+
+NEAREST_M = 0.01
+FARTHEST_M = 100.0
+"""No depth camera for objects measures nearer or farther; a median beyond tells of a wrong unit."""
+
+
+@final
+@dataclass(frozen=True)
+class Survey:
+    """What the frames of a sequence hold."""
+
+    indices: tuple[int, ...]
+    """Frame numbers."""
+    times_s: tuple[float, ...]
+    """Times of capture in s."""
+    cameras: tuple[Camera, ...]
+    """The cameras, each once."""
+    range_m: tuple[float, float, float]
+    """Depth in m that 1 %, half, and 99 % of the measured pixels do not exceed: medians over the frames."""
+    farthest_m: float
+    """Greatest depth in m."""
+    measured: float
+    """Share (0..1) of the pixels with a measurement."""
+    empty: tuple[int, ...]
+    """Numbers of the frames without any measurement."""
+    masks: int
+    """Number of frames with a mask."""
+    empty_masks: tuple[int, ...]
+    """Numbers of the frames whose mask holds no measured pixel."""
+    colours: int
+    """Number of frames with colour."""
+    truths: int
+    """Number of frames with a true pose."""
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What is not there, in words, and what follows."""
+        total, lacks = len(self.indices), []
+        if self.masks < total:
+            what = "no masks" if self.masks == 0 else f"no mask in {total - self.masks} frames"
+            lacks.append(f"{what}: the object is segmented by the program")
+        if self.colours < total:
+            what = "no colour" if self.colours == 0 else f"no colour in {total - self.colours} frames"
+            lacks.append(f"{what}: the model is uncoloured there" if self.colours else f"{what}: so is the model")
+        if self.truths == 0:
+            lacks.append("no ground truth: nothing to evaluate against")
+        if self.empty:
+            lacks.append(f"no measurement at all in frames {_some(self.empty)}: they will be left out")
+        if self.empty_masks:
+            lacks.append(f"nothing measured inside the mask in frames {_some(self.empty_masks)}: they will be left out")
+        return tuple(lacks)
+
+
+def survey(sequence: AbstractSequence) -> Survey:
+    """Read every frame once, and refuse a sequence of which nothing could be made.
+
+    Raises:
+        InputError: where a frame or the ground truth cannot be read, none measures anything, all masks are empty, or
+            the depth cannot be in the unit that it is said to be in.
+    """
+    cameras: dict[Camera, None] = {}
+    times_s, ranges, shares, farthest_m = [], [], [], 0.0
+    empty, empty_masks, masks, colours = [], [], 0, 0
+    for frame in sequence:
+        cameras.setdefault(frame.camera)
+        times_s.append(frame.time_s)
+        measured = frame.depth_m[measured_pixels(frame)]
+        shares.append(measured.size / frame.depth_m.size)
+        colours += frame.colour is not None
+        masks += frame.mask is not None
+        if not measured.size:
+            empty.append(frame.index)
+            continue
+        if frame.mask is not None and not (frame.mask & measured_pixels(frame)).any():
+            empty_masks.append(frame.index)
+        ranges.append(np.percentile(measured, (1.0, 50.0, 99.0)))
+        farthest_m = max(farthest_m, float(measured.max()))
+    if not ranges:
+        raise InputError(
+            f"{sequence.name}: none of its {len(sequence)} frames holds any depth, all is 0 or NaN; record it anew."
+        )
+    if len(empty_masks) == len(ranges):
+        raise InputError(f"{sequence.name}: its masks mark nothing that was measured; correct or remove them.")
+    low, middle, high = (float(value) for value in np.median(ranges, axis=0))
+    _check_unit(sequence, middle)
+    truth = sequence.truth()
+    return Survey(
+        indices=sequence.indices,
+        times_s=tuple(times_s),
+        cameras=tuple(cameras),
+        range_m=(low, middle, high),
+        farthest_m=farthest_m,
+        measured=float(np.mean(shares)),
+        empty=tuple(empty),
+        masks=masks,
+        empty_masks=tuple(empty_masks),
+        colours=colours,
+        truths=0 if truth is None else len(truth),
+    )
+
+
+def measured_pixels(frame: Frame) -> np.ndarray:
+    """Return which pixels (h, w) hold a measurement."""
+    return np.isfinite(frame.depth_m) & (frame.depth_m > 0.0)
+
+
+def _check_unit(sequence: AbstractSequence, middle_m: float) -> None:
+    """Refuse depth that can only be in another unit than it is said to be in.
+
+    Raises:
+        InputError: where it is.
+    """
+    if NEAREST_M <= middle_m <= FARTHEST_M:
+        return
+    in_metres = middle_m < NEAREST_M and NEAREST_M <= middle_m * 1000.0 <= FARTHEST_M
+    in_millimetres = middle_m > FARTHEST_M and NEAREST_M <= middle_m / 1000.0 <= FARTHEST_M
+    guess = "metres" if in_metres else "millimetres" if in_millimetres else "another unit"
+    factor = " (1000 times the present scale)" if in_metres else " (a thousandth of it)" if in_millimetres else ""
+    raise InputError(
+        f"{sequence.name}: half of the depth lies within {middle_m:.3g} m where one unit is {sequence.depth_unit}: "
+        f"it looks like {guess}; correct the depth scale{factor}, or convert with --depth-scale-mm."
+    )
+
+
+def _some(numbers: tuple[int, ...]) -> str:
+    return ", ".join(map(str, numbers)) if len(numbers) <= 5 else span(numbers)

@@ -1,0 +1,170 @@
+"""Folders in the layout of the TUM RGB-D benchmark: rgb.txt and depth.txt list pictures by time, the camera moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from modeler import se3
+from modeler.types import Array, InputError
+from sequences.folders import first_folder, inside, pictures
+from sequences.given import Given
+from sequences.images import picture_size
+from sequences.intrinsics_files import find_intrinsics
+from sequences.json_input import read_text
+from sequences.pictures import PictureSequence, Shot
+
+UNIT_MM = 0.2
+"""The benchmark stores 5000 units per metre."""
+CALIBRATION = (525.0, 525.0, 319.5, 239.5)
+"""What the benchmark recommends for its images of 640 x 480, which come without intrinsics."""
+MAX_APART_S = 0.02
+"""Depth and colour farther apart in time than this are no pair (the benchmark's own tool has the same)."""
+MAX_GAP_S = 0.2
+"""Ground truth is not interpolated over longer gaps."""
+
+
+def open_tum(path: Path, given: Given) -> PictureSequence:
+    """Open a folder with `depth.txt` and, where they are there, `rgb.txt`, `groundtruth.txt` and `mask/`.
+
+    Raises:
+        InputError: where it is not readable as such.
+    """
+    depth = _list(path / "depth.txt", 2)
+    if not depth:
+        raise InputError(f"{path / 'depth.txt'}: lists no depth image; write lines 'time path'.")
+    colour = _list(path / "rgb.txt", 2) if (path / "rgb.txt").exists() else []
+    folder = first_folder(path, ("mask", "masks"))
+    masks = {} if folder is None else pictures(folder, (".png",), path)
+    partner = nearest([time for time, _ in depth], [time for time, _ in colour], MAX_APART_S)
+    shots: dict[int, Shot] = {}
+    for index, (time_s, words) in enumerate(depth):
+        picture = _listed(path, "depth.txt", words[0])
+        other = partner[index]
+        shot_colour = None if other is None else _listed(path, "rgb.txt", colour[other][1][0])
+        mask = masks.get(picture.stem) or (None if shot_colour is None else masks.get(shot_colour.stem))
+        shots[index] = Shot(time_s, picture, shot_colour, mask)
+    remarks = []
+    alone = sum(other is None for other in partner)
+    if colour and alone:
+        remarks.append(f"{alone} depth images have no colour image within {MAX_APART_S * 1000:g} ms")
+    found = find_intrinsics(path, given)
+    if found is None:
+        width, height = picture_size(shots[0].depth)
+        if (width, height) != (640, 480):
+            raise InputError(
+                f"{path}: no intrinsics for images of {width} x {height}; write `fx fy cx cy` into calibration.txt "
+                "there, or convert with --intrinsics FX FY CX CY."
+            )
+        found = CALIBRATION, "assumed"
+        remarks.append("no intrinsics: the benchmark's default of 525 525 319.5 239.5 px is assumed")
+    return PictureSequence(
+        path,
+        shots=shots,
+        intrinsics=found[0],
+        depth_scale_mm=UNIT_MM if given.depth_scale_mm is None else given.depth_scale_mm,
+        what="TUM RGB-D folder",
+        unit_source="the benchmark's, 5000 per m" if given.depth_scale_mm is None else "--depth-scale-mm",
+        poses=_truth(path / "groundtruth.txt", [time for time, _ in depth]),
+        remarks=tuple(remarks),
+    )
+
+
+def nearest(times_s: Sequence[float], others_s: Sequence[float], limit_s: float) -> list[int | None]:
+    """Return for each time the place of the nearest other time within a limit; None where there is none."""
+    if not others_s:
+        return [None] * len(times_s)
+    gaps = np.asarray(others_s, dtype=np.float64)
+    order = np.argsort(gaps, kind="stable")
+    right = np.searchsorted(gaps[order], times_s).clip(1, len(gaps)) if len(gaps) > 1 else np.ones(len(times_s), int)
+    found: list[int | None] = []
+    for time_s, after in zip(times_s, right.tolist(), strict=True):
+        candidates = [int(order[place]) for place in (after - 1, after) if place < len(gaps)]
+        best = min(candidates, key=lambda place: abs(others_s[place] - time_s))
+        found.append(best if abs(others_s[best] - time_s) <= limit_s else None)
+    return found
+
+
+def trajectory(path: Path) -> list[tuple[float, Array]]:
+    """Return times in s and poses (4, 4) in m of a file with lines `time tx ty tz qx qy qz qw`.
+
+    Raises:
+        InputError: where a line says something else, or times do not grow.
+    """
+    poses = []
+    for time_s, words in _list(path, 8):
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = [math.nan]
+        size = float(np.linalg.norm(values[3:]))
+        if not (all(math.isfinite(value) for value in values) and abs(size - 1.0) < 1e-2):
+            raise InputError(
+                f"{path}: time {time_s:.6f} has no pose; write tx ty tz and a unit quaternion qx qy qz qw."
+            )
+        pose = se3.translation(np.array(values[:3]))
+        pose[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
+        poses.append((time_s, pose))
+    return poses
+
+
+def _truth(path: Path, times_s: Sequence[float]) -> dict[int, Array] | None:
+    """Return camera_from_world by frame number, on the way between the two nearest poses in time."""
+    if not path.exists():
+        return None
+    known = trajectory(path)
+    stamps = np.array([time for time, _ in known])
+    found: dict[int, Array] = {}
+    for index, time_s in enumerate(times_s):
+        after = int(np.searchsorted(stamps, time_s))
+        if after < len(stamps) and stamps[after] == time_s:
+            found[index] = se3.inverse(known[after][1])
+        elif 0 < after < len(stamps) and stamps[after] - stamps[after - 1] <= MAX_GAP_S:
+            (before_s, before), (after_s, behind) = known[after - 1], known[after]
+            share = (time_s - before_s) / (after_s - before_s)
+            found[index] = se3.inverse(before @ se3.exp(share * se3.log(se3.inverse(before) @ behind)))
+    return found or None
+
+
+def _list(path: Path, words: int) -> list[tuple[float, list[str]]]:
+    """Return the time and the other words of each line that is no comment.
+
+    Raises:
+        InputError: where a line has too few words or no time, or times do not grow.
+    """
+    inside(path, path.parent)
+    lines: list[tuple[float, list[str]]] = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        time, *rest = line.replace(",", " ").split() if words > 2 else line.split(maxsplit=1)
+        try:
+            time_s = float(time)
+        except ValueError:
+            time_s = math.nan
+        if len(rest) != words - 1 or not math.isfinite(time_s):
+            raise InputError(f"{path}: line {number} is not a time and {words - 1} more; correct it there.")
+        if lines and time_s <= lines[-1][0]:
+            how = "is the same as" if time_s == lines[-1][0] else "comes before"
+            raise InputError(f"{path}: line {number}: its time {how} that of the line above; sort, and remove doubles.")
+        lines.append((time_s, rest))
+    return lines
+
+
+def _listed(root: Path, by: str, name: str) -> Path:
+    """Return a picture that a list names.
+
+    Raises:
+        InputError: where there is none, or it lies elsewhere.
+    """
+    name = name.strip()
+    if not name.isprintable():
+        raise InputError(f"{root / by}: names a picture with control characters; correct it there.")
+    path = inside(root / name, root)
+    if not path.is_file():
+        raise InputError(f"{root / by}: names {name}, which is not there; add the picture or remove the line.")
+    return path
