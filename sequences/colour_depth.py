@@ -56,7 +56,7 @@ def open_colour_depth(path: Path, given: Given) -> PictureSequence:
         depth_scale_mm=1.0 if given.depth_scale_mm is None else given.depth_scale_mm,
         what="BundleSDF folder" if bundle else "Open3D folder",
         unit_source="the layout's" if given.depth_scale_mm is None else "--depth-scale-mm",
-        poses=_truth(path, numbers),
+        read_truth=lambda: _truth(path, numbers),
         remarks=tuple(remarks),
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -48,8 +48,8 @@ class PictureSequence(AbstractRecording):
     """The layout in words."""
     unit_source: str
     """Who says what the unit is."""
-    poses: Mapping[int, Array] | None = None
-    """True camera_from_model (4, 4) in m by frame number."""
+    read_truth: Callable[[], dict[int, Array] | None] = lambda: None
+    """Reads the true camera_from_model (4, 4) in m by frame number, when it is asked for."""
     remarks: tuple[str, ...] = ()
     """What the reader assumed or left out."""
 
@@ -84,7 +84,7 @@ class PictureSequence(AbstractRecording):
 
     def truth(self) -> dict[int, Array] | None:
         """Return the true camera_from_model (4, 4), in m, by frame number; None where it is not known."""
-        return dict(self.poses) if self.poses else None
+        return self.read_truth()
 
     @property
     def layout(self) -> str:

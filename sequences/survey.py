@@ -40,8 +40,8 @@ class Survey:
     """Numbers of the frames whose mask holds no measured pixel."""
     colours: int
     """Number of frames with colour."""
-    truths: int
-    """Number of frames with a true pose."""
+    truths: int | None
+    """Number of frames with a true pose; None where nobody looked."""
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -62,8 +62,12 @@ class Survey:
         return tuple(lacks)
 
 
-def survey(sequence: AbstractSequence) -> Survey:
+def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
     """Read every frame once, and refuse a sequence of which nothing could be made.
+
+    Args:
+        sequence: what to look at.
+        truth: whether to look at the ground truth too, which whoever estimates must not.
 
     Raises:
         InputError: where a frame or the ground truth cannot be read, none measures anything, all masks are empty, or
@@ -94,7 +98,7 @@ def survey(sequence: AbstractSequence) -> Survey:
         raise InputError(f"{sequence.name}: its masks mark nothing that was measured; correct or remove them.")
     low, middle, high = (float(value) for value in np.median(ranges, axis=0))
     _check_unit(sequence, middle)
-    truth = sequence.truth()
+    poses = sequence.truth() if truth else None
     return Survey(
         indices=sequence.indices,
         times_s=tuple(times_s),
@@ -106,7 +110,7 @@ def survey(sequence: AbstractSequence) -> Survey:
         masks=masks,
         empty_masks=tuple(empty_masks),
         colours=colours,
-        truths=0 if truth is None else len(truth),
+        truths=(0 if poses is None else len(poses)) if truth else None,
     )
 
 

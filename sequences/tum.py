@@ -69,7 +69,7 @@ def open_tum(path: Path, given: Given) -> PictureSequence:
         depth_scale_mm=UNIT_MM if given.depth_scale_mm is None else given.depth_scale_mm,
         what="TUM RGB-D folder",
         unit_source="the benchmark's, 5000 per m" if given.depth_scale_mm is None else "--depth-scale-mm",
-        poses=_truth(path / "groundtruth.txt", [time for time, _ in depth]),
+        read_truth=lambda: _truth(path / "groundtruth.txt", [time for time, _ in depth]),
         remarks=tuple(remarks),
     )
 

@@ -15,7 +15,7 @@ from modeler.cli.interrupt import Interrupt
 from modeler.cli.remembered import Remembered
 from modeler.export import RunFolder, RunMeta
 from modeler.types import InputError
-from sequences import AbstractSequence, frame_range
+from sequences import AbstractSequence, frame_range, survey
 from viz.stream import open_stream
 
 
@@ -30,6 +30,7 @@ def build(options: Build) -> int:
     began = time.perf_counter()
     whole = compose.open_sequence(options.sequence)
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
+    survey(frames, truth=False)  # what cannot be read is found before anything is made
     modeler = compose.modeler(whole, options.prior, options.method, options.where)
     meta = RunMeta(
         sequence=str(options.sequence),

@@ -1,0 +1,358 @@
+"""Bad input: one clear line that names the file, status 2, and no run folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from recordings import save, small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
+
+from modeler.cli import main
+from sequences import write_bop
+
+Damage = Callable[[Path], object]
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with one intact sequence of each kind."""
+    root, frames, truth = tmp_path_factory.mktemp("intact"), small_frames(3), small_truth(3)
+    write_bop(root / "bop", frames, truth, depth_scale_mm=1.0)
+    write_tum(root / "tum", frames, truth)
+    write_open3d(root / "open3d", frames, truth)
+    write_bundlesdf(root / "bundlesdf", frames, truth)
+    return root
+
+
+# Ways to damage
+
+
+def second(pattern: str) -> Callable[[Path], Path]:
+    return lambda folder: sorted(folder.glob(pattern))[1]
+
+
+def content(pattern: str, data: bytes) -> Damage:
+    return lambda folder: second(pattern)(folder).write_bytes(data)
+
+
+def cut(pattern: str) -> Damage:
+    def damage(folder: Path) -> None:
+        path = second(pattern)(folder)
+        path.write_bytes(path.read_bytes()[:-200])
+
+    return damage
+
+
+def pixels(pattern: str, change: Callable[[np.ndarray], np.ndarray], *, every: bool = False) -> Damage:
+    def damage(folder: Path) -> None:
+        for path in sorted(folder.glob(pattern)) if every else [second(pattern)(folder)]:
+            with Image.open(path) as picture:
+                found = np.asarray(picture)
+            save(path, change(found))
+
+    return damage
+
+
+def text(name: str, change: Callable[[str], str]) -> Damage:
+    return lambda folder: (folder / name).write_text(change((folder / name).read_text()))
+
+
+def entry(name: str, change: Callable[[dict], object]) -> Damage:
+    def damage(folder: Path) -> None:
+        tree = json.loads((folder / name).read_text())
+        change(tree)
+        (folder / name).write_text(json.dumps(tree))
+
+    return damage
+
+
+def without(pattern: str) -> Damage:
+    return lambda folder: second(pattern)(folder).unlink()
+
+
+def gone(name: str) -> Damage:
+    return lambda folder: (folder / name).unlink()
+
+
+def folder_instead(pattern: str, *, place: int = 1) -> Damage:
+    def damage(folder: Path) -> None:
+        path = sorted(folder.glob(pattern))[place]
+        path.unlink()
+        path.mkdir()
+
+    return damage
+
+
+def link_out(pattern: str, *, place: int = 1) -> Damage:
+    def damage(folder: Path) -> None:
+        path = sorted(folder.glob(pattern))[place]
+        outside = folder.parent / "outside" / path.name
+        outside.parent.mkdir(exist_ok=True)
+        path.rename(outside)
+        path.symlink_to(outside)
+
+    return damage
+
+
+def png_claiming(width: int, height: int) -> bytes:
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b"")
+
+
+def swap_lines(first: int, other: int) -> Callable[[str], str]:
+    def change(lines: str) -> str:
+        rows = lines.splitlines()
+        rows[first], rows[other] = rows[other], rows[first]
+        return "\n".join(rows)
+
+    return change
+
+
+def again(line: int) -> Callable[[str], str]:
+    return lambda lines: "\n".join([*lines.splitlines()[: line + 1], *lines.splitlines()[line:]])
+
+
+def smaller(image: np.ndarray) -> np.ndarray:
+    return image[:-7]
+
+
+def eight_bit(image: np.ndarray) -> np.ndarray:
+    return (image >> 4).astype(np.uint8)
+
+
+def to_metres(image: np.ndarray) -> np.ndarray:
+    return np.rint(image / 1000.0).astype(np.uint16)
+
+
+D = "depth/*.png"
+PICTURES: dict[str, tuple[Damage, str]] = {
+    "truncated": (cut(D), "not a readable PNG"),
+    "empty": (content(D, b""), "not a readable PNG"),
+    "text": (content(D, b"no picture"), "not a readable PNG"),
+    "wrong bit depth": (pixels(D, eight_bit), "8-bit picture; depth must be a 16-bit"),
+    "colour for depth": (pixels(D, lambda image: np.stack([eight_bit(image)] * 3, axis=2)), "a colour picture; depth"),
+    "wrong size": (pixels(D, smaller), "160 x 113 pixels where the first depth image is 160 x 120"),
+    "all zero": (pixels(D, np.zeros_like, every=True), "none of its 3 frames holds any depth, all is 0 or NaN"),
+    "decompression bomb": (content(D, png_claiming(100_000, 100_000)), "million pixels"),
+    "directory instead of a picture": (folder_instead(D), ".png"),
+    "link out of the folder": (link_out(D), "leads out of the sequence"),
+    "no pictures": (lambda folder: [path.unlink() for path in folder.glob(D)], "depth"),
+}
+B, O, K, T = "scene_camera.json", "camera_intrinsic.json", "cam_K.txt", "depth.txt"  # noqa: E741
+M, C = "masks/*.png", "rgb/*.png"
+FAULTS: dict[str, dict[str, tuple[Damage, str]]] = {
+    "bop": {
+        **PICTURES,
+        "metres for millimetres": (pixels(D, to_metres, every=True), "it looks like metres"),
+        "millimetres per metre": (
+            entry(B, lambda c: [camera.update(depth_scale=0.001) for camera in c.values()]),
+            "it looks like metres",
+        ),
+        "mask of another size": (pixels("mask_visib/*.png", smaller), "160 x 113"),
+        "masks empty": (pixels("mask_visib/*.png", np.zeros_like, every=True), "masks mark nothing"),
+        "colour of another size": (pixels("rgb/*.png", smaller), "colour and masks aligned to depth"),
+        "no intrinsics": (gone(B), B),
+        "intrinsics truncated": (text(B, lambda t: t[:100]), "not valid JSON"),
+        "focal length 0": (entry(B, lambda c: c["1"]["cam_K"].__setitem__(0, 0)), '"1"."cam_K"'),
+        "focal length absurd": (entry(B, lambda c: c["1"]["cam_K"].__setitem__(0, 1e30)), '"1"."cam_K"'),
+        "number of 400 digits": (entry(B, lambda c: c["1"].update(depth_scale=10**400)), "depth_scale"),
+        "key of 5000 digits": (entry(B, lambda c: c.update({"9" * 5000: {}})), "frame number"),
+        "wrong types": (entry(B, lambda c: c.update({"1": [1, 2]})), "must be an object"),
+        "truth of wrong types": (entry("scene_gt.json", lambda c: c.update({"1": "x"})), "must be a list"),
+        "two of one number": (lambda f: shutil.copy(f / "depth/000001.png", f / "depth/1.png"), "remove one"),
+        "frame without camera": (entry(B, lambda c: c.pop("1")), "says nothing of frame 1"),
+        "times out of order": (entry("sequence.json", lambda c: c["timestamps_s"].update({"2": -1})), "times must inc"),
+        "camera file links out": (link_out(B, place=0), "leads out of the sequence"),
+    },
+    "tum": {
+        **PICTURES,
+        "metres for millimetres": (pixels(D, lambda i: np.rint(i / 5000.0).astype(np.uint16), every=True), "metres"),
+        "no intrinsics": (gone("calibration.txt"), "no intrinsics for images of 160 x 120"),
+        "intrinsics of words": (text("calibration.txt", lambda t: "fx fy cx cy"), "calibration.txt"),
+        "focal length 0": (text("calibration.txt", lambda t: "0 0 80 60"), "does not describe a pinhole camera"),
+        "list truncated": (text(T, lambda t: t[:-30]), T),
+        "list a folder": (folder_instead(T, place=0), T),
+        "list empty": (text(T, lambda t: "# nothing\n"), "lists no depth image"),
+        "list not text": (lambda folder: (folder / T).write_bytes(b"\xff\xfe\0"), "not UTF-8"),
+        "time twice": (text(T, again(3)), "line 5: its time is the same as that of the line above"),
+        "times out of order": (text(T, swap_lines(2, 3)), "line 4: its time comes before that of the line above"),
+        "time no number": (text(T, lambda t: t.replace("1305031102.5", "noon")), "is not a time"),
+        "time infinite": (text(T, lambda t: t.replace("1305031102.500000 ", "inf ")), "is not a time"),
+        "missing picture": (without(D), "which is not there"),
+        "a picture elsewhere": (text(T, lambda t: t.replace(" depth/", " ../outside/")), "leads out of the sequence"),
+        "name of control characters": (text(T, lambda t: t.replace(" depth/", " \0depth/")), "control characters"),
+        "colour missing": (without(C), "rgb.txt: names rgb/"),
+        "colour of another size": (pixels(C, smaller), "colour and masks aligned to depth"),
+        "truth no quaternion": (text("groundtruth.txt", lambda t: t.replace(" 0.", " 7.")), "unit quaternion"),
+        "truth short": (text("groundtruth.txt", lambda t: t[:-20]), "groundtruth.txt"),
+    },
+    "open3d": {
+        **PICTURES,
+        "metres for millimetres": (pixels(D, to_metres, every=True), "it looks like metres; correct the depth scale"),
+        "no intrinsics": (gone(O), "no intrinsics; add cam_K.txt"),
+        "intrinsics empty": (text(O, lambda t: ""), "not valid JSON"),
+        "matrix lacking": (text(O, lambda t: "{}"), "intrinsic_matrix"),
+        "matrix of text": (entry(O, lambda c: c["intrinsic_matrix"].__setitem__(0, "575")), "9 finite numbers"),
+        "matrix singular": (entry(O, lambda c: c["intrinsic_matrix"].__setitem__(0, 0)), "pinhole camera"),
+        "matrix a list": (text(O, lambda t: "[1, 2]"), "must be an object"),
+        "intrinsics a folder": (folder_instead(O, place=0), O),
+        "colour of another size": (pixels("color/*.jpg", smaller), "colour and masks aligned to depth"),
+        "colour truncated": (cut("color/*.jpg"), "not a readable PNG or JPEG"),
+        "truth cut": (text("trajectory.log", lambda t: t[:-150]), "trajectory.log"),
+        "truth of words": (text("trajectory.log", lambda t: t.replace("0.", "x.")), "rigid motion"),
+    },
+    "bundlesdf": {
+        "metres for millimetres": (pixels(D, to_metres, every=True), "it looks like metres"),
+        "intrinsics short": (text(K, lambda t: t.splitlines()[0]), "does not describe a pinhole camera"),
+        "intrinsics NaN": (text(K, lambda t: t.replace("1.4375", "nan ").replace("nan 0", "nan")), K),
+        "intrinsics skewed": (lambda folder: np.savetxt(folder / K, np.ones((3, 3))), "pinhole camera"),
+        "intrinsics link out": (link_out(K, place=0), "leads out of the sequence"),
+        "mask of another size": (pixels(M, smaller), "160 x 113"),
+        "mask broken": (cut(M), "not a readable PNG"),
+        "masks empty": (pixels(M, np.zeros_like, every=True), "masks mark nothing"),
+        "two pictures of one name": (
+            lambda f: shutil.copy(next(f.glob(C)), next(f.glob(C)).with_suffix(".jpg")),
+            "too",
+        ),
+        "truth no rotation": (content("annotated_poses/*.txt", b"1 0 0 0\n" * 4), "no rigid motion"),
+        "sequence.json wrong": (lambda folder: (folder / "sequence.json").write_text('{"sensor": 3}'), "sensor"),
+    },
+}
+
+
+@pytest.mark.parametrize(("kind", "fault"), [(kind, fault) for kind, faults in FAULTS.items() for fault in faults])
+def test_every_fault_is_one_line_and_leaves_nothing(
+    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, fault: str
+) -> None:
+    folder = tmp_path / "in"
+    shutil.copytree(written / kind, folder)
+    damage, says = FAULTS[kind][fault]
+    damage(folder)
+    estimates = not fault.startswith("truth")  # which never looks at the ground truth
+    command = ["build", str(folder), "--out", str(tmp_path / "run")] if estimates else ["info", str(folder)]
+    status = main(command)
+    said = capsys.readouterr()
+    assert (status, said.out) == (2, "")
+    assert said.err.startswith("modeler: ")
+    assert said.err.count("\n") == 1
+    assert says in said.err
+    assert {path.name for path in tmp_path.iterdir()} <= {"in", "outside"}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_converting_a_broken_sequence_leaves_nothing(written: Path, tmp_path: Path, kind: str) -> None:
+    shutil.copytree(written / kind, tmp_path / "in")
+    cut(D)(tmp_path / "in")
+    assert main(["convert", str(tmp_path / "in"), "--out", str(tmp_path / "bop")]) == 2
+    assert main(["info", str(tmp_path / "in")]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+def test_what_is_told_as_a_scale_is_checked(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(written / "tum"), "--depth-scale-mm", "1000"]) == 2
+    assert "it looks like millimetres" in capsys.readouterr().err
+    assert main(["info", str(written / "tum"), "--depth-scale-mm", "-1"]) == 2
+    assert main(["info", str(written / "tum"), "--intrinsics", "0", "1", "2", "3"]) == 2
+    assert main(["info", str(written / "tum"), "--intrinsics", "nan", "1", "2", "3"]) == 2
+
+
+def test_single_empty_frames_are_named_and_left_out(
+    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(written / "bop", tmp_path / "in")
+    pixels(D, np.zeros_like)(tmp_path / "in")
+    pixels("mask_visib/*2_*.png", np.zeros_like, every=True)(tmp_path / "in")
+    assert main(["info", str(tmp_path / "in")]) == 0
+    said = capsys.readouterr().out
+    assert "no measurement at all in frames 1: they will be left out" in said
+    assert "nothing measured inside the mask in frames 2: they will be left out" in said
+
+
+@pytest.mark.parametrize("name", ["nowhere", "nowhere.bag", "", "file.txt"])
+def test_a_path_without_a_sequence_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    (tmp_path / "file.txt").write_text("hello")
+    assert main(["info", str(tmp_path / name)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert str(tmp_path / name) in said
+
+
+# The disk
+
+
+@pytest.fixture
+def as_nobody() -> Iterator[Callable[[], None]]:
+    """Return what gives root's rights up until the end of the test; others have none to give up."""
+    user = os.geteuid()
+    yield lambda: os.seteuid(65534) if user == 0 else None
+    os.seteuid(user)
+
+
+@pytest.mark.parametrize(
+    ("kind", "what"),
+    [("bop", "."), ("bop", "depth"), ("bop", B), ("bop", "depth/000001.png"), ("tum", T), ("open3d", O)],
+)
+def test_no_permission_is_said(
+    written: Path, as_nobody: Callable[[], None], capsys: pytest.CaptureFixture[str], kind: str, what: str
+) -> None:
+    with tempfile.TemporaryDirectory() as place:  # pytest's own folders are closed to others
+        os.chmod(place, 0o755)
+        folder = Path(place) / kind
+        shutil.copytree(written / kind, folder)
+        (folder / what).chmod(0)
+        as_nobody()
+        status = main(["info", str(folder)])
+        said = capsys.readouterr().err
+        os.seteuid(os.getuid())
+    assert status == 2
+    assert said.count("\n") == 1
+    assert "ermission" in said
+
+
+def test_a_full_disk_leaves_nothing_behind(written: Path, tmp_path: Path) -> None:
+    """A limit on the size of files stands for the disk: writing fails in the same way, in the middle of a picture."""
+    script = f"""
+import resource, signal, sys
+from modeler.cli import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000))
+sys.exit(main(["convert", {str(written / "bop")!r}, "--out", {str(tmp_path / "out")!r}]))
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr.startswith(f"modeler: {tmp_path / 'out'}: cannot be written (File too large)")
+    assert ended.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_output_that_is_there_is_kept(written: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    assert main(["convert", str(written / "bop"), "--out", str(tmp_path / "file")]) == 2
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_link_within_the_folder_is_followed(written: Path, tmp_path: Path) -> None:
+    shutil.copytree(written / "open3d", tmp_path / "in")
+    (tmp_path / "in" / "color").rename(tmp_path / "in" / "pictures")
+    (tmp_path / "in" / "color").symlink_to(tmp_path / "in" / "pictures")
+    assert main(["info", str(tmp_path / "in")]) == 0
+
+
+def test_frames_know_nothing_of_the_test(written: Path) -> None:
+    """The intact sequences are intact, else the faults above would prove nothing."""
+    for kind in FAULTS:
+        assert main(["info", str(written / kind)]) == 0
