@@ -192,7 +192,9 @@ class AbstractPrior(ABC):
         """
 
     def grown(self, steps: float) -> AbstractPrior:
-        """Return the prior with limits that hold for a motion of several steps, as after lost frames; itself by default.
+        """Return the prior with limits that hold for a motion of several steps; itself by default.
+
+        A frame is registered with it where frames before it were lost, or where the motion seems to lie beyond.
 
         Args:
             steps: at least 1, how many steps the motion may be made of.
@@ -325,6 +327,10 @@ class Solution:
     """Accepted edges that the optimisation left out because all others contradict them."""
     relative_covariance: Callable[[int, int], Array] = _unsolved
     """Covariance (6, 6) of `relative(target, source)`, worked out when called."""
+    edge_poses: Mapping[tuple[int, int], PoseGaussian] = field(default_factory=dict)
+    """target_from_source by (source, target) of edges that took part otherwise than by the posterior's own pose."""
+    mode_weights: Mapping[tuple[int, int], Array] = field(default_factory=dict)
+    """Weights (m,) that all edges together leave to the modes of an edge with several, by (source, target)."""
 
     def relative_gaussian(self, target: int, source: int) -> PoseGaussian:
         """Return target_from_source between two different solved frames, with its uncertainty."""
@@ -353,6 +359,11 @@ class ObjectModel:
     """(v, 3) unit normals of the vertices."""
     vertex_colours: npt.NDArray[np.uint8] | None
     """(v, 3) RGB of the vertices."""
+    vertex_views: npt.NDArray[np.int64] | None = None
+    """(v,) how many views saw each vertex; 0 = surface that nobody saw, made up to close a gap. None: not known."""
+    vertex_sigmas_m: Array | None = None
+    """(v,) standard deviation of each vertex along its normal, as far as noise and poses are known to err; inf = made
+    up. None: not known."""
 
 
 @dataclass(frozen=True, eq=False)

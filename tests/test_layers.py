@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 SOURCES = [path for package in ("modeler", "sequences", "viz") for path in sorted((ROOT / package).rglob("*.py"))]
-HOMES = {"gtsam": "modeler/graph.py", "numba": "modeler/kernels/", "rerun": "viz/", "tyro": "modeler/cli/"}
+HOMES = {"gtsam": "modeler/graph/", "numba": "modeler/kernels/", "rerun": "viz/", "tyro": "modeler/cli/"}
 
 
 def imported(path: Path) -> Iterator[str]:

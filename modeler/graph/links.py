@@ -1,0 +1,123 @@
+"""Edges as the optimisation takes them, and how they hang together: a spanning tree, and loops beyond it.
+
+Variables are object_from_camera(k). A link is `BetweenFactorPose3(target, source, target_from_source)`, whose noise
+GTSAM expresses as `target_from_source @ exp(ξ)`, rotation first: the package's own convention, see `se3`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from modeler import se3
+from modeler.types import Array, Edge, PoseGaussian
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """One edge as one Gaussian."""
+
+    edge: Edge
+    """As it was judged."""
+    pose: PoseGaussian
+    """target_from_source as the optimisation takes it."""
+
+    @property
+    def target(self) -> int:
+        """Frame number of the target view."""
+        return self.edge.target
+
+    @property
+    def source(self) -> int:
+        """Frame number of the source view."""
+        return self.edge.source
+
+    @cached_property
+    def factor(self) -> gtsam.BetweenFactorPose3:
+        """The link as GTSAM takes it.
+
+        Raises:
+            ValueError: where the covariance is not positive definite.
+        """
+        # smart=False: GTSAM's tests for simpler models have thresholds that near-singular information falls through.
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(self.root_information, False)
+        return gtsam.BetweenFactorPose3(self.target, self.source, gtsam.Pose3(self.pose.mean), noise)
+
+    @cached_property
+    def root_information(self) -> Array:
+        """R (6, 6), upper triangular, with RᵀR = Σ⁻¹: from Σ = UUᵀ with U upper triangular, R = U⁻¹.
+
+        Raises:
+            ValueError: where the covariance is not positive definite.
+        """
+        try:
+            upper = np.linalg.cholesky(self.pose.covariance[::-1, ::-1])[::-1, ::-1]
+        except np.linalg.LinAlgError as error:
+            raise ValueError(
+                f"the covariance of edge {self.source} -> {self.target} is not positive definite: leave it out"
+            ) from error
+        return np.asarray(np.triu(np.linalg.inv(upper)), dtype=np.float64)
+
+
+def split(links: Iterable[Link], root: int) -> tuple[list[Link], list[Link]]:
+    """Return the links that first connect each frame with the root, odometry preferred, and the rest that close loops.
+
+    Links that do not hang together with the root are in neither.
+    """
+    tree: list[Link] = []
+    loops: list[Link] = []
+    group: dict[int, set[int]] = {}
+    for link in sorted(links, key=lambda link: link.edge.kind != "odometry"):  # stable: by arrival within a kind
+        target, source = (group.setdefault(frame, {frame}) for frame in (link.target, link.source))
+        if source is target:
+            loops.append(link)
+            continue
+        tree.append(link)
+        larger, smaller = (target, source) if len(target) >= len(source) else (source, target)
+        larger |= smaller
+        group.update(dict.fromkeys(smaller, larger))
+    reached = group.get(root, {root})
+    return [link for link in tree if link.target in reached], [link for link in loops if link.target in reached]
+
+
+def walk(tree: Sequence[Link], root: int) -> Iterator[tuple[int, int, Link]]:
+    """Yield (frame, neighbour, link) over a tree of links, outwards from the root, nearer frames first."""
+    links: dict[int, list[Link]] = {}
+    for link in tree:
+        links.setdefault(link.target, []).append(link)
+        links.setdefault(link.source, []).append(link)
+    waiting, reached = [root], {root}
+    for frame in waiting:
+        for link in links.get(frame, []):
+            neighbour = link.source if link.target == frame else link.target
+            if neighbour not in reached:
+                reached.add(neighbour)
+                waiting.append(neighbour)
+                yield frame, neighbour, link
+
+
+def chain(tree: Sequence[Link], root: int, guess: Mapping[int, Array]) -> dict[int, Array]:
+    """Return object_from_camera by frame, outwards from the root: the guess, or else dead reckoning."""
+    poses = {root: np.eye(4)}
+    for frame, neighbour, link in walk(tree, root):
+        if neighbour in guess:
+            poses[neighbour] = guess[neighbour]
+            continue
+        target_from_source = link.pose.mean
+        frame_from_neighbour = target_from_source if link.target == frame else se3.inverse(target_from_source)
+        poses[neighbour] = poses[frame] @ frame_from_neighbour
+    return poses
+
+
+def anchored(guess: Mapping[int, Array], root: int) -> Mapping[int, Array]:
+    """Return the guess with the root's pose at the identity; without the root it says nothing."""
+    if root not in guess:
+        return {}
+    if np.array_equal(guess[root], np.eye(4)):
+        return guess
+    root_from_guess = se3.inverse(guess[root])
+    return {frame: root_from_guess @ pose for frame, pose in guess.items()}

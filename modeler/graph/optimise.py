@@ -1,0 +1,111 @@
+"""The nonlinear solution: Levenberg and Marquardt, and graduated non-convexity where loops contradict each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from modeler.graph.links import Link
+from modeler.types import Array
+
+_GAUGE_SIGMA = 1e-6  # rad and m: far below any registration, so that it pins a pose without being seen
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """The poses that meet a set of links best."""
+
+    poses: Mapping[int, Array]
+    """object_from_camera (4, 4) by frame number."""
+    inlier: tuple[bool, ...]
+    """Which loops take part."""
+    error: float
+    """Half the squared Mahalanobis distance of all links to the poses; those left out count as the threshold."""
+
+
+def optimise(
+    tree: Sequence[Link],
+    loops: Sequence[Link],
+    start: Mapping[int, Array],
+    *,
+    root: int,
+    threshold: float,
+    inlier: Sequence[bool] = (),
+    others: Iterable[gtsam.NonlinearFactor] = (),
+    values: gtsam.Values | None = None,
+) -> Optimum:
+    """Return the optimum and which loops take part in it: those whose error stays below the threshold.
+
+    Where some do not, the choice is made by graduated non-convexity with a truncated least-squares loss (Yang et al.,
+    Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020), unless the choice given already stands: all that
+    take part agree with the optimum, all that are left out contradict it.
+
+    Args:
+        tree: links that are trusted.
+        loops: links that may be contradicted.
+        start: object_from_camera (4, 4) by frame number.
+        root: the frame whose pose is the identity.
+        threshold: half the squared Mahalanobis distance beyond which a loop is left out.
+        inlier: which loops took part in an earlier solution; those beyond it are taken to.
+        others: more factors that are trusted.
+        values: initial values of variables that are no frames.
+    """
+    others = list(others)
+    initial = gtsam.Values() if values is None else gtsam.Values(values)
+    for frame, object_from_camera in start.items():
+        initial.insert(frame, gtsam.Pose3(object_from_camera))
+    taking_part = [*inlier, *[True] * (len(loops) - len(inlier))]
+    chosen = [loop for loop, good in zip(loops, taking_part, strict=True) if good]
+    found = _least_squares(_factors([*tree, *chosen], root, others), initial)
+    if not _stands(loops, taking_part, found, threshold):
+        factors = _factors([*tree, *loops], root, others, loops_last=len(loops))
+        trusted = factors.size() - len(loops)
+        parameters = gtsam.GncLMParams(_parameters())
+        parameters.setLossType(gtsam.GncLossType.TLS)
+        parameters.setKnownInliers(list(range(trusted)))
+        annealing = gtsam.GncLMOptimizer(factors, initial, parameters)
+        annealing.setInlierCostThresholds(threshold)
+        found = annealing.optimize()
+        taking_part = [bool(weight > 0.5) for weight in annealing.getWeights()[trusted:]]
+        chosen = [loop for loop, good in zip(loops, taking_part, strict=True) if good]
+        # At full weight, where annealing ended between.
+        found = _least_squares(_factors([*tree, *chosen], root, others), found)
+    error = _factors([*tree, *chosen], root, others).error(found) + threshold * taking_part.count(False)
+    poses = {frame: np.asarray(found.atPose3(frame).matrix(), dtype=np.float64) for frame in start}
+    # The gauge stands in the graph as a tight prior, in the result as what it means.
+    return Optimum(poses | {root: np.eye(4)}, tuple(taking_part), error)
+
+
+def _stands(loops: Sequence[Link], taking_part: Sequence[bool], values: gtsam.Values, threshold: float) -> bool:
+    """Return whether the loops that take part, and only those, stay below the threshold."""
+    return all((loop.factor.error(values) <= threshold) == good for loop, good in zip(loops, taking_part, strict=True))
+
+
+def _factors(
+    links: Sequence[Link], root: int, others: Sequence[gtsam.NonlinearFactor], *, loops_last: int = 0
+) -> gtsam.NonlinearFactorGraph:
+    """Return a prior that pins the root at the identity, and links; the last few after all else."""
+    factors = gtsam.NonlinearFactorGraph()
+    factors.add(gtsam.PriorFactorPose3(root, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, _GAUGE_SIGMA)))
+    for link in links[: len(links) - loops_last]:
+        factors.push_back(link.factor)
+    for factor in others:
+        factors.push_back(factor)
+    for link in links[len(links) - loops_last :]:
+        factors.push_back(link.factor)
+    return factors
+
+
+def _least_squares(factors: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
+    return gtsam.LevenbergMarquardtOptimizer(factors, start, _parameters()).optimize()
+
+
+def _parameters() -> gtsam.LevenbergMarquardtParams:
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky gives up where one direction is 4096 times vaguer
+    parameters.setRelativeErrorTol(1e-12)
+    parameters.setAbsoluteErrorTol(1e-12)
+    return parameters
