@@ -25,13 +25,43 @@ from PIL import Image
 from turning_box import CENTRE_M, COVARIANCE, HALF_M, object_from_camera, steps
 
 from modeler import se3
-from modeler.types import Array, Outcome, PoseGaussian, Segmentation, Solution, Step
-from viz import blueprint, clouds, entities, images, readings, spread, uncertainty, viewer
+from modeler.types import Array, Mode, Outcome, PoseGaussian, Segmentation, Solution, Step
+from viz import (
+    blueprint,
+    chain,
+    clouds,
+    entities,
+    ghosts,
+    images,
+    readings,
+    spread,
+    uncertainty,
+    viewer,
+    visibility,
+)
 from viz.stream import RerunStream, open_stream
 
 Recording = dict[str, dict[int, dict[str, Any]]]
 COUNT, LOST = 6, 3
 PAIR_CLOUDS = (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER)
+GHOSTS = (entities.GHOSTS, entities.GHOST_MEANS, entities.GHOST_TIPS)
+SEEN = (entities.VISIBILITY_AGREES, entities.VISIBILITY_HIDDEN)
+CAPTIONS = (
+    entities.MAGNIFICATION,
+    entities.BEFORE_MAGNIFICATION,
+    entities.EDGES_MAGNIFICATION,
+    entities.GHOST_LABELS,
+    entities.PAIR_CAPTION,
+    entities.VISIBILITY_CAPTION,
+)
+SPREADS = (
+    entities.POSITION_1_SIGMA,
+    entities.POSITION_3_SIGMA,
+    entities.AXIS_TIPS_1_SIGMA,
+    entities.BEFORE_POSITION_1_SIGMA,
+    entities.BEFORE_POSITION_3_SIGMA,
+    entities.BEFORE_AXIS_TIPS_1_SIGMA,
+)
 EDGES = (entities.ODOMETRY, entities.CLOSURE, entities.REJECTED)
 
 
@@ -77,6 +107,11 @@ def drawn(recording: Recording, entity: str, component: str) -> dict[int, Array]
     }
 
 
+def drawn_factor(label: str) -> float:
+    """Return how many times larger than life a caption says that something is drawn."""
+    return 1.0 if label.endswith("to scale") else float(label.rpartition("\N{MULTIPLICATION SIGN}")[2])
+
+
 def decoded(blob: list[list[int]]) -> npt.NDArray[Any]:
     return np.asarray(Image.open(io.BytesIO(bytes(blob[0]))))
 
@@ -84,16 +119,16 @@ def decoded(blob: list[list[int]]) -> npt.NDArray[Any]:
 def test_every_promised_entity_is_recorded(recording: Recording) -> None:
     promised = {
         "blob": [entities.COLOUR, entities.DEPTH],
-        "buffer": [entities.MASK],
-        "positions": [*PAIR_CLOUDS, entities.PAIR_DRAWS, entities.CLOUD],
+        "buffer": [entities.MASK, entities.VISIBILITY_AREAS],
+        "positions": [*PAIR_CLOUDS, entities.PAIR_DRAWS, entities.CLOUD, *GHOSTS, *SEEN],
         "vertex_positions": [entities.MESH],
-        "strips": [entities.CAMERAS, entities.CURRENT, entities.CHAIN, *EDGES],
+        "strips": [entities.CAMERAS, entities.CURRENT, entities.CHAIN, entities.BEFORE_CAMERAS, *EDGES],
         "vectors": [entities.AXES, entities.PAIR_AXES],
-        "half_sizes": [entities.POSITION_1_SIGMA, entities.POSITION_3_SIGMA, entities.AXIS_TIPS_1_SIGMA],
-        "labels": [entities.MAGNIFICATION],
+        "half_sizes": [*SPREADS, entities.EDGES_1_SIGMA, entities.GHOST_CENTRE_1_SIGMA, entities.GHOST_CENTRE_3_SIGMA],
+        "labels": CAPTIONS,
         "scalars": [f"{path}/{kind}" for path in entities.READINGS for kind in ("odometry", "closure")]
         + [f"{path}/pose" for path in entities.POSE_READINGS],
-        "text": [entities.NOW, entities.LOG, entities.LEGEND],
+        "text": [entities.NOW, entities.LOG, entities.LEGEND, entities.RUN],
         "xyz": [entities.PAIR, entities.WORLD],
     }
     for component, paths in promised.items():
@@ -120,10 +155,10 @@ def test_a_recording_opens_with_a_layout(tmp_path: Path, run: list[Step]) -> Non
     reader = rerun.chunk.RrdReader(tmp_path / "r.rrd")
     waiting, knowing = sorted((list(reader.stream(store=entry)) for entry in reader.blueprints()), key=len)
     views = [sum(str(chunk.entity_path).endswith("/ViewContents") for chunk in layout) for layout in (waiting, knowing)]
-    assert views == [14, 14]
+    assert views == [19, 19]
     eyes = [c.to_record_batch() for c in knowing if str(c.entity_path).endswith("/EyeControls3D")]
     targets = np.array([batch["EyeControls3D:look_target"][0].as_py()[0] for batch in eyes])
-    assert len(targets) == 4
+    assert len(targets) == 7
     assert np.linalg.norm(targets - CENTRE_M, axis=1).max() < HALF_M.max()
 
 
@@ -214,6 +249,107 @@ def test_the_ends_of_the_axes_gather_about_the_mean(recording: Recording, run: l
         assert 0.0 < distance_m.max() < 0.01
 
 
+def test_the_visibility_picture_has_the_three_areas(run: list[Step], recording: Recording) -> None:
+    target = run[0].view
+    assert target is not None
+    shape = target.frame.depth_m.shape
+    areas = np.array(recording[entities.VISIBILITY_AREAS][1]["buffer"][0], dtype=np.uint8).reshape(shape)
+    assert target.frame.mask is not None
+    np.testing.assert_array_equal(areas == visibility.OBJECT, target.frame.mask)
+    np.testing.assert_array_equal(areas == visibility.MISSING, np.isnan(target.frame.depth_m))
+
+
+def test_points_hang_in_front_only_where_the_motion_is_wrong(run: list[Step]) -> None:
+    source, target = run[1].view, run[0].view
+    assert source is not None
+    assert target is not None
+    truth = se3.inverse(object_from_camera(0)) @ object_from_camera(1)
+
+    def share(verdict: int, offset_m: list[float]) -> float:
+        verdicts = visibility.projection(source, target, se3.translation(np.array(offset_m)) @ truth).verdicts
+        judged = verdicts[verdicts != visibility.NO_SAY]
+        assert len(judged) > 0.6 * len(verdicts)
+        return float(np.mean(judged == verdict))
+
+    assert share(visibility.VIOLATION, [0.0, 0.0, 0.0]) < 0.01
+    assert share(visibility.AGREES, [0.0, 0.0, 0.0]) > 0.6
+    assert share(visibility.VIOLATION, [0.0, 0.0, -0.05]) > 0.9
+    assert share(visibility.HIDDEN, [0.0, 0.0, 0.05]) > 0.9
+    assert share(visibility.VIOLATION, [0.25, 0.0, 0.0]) > 0.9  # before the background
+    beyond = visibility.projection(source, target, se3.translation(np.array([5.0, 0.0, 0.0])) @ truth)
+    assert len(beyond.pixels) == 0
+
+
+def test_where_nothing_was_measured_no_point_is_judged(run: list[Step]) -> None:
+    source, target = run[1].view, run[0].view
+    assert source is not None
+    assert target is not None
+    blind = replace(target, frame=replace(target.frame, depth_m=np.full_like(target.frame.depth_m, np.nan)))
+    verdicts = visibility.projection(source, blind, np.eye(4)).verdicts
+    assert len(verdicts) > 100
+    assert (verdicts == visibility.NO_SAY).all()
+
+
+def test_the_chain_adds_up_what_its_edges_err(run: list[Step]) -> None:
+    step, rng = run[-1], np.random.default_rng(1)
+    got = chain.covariances(step)
+    assert set(got) == set(step.solution.odometry)
+    edges = [edge for edge in step.edges_so_far if edge.kind == "odometry" and edge.accepted]
+    ends = np.tile(np.eye(4), (20_000, 1, 1))
+    for edge in edges:
+        pose = edge.posterior.pose
+        ends = ends @ pose.mean @ se3.exp(rng.multivariate_normal(np.zeros(6), 0.04 * pose.covariance, len(ends)))
+    xi = se3.log(se3.inverse(step.solution.odometry[edges[-1].source]) @ ends)
+    np.testing.assert_allclose(
+        np.cov(xi.T) / 0.04, got[edges[-1].source], atol=0.05 * np.abs(np.cov(xi.T)).max() / 0.04
+    )
+
+
+def test_ghosts_stay_with_their_mode_and_spread_about_it(run: list[Step]) -> None:
+    step, rng = run[1], np.random.default_rng(2)
+    posterior, view = step.posteriors[0], step.view
+    assert view is not None
+    centre = se3.translation(view.centroid_m)
+    turned = posterior.pose.mean @ centre @ se3.exp(np.array([0.0, 1.5, 0.0, 0.0, 0.0, 0.0])) @ se3.inverse(centre)
+    tight = 0.01 * COVARIANCE
+    modes = (Mode(0.75, PoseGaussian(posterior.pose.mean, tight)), Mode(0.25, PoseGaussian(turned, tight)))
+    draws = np.concatenate(
+        [
+            mode.pose.mean @ se3.exp(rng.multivariate_normal(np.zeros(6), tight, round(400 * mode.weight)))
+            for mode in modes
+        ]
+    )
+    modal = replace(posterior, modes=modes, samples=draws, weights=np.full(400, 1 / 400))
+    shown = ghosts.magnified(modal, view)
+    assert np.mean(shown.mode_of == 0) == pytest.approx(0.75, abs=1 / 24)
+    assert shown.factor > 1.0
+    for number, mode in enumerate(modes):
+        apart_m = [
+            np.linalg.norm(se3.transform(pose, view.centroid_m[None]) - se3.transform(mode.pose.mean, view.centroid_m))
+            for pose in shown.poses[shown.mode_of == number]
+        ]
+        assert 0.0 < max(apart_m) < 0.3 * HALF_M.max()
+    recording_of = dict(ghosts.drawing(replace(step, posteriors=(modal,))))
+    labels = recording_of[entities.GHOST_LABELS]
+    assert isinstance(labels, rr.Points3D)
+    assert labels.labels is not None
+    assert [text.partition(",")[0] for text in labels.labels.as_arrow_array().to_pylist()] == [
+        "mode 1: 75 %",
+        "mode 2: 25 %",
+    ]
+
+
+def test_the_run_is_described_in_words(run: list[Step], tmp_path: Path) -> None:
+    stream = open_stream("box", save=tmp_path / "r.rrd", facts={"prior": "table", "roi": (1, 2, 3, 4), "odd": "a|b"})
+    stream(run[0])
+    stream.close()
+    text = read(tmp_path / "r.rrd")[entities.RUN][-1]["text"][0]
+    assert "box" in text
+    assert "| prior | table |" in text
+    assert "| roi | 1 2 3 4 |" in text
+    assert "a\\|b" in text
+
+
 def test_the_camera_stands_where_its_pose_says(run: list[Step], recording: Recording) -> None:
     currents = drawn(recording, entities.CURRENT, "strips")
     assert set(currents) == set(range(COUNT)) - {LOST}  # a lost frame has no place
@@ -257,7 +393,7 @@ def test_an_edge_that_the_optimisation_left_out_counts_as_rejected(run: list[Ste
 def test_ellipsoids_are_the_covariance_as_magnified(run: list[Step], recording: Recording) -> None:
     for step in run:
         label = recording[entities.MAGNIFICATION][step.frame.index]["labels"][0]
-        factor = float(label.rpartition("\N{MULTIPLICATION SIGN}")[2])
+        factor = drawn_factor(label)
         one, three = (recording[p][step.frame.index] for p in (entities.POSITION_1_SIGMA, entities.POSITION_3_SIGMA))
         np.testing.assert_allclose(3.0 * np.array(one["half_sizes"]), three["half_sizes"], rtol=1e-5)
         for n, index in enumerate(sorted(step.solution.covariances)):

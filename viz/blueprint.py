@@ -8,7 +8,7 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from modeler.types import Array, RayImage
-from viz import entities, images
+from viz import entities, images, poses
 
 _BACKGROUND: Final = (24, 26, 30)
 _ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object towards the eye; the camera is at -z, up is -y
@@ -16,15 +16,19 @@ _FROM_THE_SIDE: Final = np.array([-0.8, -0.35, -0.5])  # errors along the camera
 
 
 def layout(first: RayImage | None) -> rrb.Blueprint:
-    """Return the layout: images, model and pose graph, the newest pair, words and readings.
+    """Return the layout: images left, model, graph and readings in the middle, the newest pair right.
 
     Args:
         first: the first accepted view, which tells where to look from; None before there is one.
     """
-    upper = rrb.Horizontal(_images(first), *_object(first), _pair(first), column_shares=[0.95, 1.15, 1.5, 0.95])
-    lower = rrb.Horizontal(_words(), _readings(), column_shares=[1.0, 2.0])
+    middle = rrb.Vertical(
+        rrb.Horizontal(*_object(first), column_shares=[1.0, 1.2]),
+        rrb.Horizontal(*_closure(first), _words(), column_shares=[1.0, 1.0, 1.35]),
+        row_shares=[1.55, 1.0],
+    )
+    above = rrb.Horizontal(_images(first), middle, _pair(first), column_shares=[1.0, 3.2, 1.0])
     return rrb.Blueprint(
-        rrb.Vertical(upper, lower, row_shares=[2.1, 1.0]),
+        rrb.Vertical(above, _readings(), row_shares=[4.6, 1.0]),
         rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=3.0),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
@@ -34,81 +38,88 @@ def layout(first: RayImage | None) -> rrb.Blueprint:
 
 
 def _images(first: RayImage | None) -> rrb.Container:
-    """Return the camera's images; depth alone where the first frame has no colour."""
+    """Return the camera's images, without colour where the first frame has none, and the picture of visibility."""
+    near = None if first is None else around(first)
     depth = rrb.Spatial2DView(
-        origin=entities.CAMERA,
-        contents=[entities.DEPTH, entities.MASK],
-        name="Depth around the object",
-        visual_bounds=None if first is None else around(first),
+        origin=entities.CAMERA, contents=[entities.DEPTH, entities.MASK], name="Depth of the frame", visual_bounds=near
+    )
+    seen = rrb.Spatial2DView(
+        origin=entities.VISIBILITY,
+        contents=[f"{entities.VISIBILITY}/**"],
+        name="New points in last view",
+        visual_bounds=near,
     )
     if first is not None and first.frame.colour is None:
-        return rrb.Vertical(depth)
+        return rrb.Vertical(depth, seen)
     colour = rrb.Spatial2DView(
-        origin=entities.CAMERA, contents=[entities.COLOUR, entities.MASK], name="Camera, all but the object dimmed"
+        origin=entities.CAMERA, contents=[entities.COLOUR, entities.MASK], name="Frame, object bright"
     )
-    return rrb.Vertical(colour, depth)
+    return rrb.Vertical(colour, depth, seen)
 
 
 def _object(first: RayImage | None) -> tuple[rrb.View, rrb.View]:
     """Return the views of the model alone and among the cameras that saw it."""
-    model = _spatial("Object model", entities.WORLD, [f"{entities.WORLD}/model/**"])
-    graph = _spatial("Camera poses, edges and uncertainty", entities.WORLD, [f"{entities.WORLD}/**"])
-    if first is not None:
-        centre, radius_m = first.centroid_m, _radius_m(first)
-        distance_m = float(np.linalg.norm(centre))
-        model = _spatial(
-            "Object model", entities.WORLD, [f"{entities.WORLD}/model/**"], _eye(centre, 4.0 * radius_m, _ABOVE_LEFT)
-        )
-        graph = _spatial(
-            "Camera poses, edges and uncertainty",
-            entities.WORLD,
-            [f"{entities.WORLD}/**"],
-            _eye(centre, 3.3 * distance_m, np.array([-0.45, -0.8, -0.4])),
-        )
-    return model, graph
+    graph = [f"{entities.WORLD}/{part}/**" for part in ("model", "poses", "edges")]
+    graph += [entities.EDGES_1_SIGMA, entities.EDGES_MAGNIFICATION]
+    return (
+        _spatial("Object model", entities.WORLD, [f"{entities.WORLD}/model/**"], _near(first, _ABOVE_LEFT, 4.0)),
+        _spatial("Pose graph: cameras, edges and their uncertainty", entities.WORLD, graph, _far(first)),
+    )
+
+
+def _closure(first: RayImage | None) -> tuple[rrb.View, rrb.View]:
+    """Return the poses' uncertainty without loop closure and with it, seen alike."""
+    model = f"{entities.WORLD}/model/**"
+    before = [model, f"{entities.WORLD}/before/**", entities.CHAIN]
+    after = [model, entities.CAMERAS, entities.ODOMETRY, entities.CLOSURE, entities.MAGNIFICATION]
+    after += [entities.POSITION_1_SIGMA, entities.POSITION_3_SIGMA, entities.AXIS_TIPS_1_SIGMA]
+    return (
+        _spatial("Uncertainty before closure", entities.WORLD, before, _far(first)),
+        _spatial("Uncertainty after closure", entities.WORLD, after, _far(first)),
+    )
 
 
 def _pair(first: RayImage | None) -> rrb.Container:
-    """Return the newest pair before and after alignment, one above the other."""
-    eye = None if first is None else _eye(first.centroid_m, 3.7 * _radius_m(first), _FROM_THE_SIDE)
-    before = [entities.PAIR_TARGET, entities.PAIR_BEFORE]
+    """Return the newest pair before and after alignment, and the posterior larger than life."""
+    eye = _near(first, _FROM_THE_SIDE, 3.7)
+    before = [entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_CAPTION]
     after = [entities.PAIR_TARGET, entities.PAIR_AFTER, entities.PAIR_AXES, entities.PAIR_DRAWS]
+    ghosts = [entities.GHOSTS, entities.GHOST_MEANS, entities.GHOST_TIPS, entities.GHOST_LABELS]
+    ghosts += [entities.GHOST_CENTRE_1_SIGMA, entities.GHOST_CENTRE_3_SIGMA, entities.PAIR_AXES]
     return rrb.Vertical(
-        _spatial("Before: target teal, source orange", entities.PAIR, before, eye),
-        _spatial("After, with the posterior's spread", entities.PAIR, after, eye),
+        _spatial("Pair before alignment", entities.PAIR, before, eye),
+        _spatial("Pair after alignment", entities.PAIR, after, eye),
+        _spatial("Posterior, magnified", entities.PAIR, ghosts, eye),
     )
 
 
 def _words() -> rrb.Container:
-    """Return what happened in words, with the history behind it."""
+    """Return what happened in words, with the run's facts, the history and the legend behind it."""
     return rrb.Tabs(
         rrb.TextDocumentView(origin=entities.NOW, name="What happened"),
+        rrb.TextDocumentView(origin=entities.RUN, name="Run"),
         rrb.TextLogView(origin=entities.LOG, name="History"),
+        rrb.TextDocumentView(origin=entities.LEGEND, name="Legend"),
         active_tab=0,
     )
 
 
 def _readings() -> rrb.Container:
-    """Return one plot for each reading, and the legend of everything."""
+    """Return one plot for each reading."""
     titles = {
         entities.ROTATION_SD: "Rotation sd [°]",
-        entities.TRANSLATION_SD: "Transl. sd [mm]",
+        entities.TRANSLATION_SD: "Translation sd [mm]",
         entities.EFFECTIVE_SAMPLES: "Effective samples",
         entities.OVERLAP: "Overlap [%]",
         entities.SECONDS: "Seconds per pair",
     }
     hidden = rrb.PlotLegend(visible=False)
     dark = rrb.archetypes.PlotBackground(color=_BACKGROUND)  # in the browser too, whatever its theme, for white lines
-    plots = [
-        rrb.TimeSeriesView(origin=path, name=title, plot_legend=hidden, background=dark)
-        for path, title in titles.items()
-    ]
     return rrb.Horizontal(
-        rrb.Vertical(*plots[:2]),
-        rrb.Vertical(*plots[2:4]),
-        rrb.Vertical(plots[4]),
-        rrb.TextDocumentView(origin=entities.LEGEND, name="Legend"),
-        column_shares=[1.0, 1.0, 1.0, 1.5],
+        *(
+            rrb.TimeSeriesView(origin=path, name=title, plot_legend=hidden, background=dark)
+            for path, title in titles.items()
+        )
     )
 
 
@@ -130,6 +141,18 @@ def _eye(target: Array, distance_m: float, direction: Array) -> rrb.EyeControls3
     return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=target, eye_up=(0.0, -1.0, 0.0))
 
 
+def _near(first: RayImage | None, direction: Array, radii: float) -> rrb.EyeControls3D | None:
+    """Return an eye on the object from so many of its radii away; None before there is one."""
+    return None if first is None else _eye(first.centroid_m, radii * _radius_m(first), direction)
+
+
+def _far(first: RayImage | None) -> rrb.EyeControls3D | None:
+    """Return an eye on the whole graph; None before there is an object."""
+    if first is None:
+        return None
+    return _eye(first.centroid_m, 2.8 * float(np.linalg.norm(first.centroid_m)), poses.OVER_THE_RING)
+
+
 def _radius_m(view: RayImage) -> float:
     """Return the distance from the centroid within which most surface points lie."""
     return float(np.percentile(np.linalg.norm(view.points_m - view.centroid_m, axis=1), 95))
@@ -139,7 +162,7 @@ def around(view: RayImage) -> rrb.VisualBounds2D:
     """Return the part of the image around the object, with room for it to move."""
     pixels = view.pixels / images.stride_px(view.frame)
     low, high = pixels.min(axis=0), pixels.max(axis=0)
-    margin = 0.6 * float((high - low).max())
+    margin = 0.4 * float((high - low).max())
     return rrb.VisualBounds2D(
         x_range=(float(low[1]) - margin, float(high[1]) + margin),
         y_range=(float(low[0]) - margin, float(high[0]) + margin),

@@ -33,18 +33,31 @@ def pair_drawing(step: Step) -> Drawing:
     """Yield the source and target clouds of the step's first registration in the target's camera frame."""
     posterior = shown_posterior(step)
     if posterior is None or step.view is None:
-        for path in (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER):
+        for path in (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER, entities.PAIR_CAPTION):
             yield path, _CLEAR
         return
     identity = np.eye(4)
     yield entities.PAIR_TARGET, _view_points(step.views[posterior.target], identity, entities.TARGET_RGB)
     yield entities.PAIR_BEFORE, _view_points(step.view, identity, entities.SOURCE_RGB)
     yield entities.PAIR_AFTER, _view_points(step.view, posterior.pose.mean, entities.SOURCE_RGB)
+    words = f"orange: frame {posterior.source}, teal: frame {posterior.target}"
+    yield entities.PAIR_CAPTION, caption(below_m(step.views[posterior.target]), words, (200, 200, 200))
 
 
 def shown_posterior(step: Step) -> Posterior | None:
     """Return the step's first registration to a view that is at hand: the odometry pair."""
     return next((posterior for posterior in step.posteriors if posterior.target in step.views), None)
+
+
+def below_m(view: RayImage) -> Array:
+    """Return a point (3,) below what a view saw of the object, where a caption has room."""
+    centre = view.centroid_m
+    return centre + np.array([0.0, 1.2 * float(np.linalg.norm(view.points_m - centre, axis=1).max()), 0.0])
+
+
+def caption(at_m: Array, words: str, rgb: entities.Rgb) -> rr.Points3D:
+    """Return words that stand at a point (3,)."""
+    return rr.Points3D(at_m, labels=words, show_labels=True, radii=rr.Radius.ui_points(0.0), colors=rgb)
 
 
 def model_drawing(step: Step) -> Drawing:

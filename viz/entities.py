@@ -19,8 +19,24 @@ PAIR: Final = "pair"
 PAIR_TARGET: Final = "pair/target"
 PAIR_BEFORE: Final = "pair/source_before"
 PAIR_AFTER: Final = "pair/source_after"
+PAIR_CAPTION: Final = "pair/caption"
 PAIR_AXES: Final = "pair/mean_axes"
 PAIR_DRAWS: Final = "pair/posterior_draws"
+GHOSTS: Final = "pair/ghosts"
+GHOST_MEANS: Final = "pair/ghost_means"
+GHOST_TIPS: Final = "pair/ghost_axis_tips"
+GHOST_CENTRE_1_SIGMA: Final = "pair/ghost_centre_1_sigma"
+GHOST_CENTRE_3_SIGMA: Final = "pair/ghost_centre_3_sigma"
+GHOST_LABELS: Final = "pair/ghost_labels"
+
+# The target's image with the source's points in it, in pixels.
+VISIBILITY: Final = "visibility"
+VISIBILITY_AREAS: Final = "visibility/areas"
+VISIBILITY_AGREES: Final = "visibility/points_that_agree"
+VISIBILITY_HIDDEN: Final = "visibility/points_hidden"
+VISIBILITY_NO_SAY: Final = "visibility/points_without_measurement"
+VISIBILITY_VIOLATIONS: Final = "visibility/points_in_front"
+VISIBILITY_CAPTION: Final = "visibility/caption"
 
 # The object frame.
 WORLD: Final = "world"
@@ -36,7 +52,14 @@ REJECTED: Final = "world/edges/rejected"
 POSITION_1_SIGMA: Final = "world/uncertainty/position_1_sigma"
 POSITION_3_SIGMA: Final = "world/uncertainty/position_3_sigma"
 AXIS_TIPS_1_SIGMA: Final = "world/uncertainty/axis_tips_1_sigma"
+EDGES_1_SIGMA: Final = "world/uncertainty/edges_1_sigma"
+EDGES_MAGNIFICATION: Final = "world/uncertainty/edges_magnification"
 MAGNIFICATION: Final = "world/uncertainty/magnification"
+BEFORE_CAMERAS: Final = "world/before/cameras"
+BEFORE_POSITION_1_SIGMA: Final = "world/before/position_1_sigma"
+BEFORE_POSITION_3_SIGMA: Final = "world/before/position_3_sigma"
+BEFORE_AXIS_TIPS_1_SIGMA: Final = "world/before/axis_tips_1_sigma"
+BEFORE_MAGNIFICATION: Final = "world/before/magnification"
 
 # Readings over time. Each has the series `odometry` and `closure`; the first two also `pose`.
 ROTATION_SD: Final = "readings/rotation_sd_deg"
@@ -51,6 +74,7 @@ POSE_READINGS: Final = (ROTATION_SD, TRANSLATION_SD)
 # Words
 NOW: Final = "words/now"
 LOG: Final = "words/log"
+RUN: Final = "words/run"
 LEGEND: Final = "words/legend"
 
 Rgb = tuple[int, int, int]
@@ -62,16 +86,29 @@ REJECTED_RGB: Final[Rgb] = (240, 60, 60)
 CAMERA_RGB: Final[Rgb] = (130, 145, 165)
 CURRENT_RGB: Final[Rgb] = SOURCE_RGB
 CHAIN_RGB: Final[Rgb] = (120, 100, 160)
+MODE_RGB: Final[tuple[Rgb, ...]] = (SOURCE_RGB, (200, 120, 255), (120, 210, 90), (255, 110, 130), (110, 170, 255))
+AREAS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((0, 0, 0), (128, 128, 128), (45, 85, 190))
+AGREES_RGB: Final[Rgb] = SOURCE_RGB
+HIDDEN_RGB: Final[Rgb] = (120, 80, 45)
+NO_SAY_RGB: Final[Rgb] = (70, 70, 70)
+VIOLATION_RGB: Final[Rgb] = (255, 40, 160)
 UNCERTAINTY_RGB: Final[Rgb] = (255, 225, 90)
 AXIS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((230, 70, 70), (80, 200, 80), (90, 130, 255))
 
 LEGEND_TEXT: Final = """\
-- **Pair**: new view orange, the view it is aligned to teal, in the latter's camera frame. Dots are where the ends of
-the axes land under samples of the posterior.
-- **Poses**: a pyramid is the camera as the object saw it, the newest orange. Odometry edges are white, closures
-green, rejected ones red; violet is the chain without closure.
-- **Uncertainty**: yellow ellipsoids are the position within 1 sd (solid) and 3 sd (wire), discs at the axes' tips the
-rotation within 1 sd, magnified by the factor written under the object.
-- **Readings**: white odometry, green closure, yellow the newest pose after optimisation. Sd along the worst axis;
+**Image column.** The frame as the camera saw it, all but the object dimmed; its depth; and, lowest, what the *last* view
+saw (blue: object, grey: background, black: no measurement) with the new view's points in it: orange they agree with the
+surface measured there, brown they are hidden behind it, **pink they hang in front of what was measured**, which no true
+motion makes them do.
+
+**Pair column.** New view orange, the view it is aligned to teal, in the latter's camera frame. Lowest, the posterior
+spread by the factor written there: the object at its mean, ghosts of it at samples, the ends of its axes as dots, its
+centre within 1 and 3 sd as yellow ellipsoids; other modes in other colours, with their share of the probability.
+
+**Graph.** A pyramid is the camera as the object saw it, the newest orange. Edges: odometry white, closure green,
+rejected red, each with an ellipsoid of the shift it allows within 1 sd. Yellow: position of a camera within 1 sd
+(solid) and 3 sd (wire); discs at the tips of its axes: rotation within 1 sd. All magnified as written below.
+
+**Readings.** White odometry, green closure, yellow the newest pose after optimisation. Sd along the worst axis;
 translation is that of the object's centre.
 """

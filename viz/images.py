@@ -59,7 +59,7 @@ def _depth_png(depth_m: npt.NDArray[np.float32], mask: BoolArray) -> rr.EncodedD
     units = np.nan_to_num(depth_m * _DEPTH_UNITS_PER_M, nan=0.0, posinf=0.0, neginf=0.0)
     buffer = io.BytesIO()
     pixels = np.clip(np.rint(units), 0, np.iinfo(np.uint16).max).astype(np.uint16)
-    Image.fromarray(pixels).save(buffer, "PNG", compress_level=3)
+    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
     return rr.EncodedDepthImage(
         blob=buffer.getvalue(),
         media_type="image/png",

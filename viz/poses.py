@@ -15,8 +15,12 @@ from viz import entities
 
 Drawing = Iterator[tuple[str, rr.AsComponents]]
 
+OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
+"""From the object towards the eye that looks at the whole graph."""
+
 _POSES: Final = 150  # of more than so many poses every n-th is drawn
 _CAMERA_SIZE: Final = 0.1  # as a share of the distance to the object
+_CAPTION: Final = 1.0  # of captions below the object, as a share of the distance to it
 _CLEAR: Final = rr.Clear(recursive=False)
 
 
@@ -35,6 +39,8 @@ def drawing(step: Step) -> Drawing:
         yield entities.CURRENT, _frusta(current[None], step.frame.camera, 1.3 * size_m, style)
     chain = [step.solution.odometry[k][:3, 3] for k in sorted(step.solution.odometry)]
     yield entities.CHAIN, _lines([chain] if len(chain) > 1 else [], entities.CHAIN_RGB, 1.0)
+    before = np.array([step.solution.odometry[k] for k in shown(step) if k in step.solution.odometry]).reshape(-1, 4, 4)
+    yield entities.BEFORE_CAMERAS, _frusta(before, step.frame.camera, size_m, (entities.CHAIN_RGB, 1.0))
     yield from _edges(step)
 
 
@@ -58,7 +64,15 @@ def distance_m(step: Step) -> float:
     """Return how far the object was from the camera in the first accepted view; 1 m before there is one."""
     if not step.views:
         return 1.0
-    return float(np.linalg.norm(step.views[min(step.views)].centroid_m))
+    points_m = step.views[min(step.views)].points_m
+    return float(np.linalg.norm(points_m[:: math.ceil(len(points_m) / 500)].mean(axis=0)))
+
+
+def below_ring_m(step: Step) -> Array:
+    """Return a point (3,) that the eye over the whole graph sees below it: where a caption has room."""
+    towards_eye = OVER_THE_RING / np.linalg.norm(OVER_THE_RING)
+    down = np.array([0.0, 1.0, 0.0]) - towards_eye[1] * towards_eye
+    return step.views[min(step.views)].centroid_m + _CAPTION * distance_m(step) * down / np.linalg.norm(down)
 
 
 def _edges(step: Step) -> Drawing:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import rerun as rr
@@ -17,8 +17,8 @@ Drawing = Iterator[tuple[str, rr.AsComponents]]
 _SERIES_RGB = {"odometry": entities.ODOMETRY_RGB, "closure": entities.CLOSURE_RGB, "pose": entities.UNCERTAINTY_RGB}
 
 
-def statics() -> Drawing:
-    """Yield what is said once: how each series looks, and the legend."""
+def statics(name: str, facts: Mapping[str, object]) -> Drawing:
+    """Yield what is said once: how each series looks, the legend, and what the run was asked to do."""
     for reading in entities.READINGS:
         for series in entities.SERIES:
             if series != "pose" or reading in entities.POSE_READINGS:
@@ -26,6 +26,24 @@ def statics() -> Drawing:
                 yield path, rr.SeriesLines(colors=rgb, names=series, widths=1.5)
                 yield path, rr.SeriesPoints(colors=rgb, names=series, markers="circle", marker_sizes=3.0)
     yield entities.LEGEND, rr.TextDocument(entities.LEGEND_TEXT, media_type=rr.MediaType.MARKDOWN)
+    yield entities.RUN, rr.TextDocument(run_words(name, facts), media_type=rr.MediaType.MARKDOWN)
+
+
+def run_words(name: str, facts: Mapping[str, object]) -> str:
+    """Say in Markdown what the run is and what it was asked to do.
+
+    Args:
+        name: of the sequence.
+        facts: whatever else is known before the run, by name.
+    """
+    rows = [f"| {key.replace('_', ' ')} | {_fact(value)} |" for key, value in facts.items()]
+    return "\n".join([f"### {name}", "", "| | |", "|---|---|", *rows] if rows else [f"### {name}"])
+
+
+def _fact(value: object) -> str:
+    """Return a value as a cell of a table."""
+    text = " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+    return text.replace("|", "\\|")
 
 
 def drawing(step: Step) -> Drawing:

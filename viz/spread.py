@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from modeler import se3
-from modeler.types import Array, Posterior, Step
+from modeler.types import Array, Posterior, RayImage, Step
 from viz import clouds, entities
 
 Drawing = Iterator[tuple[str, rr.AsComponents]]
@@ -27,7 +27,7 @@ def drawing(step: Step) -> Drawing:
         yield entities.PAIR_DRAWS, _CLEAR
         return
     centre = step.view.centroid_m
-    length_m = _LENGTH * float(np.linalg.norm(step.view.points_m - centre, axis=1).max())
+    length_m = axes_length_m(step.view)
     ends = centre + length_m * np.eye(3)
     mean = posterior.pose.mean
     colours = np.array(entities.AXIS_RGB, dtype=np.uint8)
@@ -46,6 +46,11 @@ def drawing(step: Step) -> Drawing:
         entities.PAIR_DRAWS,
         rr.Points3D(points.reshape(-1, 3), colors=np.tile(colours, (len(poses), 1)), radii=rr.Radius.ui_points(2.0)),
     )
+
+
+def axes_length_m(view: RayImage) -> float:
+    """Return the length of the object's axes as drawn."""
+    return _LENGTH * float(np.linalg.norm(view.points_m - view.centroid_m, axis=1).max())
 
 
 def draws(posterior: Posterior) -> Array:

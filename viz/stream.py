@@ -6,6 +6,7 @@ import itertools
 import logging
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -42,7 +43,7 @@ class RerunStream:
         if not self.recording.is_enabled():
             return
         # Rerun takes half a second to import: only runs that record pay for it.
-        from viz import blueprint, clouds, images, poses, readings, spread, uncertainty
+        from viz import blueprint, clouds, ghosts, images, poses, readings, spread, uncertainty, visibility
 
         self.recording.set_time(entities.FRAME, sequence=step.frame.index)
         self.recording.set_time(entities.ELAPSED, duration=time.monotonic() - self.started_s)
@@ -52,6 +53,8 @@ class RerunStream:
             images.drawing(step),
             clouds.pair_drawing(step),
             spread.drawing(step),
+            ghosts.drawing(step),
+            visibility.drawing(step),
             clouds.model_drawing(step),
             poses.drawing(step),
             uncertainty.drawing(step),
@@ -77,7 +80,13 @@ class RerunStream:
 
 
 def open_stream(
-    name: str, *, save: Path | None, spawn: bool = False, web: bool = False, connect: str | None = None
+    name: str,
+    *,
+    save: Path | None,
+    spawn: bool = False,
+    web: bool = False,
+    connect: str | None = None,
+    facts: Mapping[str, object] | None = None,
 ) -> RerunStream:
     """Open a recording and the viewer that is to watch it.
 
@@ -89,13 +98,14 @@ def open_stream(
         spawn: open the viewer in a window.
         web: serve the viewer in the browser on 127.0.0.1; `address` names the page.
         connect: `rerun+http://HOST:PORT/proxy` of a viewer that is already open.
+        facts: what the run was asked to do, by name: shown beside what happens.
 
     Raises:
         InputError: where `save` cannot be written, or `connect` is not an address.
     """
     import rerun as rr
 
-    from viz import blueprint, clouds, images, readings
+    from viz import blueprint, clouds, images, readings, visibility
 
     listens = connect is not None and viewer.reachable(connect)
     sinks: list[rr.FileSink | rr.GrpcSink] = [] if save is None else [_file_sink(save)]
@@ -110,7 +120,9 @@ def open_stream(
         recording.set_sinks(*sinks)
         recording.send_recording_name(name)
         recording.send_blueprint(blueprint.layout(None))
-        for path, archetype in itertools.chain(images.statics(), clouds.statics(), readings.statics()):
+        for path, archetype in itertools.chain(
+            images.statics(), clouds.statics(), visibility.statics(), readings.statics(name, facts or {})
+        ):
             recording.log(path, archetype, static=True)
     return RerunStream(recording, viewers, time.monotonic())
 

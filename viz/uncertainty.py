@@ -1,9 +1,9 @@
-"""How sure each pose of the graph is, drawn."""
+"""How sure each edge and each pose of the graph is, drawn: before loop closure and after."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -12,32 +12,58 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.types import Array, Edge, Step
-from viz import entities, poses
+from viz import chain, clouds, entities, poses
 
 Drawing = Iterator[tuple[str, rr.AsComponents]]
 
 _LARGEST_3_SIGMA: Final = 0.3  # half axis of the largest ellipsoid of a chain, as a share of the object's distance
+_LARGEST_EDGE_SIGMA: Final = 0.12  # half axis of the largest ellipsoid of an edge, as a share of that distance
 _CLEAR: Final = rr.Clear(recursive=False)
+_AFTER: Final = (
+    entities.POSITION_1_SIGMA,
+    entities.POSITION_3_SIGMA,
+    entities.AXIS_TIPS_1_SIGMA,
+    entities.MAGNIFICATION,
+)
+_BEFORE: Final = (
+    entities.BEFORE_POSITION_1_SIGMA,
+    entities.BEFORE_POSITION_3_SIGMA,
+    entities.BEFORE_AXIS_TIPS_1_SIGMA,
+    entities.BEFORE_MAGNIFICATION,
+)
 
 
 def drawing(step: Step) -> Drawing:
-    """Yield the ellipsoids of the poses whose covariance is known."""
-    size_m = poses.camera_size_m(step)
-    paths = (entities.POSITION_1_SIGMA, entities.POSITION_3_SIGMA, entities.AXIS_TIPS_1_SIGMA, entities.MAGNIFICATION)
-    covariances = step.solution.covariances
-    known = [k for k in poses.shown(step) if k in covariances and step.views and np.isfinite(covariances[k]).all()]
-    if not known:
+    """Yield the ellipsoids of the edges, of the poses, and of the poses of the chain before closure, all magnified."""
+    factor = magnification(step.edges_so_far, poses.distance_m(step))
+    shown = poses.shown(step)
+    after = {frame: step.solution.covariances[frame] for frame in shown if frame in step.solution.covariances}
+    before = chain.covariances(step)
+    yield from _of_poses(step, _AFTER, step.solution.trajectory, after, factor)
+    yield from _of_poses(
+        step, _BEFORE, step.solution.odometry, {frame: before[frame] for frame in shown if frame in before}, factor
+    )
+    yield from _of_edges(step)
+
+
+def _of_poses(
+    step: Step, paths: Sequence[str], trajectory: Mapping[int, Array], covariances: Mapping[int, Array], factor: float
+) -> Drawing:
+    """Yield the ellipsoids of poses whose covariance is known, to the four paths of a set."""
+    covariances = {k: covariance for k, covariance in covariances.items() if np.isfinite(covariance).all()}
+    if not covariances or not step.views:
         for path in paths:
             yield path, _CLEAR
         return
-    factor = magnification(step.edges_so_far, poses.distance_m(step))
-    known_poses = np.array([step.solution.trajectory[k] for k in known])
+    size_m = poses.camera_size_m(step)
+    known_poses = np.array([trajectory[k] for k in covariances])
     rotations, centres = known_poses[:, :3, :3], known_poses[:, :3, 3]
-    blocks = np.array([covariances[k] for k in known])
+    blocks = np.array(list(covariances.values()))
     half_axes, quaternions = ellipsoids(rotations @ blocks[:, 3:, 3:] @ np.swapaxes(rotations, 1, 2))
+    one_sigma, three_sigma, tips_one_sigma, label = paths
     for path, sigmas, style in (
-        (entities.POSITION_1_SIGMA, 1.0, rr.components.FillMode.Solid),
-        (entities.POSITION_3_SIGMA, 3.0, rr.components.FillMode.MajorWireframe),
+        (one_sigma, 1.0, rr.components.FillMode.Solid),
+        (three_sigma, 3.0, rr.components.FillMode.MajorWireframe),
     ):
         yield (
             path,
@@ -55,26 +81,56 @@ def drawing(step: Step) -> Drawing:
     )
     half_axes, quaternions = ellipsoids(size_m**2 * tips)
     yield (
-        entities.AXIS_TIPS_1_SIGMA,
+        tips_one_sigma,
         rr.Ellipsoids3D(
             centers=(centres[:, None] + size_m * np.swapaxes(rotations, 1, 2)).reshape(-1, 3),
             half_sizes=factor * half_axes,
             quaternions=quaternions,
-            colors=np.tile(np.array(entities.AXIS_RGB, dtype=np.uint8), (len(known), 1)),
+            colors=np.tile(np.array(entities.AXIS_RGB, dtype=np.uint8), (len(blocks), 1)),
             fill_mode=rr.components.FillMode.Solid,
         ),
     )
-    below_object = step.views[min(step.views)].centroid_m + np.array([0.0, 4.0 * size_m, 0.0])
+    words = f"1 and 3 sd, {scale_words(factor)}"
+    yield label, clouds.caption(poses.below_ring_m(step), words, entities.UNCERTAINTY_RGB)
+
+
+def scale_words(factor: float) -> str:
+    """Say how many times larger than life something is drawn."""
+    return "to scale" if factor == 1.0 else f"drawn \N{MULTIPLICATION SIGN}{factor:g}"
+
+
+def _of_edges(step: Step) -> Drawing:
+    """Yield an ellipsoid half way along each edge that takes part: the shift within 1 sd that its posterior allows."""
+    trajectory = step.solution.trajectory
+    edges = [
+        edge
+        for edge in step.edges_so_far
+        if edge.source in trajectory and edge.target in trajectory and poses.takes_part(edge, step)
+    ]
+    edges = [edge for edge in edges if np.isfinite(edge.posterior.pose.covariance).all()]
+    if not edges or not step.views:
+        yield entities.EDGES_1_SIGMA, _CLEAR
+        yield entities.EDGES_MAGNIFICATION, _CLEAR
+        return
+    ends = np.array([[trajectory[edge.target][:3, 3], trajectory[edge.source][:3, 3]] for edge in edges])
+    rotations = np.array([trajectory[edge.source][:3, :3] for edge in edges])
+    blocks = np.array([edge.posterior.pose.covariance[3:, 3:] for edge in edges])
+    half_axes, quaternions = ellipsoids(rotations @ blocks @ np.swapaxes(rotations, 1, 2))
+    rgb = {"odometry": entities.ODOMETRY_RGB, "closure": entities.CLOSURE_RGB}
+    factor = rounded_down(_LARGEST_EDGE_SIGMA * poses.distance_m(step) / max(float(half_axes.max()), 1e-9))
+    factor = min(max(factor, 0.1), 1000.0)
     yield (
-        entities.MAGNIFICATION,
-        rr.Points3D(
-            below_object,
-            labels=f"uncertainty drawn \N{MULTIPLICATION SIGN}{factor:g}",
-            show_labels=True,
-            radii=rr.Radius.ui_points(0.0),
-            colors=entities.UNCERTAINTY_RGB,
+        entities.EDGES_1_SIGMA,
+        rr.Ellipsoids3D(
+            centers=ends.mean(axis=1),
+            half_sizes=factor * half_axes,
+            quaternions=quaternions,
+            colors=np.array([rgb[edge.kind] for edge in edges], dtype=np.uint8),
+            fill_mode=rr.components.FillMode.Solid,
         ),
     )
+    words = f"edges: 1 sd, {scale_words(factor)}"
+    yield entities.EDGES_MAGNIFICATION, clouds.caption(poses.below_ring_m(step), words, entities.ODOMETRY_RGB)
 
 
 def magnification(edges: Sequence[Edge], distance_m: float) -> float:
@@ -92,9 +148,13 @@ def magnification(edges: Sequence[Edge], distance_m: float) -> float:
     if not variances:
         return 1.0
     sigma_m = math.sqrt(max(9.0 * variances[0], sum(variances)))  # room for nine edges from the start
-    wanted = _LARGEST_3_SIGMA * distance_m / (3.0 * sigma_m)
-    decade = 10.0 ** math.floor(math.log10(wanted))
-    return min(max(max(factor * decade for factor in (1, 2, 5) if factor * decade <= wanted), 0.1), 1000.0)
+    return min(max(rounded_down(_LARGEST_3_SIGMA * distance_m / (3.0 * sigma_m)), 0.1), 1000.0)
+
+
+def rounded_down(number: float) -> float:
+    """Return the largest of …, 0.5, 1, 2, 5, 10, … that is not above a positive number."""
+    decade = 10.0 ** math.floor(math.log10(number))
+    return max(factor * decade for factor in (1, 2, 5) if factor * decade <= number)
 
 
 def ellipsoids(covariances: Array) -> tuple[Array, Array]:

@@ -1,0 +1,170 @@
+"""The posterior of the newest pair larger than life: the object where samples put it, mode by mode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from modeler import se3
+from modeler.types import Array, Mode, Posterior, RayImage, Step
+from viz import clouds, entities, spread, uncertainty
+
+Drawing = Iterator[tuple[str, rr.AsComponents]]
+
+_GHOSTS: Final = 24
+_GHOST_POINTS: Final = 250
+_MEAN_POINTS: Final = 1_500
+_SHOWN_SD: Final = 0.12  # of the farthest point under the widest mode, as a share of its distance from the centre
+_MOST_RAD: Final = 0.25  # sd of the rotation as drawn: beyond it a magnified spread no longer looks like one
+_GHOST_LIGHT: Final = 0.55
+_CLEAR: Final = rr.Clear(recursive=False)
+_PATHS: Final = (
+    entities.GHOSTS,
+    entities.GHOST_MEANS,
+    entities.GHOST_TIPS,
+    entities.GHOST_CENTRE_1_SIGMA,
+    entities.GHOST_CENTRE_3_SIGMA,
+    entities.GHOST_LABELS,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Ghosts:
+    """Motions drawn from a posterior, spread wider about the modes they belong to."""
+
+    modes: tuple[Mode, ...]
+    """Heaviest first; one where the posterior tells of none."""
+    factor: float
+    """How many times wider; never less than 1."""
+    poses: Array
+    """(n, 4, 4) target_from_source as drawn."""
+    mode_of: npt.NDArray[np.int64]
+    """(n,) number of the mode that each belongs to."""
+
+
+def drawing(step: Step) -> Drawing:
+    """Yield the source at every mode, ghosts of it, the ends of its axes and the ellipsoid of its centre."""
+    posterior = clouds.shown_posterior(step)
+    if posterior is None or step.view is None or not np.isfinite(posterior.pose.covariance).all():
+        for path in _PATHS:
+            yield path, _CLEAR
+        return
+    view, ghosts = step.view, magnified(posterior, step.view)
+    colours = np.array([entities.MODE_RGB[k % len(entities.MODE_RGB)] for k in range(len(ghosts.modes))])
+    few = view.points_m[:: math.ceil(len(view.points_m) / _GHOST_POINTS)]
+    points = np.concatenate([se3.transform(pose, few) for pose in ghosts.poses])
+    dim = np.repeat((_GHOST_LIGHT * colours[ghosts.mode_of]).astype(np.uint8), len(few), axis=0)
+    yield entities.GHOSTS, rr.Points3D(points, colors=dim, radii=rr.Radius.ui_points(0.6))
+    yield entities.GHOST_MEANS, _means(view, ghosts.modes, colours)
+    yield from _tips(view, ghosts)
+    yield from _centres(view, ghosts, colours)
+
+
+def magnified(posterior: Posterior, view: RayImage) -> Ghosts:
+    """Return ghosts of a posterior, spread by a round factor that makes them easy to tell apart.
+
+    Each motion moves away from the mean of its own mode, turning about the object's centre, so that separate modes
+    stay where they are.
+    """
+    modes = posterior.modes or (Mode(1.0, posterior.pose),)
+    centre = se3.translation(view.centroid_m)
+    drawn = spread.draws(posterior)
+    drawn = drawn[np.linspace(0, len(drawn) - 1, min(_GHOSTS, len(drawn))).astype(np.int64)]
+    mode_of = np.array([_nearest(modes, pose) for pose in drawn])
+    means = np.array([mode.pose.mean for mode in modes])[mode_of] @ centre
+    factor = _factor(modes, view)
+    poses = means @ se3.exp(factor * se3.log(se3.inverse(means) @ drawn @ centre)) @ se3.inverse(centre)
+    return Ghosts(modes, factor, poses, mode_of)
+
+
+def _nearest(modes: Sequence[Mode], pose: Array) -> int:
+    """Return the number of the mode under which a motion (4, 4) is most likely."""
+    if len(modes) == 1:
+        return 0
+    costs = []
+    for mode in modes:
+        xi = se3.log(se3.inverse(mode.pose.mean) @ pose)
+        _, log_det = np.linalg.slogdet(mode.pose.covariance)
+        costs.append(xi @ np.linalg.solve(mode.pose.covariance, xi) + log_det - 2.0 * math.log(max(mode.weight, 1e-9)))
+    return int(np.argmin(costs))
+
+
+def _factor(modes: Sequence[Mode], view: RayImage) -> float:
+    """Return by how much to spread the draws."""
+    radius_m = float(np.linalg.norm(view.points_m - view.centroid_m, axis=1).max())
+    widest_rad, widest_m = 0.0, 0.0
+    for mode in modes:
+        covariance = about_centre(mode.pose.covariance, view.centroid_m)
+        widest_rad = max(widest_rad, _sd(covariance[:3, :3]))
+        widest_m = max(widest_m, math.hypot(radius_m * _sd(covariance[:3, :3]), _sd(covariance[3:, 3:])))
+    if not widest_m > 0.0:
+        return 1.0
+    wanted = min(_SHOWN_SD * radius_m / widest_m, _MOST_RAD / max(widest_rad, 1e-9))
+    return min(uncertainty.rounded_down(wanted), 1000.0) if wanted >= 1.0 else 1.0
+
+
+def about_centre(covariance: Array, centre_m: Array) -> Array:
+    """Return the covariance (6, 6) of a motion's ξ about a point (3,) of the source instead of its camera."""
+    to_centre = se3.adjoint(se3.translation(-centre_m))
+    return to_centre @ covariance @ to_centre.T
+
+
+def _sd(covariance: Array) -> float:
+    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
+
+
+def _means(view: RayImage, modes: Sequence[Mode], colours: npt.NDArray[np.int64]) -> rr.Points3D:
+    """Return the source's cloud at the mean of every mode."""
+    stride = math.ceil(len(view.points_m) * len(modes) / _MEAN_POINTS)
+    points, normals = view.points_m[::stride], view.normals[::stride]
+    return rr.Points3D(
+        np.concatenate([se3.transform(mode.pose.mean, points) for mode in modes]),
+        colors=np.concatenate([clouds.shaded(tuple(rgb), normals) for rgb in colours.tolist()]),
+        radii=rr.Radius.ui_points(1.0),
+    )
+
+
+def _tips(view: RayImage, ghosts: Ghosts) -> Drawing:
+    """Yield where the ends of the object's axes land."""
+    ends = view.centroid_m + spread.axes_length_m(view) * np.eye(3)
+    points = np.einsum("nij,kj->nki", ghosts.poses[:, :3, :3], ends) + ghosts.poses[:, None, :3, 3]
+    colours = np.tile(np.array(entities.AXIS_RGB, dtype=np.uint8), (len(ghosts.poses), 1))
+    yield entities.GHOST_TIPS, rr.Points3D(points.reshape(-1, 3), colors=colours, radii=rr.Radius.ui_points(2.5))
+
+
+def _centres(view: RayImage, ghosts: Ghosts, colours: npt.NDArray[np.int64]) -> Drawing:
+    """Yield the ellipsoids of the object's centre under every mode, and what they are in words."""
+    poses = np.array([mode.pose.mean for mode in ghosts.modes])
+    rotations = poses[:, :3, :3]
+    centres = np.array([se3.transform(pose, view.centroid_m) for pose in poses])
+    blocks = np.array([about_centre(mode.pose.covariance, view.centroid_m)[3:, 3:] for mode in ghosts.modes])
+    half_axes, quaternions = uncertainty.ellipsoids(rotations @ blocks @ np.swapaxes(rotations, 1, 2))
+    for path, sigmas, style in (
+        (entities.GHOST_CENTRE_1_SIGMA, 1.0, rr.components.FillMode.Solid),
+        (entities.GHOST_CENTRE_3_SIGMA, 3.0, rr.components.FillMode.DenseWireframe),
+    ):
+        yield (
+            path,
+            rr.Ellipsoids3D(
+                centers=centres,
+                half_sizes=sigmas * ghosts.factor * half_axes,
+                quaternions=quaternions,
+                colors=entities.UNCERTAINTY_RGB,
+                line_radii=rr.Radius.ui_points(0.5),
+                fill_mode=style,
+            ),
+        )
+    below = centres + np.array([0.0, 1.1 * spread.axes_length_m(view), 0.0])
+    scale = f"spread {uncertainty.scale_words(ghosts.factor)}"
+    shares = [f"mode {k + 1}: {100.0 * mode.weight:.0f} %" for k, mode in enumerate(ghosts.modes)]
+    labels = [scale] if len(shares) == 1 else [f"{share}, {scale}" for share in shares]
+    yield (
+        entities.GHOST_LABELS,
+        rr.Points3D(below, labels=labels, show_labels=True, radii=rr.Radius.ui_points(0.0), colors=colours),
+    )
