@@ -189,6 +189,20 @@ def test_exported_mesh_is_the_same_surface(tmp_path: Path, suffix: str) -> None:
     assert [path.name for path in out.parent.iterdir()] == [out.name]
 
 
+def test_vertices_tell_who_saw_them(tmp_path: Path) -> None:
+    model = _model()
+    views = np.arange(len(model.vertices_m))
+    sigmas_m = np.where(views == 0, np.inf, 1e-3 / np.maximum(views, 1))
+    path = tmp_path / "model.ply"
+    path.write_bytes(mesh_ply(replace(model, vertex_views=views, vertex_sigmas_m=sigmas_m)))
+    mesh = _loaded(path)
+    columns = mesh.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(columns["views"].ravel(), views)
+    np.testing.assert_allclose(columns["sigma_m"].ravel(), np.where(views == 0, -1.0, sigmas_m), rtol=1e-6)
+    np.testing.assert_allclose(mesh.vertices, model.vertices_m, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(o3d.io.read_triangle_mesh(path).vertices), model.vertices_m, atol=1e-6)
+
+
 def test_mesh_that_cannot_be_exported_is_said_in_one_line(tmp_path: Path) -> None:
     empty = replace(_model(), triangles=np.zeros((0, 3), dtype=np.int64))
     (tmp_path / "empty.ply").write_bytes(mesh_ply(empty))

@@ -14,8 +14,15 @@ def cloud_ply(model: ObjectModel) -> bytes:
 
 
 def mesh_ply(model: ObjectModel) -> bytes:
-    """Return the mesh of a model as PLY."""
-    return ply_bytes(model.vertices_m, model.vertex_normals, model.vertex_colours, model.triangles)
+    """Return the mesh of a model as PLY; vertices have `views` and `sigma_m` beside the usual, where they are known."""
+    return ply_bytes(
+        model.vertices_m,
+        model.vertex_normals,
+        model.vertex_colours,
+        model.triangles,
+        views=model.vertex_views,
+        sigmas_m=model.vertex_sigmas_m,
+    )
 
 
 def ply_bytes(
@@ -23,6 +30,9 @@ def ply_bytes(
     normals: Array,
     colours: npt.NDArray[np.uint8] | None = None,
     triangles: npt.NDArray[np.int64] | None = None,
+    *,
+    views: npt.NDArray[np.int64] | None = None,
+    sigmas_m: Array | None = None,
 ) -> bytes:
     """Return a little-endian PLY file.
 
@@ -31,6 +41,8 @@ def ply_bytes(
         normals: (n, 3) unit vectors.
         colours: (n, 3) RGB.
         triangles: (t, 3) vertex numbers; None: a cloud, without a face element.
+        views: (n,) number of views that saw each point, stored as `views`; 0 = made up.
+        sigmas_m: (n,) standard deviation along the normal, stored as `sigma_m`; inf, stored as -1, where there is none.
     """
     names = ["x", "y", "z", "nx", "ny", "nz"]
     fields = [(name, "<f4") for name in names]
@@ -41,6 +53,14 @@ def ply_bytes(
         fields += [(name, "u1") for name in names]
         header += [f"property uchar {name}" for name in names]
         values += list(colours.T)
+    if views is not None:
+        fields.append(("views", "<u2"))
+        header.append("property ushort views")
+        values.append(np.minimum(views, np.iinfo(np.uint16).max))
+    if sigmas_m is not None:
+        fields.append(("sigma_m", "<f4"))
+        header.append("property float sigma_m")
+        values.append(np.where(np.isfinite(sigmas_m), sigmas_m, -1.0))  # readers of PLY stumble over inf
     vertices = np.empty(len(points_m), dtype=fields)
     for (name, _), column in zip(fields, values, strict=True):
         vertices[name] = column

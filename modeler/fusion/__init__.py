@@ -1,5 +1,7 @@
 """Views and their poses to one model of the object: merged cloud and mesh."""
 
 from modeler.fusion.fuser import Fuser
+from modeler.fusion.poses import own_covariances
+from modeler.fusion.scan import Scan
 
-__all__ = ["Fuser"]
+__all__ = ["Fuser", "Scan", "own_covariances"]

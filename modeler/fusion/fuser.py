@@ -6,15 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from modeler import se3
-from modeler.fusion import cloud, grid, surface
-from modeler.fusion.stack import GREY, Stack, colours_at, posed, spread, stack
-from modeler.kernels import fusion
+from modeler.fusion import cloud, grid
+from modeler.fusion.scan import Scan
+from modeler.fusion.stack import GREY, SMOOTHED, colours_at, posed, spread, stack
 from modeler.types import Array, InputError, ObjectModel, RayImage
-
-LONELY = 6  # a point of the cloud with fewer neighbours within a few voxels is an outlier
 
 
 @dataclass(frozen=True)
@@ -45,29 +42,38 @@ class Fuser:
     """Mesh that is seen less is removed. A view counts 1 head-on, less at flat angles, `edge_weight` at silhouettes."""
     closing: int = 3
     """Gaps narrower than about twice so many voxels are closed; what nobody saw beyond stays open."""
+    opening: int = 2
+    """Spikes and strips along open borders narrower than about twice so many voxels are cut off."""
     fairing: int = 10
     """Passes of smoothing the mesh without shrinking it."""
     min_piece: float = 0.01
     """Loose pieces of the mesh smaller than this share of the largest piece's area are removed."""
 
-    def preview(self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> ObjectModel:
+    def preview(
+        self,
+        views: Mapping[int, RayImage],
+        trajectory: Mapping[int, Array],
+        covariances: Mapping[int, Array] | None = None,
+    ) -> ObjectModel:
         """Return the merged cloud alone, one point a voxel, without a mesh: cheap enough for every frame.
 
         Args:
             views: by frame number; those without a pose are left out.
             trajectory: object_from_camera (4, 4) by frame number.
+            covariances: of the poses; a preview does not look at them.
 
         Raises:
             InputError: where no view with surface points has a pose.
         """
         pairs = posed(views, trajectory)
-        points, normals, colours = cloud.thinned(
+        points, normals, colours = cloud.painted(
             np.concatenate([se3.transform(pose, view.points_m) for view, pose in pairs]),
             np.concatenate([view.normals @ pose[:3, :3].T for view, pose in pairs]),
             np.concatenate([colours_at(view) for view, _ in pairs]),
-            np.ones(sum(len(view.points_m) for view, _ in pairs)),
+            np.concatenate([np.full(len(view.points_m), view.frame.colour is not None) for view, _ in pairs]),
             voxel_m=self.preview_voxels * self._voxel_m(pairs),
             max_voxels=self.max_voxels,
+            unknown=GREY,
         )
         coloured = any(view.frame.colour is not None for view, _ in pairs)
         return ObjectModel(
@@ -80,7 +86,12 @@ class Fuser:
             vertex_colours=np.zeros((0, 3), dtype=np.uint8) if coloured else None,
         )
 
-    def fuse(self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> ObjectModel:
+    def fuse(
+        self,
+        views: Mapping[int, RayImage],
+        trajectory: Mapping[int, Array],
+        covariances: Mapping[int, Array] | None = None,
+    ) -> ObjectModel:
         """Return cloud and mesh, made with care.
 
         Space that a view saw empty is carved, what nobody saw stays open, and nothing but pixels of the object becomes
@@ -89,10 +100,21 @@ class Fuser:
         Args:
             views: by frame number; those without a pose are left out.
             trajectory: object_from_camera (4, 4) by frame number.
+            covariances: (6, 6) of the poses by frame number; the surer a pose, the more its view counts. A pose without
+                one counts as exact.
 
         Raises:
             InputError: where no view with surface points has a pose.
         """
+        return self.scanned(views, trajectory, covariances).model()
+
+    def scanned(
+        self,
+        views: Mapping[int, RayImage],
+        trajectory: Mapping[int, Array],
+        covariances: Mapping[int, Array] | None = None,
+    ) -> Scan:
+        """Return the views laid together in one volume, from which models are made; arguments as of `fuse`."""
         pairs = posed(views, trajectory)
         noise_m = float(np.median([view.sigma_r_m for view, _ in pairs]))
         voxel_m = self._voxel_m(pairs)
@@ -103,46 +125,18 @@ class Fuser:
             max_voxels=self.max_voxels,
         )
         seen = stack(
-            pairs, box.corners_m, margin_px=self.margin_px, min_cosine=self.min_cosine, edge_weight=self.edge_weight
+            pairs,
+            box.corners_m,
+            margin_px=self.margin_px,
+            min_cosine=self.min_cosine,
+            edge_weight=self.edge_weight,
+            covariances=covariances,
         )
         # Where poses are off, the band must be wide enough for the views to meet in it.
         limit_m = 0.05 * float(np.linalg.norm(box.shape)) * box.voxel_m
-        spread_m = spread(seen, limit_m) or noise_m
+        spread_m, sigma_m = spread(seen, limit_m) or (noise_m, SMOOTHED * noise_m)
         tau_m = self.truncation_m or 3.0 * box.voxel_m + 2.0 * spread_m
-        near_m = box.voxel_m + 2.0 * spread_m
-        vertices, triangles, vertex_colours = self._mesh(seen, box, tau_m=tau_m, near_m=near_m)
-
-        points, normals, colours = cloud.thinned(
-            seen.points_m, seen.normals, seen.colours, seen.weights, voxel_m=box.voxel_m, max_voxels=8 * self.max_voxels
-        )
-        support, emptiness, _ = _survey(seen, points, normals, tau_m=tau_m, near_m=near_m)
-        kept = (support > self.empty_weight * emptiness) & cloud.crowded(points, 2.0 * box.voxel_m, LONELY)
-        coloured = bool(seen.coloured.any())
-        return ObjectModel(
-            points_m=points[kept],
-            normals=normals[kept],
-            colours=colours[kept] if coloured else None,
-            vertices_m=vertices,
-            triangles=triangles,
-            vertex_normals=surface.normals_of(vertices, triangles),
-            vertex_colours=vertex_colours if coloured else None,
-        )
-
-    def _mesh(
-        self, seen: Stack, box: grid.Grid, *, tau_m: float, near_m: float
-    ) -> tuple[Array, surface.Triangles, npt.NDArray[np.uint8]]:
-        """Return vertices (v, 3), triangles (t, 3) and RGB (v, 3) of the surface that the views support."""
-        field = grid.measure(box, seen, tau_m=tau_m, empty_weight=self.empty_weight)
-        for _ in range(self.closing):
-            field = grid.filled(field)
-        vertices, triangles = surface.extracted(field)
-        normals = surface.normals_of(vertices, triangles)
-        support, _, colours = _survey(seen, vertices, normals, tau_m=tau_m, near_m=near_m)
-        kept = surface.closed(support > self.min_support, triangles, self.closing)
-        triangles = triangles[np.any(kept[triangles], axis=1)]
-        triangles = triangles[surface.large_pieces(vertices, triangles, self.min_piece)]
-        used, triangles = surface.compacted(triangles, len(vertices))
-        return surface.fair(vertices[used], triangles, self.fairing), triangles, colours[used]
+        return Scan(self, seen.carving(tau_m), box, tau_m, box.voxel_m + 2.0 * spread_m, sigma_m)
 
     def _voxel_m(self, pairs: list[tuple[RayImage, Array]]) -> float:
         """Return the side of a voxel, before the box is known."""
@@ -152,19 +146,3 @@ class Fuser:
             return self.voxel_m
         footprint_m = np.concatenate([view.points_m[:, 2] / view.frame.camera.fx for view, _ in pairs])
         return max(float(np.median(footprint_m)), 0.5 * float(np.median([view.sigma_r_m for view, _ in pairs])))
-
-
-def _survey(
-    seen: Stack, points_m: Array, normals: Array, *, tau_m: float, near_m: float
-) -> tuple[Array, Array, npt.NDArray[np.uint8]]:
-    """Return how much the views support points (n, 3), how many see them empty, and the RGB (n, 3) they give them."""
-    support, emptiness, colours, share = fusion.survey(
-        np.ascontiguousarray(points_m),
-        np.ascontiguousarray(normals),
-        near_m,
-        tau_m,
-        *seen.lookup,
-        seen.colour,
-        seen.coloured,
-    )
-    return support, emptiness, np.rint(np.where(share[:, None] > 0.0, colours, GREY)).astype(np.uint8)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from modeler.types import Array, BoolArray, InputError, RayImage
 
 WITNESSES = 20000  # points asked for how well the views agree
 GREY = 128  # colour of what no view with colour sees
+SMOOTHED = 0.5  # noise of a surface point, smoothed over its neighbours, against that of its pixel
 STEEPEST_RAD = 1.40  # a step between neighbouring pixels steeper than this (80°) is an edge, not a surface
 
 
@@ -27,6 +28,8 @@ class Stack:
     """(f, h, w) number of the surface point at a pixel, -1 = none."""
     free_m: npt.NDArray[np.float32]
     """(f, h, w) depth up to which the space along a pixel was seen empty, 0 = nothing known."""
+    beside_m: npt.NDArray[np.float32]
+    """(f, h, w) depth measured at pixels around which nothing of the object is seen, 0 = object near by, or nothing."""
     colour: npt.NDArray[np.uint8]
     """(f, h, w, 3) RGB."""
     coloured: BoolArray
@@ -50,6 +53,15 @@ class Stack:
     def lookup(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32], Array, Array, Array, Array, Array]:
         """Arguments that every kernel shares."""
         return self.index, self.free_m, self.poses, self.lenses, self.points_m, self.normals, self.weights
+
+    def carving(self, tau_m: float) -> Stack:
+        """Return the views with empty space that ends behind what is measured beside the object, by a band ±`tau_m`.
+
+        Empty space ends a band short of the object's surface, whose place is not known better. Something else that is
+        seen tells more: right there is nothing of the object.
+        """
+        beside_m = np.where(self.beside_m > 0.0, self.beside_m + np.float32(1.5 * tau_m), np.float32(0.0))
+        return replace(self, free_m=np.maximum(self.free_m, beside_m))
 
 
 def posed(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> list[tuple[RayImage, Array]]:
@@ -94,6 +106,7 @@ class _Cut:
 
     index: npt.NDArray[np.int32]
     free_m: npt.NDArray[np.float32]
+    beside_m: npt.NDArray[np.float32]
     colour: npt.NDArray[np.uint8] | None
     lens: Array
     points_m: Array
@@ -138,10 +151,12 @@ def _cut(view: RayImage, window: tuple[slice, slice], *, margin_px: int, min_cos
     pixels = pixels[kept]
     index = np.full(depth_m.shape, -1, dtype=np.int32)
     index[tuple(pixels.T)] = np.arange(len(pixels))
+    around = np.asarray(maximum_filter(mask, size=2 * margin_px + 1, mode="nearest"), dtype=bool)
     reach_m = minimum_filter(np.where(measured, depth_m, np.inf), size=2 * margin_px + 1, mode="nearest")
     return _Cut(
         index=index,
         free_m=np.where(measured, reach_m, 0.0).astype(np.float32),
+        beside_m=np.where(measured & ~around, depth_m, 0.0).astype(np.float32),
         colour=None if frame.colour is None else frame.colour[window],
         lens=lens,
         points_m=points_m[kept],
@@ -151,8 +166,24 @@ def _cut(view: RayImage, window: tuple[slice, slice], *, margin_px: int, min_cos
     )
 
 
+def _pose_variances(cut: _Cut, view: RayImage, covariances: Mapping[int, Array] | None) -> Array:
+    """Return the variances (n,) of points along their normals that the pose's error makes, against a pixel's own."""
+    covariance = None if covariances is None else covariances.get(view.index)
+    if covariance is None:
+        return np.zeros(len(cut.points_m))
+    # A pose moved by ξ = (ω, v) moves a point p along its normal n by ω · (p × n) + v · n.
+    rows = np.concatenate([np.cross(cut.points_m, cut.normals), cut.normals], axis=1)
+    return np.einsum("ni,ij,nj->n", rows, covariance, rows) / (SMOOTHED * view.sigma_r_m) ** 2
+
+
 def stack(
-    pairs: list[tuple[RayImage, Array]], corners_m: Array, *, margin_px: int, min_cosine: float, edge_weight: float
+    pairs: list[tuple[RayImage, Array]],
+    corners_m: Array,
+    *,
+    margin_px: int,
+    min_cosine: float,
+    edge_weight: float,
+    covariances: Mapping[int, Array] | None = None,
 ) -> Stack:
     """Lay views side by side.
 
@@ -162,6 +193,7 @@ def stack(
         margin_px: a pixel calls space empty only as far as all pixels within this distance do.
         min_cosine: points seen at a flatter angle than this cosine are left out.
         edge_weight: factor on the weight of pixels next to a silhouette or a step in depth.
+        covariances: (6, 6) of object_from_camera by frame number; poses without one count as exact.
 
     Raises:
         InputError: where no view sees anything of the object in the box.
@@ -177,13 +209,15 @@ def stack(
         for view, pose in pairs
     ]
     size = (len(cuts), *(max(cut.index.shape[axis] for cut in cuts) for axis in range(2)))
-    index, free_m = np.full(size, -1, dtype=np.int32), np.zeros(size, dtype=np.float32)
+    index = np.full(size, -1, dtype=np.int32)
+    free_m, beside_m = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.float32)
     colour = np.zeros((*size, 3), dtype=np.uint8)
     colours, count = [], 0
     for number, cut in enumerate(cuts):
         height, width = cut.index.shape
         index[number, :height, :width] = np.where(cut.index >= 0, cut.index + count, -1)
         free_m[number, :height, :width] = cut.free_m
+        beside_m[number, :height, :width] = cut.beside_m
         if cut.colour is not None:
             colour[number, :height, :width] = cut.colour
         colours.append(_sampled(cut.colour, cut.pixels))
@@ -194,9 +228,15 @@ def stack(
     # The noise of a triangulating camera grows with z².
     depth_m = np.concatenate([cut.points_m[:, 2] for cut in cuts])
     weights = np.concatenate([cut.weights for cut in cuts]) * (np.median(depth_m) / depth_m) ** 4
+    noise = np.concatenate(
+        [_pose_variances(cut, view, covariances) for cut, (view, _) in zip(cuts, pairs, strict=True)]
+    )
+    trust = 1.0 / (1.0 + weights * noise)
+    weights = weights * trust / np.median(trust)
     return Stack(
         index=index,
         free_m=free_m,
+        beside_m=beside_m,
         colour=colour,
         coloured=np.array([cut.colour is not None for cut in cuts]),
         poses=np.stack([se3.inverse(pose)[:3] for _, pose in pairs]),
@@ -209,18 +249,25 @@ def stack(
     )
 
 
-def spread(views: Stack, limit_m: float) -> float | None:
-    """Return by how much views disagree about where the surface is, in m: a robust standard deviation.
+def spread(views: Stack, limit_m: float) -> tuple[float, float] | None:
+    """Return by how much views disagree about where the surface is, in m: robust standard deviations.
 
-    It holds the noise of both views and the error of their poses. None where no two views see the same surface.
+    They hold the noise of both views and the error of their poses. None where no two views see the same surface.
 
     Args:
         views: the views.
         limit_m: disagreements beyond this are two surfaces.
+
+    Returns:
+        The standard deviation between two views, and that of one view of weight 1.
     """
     chosen = np.arange(0, len(views.points_m), max(1, len(views.points_m) // WITNESSES))
-    distance_m = fusion.disagreements(
+    distance_m, rivals = fusion.disagreements(
         chosen, views.views[chosen], limit_m, views.index, views.poses, views.lenses, views.points_m, views.normals
     )
-    found = np.isfinite(distance_m)
-    return 1.4826 * float(np.median(np.abs(distance_m[found]))) if found.any() else None
+    found = rivals >= 0
+    if not found.any():
+        return None
+    mine, theirs = views.weights[chosen[np.nonzero(found)[0]]], views.weights[rivals[found]]
+    off_m = np.abs(distance_m[found])
+    return 1.4826 * float(np.median(off_m)), 1.4826 * float(np.median(off_m / np.sqrt(1.0 / mine + 1.0 / theirs)))

@@ -76,6 +76,19 @@ def closed(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
     return ~outside
 
 
+def opened(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
+    """Return the marked vertices (v,) without spikes and strips along the border narrower than about twice `rings`."""
+    outside = ~marked
+    outside[rim(triangles[np.all(marked[triangles], axis=1)])] = True
+    for _ in range(rings - 1):
+        outside[triangles[np.any(outside[triangles], axis=1)]] = True
+    core = ~outside
+    for _ in range(rings):
+        core[triangles[np.any(core[triangles], axis=1)]] = True
+        core &= marked
+    return core
+
+
 def fair(vertices_m: Array, triangles: Triangles, passes: int) -> Array:
     """Return vertices (v, 3) with ripples of a few edges' length taken out, without shrinking the mesh.
 
@@ -95,6 +108,24 @@ def fair(vertices_m: Array, triangles: Triangles, passes: int) -> Array:
     for step in [0.5, -0.53] * passes:
         vertices_m = vertices_m + step * (mean @ vertices_m - vertices_m)
     return vertices_m
+
+
+def spread_colours(colours: npt.NDArray[np.uint8], known: BoolArray, triangles: Triangles) -> npt.NDArray[np.uint8]:
+    """Return RGB (v, 3) with unknown ones taken from their neighbours, ring by ring."""
+    values, known = colours.astype(np.float64), known.copy()
+    pairs = np.concatenate([triangles[:, :2], triangles[:, 1:], triangles[:, [2, 0]]])
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    while True:
+        pairs = pairs[~known[pairs[:, 0]]]
+        telling = pairs[known[pairs[:, 1]]]
+        if not len(telling):
+            return np.rint(values).astype(np.uint8)
+        counts = np.bincount(telling[:, 0], minlength=len(values))
+        reached = counts > 0
+        for c in range(3):
+            sums = np.bincount(telling[:, 0], weights=values[telling[:, 1], c], minlength=len(values))
+            values[reached, c] = sums[reached] / counts[reached]
+        known |= reached
 
 
 def compacted(triangles: Triangles, count: int) -> tuple[npt.NDArray[np.int64], Triangles]:

@@ -164,9 +164,21 @@ def integrate(blocks, origin, voxel_m, tau_m, empty_weight, index, free_m, poses
 
 @njit(cache=True, parallel=True)
 def survey(
-    queries, directions, tolerance_m, tau_m, index, free_m, poses, lenses, points, normals, weights, colour, coloured
+    queries,
+    directions,
+    tolerance_m,
+    tau_m,
+    index,
+    free_m,
+    poses,
+    lenses,
+    points,
+    normals,
+    weights,
+    colour,
+    gains,
 ):
-    """Return what the views say of oriented points: support (n,), emptiness (n,), and RGB (n, 3) with its weight (n,).
+    """Return what the views say of oriented points.
 
     A view supports a point where it sees, along the same pixel, a surface within `tolerance_m` that faces the same way;
     it calls the point empty where it sees past it. Colours are averaged over the supporting views, the frontal ones
@@ -185,11 +197,14 @@ def survey(
         normals: (p, 3).
         weights: (p,).
         colour: (f, h, w, 3) uint8.
-        coloured: (f,) bool, which views have colour.
+        gains: (f, 4) factors on red, green and blue, and the say a view has in colours, 0 = it has none.
+
+    Returns:
+        (n, 5): sum of the supporting views' weights w, number of views that see the point empty, number of supporting
+        views, Σ w d and Σ w d² with d the distance of the point above what they see; and (n, 4) RGB with its weight.
     """
     frames, height, width = index.shape
-    support, emptiness = np.zeros(len(queries)), np.zeros(len(queries))
-    sums, shares = np.zeros((len(queries), 3)), np.zeros(len(queries))
+    told, colours = np.zeros((len(queries), 5)), np.zeros((len(queries), 4))
     for q in prange(len(queries)):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
         for f in range(frames):
@@ -199,7 +214,7 @@ def survey(
                 continue
             n = index[f, row, column]
             if depth < free_m[f, row, column] - tau_m:
-                emptiness[q] += 1.0
+                told[q, 1] += 1.0
             if n < 0:
                 continue
             along = (
@@ -212,30 +227,31 @@ def survey(
             )
             if abs(along) > tolerance_m or facing < AGREE:
                 continue
-            support[q] += weights[n]
-            if not coloured[f]:
-                continue
+            told[q, 0] += weights[n]
+            told[q, 2] += 1.0
+            told[q, 3] += weights[n] * along
+            told[q, 4] += weights[n] * along * along
             left, top = math.floor(u), math.floor(v)
-            if left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
+            if gains[f, 3] == 0.0 or left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
                 continue
-            share = weights[n] * weights[n] * weights[n] * weights[n]
+            share = gains[f, 3] * weights[n] * weights[n] * weights[n] * weights[n]
             right, bottom = u - left, v - top
-            shares[q] += share
+            colours[q, 3] += share
             for c in range(3):
-                sums[q, c] += share * (
-                    (1.0 - bottom) * ((1.0 - right) * colour[f, top, left, c] + right * colour[f, top, left + 1, c])
-                    + bottom * ((1.0 - right) * colour[f, top + 1, left, c] + right * colour[f, top + 1, left + 1, c])
-                )
-    for q in prange(len(queries)):
-        if shares[q] > 0.0:
+                above = (1.0 - right) * colour[f, top, left, c] + right * colour[f, top, left + 1, c]
+                below = (1.0 - right) * colour[f, top + 1, left, c] + right * colour[f, top + 1, left + 1, c]
+                colours[q, c] += share * gains[f, c] * ((1.0 - bottom) * above + bottom * below)
+        if colours[q, 3] > 0.0:
             for c in range(3):
-                sums[q, c] /= shares[q]
-    return support, emptiness, sums, shares
+                colours[q, c] = min(255.0, colours[q, c] / colours[q, 3])
+    return told, colours
 
 
 @njit(cache=True)
 def disagreements(chosen, views, limit_m, index, poses, lenses, points, normals):
-    """Return how far above the surface of each view chosen surface points lie, (m, f) along its normal; NaN = not seen.
+    """Return how far above the surface of each view chosen surface points lie, and above which of its points.
+
+    The distances (m, f) are along its normal; NaN and -1 where it is not seen.
 
     Args:
         chosen: (m,) numbers of points.
@@ -249,6 +265,7 @@ def disagreements(chosen, views, limit_m, index, poses, lenses, points, normals)
     """
     frames, height, width = index.shape
     result = np.full((len(chosen), frames), np.nan)
+    rivals = np.full((len(chosen), frames), -1, dtype=np.int64)
     for q in range(len(chosen)):
         i = chosen[q]
         for f in range(frames):
@@ -263,5 +280,5 @@ def disagreements(chosen, views, limit_m, index, poses, lenses, points, normals)
                 along += normals[n, k] * (points[i, k] - points[n, k])
                 facing += normals[n, k] * normals[i, k]
             if abs(along) <= limit_m and facing > AGREE:
-                result[q, f] = along
-    return result
+                result[q, f], rivals[q, f] = along, n
+    return result, rivals

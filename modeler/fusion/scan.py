@@ -1,0 +1,105 @@
+"""Views laid together in one volume, and the models made from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from modeler.fusion import cloud, grid, surface, tones
+from modeler.fusion.stack import Stack
+from modeler.fusion.testimony import Testimony, heard
+from modeler.types import Array, ObjectModel
+
+if TYPE_CHECKING:
+    from modeler.fusion.fuser import Fuser
+
+LONELY = 6  # a point of the cloud with fewer neighbours within a few voxels is an outlier
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Posed views and the voxels around the object."""
+
+    how: Fuser
+    """Parameters."""
+    seen: Stack
+    """The views."""
+    box: grid.Grid
+    """The voxels."""
+    tau_m: float
+    """Half width of the band around the surface within which distances are measured."""
+    near_m: float
+    """Surface that a view sees further away than this along the normal is another one."""
+    sigma_m: float
+    """Standard deviation of what one view says of the surface head-on."""
+
+    def model(self) -> ObjectModel:
+        """Return cloud and mesh."""
+        vertices, triangles = self._mesh()
+        normals = surface.normals_of(vertices, triangles)
+        told = self.asked(vertices, normals)
+        points, normals_of_points = cloud.thinned(
+            self.seen.points_m,
+            self.seen.normals,
+            self.seen.weights,
+            voxel_m=self.box.voxel_m,
+            max_voxels=8 * self.how.max_voxels,
+        )
+        told_of_points = self.asked(points, normals_of_points)
+        kept = self._believed(told_of_points) & cloud.crowded(points, 2.0 * self.box.voxel_m, LONELY)
+        coloured = bool(self.seen.coloured.any())
+        return ObjectModel(
+            points_m=points[kept],
+            normals=normals_of_points[kept],
+            colours=told_of_points.colours[kept] if coloured else None,
+            vertices_m=vertices,
+            triangles=triangles,
+            vertex_normals=normals,
+            vertex_colours=surface.spread_colours(told.colours, told.coloured, triangles) if coloured else None,
+            vertex_views=told.views,
+            vertex_sigmas_m=told.sigmas_m,
+        )
+
+    def asked(self, points_m: Array, normals: Array) -> Testimony:
+        """Return what the views say of oriented points (n, 3) of the object frame."""
+        return self._heard(points_m, normals, self._gains)
+
+    @cached_property
+    def _gains(self) -> Array:
+        """Exposure and say of the views, (f, 4)."""
+        return tones.gains(self.seen, self.seen.points_m, self.seen.normals, tau_m=self.tau_m, near_m=self.near_m)
+
+    def _heard(self, points_m: Array, normals: Array, gains: Array) -> Testimony:
+        return heard(
+            self.seen,
+            points_m,
+            normals,
+            tau_m=self.tau_m,
+            near_m=self.near_m,
+            sigma_m=self.sigma_m,
+            gains=gains,
+        )
+
+    def _believed(self, told: Testimony) -> np.ndarray:
+        """Return which points (n,) more views see than see through."""
+        return told.support > self.how.empty_weight * told.emptiness
+
+    def _mesh(self) -> tuple[Array, surface.Triangles]:
+        """Return vertices (v, 3) and triangles (t, 3) of the surface that the views support."""
+        field = grid.measure(self.box, self.seen, tau_m=self.tau_m, empty_weight=self.how.empty_weight)
+        for _ in range(self.how.closing):
+            field = grid.filled(field)
+        vertices, triangles = surface.extracted(field)
+        told = self._heard(vertices, surface.normals_of(vertices, triangles), np.zeros((len(self.seen.index), 4)))
+        # Gaps in what is believed are closed, but not with what several views see through.
+        empty = told.emptiness * self.how.empty_weight > told.support + self.how.empty_weight
+        marked = (told.support > self.how.min_support) & self._believed(told)
+        marked = surface.closed(marked, triangles, self.how.closing) & ~empty
+        kept = surface.opened(marked, triangles, self.how.opening)
+        triangles = triangles[np.all(kept[triangles], axis=1)]
+        triangles = triangles[surface.large_pieces(vertices, triangles, self.how.min_piece)]
+        used, triangles = surface.compacted(triangles, len(vertices))
+        return surface.fair(vertices[used], triangles, self.how.fairing), triangles
