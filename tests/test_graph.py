@@ -2,65 +2,23 @@
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import gtsam
 import numpy as np
 import pytest
+from rings import OBJECT_M
+from rings import covariance as _covariance
+from rings import edge as _edge
+from rings import measured as _measured
+from rings import nees as _nees
+from rings import ring as _ring
+from rings import turntable as _truth
 from scipy import stats
 
 from modeler import se3
 from modeler.graph import PoseGraph, solve
-from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior
-
-OBJECT_M = np.array([0.05, 0.02, 0.8])
-
-
-def _edge(target: int, source: int, pose: PoseGaussian, kind: str = "odometry", *, accepted: bool = True) -> Edge:
-    return Edge(Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.8), kind, accepted, "made up")
-
-
-def _covariance(rng: np.random.Generator, sigma_rad: float = 0.01, sigma_m: float = 0.002) -> Array:
-    """A covariance (6, 6) as registration gives it: compact at the object, strongly correlated at the camera."""
-    scale = np.diag([sigma_rad] * 3 + [sigma_m] * 3)
-    factor = 0.3 * rng.normal(size=(6, 6)) + np.eye(6)
-    adjoint = se3.adjoint(se3.translation(OBJECT_M))
-    return adjoint @ scale @ factor @ factor.T @ scale @ adjoint.T
-
-
-def _turn(angle_rad: float) -> Array:
-    """Motion (4, 4) of an object turned about a tilted axis through itself."""
-    about = se3.exp(np.array([0.1, angle_rad, -0.05 * angle_rad, 0.0, 0.0, 0.0]))
-    return se3.translation(OBJECT_M) @ about @ se3.translation(-OBJECT_M)
-
-
-def _truth(count: int) -> dict[int, Array]:
-    """True object_from_camera of a turntable with `count` stops."""
-    first_from_first = _turn(0.0)
-    return {k: se3.inverse(_turn(2.0 * np.pi * k / count)) @ first_from_first for k in range(count)}
-
-
-def _measured(
-    truth: Mapping[int, Array], target: int, source: int, rng: np.random.Generator, luck: float = 1.0
-) -> PoseGaussian:
-    """A measurement with the error that its covariance states, or `luck` times that: truth = mean @ exp(ξ)."""
-    covariance = _covariance(rng)
-    xi = luck * rng.multivariate_normal(np.zeros(6), covariance)
-    return PoseGaussian(se3.inverse(truth[target]) @ truth[source] @ se3.exp(-xi), covariance)
-
-
-def _ring(
-    count: int, rng: np.random.Generator, closures: Sequence[tuple[int, int]], luck: float = 1.0
-) -> tuple[PoseGraph, dict[int, Array]]:
-    truth = _truth(count)
-    odometry = [_edge(k - 1, k, _measured(truth, k - 1, k, rng, luck)) for k in range(1, count)]
-    loops = [_edge(t, s, _measured(truth, t, s, rng, luck), "closure") for t, s in closures]
-    return PoseGraph((*odometry, *loops)), truth
-
-
-def _nees(gaussian: PoseGaussian, truth: Array) -> float:
-    xi = se3.log(se3.inverse(gaussian.mean) @ truth)
-    return float(xi @ np.linalg.solve(gaussian.covariance, xi))
+from modeler.types import Array, PoseGaussian
 
 
 def _assert_same(actual: Mapping[int, Array], expected: Mapping[int, Array], atol: float = 1e-8) -> None:

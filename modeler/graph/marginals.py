@@ -3,7 +3,7 @@
 Errors are written in object coordinates, δ_k with true object_from_camera(k) = exp(δ_k) object_from_camera(k), so that
 a link says R Ad(source_from_object) (δ_source − δ_target) ~ N(0, I), with RᵀR the inverse of its covariance; the root
 has no error. Householder QR of all rows, clique by clique along a sparse ordering, leaves U with UᵀU the information of
-all poses (Kaess and Dellaert, Covariance recovery from a square root information matrix for data association, RAS 2009).
+all poses (Kaess and Dellaert, Covariance recovery from a square root information matrix, RAS 2009).
 Neither information nor covariance is ever formed, subtracted or inverted as a whole, so that a direction nobody
 observed, metres wide beside micrometres, is as welcome as any other. First order in the errors.
 """

@@ -1,0 +1,184 @@
+"""Posteriors with several modes in the graph: loops and the other edges decide, and what is not decided stays wide."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rings import OBJECT_M, covariance, edge, measured, nees, ring, rotation_error, turntable
+
+from modeler import se3
+from modeler.graph import PoseGraph, solve
+from modeler.types import Array, Edge, Mode, PoseGaussian
+
+COUNT = 12
+WRONG_RAD = (np.pi / 2, -np.pi / 2, np.pi)
+
+
+def _spun(pose: PoseGaussian, angle_rad: float) -> PoseGaussian:
+    """The same bump where the object has turned by a further angle about its own axis, as a square box might have."""
+    about = se3.translation(OBJECT_M) @ se3.exp(np.array([0, angle_rad, 0, 0, 0, 0])) @ se3.translation(-OBJECT_M)
+    return PoseGaussian(pose.mean @ about, pose.covariance)
+
+
+def _ambiguous(truth: Mapping[int, Array], target: int, source: int, *, rng: np.random.Generator, weights: list[float],
+               kind: str = "odometry") -> Edge:  # fmt: skip
+    """An edge whose true mode has the first of the weights; they need not be in order."""
+    true = measured(truth, target, source, rng)
+    modes = [Mode(weights[0], true)]
+    modes += [Mode(w, _spun(true, angle)) for w, angle in zip(weights[1:], WRONG_RAD, strict=False)]
+    modes.sort(key=lambda mode: -mode.weight)
+    centre, offsets = modes[0].pose.mean, []
+    offsets = [se3.log(se3.inverse(centre) @ mode.pose.mean) for mode in modes]
+    mean_xi = sum(mode.weight * xi for mode, xi in zip(modes, offsets, strict=True))
+    spread = true.covariance + sum(
+        mode.weight * np.outer(xi - mean_xi, xi - mean_xi) for mode, xi in zip(modes, offsets, strict=True)
+    )
+    whole = PoseGaussian(centre @ se3.exp(np.asarray(mean_xi)), spread)
+    return edge(target, source, whole, kind, modes=modes)
+
+
+def _heaviest(graph: PoseGraph) -> PoseGraph:
+    """The graph with one Gaussian an edge, the heaviest mode."""
+    kept = [
+        replace(e, posterior=replace(e.posterior, pose=e.posterior.modes[0].pose, modes=())) if e.posterior.modes else e
+        for e in graph.edges
+    ]
+    return PoseGraph(tuple(kept))
+
+
+def _overall(graph: PoseGraph) -> PoseGraph:
+    """The graph with one Gaussian an edge, mean and covariance of all modes."""
+    return PoseGraph(tuple(replace(e, posterior=replace(e.posterior, modes=())) for e in graph.edges))
+
+
+def _graph(rng: np.random.Generator, ambiguous: Mapping[int, list[float]], closures: list[tuple[int, int]]):
+    graph, truth = ring(COUNT, rng, closures)
+    edges = [
+        _ambiguous(truth, e.target, e.source, rng=rng, weights=ambiguous[e.source])
+        if e.source in ambiguous and e.kind == "odometry"
+        else e
+        for e in graph.edges
+    ]
+    return PoseGraph(tuple(edges)), truth
+
+
+@pytest.mark.parametrize(
+    "ambiguous",
+    [
+        {4: [0.4, 0.6]},
+        {3: [0.3, 0.4, 0.3], 7: [0.2, 0.6, 0.2]},
+        {2: [0.45, 0.55], 5: [0.3, 0.3, 0.3, 0.1], 8: [0.4, 0.6], 10: [0.35, 0.4, 0.25]},
+    ],
+)
+def test_one_gaussian_breaks_the_loop_that_modes_close(ambiguous: dict[int, list[float]]) -> None:
+    """The true mode is never the heaviest; three closures tell, as no one mode but the true one agrees with all."""
+    rng = np.random.default_rng(len(ambiguous))
+    graph, truth = _graph(rng, ambiguous, [(0, 3), (2, 6), (4, 9), (0, 11)])
+    kept, overall, solution = solve(_heaviest(graph), {}), solve(_overall(graph), {}), solve(graph, {})
+    assert solution.outliers == ()
+    assert len(kept.outliers) >= 1  # a true closure is thrown out …
+    assert rotation_error(kept.trajectory, truth) > np.radians(20.0)  # … and the model is broken
+    good = rotation_error(solution.trajectory, truth)
+    assert good < np.radians(3.0)
+    assert good < rotation_error(overall.trajectory, truth)
+    for number, weights in ambiguous.items():
+        left = solution.mode_weights[number, number - 1]
+        modes = next(e for e in graph.edges if e.source == number).posterior.modes
+        true = [mode.weight for mode in modes].index(weights[0]) if weights[0] not in weights[1:] else None
+        assert left.sum() == pytest.approx(1.0)
+        assert left.max() > 0.999
+        assert true is None or int(np.argmax(left)) == true
+
+
+def test_poses_are_calibrated_where_loops_choose_the_modes() -> None:
+    trials = 60
+    values = np.zeros(trials)
+    for trial in range(trials):
+        rng = np.random.default_rng(100 + trial)
+        graph, truth = _graph(rng, {3: [0.4, 0.6], 8: [0.3, 0.4, 0.3]}, [(0, 5), (4, 9), (0, 11)])
+        solution = solve(graph, {})
+        frame = 1 + trial % 11
+        values[trial] = nees(PoseGaussian(solution.trajectory[frame], solution.covariances[frame]), truth[frame])
+    assert values.mean() == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / trials))
+
+
+def test_all_edges_ambiguous_are_decided_by_loops_that_overlap() -> None:
+    """Two modes at each of eleven edges: two thousand combinations, of which loops of three edges leave one."""
+    rng = np.random.default_rng(5)
+    ambiguous = {k: [0.45, 0.55] for k in range(1, COUNT)}
+    closures = [(k, k + 2) for k in range(COUNT - 2)] + [(k, k + 3) for k in range(COUNT - 3)] + [(0, 11)]
+    graph, truth = _graph(rng, ambiguous, closures)
+    solution = solve(graph, {})
+    assert solution.outliers == ()
+    assert rotation_error(solution.trajectory, truth) < np.radians(3.0)
+    assert all(left.max() > 0.999 for left in solution.mode_weights.values())
+
+
+def test_without_a_loop_an_edge_stands_at_its_heaviest_mode_as_wide_as_all() -> None:
+    rng = np.random.default_rng(6)
+    truth = turntable(COUNT)
+    ambiguous = _ambiguous(truth, 0, 1, rng=rng, weights=[0.3, 0.7])
+    solution = solve(PoseGraph((ambiguous,)), {})
+    heavy, light = ambiguous.posterior.modes
+    np.testing.assert_allclose(solution.trajectory[1], heavy.pose.mean, atol=1e-12)
+    np.testing.assert_allclose(solution.mode_weights[1, 0], [0.7, 0.3])
+    offset = se3.log(se3.inverse(heavy.pose.mean) @ light.pose.mean)
+    # The variance along the way to the other mode is w (1 - w) d² about the mean, and w d² about the heavier mode.
+    assert offset @ np.linalg.solve(solution.covariances[1], offset) == pytest.approx(1.0 / 0.3, rel=0.02)
+
+
+def test_what_a_loop_cannot_tell_apart_keeps_its_weights() -> None:
+    """Two edges each turned by 90° or not, and a loop that allows one turn: which of them it was stays open."""
+    rng = np.random.default_rng(7)
+    truth = {k: se3.inverse(se3.translation(OBJECT_M) @ se3.exp(np.array([0, 0.5 * k, 0, 0, 0, 0]))
+                            @ se3.translation(-OBJECT_M)) for k in range(3)}  # fmt: skip
+    edges = []
+    for source in (1, 2):
+        spread = covariance(rng, 0.01, 0.002)
+        pose = PoseGaussian(se3.inverse(truth[source - 1]) @ truth[source], spread)
+        modes = [Mode(0.6, pose), Mode(0.4, _spun(pose, np.pi / 2))]
+        edges.append(edge(source - 1, source, pose, modes=modes))
+    direct = _spun(PoseGaussian(se3.inverse(truth[0]) @ truth[2], covariance(rng)), np.pi / 2)
+    solution = solve(PoseGraph((*edges, edge(0, 2, direct, "closure"))), {})
+    assert solution.outliers == ()
+    one, other = (solution.mode_weights[source, source - 1] for source in (1, 2))
+    assert one[0] + other[0] == pytest.approx(1.0, abs=1e-6)  # exactly one of them turned
+    assert 0.2 < one[0] < 0.8
+    sigma = np.sqrt(np.linalg.eigvalsh(solution.covariances[1][:3, :3])[-1])
+    assert sigma > np.radians(30.0)
+
+
+def test_modes_of_a_closure_are_decided_by_the_chain() -> None:
+    rng = np.random.default_rng(8)
+    graph, truth = ring(COUNT, rng, [])
+    closure = _ambiguous(truth, 0, 11, rng=rng, weights=[0.2, 0.8], kind="closure")
+    solution = solve(graph.plus([closure]), {})
+    assert solution.outliers == ()
+    np.testing.assert_allclose(solution.mode_weights[11, 0], [0.0, 1.0], atol=1e-6)
+    assert rotation_error(solution.trajectory, truth) < np.radians(3.0)
+
+
+def test_false_closure_does_not_choose_a_mode() -> None:
+    rng = np.random.default_rng(9)
+    graph, truth = _graph(rng, {4: [0.4, 0.6]}, [(0, 5), (2, 7), (0, 11)])
+    false = edge(1, 9, _spun(measured(truth, 1, 9, rng), 0.7), "closure")
+    solution = solve(graph.plus([false]), {})
+    assert solution.outliers == (false,)
+    assert rotation_error(solution.trajectory, truth) < np.radians(3.0)
+
+
+def test_mode_of_almost_no_weight_changes_nothing() -> None:
+    rng = np.random.default_rng(10)
+    graph, _ = ring(COUNT, rng, [(0, 11)])
+    first = graph.edges[4]
+    pose = first.posterior.pose
+    modes = (Mode(1.0 - 1e-12, pose), Mode(1e-12, _spun(pose, np.pi / 2)))
+    again = replace(first, posterior=replace(first.posterior, modes=modes))
+    solution = solve(PoseGraph((*graph.edges[:4], again, *graph.edges[5:])), {})
+    wanted = solve(graph, {})
+    for frame in range(COUNT):
+        np.testing.assert_allclose(solution.trajectory[frame], wanted.trajectory[frame], atol=1e-7)
+        np.testing.assert_allclose(solution.covariances[frame], wanted.covariances[frame], atol=1e-9)
