@@ -7,6 +7,8 @@ import numpy as np
 from modeler import se3
 from modeler.types import AbstractMotion, AbstractPrior, Array, RayImage
 
+_WIDEST_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of what was seen of it
+
 
 @dataclass(frozen=True)
 class GeneralPrior(AbstractPrior):
@@ -63,10 +65,11 @@ class GeneralMotion(AbstractMotion):
 def grown_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -> tuple[float, float]:
     """Return the limits of rotation in degrees and of the centroids' offset in m for so many steps (at least 1).
 
-    The centroid of what is seen lies before the middle of the object, so that a turn by θ parts two of them by a chord
-    of 2 sin(θ/2): the offset grows as that does, and no more once the far side is seen.
+    Rotation grows up to what two views can be registered across: beyond, they share so little surface that none at all
+    explains them as well. The centroid of what is seen lies before the middle of the object, so that a turn by θ parts
+    two of them by a chord of 2 sin(θ/2), and the offset grows as that does.
     """
-    rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, 180.0))
+    rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, _WIDEST_DEG))
     chord = np.sin(np.radians(rotation_deg) / 2.0) / np.sin(np.radians(max_rotation_deg) / 2.0)
     return rotation_deg, float(max(chord, 1.0)) * max_offset_m
 
