@@ -15,9 +15,10 @@ _TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 def g2o_text(edges: Sequence[Edge], solution: Solution) -> str:
     """Return the solved graph as VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines, numbers written in full.
 
-    Vertices are object_from_camera, edges `target source target_from_source`. Information matrices are of translation
-    first, then rotation in rad, as g2o orders them and GTSAM reads and writes them. (g2o itself measures rotation by
-    the vector part of a quaternion, half the angle: it takes such files, GTSAM's too, for twice as vague in rotation.)
+    Vertices are object_from_camera, edges `target source target_from_source` as they took part: of an edge with several
+    modes, the one that the loops chose. Information matrices are of translation first, then rotation in rad, as g2o
+    orders them and GTSAM reads and writes them. (g2o itself measures rotation by the vector part of a quaternion, half
+    the angle: it takes such files, GTSAM's too, for twice as vague in rotation.)
 
     Args:
         edges: those that take part are written: accepted, no outliers, both ends solved.
@@ -29,8 +30,9 @@ def g2o_text(edges: Sequence[Edge], solution: Solution) -> str:
     for edge in edges:
         solved = edge.target in solution.trajectory and edge.source in solution.trajectory
         if edge.accepted and solved and edge not in solution.outliers:
-            numbers = " ".join(repr(float(value)) for value in _upper_triangle(edge.posterior.pose.covariance))
-            lines.append(f"EDGE_SE3:QUAT {edge.target} {edge.source} {pose_text(edge.posterior.pose.mean)} {numbers}")
+            pose = solution.edge_poses.get((edge.source, edge.target), edge.posterior.pose)
+            numbers = " ".join(repr(float(value)) for value in _upper_triangle(pose.covariance))
+            lines.append(f"EDGE_SE3:QUAT {edge.target} {edge.source} {pose_text(pose.mean)} {numbers}")
     return "".join(f"{line}\n" for line in lines)
 
 

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Solution, Step
+from modeler.export.words import undetermined
+from modeler.types import Array, Edge, Mode, Outcome, PoseGaussian, Posterior, RayImage, Solution, Step
 
 _SCHEMA = 1
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
@@ -76,7 +77,9 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         frames: what became of every frame so far.
         meta: everything else.
     """
-    solution = step.solution
+    solution, views = step.solution, dict(step.views)
+    if step.view is not None:  # also where the frame was left out
+        views[step.frame.index] = step.view
     reasons = _shortcomings(step, frames, meta)
     report = {
         "schema": _SCHEMA,
@@ -91,7 +94,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "trustworthy": not reasons,
         "reasons": reasons,
         "frames": [vars(frame) for frame in frames],
-        "edges": [edge_record(edge, solution) for edge in step.edges_so_far],
+        "edges": [edge_record(edge, solution, views.get(edge.source)) for edge in step.edges_so_far],
         "poses": [
             {"id": frame, "object_from_camera": pose, "covariance": solution.covariances[frame]}
             for frame, pose in sorted(solution.trajectory.items())
@@ -137,15 +140,17 @@ def _reason(edge: Edge, step: Step) -> str:
 _OUTLIER = "the optimisation left it out: all other edges contradict it"
 
 
-def edge_record(edge: Edge, solution: Solution) -> dict[str, Any]:
+def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) -> dict[str, Any]:
     """Return an edge as the report has it, in values that JSON holds.
 
     Args:
         edge: as it was judged.
         solution: the poses, which may contradict it.
+        view: the edge's source, by which directions that are not determined are named; None: by the camera alone.
     """
     posterior = edge.posterior
     outlier = edge in solution.outliers
+    left = solution.mode_weights.get((edge.source, edge.target)) if edge.accepted else None
     record = {
         "source": posterior.source,
         "target": posterior.target,
@@ -156,6 +161,8 @@ def edge_record(edge: Edge, solution: Solution) -> dict[str, Any]:
         "target_from_source": posterior.pose.mean,
         "covariance": posterior.pose.covariance,
         "information": posterior.information,
+        "undetermined": undetermined(posterior, view),
+        "modes": [_mode_record(mode, None if left is None else left[k]) for k, mode in enumerate(posterior.modes)],
         "effective_samples": posterior.effective_samples,
         "pareto_k": posterior.pareto_k,
         "log_evidence": posterior.log_evidence,
@@ -165,12 +172,23 @@ def edge_record(edge: Edge, solution: Solution) -> dict[str, Any]:
     return _json(record)
 
 
+def _mode_record(mode: Mode, left: float | None) -> dict[str, Any]:
+    """Return a mode as the report has it, with the weight that all edges together leave to it."""
+    return {
+        "weight": mode.weight,
+        "weight_in_graph": left,
+        "target_from_source": mode.pose.mean,
+        "covariance": mode.pose.covariance,
+    }
+
+
 def _posterior(edge: Mapping[str, Any]) -> Posterior:
     information = edge["information"]
     return Posterior(
         source=edge["source"],
         target=edge["target"],
-        pose=PoseGaussian(_matrix(edge["target_from_source"], 4), _matrix(edge["covariance"], 6)),
+        pose=_gaussian(edge),
+        modes=tuple(Mode(_number(mode["weight"]), _gaussian(mode)) for mode in edge.get("modes", ())),
         outcome=Outcome(edge["outcome"]),
         overlap=_number(edge["overlap"]),
         information=None if information is None else _matrix(information, 6),
@@ -179,6 +197,10 @@ def _posterior(edge: Mapping[str, Any]) -> Posterior:
         log_evidence=_number(edge["log_evidence"]),
         seconds=_number(edge["seconds"]),
     )
+
+
+def _gaussian(record: Mapping[str, Any]) -> PoseGaussian:
+    return PoseGaussian(_matrix(record["target_from_source"], 4), _matrix(record["covariance"], 6))
 
 
 def _matrix(numbers: Sequence[float | None], size: int) -> Array:
