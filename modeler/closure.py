@@ -28,6 +28,8 @@ class Closer:
     """How far in degrees the object must have turned away from an earlier view before it counts as coming back."""
     max_closures: int = 2
     """At most so many closures are tried for one frame; 0 = never close."""
+    max_relocations: int = 4
+    """At most so many earlier views are tried for a frame that neither the previous view nor a closure places."""
     min_overlap: float = 0.4
     """Smallest overlap (0..1) of a closure."""
     sigma_scale: float = 2.0
@@ -61,6 +63,38 @@ class Closer:
         ]
         candidates.sort(key=lambda number: (number != 0, angle_deg[number]))  # to close on the first frame is best
         return (frames[-1], *(frames[number] for number in candidates[: self.max_closures]))
+
+    def relocation(
+        self, posteriors: Sequence[Posterior], views: Mapping[int, RayImage], solution: Solution
+    ) -> int | None:
+        """Return the earlier view to register a lost frame against next; None: it is given up.
+
+        A posterior that stands alone wants a witness: the view nearest to where it puts the frame. Otherwise the view
+        nearest to where the motion leads comes first, then those farthest from all views tried.
+
+        Args:
+            posteriors: what was tried for the frame, the previous view first.
+            views: the accepted views, in order of acceptance.
+            solution: the poses so far.
+        """
+        tried = [posterior.target for posterior in posteriors]
+        frames = [frame for frame in views if frame in solution.trajectory]
+        left = [frame for frame in frames if frame not in tried]
+        if not left or len(tried) > self.max_relocations + self.max_closures:
+            return None
+        poses = np.stack([solution.trajectory[frame] for frame in left])
+        for posterior in posteriors:
+            if self._stands(posterior):
+                placed = solution.trajectory[posterior.target] @ posterior.pose.mean
+                angle_rad = se3.rotation_angle(se3.inverse(poses) @ placed)
+                nearest = int(np.argmin(angle_rad))
+                if np.degrees(angle_rad[nearest]) <= self.max_angle_deg:
+                    return left[nearest]
+        if len(tried) == 1:
+            expected = _continued(solution, frames, posteriors[0].source)
+            return left[int(np.argmin(se3.rotation_angle(se3.inverse(poses) @ expected)))]
+        apart = [se3.rotation_angle(se3.inverse(solution.trajectory[frame]) @ poses) for frame in tried]
+        return left[int(np.argmax(np.min(apart, axis=0)))]
 
     def edges(
         self, posteriors: Sequence[Posterior], views: Mapping[int, RayImage], solution: Solution
@@ -102,15 +136,21 @@ class Closer:
             return odometry, f"joins the previous view: {odometry.outcome.label}, overlap {odometry.overlap:.2f}"
         frames = [frame for frame in views if frame in solution.trajectory]
         expected = _continued(solution, frames, odometry.source)
-        for posterior in sorted(closures, key=lambda posterior: -posterior.overlap):
-            if posterior.outcome is not Outcome.CONVERGED or _flaw(posterior, self.min_overlap) is not None:
-                continue
+        standing = sorted(filter(self._stands, closures), key=lambda posterior: -posterior.overlap)
+        for posterior in standing:
+            reason = f"joins in place of the failed previous view: overlap {posterior.overlap:.2f}"
+            for witness in standing:
+                if witness is not posterior and self._agreement(witness, posterior, views, solution)[0]:
+                    return posterior, f"{reason}, frame {witness.target} agrees"
             measured = solution.trajectory[posterior.target] @ posterior.pose.mean
             off_deg = float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ measured)))
             if off_deg <= self.max_angle_deg:
-                reason = f"joins in place of the failed previous view: overlap {posterior.overlap:.2f}"
                 return posterior, f"{reason}, {off_deg:.0f}° from the motion going on"
         return None, ""
+
+    def _stands(self, posterior: Posterior) -> bool:
+        """Return whether a closure could place a frame without the previous view."""
+        return posterior.outcome is Outcome.CONVERGED and _flaw(posterior, self.min_overlap) is None
 
     def _agreement(
         self, posterior: Posterior, base: Posterior, views: Mapping[int, RayImage], solution: Solution
