@@ -1,9 +1,13 @@
 """Depth, colour and mask pictures on disk."""
 
+import io
+import re
 import struct
 import warnings
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -18,13 +22,28 @@ _KINDS = {"L": "an 8-bit picture", "P": "an 8-bit picture", "RGB": "a colour pic
 _BROKEN = (OSError, SyntaxError, ValueError, EOFError, MemoryError, struct.error, zlib.error)
 
 
-def _open(path: Path, formats: tuple[str, ...]) -> Image.Image:
+@final
+@dataclass(frozen=True)
+class Packed:
+    """A picture that lies within another file."""
+
+    content: bytes
+    """Its bytes."""
+    where: str
+    """The file and the place in it, for messages."""
+
+    def __str__(self) -> str:
+        return self.where
+
+
+def _open(path: Path | Packed, formats: tuple[str, ...]) -> Image.Image:
     """Return a picture fully decoded."""
     wanted = " or ".join(formats)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(path, formats=formats) as picture:
+            source = io.BytesIO(path.content) if isinstance(path, Packed) else path
+            with Image.open(source, formats=formats) as picture:
                 if picture.width * picture.height > MAX_PIXELS:
                     raise Image.DecompressionBombError
                 picture.load()
@@ -34,7 +53,8 @@ def _open(path: Path, formats: tuple[str, ...]) -> Image.Image:
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise InputError(f"{path}: has more than {MAX_PIXELS // 1_000_000} million pixels; scale it down.") from None
     except _BROKEN as error:
-        why = " ".join(str(error).split()).replace(str(path), "the file") or type(error).__name__
+        said = re.sub(r"<_io\.BytesIO[^>]*>", "it", " ".join(str(error).split()))
+        why = said.replace(str(path), "the file") or type(error).__name__
         raise InputError(f"{path}: is not a readable {wanted} picture ({why}); replace it.") from None
 
 
@@ -45,13 +65,15 @@ def picture_size(path: Path) -> tuple[int, int]:
         InputError: where the file is missing or no picture.
     """
     try:
-        with Image.open(path, formats=("PNG", "TIFF")) as picture:
-            return picture.size
-    except _BROKEN as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=("PNG", "TIFF")) as picture:
+                return picture.size
+    except (*_BROKEN, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: is not a readable picture ({type(error).__name__}); replace it.") from None
 
 
-def read_depth(path: Path) -> npt.NDArray[np.uint16]:
+def read_depth(path: Path | Packed) -> npt.NDArray[np.uint16]:
     """Return a 16-bit PNG or TIFF (h, w) in raw units; 0 = no measurement.
 
     Raises:
@@ -78,7 +100,7 @@ def read_mask(path: Path) -> BoolArray:
     return pixels != 0
 
 
-def read_colour(path: Path) -> npt.NDArray[np.uint8]:
+def read_colour(path: Path | Packed) -> npt.NDArray[np.uint8]:
     """Return a PNG, JPEG or TIFF, in colour or grey, as RGB (h, w, 3).
 
     Raises:

@@ -12,7 +12,8 @@ from sequences.folders import entries
 from sequences.given import Given
 from sequences.tum import open_tum
 
-FORMATS = "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder"
+FORMATS = "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder, or a ROS bag"
+BAGS = (".bag", ".mcap", ".db3")
 
 
 def open_sequence(path: str | Path, given: Given | None = None) -> AbstractSequence:
@@ -35,6 +36,10 @@ def open_sequence(path: str | Path, given: Given | None = None) -> AbstractSeque
 def _open(path: Path, given: Given) -> AbstractSequence:
     if not path.exists():
         raise InputError(f"{path}: no such folder or file; give {FORMATS}.")
+    if path.suffix.lower() in BAGS or (path / "metadata.yaml").exists():
+        from sequences.ros import open_ros
+
+        return open_ros(path, given)
     if not path.is_dir():
         raise InputError(f"{path}: no such folder; a file of this kind holds no sequence, give {FORMATS}.")
     if (path / "scene_camera.json").exists():

@@ -1,0 +1,110 @@
+"""Images and cameras in ROS messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.types import Camera, InputError
+from sequences.given import sane
+from sequences.images import MAX_PIXELS, Packed, read_colour, read_depth
+from sequences.lens import Lens, coefficients
+
+IMAGE, PACKED, CAMERA = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
+MILLIMETRES = ("16UC1", "mono16")
+METRES = ("32FC1",)
+COLOURS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4, "mono8": 1, "8UC1": 1}
+"""Bytes a pixel; what OpenCV calls 8UC3 is BGR."""
+_PACKED_DEPTH_HEADER = 12  # bytes of image_transport's compressedDepth before the PNG
+
+
+def is_depth(message: Any) -> bool:
+    """Return whether an image message holds what may be depth."""
+    if _is_raw(message):
+        return message.encoding in MILLIMETRES + METRES
+    return "compressedDepth" in message.format
+
+
+def is_colour(message: Any) -> bool:
+    """Return whether an image message holds colour or grey that can be read."""
+    if _is_raw(message):
+        return message.encoding in COLOURS
+    return not is_depth(message) and any(kind in message.format for kind in ("jpeg", "jpg", "png"))
+
+
+def depth_m(message: Any, unit_mm: float, where: str) -> npt.NDArray[np.float32]:
+    """Return depth (h, w) in m, NaN where nothing was measured.
+
+    Args:
+        message: an image for which `is_depth`.
+        unit_mm: what one unit of 16-bit depth is.
+        where: the bag and the topic, for messages.
+
+    Raises:
+        InputError: where the message contradicts itself.
+    """
+    if _is_raw(message) and message.encoding in METRES:
+        depth = _rows(message, 4, where).view(">f4" if message.is_bigendian else "<f4").astype(np.float32)
+        return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(np.nan))
+    if _is_raw(message):
+        raw = _rows(message, 2, where).view(">u2" if message.is_bigendian else "<u2").astype(np.uint16)
+    elif "32FC1" in message.format:
+        raise InputError(f"{where}: holds packed 32FC1 depth, which is lossy; record the raw topic or 16UC1.")
+    else:
+        raw = read_depth(Packed(bytes(message.data[_PACKED_DEPTH_HEADER:]), where))
+    return np.where(raw == 0, np.float32(np.nan), (raw * (unit_mm / 1000.0)).astype(np.float32))
+
+
+def colour(message: Any, where: str) -> npt.NDArray[np.uint8]:
+    """Return colour (h, w, 3) as RGB of an image for which `is_colour`.
+
+    Raises:
+        InputError: where the message contradicts itself.
+    """
+    if not _is_raw(message):
+        return read_colour(Packed(bytes(message.data), where))
+    channels = COLOURS[message.encoding]
+    pixels = _rows(message, channels, where).reshape(message.height, message.width, channels)
+    if channels == 1:
+        return np.repeat(pixels, 3, axis=2)
+    in_order = pixels[..., :3] if message.encoding.startswith("rgb") else pixels[..., 2::-1]
+    return np.ascontiguousarray(in_order)
+
+
+def lens(message: Any, where: str, *, ros1: bool) -> Lens:
+    """Return the camera that a CameraInfo message describes.
+
+    Raises:
+        InputError: where it is not calibrated, or is no pinhole camera with common distortion.
+    """
+    matrix = np.asarray(message.K if ros1 else message.k, dtype=np.float64)
+    bend = np.asarray(message.D if ros1 else message.d, dtype=np.float64)
+    fx, _, cx, _, fy, cy = (float(value) for value in matrix[:6])
+    model = str(message.distortion_model)
+    if not sane((fx, fy, cx, cy)) or not np.isfinite(bend).all():
+        raise InputError(f"{where}: camera_info has no usable K; calibrate the camera, or convert with --intrinsics.")
+    known = Lens(Camera(int(message.width), int(message.height), fx, fy, cx, cy), coefficients(bend.tolist()))
+    if known.bends and model not in ("plumb_bob", "rational_polynomial", "", "None"):
+        raise InputError(f"{where}: its distortion model {model!r} is not known; record the rectified topic.")
+    return known
+
+
+def _is_raw(message: Any) -> bool:
+    return bool(message.__msgtype__ == IMAGE)
+
+
+def _rows(message: Any, bytes_a_pixel: int, where: str) -> npt.NDArray[np.uint8]:
+    """Return the bytes (h, w · bytes) of an image without what pads its rows."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    length, needed = len(message.data), width * bytes_a_pixel
+    if not 0 < height * width <= MAX_PIXELS:
+        raise InputError(f"{where}: an image has {width} x {height} pixels; record it anew.")
+    if step < needed or step * height > length:
+        raise InputError(
+            f"{where}: an image of {width} x {height} pixels, {message.encoding}, has {length} bytes, {step} a row; "
+            "it is cut off or not what it says."
+        )
+    rows = np.asarray(message.data, dtype=np.uint8)[: step * height].reshape(height, step)
+    return np.ascontiguousarray(rows[:, :needed])

@@ -1,0 +1,140 @@
+"""Which topics of a bag hold depth, the camera that took it, and colour that is aligned to it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from modeler.types import Camera, InputError
+from sequences import ros_images
+from sequences.bag import Bag
+from sequences.given import Given
+from sequences.lens import Lens
+
+_DEPTH_UNITS = "/option/Depth_Units/value"
+"""Where RealSense's recorder puts the metres in one unit, beside the sensor's other options."""
+
+
+def first_images(bag: Bag) -> dict[str, Any]:
+    """Return the first message of each topic of images."""
+    kinds = (ros_images.IMAGE, ros_images.PACKED)
+    found = {}
+    for topic in sorted(topic for topic, kind in bag.types.items() if kind in kinds):
+        for _, message in bag.messages(topic, most=1):
+            found[topic] = message
+    return found
+
+
+def depth_topic(bag: Bag, first: Mapping[str, Any], given: Given) -> str:
+    """Return the topic of depth images.
+
+    Raises:
+        InputError: where there is none or nothing tells which.
+    """
+    found = [topic for topic, message in first.items() if ros_images.is_depth(message)]
+    if given.depth_topic is not None:
+        if given.depth_topic not in found:
+            raise InputError(f"{bag.path}: {given.depth_topic} holds no depth images; {_listed(found)}.")
+        return given.depth_topic
+    for better in (
+        [topic for topic in found if "depth" in topic.lower()],
+        [topic for topic in found if not topic.endswith("compressedDepth")],
+        [topic for topic in found if "aligned" in topic or "registered" in topic],  # colour comes with it
+    ):
+        found = better or found
+    if not found:
+        raise InputError(f"{bag.path}: holds no depth images (16UC1 or 32FC1); its image topics are: {_names(first)}.")
+    if len(found) > 1:
+        raise InputError(f"{bag.path}: {_listed(found)}; convert with --depth-topic.")
+    return found[0]
+
+
+def depth_lens(bag: Bag, topic: str, image: Any, given: Given) -> Lens:
+    """Return the camera of a topic.
+
+    Raises:
+        InputError: where nothing tells it.
+    """
+    if given.intrinsics is not None:
+        if image.__msgtype__ == ros_images.IMAGE:
+            return Lens(Camera(int(image.width), int(image.height), *given.intrinsics), ())
+        height, width = ros_images.depth_m(image, 1.0, f"{bag.path}: {topic}").shape
+        return Lens(Camera(width, height, *given.intrinsics), ())
+    known = _camera(bag, topic)
+    if known is None:
+        raise InputError(
+            f"{bag.path}: no camera_info belongs to {topic}; record it too, or convert with --intrinsics FX FY CX CY."
+        )
+    return known
+
+
+def _camera(bag: Bag, topic: str) -> Lens | None:
+    """Return what the first camera_info message beside a topic of images says; None where there is none."""
+    infos = [other for other, kind in bag.types.items() if kind == ros_images.CAMERA]
+    bare = re.sub(r"/(compressedDepth|compressed|theora)$", "", topic)
+    parent = bare.rsplit("/", 1)[0]
+    wanted = (f"{parent}/camera_info", f"{parent.rsplit('/', 1)[0]}/info/camera_info", f"{bare}/camera_info")
+    for info in (name for name in wanted if name in infos):
+        for _, message in bag.messages(info, most=1):
+            known = ros_images.lens(message, f"{bag.path}: {info}", ros1=bag.is_ros1)
+            return Lens(known.camera, ()) if "rect" in bare.rsplit("/", 1)[1] else known
+    return None
+
+
+def colour_topic(bag: Bag, first: Mapping[str, Any], lens: Lens, given: Given) -> tuple[str | None, list[str]]:
+    """Return the topic of colour images that the depth camera's own pixels have, and which others there are.
+
+    Raises:
+        InputError: where the topic asked for holds none.
+    """
+    found = [topic for topic, message in first.items() if ros_images.is_colour(message)]
+    if given.colour_topic is not None:
+        if given.colour_topic not in found:
+            raise InputError(f"{bag.path}: {given.colour_topic} holds no colour images; there are {_names(found)}.")
+        return given.colour_topic, []
+    aligned = [topic for topic in found if _same(_camera(bag, topic), lens)]
+    for better in (
+        [topic for topic in aligned if "color" in topic or "rgb" in topic or "colour" in topic],
+        [topic for topic in aligned if first[topic].__msgtype__ == ros_images.IMAGE],
+    ):
+        aligned = better or aligned
+    if aligned:
+        return aligned[0], []
+    return None, [f"colour of {topic} is not aligned to depth and is left out" for topic in found[:3]]
+
+
+def _same(one: Lens | None, other: Lens) -> bool:
+    """Return whether two cameras see the same thing at every pixel."""
+    if one is None:
+        return False
+    ours, theirs = one.camera, other.camera
+    alike = np.allclose([ours.fx, ours.fy, ours.cx, ours.cy], [theirs.fx, theirs.fy, theirs.cx, theirs.cy], atol=0.5)
+    return (ours.width, ours.height) == (theirs.width, theirs.height) and bool(alike)
+
+
+def unit(bag: Bag, topic: str, image: Any, given: Given) -> tuple[float, str]:
+    """Return the millimetres in one unit of 16-bit depth, and the unit in words."""
+    if given.depth_scale_mm is not None:
+        return given.depth_scale_mm, f"{given.depth_scale_mm:g} mm (--depth-scale-mm)"
+    if image.__msgtype__ == ros_images.IMAGE and image.encoding in ros_images.METRES:
+        return 1000.0, "m (32FC1)"
+    sensor = re.match(r"/device_\d+/sensor_\d+", topic)
+    option = "" if sensor is None else sensor[0] + _DEPTH_UNITS
+    for name in bag.types:
+        if name.replace(" ", "_") == option:
+            for _, message in bag.messages(name, most=1):
+                unit_mm = float(message.data) * 1000.0
+                if 1e-6 <= unit_mm <= 1e3:
+                    return unit_mm, f"{unit_mm:g} mm ({name})"
+    return 1.0, "1 mm (16UC1)"
+
+
+def _listed(topics: list[str]) -> str:
+    return f"depth images are in {_names(topics)}" if topics else "there are none"
+
+
+def _names(topics: Iterable[str]) -> str:
+    return ", ".join(topics) or "none"

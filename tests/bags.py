@@ -1,0 +1,157 @@
+"""Writers of ROS bags of small frames, with rosbags as its users write them."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from PIL import Image
+from recordings import matrix, raw_depth
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import Stores, get_typestore
+
+from modeler.types import Frame
+
+START_NS = 1_700_000_000_000_000_000
+
+
+@dataclass(frozen=True)
+class Recorder:
+    """What a robot records."""
+
+    encoding: str = "16UC1"
+    """16UC1, mono16 or 32FC1; "compressedDepth" for image_transport's PNG."""
+    colour: str | None = "rgb8"
+    """rgb8, bgr8, bgra8, mono8, "jpeg", or None."""
+    big_endian: bool = False
+    """Order of the bytes of depth."""
+    padding: int = 0
+    """Bytes after each row."""
+    distortion: tuple[float, ...] = (0.0,) * 5
+    """D of both cameras."""
+    compression: rosbag1.Writer.CompressionFormat | None = None
+    """Of ROS 1 bags."""
+    camera_info: bool = True
+    """Whether it is recorded."""
+    names: dict[str, str] = field(
+        default_factory=lambda: {
+            "depth": "/camera/depth/image_raw",
+            "info": "/camera/depth/camera_info",
+            "colour": "/camera/rgb/image_raw",
+            "colour_info": "/camera/rgb/camera_info",
+        }
+    )
+    """Topics."""
+    colour_scale: float = 1.0
+    """What the colour camera's focal length is a multiple of."""
+
+    def write(self, path: Path, frames: list[Frame]) -> Path:
+        """Write `*.bag` for ROS 1, `*.mcap` for one such file, and a folder of ROS 2 otherwise."""
+        if path.suffix == ".bag":
+            writer = rosbag1.Writer(path)
+            if self.compression is not None:
+                writer.set_compression(self.compression)
+        else:
+            plugin = rosbag2.StoragePlugin.SQLITE3 if path.suffix == ".db3" else rosbag2.StoragePlugin.MCAP
+            writer = rosbag2.Writer(path.with_suffix(""), version=9, storage_plugin=plugin)
+        with writer:
+            self._fill(writer, frames)
+        if path.suffix in (".mcap", ".db3"):
+            inner = next(path.with_suffix("").glob(f"*{path.suffix}"))
+            inner.rename(path)
+            return path
+        return path if path.suffix == ".bag" else path.with_suffix("")
+
+    def _fill(self, writer: Any, frames: list[Frame]) -> None:
+        ros1 = isinstance(writer, rosbag1.Writer)
+        store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+        types, connections = store.types, {}
+
+        def send(topic: str, time_ns: int, message: Any) -> None:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+            writer.write(connections[topic], time_ns, bytes(serialize(message, kind)))
+
+        def header(time_ns: int, frame_id: str) -> Any:
+            stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+            extra = {"seq": 0} if ros1 else {}
+            return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id, **extra)
+
+        for frame in frames:
+            time_ns = START_NS + round(frame.time_s * 1e9)
+            received_ns = time_ns + 7_000_000
+            if self.camera_info:
+                for name, scale in (("info", 1.0), ("colour_info", self.colour_scale)):
+                    camera = self._camera(types, header(time_ns, name), frame, scale, ros1=ros1)
+                    send(self.names[name], received_ns, camera)
+            send(self.names["depth"], received_ns, self._depth(types, header(time_ns, "depth"), frame))
+            if self.colour is not None and frame.colour is not None:
+                late = time_ns + 4_000_000
+                send(self.names["colour"], received_ns, self._colour(types, header(late, "colour"), frame.colour))
+
+    def _camera(self, types: Any, header: Any, frame: Frame, scale: float, *, ros1: bool) -> Any:
+        camera = frame.camera
+        k = matrix(camera) * np.array([[scale], [scale], [1.0]])
+        p = np.hstack([k, np.zeros((3, 1))]).ravel()
+        values = {"d": np.array(self.distortion), "k": k.ravel(), "r": np.eye(3).ravel(), "p": p}
+        roi = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        return types["sensor_msgs/msg/CameraInfo"](
+            header=header,
+            height=camera.height,
+            width=camera.width,
+            distortion_model="plumb_bob",
+            binning_x=0,
+            binning_y=0,
+            roi=roi,
+            **({name.upper(): value for name, value in values.items()} if ros1 else values),
+        )
+
+    def _depth(self, types: Any, header: Any, frame: Frame) -> Any:
+        if self.encoding == "compressedDepth":
+            packed = io.BytesIO()
+            Image.fromarray(raw_depth(frame, 1.0)).save(packed, "PNG")
+            data = np.frombuffer(b"\0" * 12 + packed.getvalue(), np.uint8)
+            return types["sensor_msgs/msg/CompressedImage"](
+                header=header, format="16UC1; compressedDepth png", data=data
+            )
+        pixels = frame.depth_m if self.encoding == "32FC1" else raw_depth(frame, 1.0)
+        return self._image(types, header, self.encoding, pixels.astype(pixels.dtype.newbyteorder(self._order)))
+
+    def _colour(self, types: Any, header: Any, colour: np.ndarray) -> Any:
+        if self.colour == "jpeg":
+            packed = io.BytesIO()
+            Image.fromarray(colour).save(packed, "JPEG", quality=95)
+            data = np.frombuffer(packed.getvalue(), np.uint8)
+            return types["sensor_msgs/msg/CompressedImage"](
+                header=header, format="rgb8; jpeg compressed bgr8", data=data
+            )
+        pixels = {
+            "rgb8": colour,
+            "bgr8": colour[..., ::-1],
+            "bgra8": np.concatenate([colour[..., ::-1], np.full_like(colour[..., :1], 255)], axis=2),
+            "mono8": colour[..., 1],
+        }[str(self.colour)]
+        return self._image(types, header, str(self.colour), pixels)
+
+    def _image(self, types: Any, header: Any, encoding: str, pixels: np.ndarray) -> Any:
+        height, width = pixels.shape[:2]
+        rows = np.frombuffer(np.ascontiguousarray(pixels).tobytes(), np.uint8).reshape(height, -1)
+        rows = np.pad(rows, ((0, 0), (0, self.padding)))
+        return types["sensor_msgs/msg/Image"](
+            header=header,
+            height=height,
+            width=width,
+            encoding=encoding,
+            is_bigendian=int(self.big_endian),
+            step=rows.shape[1],
+            data=rows.ravel(),
+        )
+
+    @property
+    def _order(self) -> Literal[">", "<"]:
+        return ">" if self.big_endian else "<"

@@ -1,0 +1,242 @@
+"""ROS 1 and ROS 2 bags and MCAP files: what was recorded is what is read."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bags import START_NS, Recorder
+from recordings import small_frames
+from rosbags import rosbag1
+
+from modeler.cli import main
+from modeler.types import Camera, Frame, InputError
+from sequences import Given, open_sequence
+from sequences.lens import Lens
+
+SUFFIXES = (".bag", ".mcap", ".db3", "")
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return small_frames(3)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_what_was_recorded_is_read(tmp_path: Path, frames: list[Frame], suffix: str, encoding: str) -> None:
+    path = Recorder(encoding).write(tmp_path / f"two boxes{suffix}", frames)
+    sequence = open_sequence(path)
+    assert sequence.indices == (0, 1, 2)
+    assert sequence.name == "two boxes"
+    assert sequence.layout.startswith({".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(suffix, "ROS 2 bag"))
+    assert sequence.depth_unit == ("1 mm (16UC1)" if encoding == "16UC1" else "m (32FC1)")
+    assert sequence.truth() is None
+    for read, wrote in zip(sequence, frames, strict=True):
+        np.testing.assert_allclose(read.depth_m, wrote.depth_m, rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(read.colour, wrote.colour)  # type: ignore[arg-type]
+        assert read.camera == wrote.camera
+        assert read.time_s == pytest.approx(START_NS * 1e-9 + wrote.time_s, abs=1e-6)
+    again = sequence.frame(1)  # in any order
+    np.testing.assert_allclose(again.depth_m, frames[1].depth_m, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "recorder",
+    [
+        Recorder("mono16", "bgr8"),
+        Recorder("16UC1", "bgra8", big_endian=True),
+        Recorder("32FC1", "mono8", big_endian=True, padding=12),
+        Recorder("16UC1", "rgb8", padding=5),
+        Recorder("compressedDepth", "jpeg"),
+        Recorder(compression=rosbag1.Writer.CompressionFormat.LZ4),
+        Recorder(compression=rosbag1.Writer.CompressionFormat.BZ2),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+def test_every_way_of_storing_pixels_is_read(
+    tmp_path: Path, frames: list[Frame], recorder: Recorder, suffix: str
+) -> None:
+    sequence = open_sequence(recorder.write(tmp_path / f"s{suffix}", frames))
+    for read, wrote in zip(sequence, frames, strict=True):
+        np.testing.assert_allclose(read.depth_m, wrote.depth_m, rtol=0, atol=1e-6)
+        assert read.colour is not None
+        assert wrote.colour is not None
+        expected = wrote.colour[..., 1:2].repeat(3, axis=2) if recorder.colour == "mono8" else wrote.colour
+        assert np.abs(read.colour.astype(float) - expected).mean() < (3.0 if recorder.colour == "jpeg" else 1e-9)
+
+
+def test_converting_a_bag_gives_a_scene(tmp_path: Path, frames: list[Frame]) -> None:
+    path = Recorder().write(tmp_path / "s.mcap", frames)
+    assert main(["convert", str(path), "--out", str(tmp_path / "bop")]) == 0
+    for read, wrote in zip(open_sequence(tmp_path / "bop"), frames, strict=True):
+        np.testing.assert_allclose(read.depth_m, wrote.depth_m, rtol=0, atol=1e-6)
+
+
+def test_colour_is_optional_and_must_be_aligned(tmp_path: Path, frames: list[Frame]) -> None:
+    bare = open_sequence(Recorder(colour=None).write(tmp_path / "bare.bag", frames))
+    assert bare.frame(0).colour is None
+    assert bare.notes == ()
+    other = open_sequence(Recorder(colour_scale=1.2).write(tmp_path / "other.bag", frames))
+    assert other.frame(0).colour is None
+    assert other.notes == ("colour of /camera/rgb/image_raw is not aligned to depth and is left out",)
+    forced = open_sequence(tmp_path / "other.bag", Given(colour_topic="/camera/rgb/image_raw"))
+    assert forced.frame(0).colour is not None
+
+
+def test_images_come_in_order_of_capture_each_once(tmp_path: Path, frames: list[Frame]) -> None:
+    shuffled = [frames[place] for place in (1, 0, 0, 2)]
+    shuffled[2] = dataclasses.replace(shuffled[2], index=9)
+    sequence = open_sequence(Recorder().write(tmp_path / "s.bag", shuffled))
+    assert len(sequence) == 3
+    for read, wrote in zip(sequence, frames, strict=True):
+        np.testing.assert_allclose(read.depth_m, wrote.depth_m, rtol=0, atol=1e-6)
+
+
+def test_several_depth_topics_need_a_choice(tmp_path: Path, frames: list[Frame]) -> None:
+    def named(depth: str, colour: str) -> dict[str, str]:
+        return {"depth": depth, "info": "/a/camera_info", "colour": colour, "colour_info": "/b/camera_info"}
+
+    path = Recorder(colour="rgb8", names=named("/a/depth", "/b/rgb")).write(tmp_path / "one.bag", frames)
+    assert open_sequence(path).frame(0).colour is not None
+    both = tmp_path / "both.bag"
+    Two("16UC1", "32FC1", names=named("/a/depth_one", "/a/depth_two")).write(both, frames)
+    with pytest.raises(InputError, match=r"/a/depth_one, /a/depth_two; convert with --depth-topic"):
+        open_sequence(both)
+    assert "topic /a/depth_two" in open_sequence(both, Given(depth_topic="/a/depth_two")).layout
+    with pytest.raises(InputError, match="/c holds no depth images"):
+        open_sequence(both, Given(depth_topic="/c"))
+
+
+class Two(Recorder):
+    """Records depth twice, the second time as floats."""
+
+    def _colour(self, types, header, colour):
+        depth = np.full(colour.shape[:2], 0.7, np.float32)
+        return self._image(types, header, "32FC1", depth)
+
+
+def test_realsense_recordings_tell_their_unit(tmp_path: Path, frames: list[Frame]) -> None:
+    sensor = "/device_0/sensor_0/Depth_0"
+    names = {
+        "depth": f"{sensor}/image/data",
+        "info": f"{sensor}/info/camera_info",
+        "colour": "/device_0/sensor_1/Color_0/image/data",
+        "colour_info": "/device_0/sensor_1/Color_0/info/camera_info",
+    }
+    path = RealSense("mono16", names=names).write(tmp_path / "s.bag", frames)
+    sequence = open_sequence(path)
+    assert sequence.depth_unit == "0.25 mm (/device_0/sensor_0/option/Depth Units/value)"
+    assert "by RealSense" in sequence.layout
+    np.testing.assert_allclose(sequence.frame(0).depth_m, frames[0].depth_m * 0.25, rtol=1e-5)
+
+
+class RealSense(Recorder):
+    """Records the sensor's option too."""
+
+    def _fill(self, writer, frames):
+        from rosbags.typesys import Stores, get_typestore
+
+        store = get_typestore(Stores.ROS1_NOETIC)
+        unit = writer.add_connection(
+            "/device_0/sensor_0/option/Depth Units/value", "std_msgs/msg/Float32", typestore=store
+        )
+        message = store.types["std_msgs/msg/Float32"](data=0.00025)
+        writer.write(unit, START_NS, bytes(store.serialize_ros1(message, "std_msgs/msg/Float32")))
+        super()._fill(writer, frames)
+
+
+# Lenses
+
+
+def test_distortion_is_taken_out(tmp_path: Path) -> None:
+    """A slanted plane seen through a bent lens comes out as a plane."""
+    camera = Camera(160, 120, 140.0, 141.0, 79.0, 60.5)
+    lens = Lens(camera, (-0.35, 0.12, 0.003, -0.002))
+    w, h = camera.rays()
+    for _ in range(100):  # rays whose bent image the pixels are
+        bent_w, bent_h = lens.bent(w, h)
+        straight_w, straight_h = camera.rays()
+        w, h = w + straight_w - bent_w, h + straight_h - bent_h
+    depth_m = (1.0 / (1.2 - 0.6 * w + 0.3 * h)).astype(np.float32)
+    frame = Frame(0, 0.0, depth_m, camera)
+    path = Recorder("32FC1", None, distortion=lens.coefficients).write(tmp_path / "s.bag", [frame])
+    read = open_sequence(path).frame(0)
+    true_w, true_h = camera.rays()
+    plane_m = 1.0 / (1.2 - 0.6 * true_w + 0.3 * true_h)
+    seen = np.isfinite(read.depth_m)
+    assert seen.mean() > 0.95
+    np.testing.assert_allclose(read.depth_m[seen], plane_m[seen], rtol=0.006)  # within a pixel of slope
+    assert np.abs(depth_m / plane_m - 1.0).max() > 0.02
+
+
+# Faults
+
+
+def fails(path: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    capsys.readouterr()
+    run = path.parent / "run"
+    assert main(["build", str(path), "--out", str(run)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert not run.exists()
+    return said
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
+@pytest.mark.parametrize("fault", ["truncated", "empty", "noise", "a folder"])
+def test_broken_bags_are_one_line(
+    tmp_path: Path, frames: list[Frame], capsys: pytest.CaptureFixture[str], suffix: str, fault: str
+) -> None:
+    path = Recorder().write(tmp_path / f"s{suffix}", frames)
+    content = path.read_bytes()
+    path.unlink()
+    if fault == "a folder":
+        path.mkdir()
+    else:
+        damaged = {"truncated": content[: len(content) // 2], "empty": b"", "noise": b"noise" * 1000}
+        path.write_bytes(damaged[fault])
+    assert str(path) in fails(path, capsys)
+
+
+def test_a_bag_of_ros_2_that_lacks_its_data_is_one_line(
+    tmp_path: Path, frames: list[Frame], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = Recorder().write(tmp_path / "s", frames)
+    shutil.copytree(path, tmp_path / "yaml")
+    (tmp_path / "yaml" / "metadata.yaml").write_text("rosbag2_bagfile_information: [1")
+    assert "YAML" in fails(tmp_path / "yaml", capsys)
+    next(path.glob("*.mcap")).unlink()
+    assert "missing" in fails(path, capsys)
+
+
+def test_recordings_without_what_is_needed_are_one_line(
+    tmp_path: Path, frames: list[Frame], capsys: pytest.CaptureFixture[str]
+) -> None:
+    no_info = Recorder(camera_info=False).write(tmp_path / "no_info.bag", frames)
+    assert "no camera_info belongs to /camera/depth/image_raw" in fails(no_info, capsys)
+    assert open_sequence(no_info, Given(intrinsics=(140.0, 140.0, 80.0, 60.0))).frame(0).camera.fx == 140.0
+    flat = [dataclasses.replace(f, depth_m=np.full_like(f.depth_m, np.nan)) for f in frames]
+    assert "all is 0 or NaN" in fails(Recorder("32FC1").write(tmp_path / "nan.bag", flat), capsys)
+    large = [dataclasses.replace(f, depth_m=f.depth_m * 1000.0) for f in frames]
+    assert "looks like millimetres" in fails(Recorder("32FC1").write(tmp_path / "mm.bag", large), capsys)
+    small = [dataclasses.replace(f, depth_m=f.depth_m[:50]) for f in frames]
+    assert "160 x 50 pixels where camera_info says 160 x 120" in fails(
+        Recorder().write(tmp_path / "size.bag", small), capsys
+    )
+    bent = [dataclasses.replace(f, camera=dataclasses.replace(f.camera, fx=0.0)) for f in frames]
+    assert "no usable K" in fails(Recorder().write(tmp_path / "k.bag", bent), capsys)
+    assert "no depth images" in fails(Recorder("8UC1", None).write(tmp_path / "grey.bag", frames), capsys)
+    cut = Cut().write(tmp_path / "cut.bag", frames)
+    assert "it is cut off" in fails(cut, capsys)
+
+
+class Cut(Recorder):
+    """Records images that lack their last rows."""
+
+    def _image(self, types, header, encoding, pixels):
+        message = super()._image(types, header, encoding, pixels)
+        return dataclasses.replace(message, data=message.data[:-1000]) if encoding == "16UC1" else message
