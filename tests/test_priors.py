@@ -1,114 +1,199 @@
 """What every prior must keep: samples follow the density, support is respected, the camera's frame does not matter."""
 
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
 import numpy as np
 import pytest
+from prior_cases import CASES, held, solution, truth, turned, views
 from scipy import stats
 
-from modeler import se3
-from modeler.priors import GeneralPrior, TablePrior
-from modeler.types import Camera, Frame, InputError, Plane, RayImage
+from modeler import priors, se3
+from modeler.priors.gaussian import Gaussian
+from modeler.types import AbstractMotion, AbstractPrior, Array, Plane
 
-PRIORS = [GeneralPrior(max_rotation_deg=30, max_offset_m=0.03), TablePrior(max_rotation_deg=40, max_shift_m=0.03)]
-IDS = ["general", "table"]
-
-
-def view(points_m, plane):
-    """A view with nothing but surface points and a support plane."""
-    frame = Frame(0, 0.0, np.ones((2, 2), dtype=np.float32), Camera(2, 2, 1.0, 1.0, 0.5, 0.5))
-    return RayImage(frame, plane, 0.002, 0.002, points_m, np.zeros_like(points_m), np.zeros((len(points_m), 2), int))
+every_prior = pytest.mark.parametrize("name", CASES)
+PROPOSALS = [name for name, case in CASES.items() if case.proposes]
+SOURCE, TARGET = views(np.eye(4))
+CENTRE_M = SOURCE.centroid_m
 
 
-@pytest.fixture
-def views(rng):
-    """Two views of points on a tilted table."""
-    normal = np.array([0.1, -0.8, -0.6])
-    normal /= np.linalg.norm(normal)
-    plane = Plane(normal, 0.7, sigma_tilt_rad=0.004, sigma_offset_m=0.001)
-    points_m = np.array([0.0, 0.0, 0.8]) + rng.normal(0, 0.03, (100, 3))
-    return view(points_m, plane), view(points_m + np.array([0.01, 0.0, 0.005]), plane)
+@cache
+def motion(name: str) -> AbstractMotion:
+    return CASES[name].motion()
 
 
-@pytest.mark.parametrize("prior", PRIORS, ids=IDS)
-def test_samples_lie_in_the_support_and_repeat_under_a_seed(prior, views):
-    motion = prior.between(*views)
-    samples = motion.sample(2000, np.random.default_rng(1))
-    assert np.isfinite(motion.log_density(samples)).all()
-    np.testing.assert_array_equal(samples, motion.sample(2000, np.random.default_rng(1)))
+@cache
+def drawn(name: str) -> Array:
+    return motion(name).sample(6000, np.random.default_rng(1))
+
+
+def readings(poses: Array) -> dict[str, Array]:
+    """Numbers that tell where poses are, each (n,)."""
+    plane = SOURCE.plane
+    assert isinstance(plane, Plane)
+    offset_m = poses[:, :3, :3] @ CENTRE_M + poses[:, :3, 3] - TARGET.centroid_m
+    vectors = se3.log(poses)[:, :3]
+    tilt = np.arccos(np.clip((poses[:, :3, :3] @ plane.normal) @ plane.normal, -1, 1))
+    return {
+        "angle": np.linalg.norm(vectors, axis=1),
+        "turn": vectors @ plane.normal,
+        "tilt": tilt,
+        "height": offset_m @ plane.normal,
+        "distance": np.linalg.norm(offset_m, axis=1),
+        "x": offset_m[:, 0],
+    }
+
+
+def near(poses: Array, log_density: Array) -> Gaussian:
+    """A Gaussian about the densest of some poses, narrow enough to lie among its like."""
+    best = poses[np.argmax(log_density)]
+    about = Gaussian(best, np.eye(6), CENTRE_M)
+    deviations = about.deviations(poses)
+    for share in (0.5, 0.5, 0.5):
+        spread = deviations.T @ deviations / len(deviations) + np.diag(np.repeat([1e-6, 1e-8], 3))
+        distance = np.sum(deviations * np.linalg.solve(spread, deviations.T).T, axis=1)
+        deviations = deviations[np.argsort(distance)[: max(int(share * len(deviations)), 60)]]
+    spread = deviations.T @ deviations / len(deviations) + np.diag(np.repeat([1e-6, 1e-8], 3)) ** 2
+    return Gaussian(best, spread, CENTRE_M)
+
+
+@every_prior
+def test_samples_lie_in_the_support_and_repeat_under_a_seed(name: str) -> None:
+    samples = drawn(name)[:500]
+    assert np.isfinite(motion(name).log_density(samples)).all()
+    assert np.isfinite(motion(name).log_evidence(samples)).all()
+    again = CASES[name].motion().sample(6000, np.random.default_rng(1))
+    np.testing.assert_array_equal(drawn(name), again)
     np.testing.assert_allclose(np.linalg.det(samples[:, :3, :3]), 1.0)
+    np.testing.assert_allclose(samples[:, 3], np.tile([0.0, 0.0, 0.0, 1.0], (500, 1)))
 
 
-@pytest.mark.parametrize("prior", PRIORS, ids=IDS)
-def test_samples_follow_the_density(prior, views, rng):
+@every_prior
+def test_the_truth_is_in_the_support(name: str) -> None:
+    assert np.isfinite(motion(name).log_density(truth(np.eye(4))[None]))
+
+
+@every_prior
+def test_the_density_integrates_to_one(name: str) -> None:
+    """Bridge sampling (Meng and Wong 1996) between the samples and a Gaussian among them, whose density is known."""
+    samples = drawn(name)
+    gaussian = near(samples[::2], motion(name).log_density(samples[::2]))
+    others = gaussian.sample(15_000, np.random.default_rng(3))
+    samples = samples[1::2]
+    here, there = (
+        np.clip(motion(name).log_density(poses) - gaussian.log_density(poses), -500.0, 500.0)
+        for poses in (samples, others)
+    )
+    share = len(samples) / (len(samples) + len(others))
+    log_integral, of_others, of_samples = 0.0, np.ones(1), np.ones(1)
+    for _ in range(50):
+        of_others = 1.0 / (share * np.exp(-log_integral) + (1.0 - share) * np.exp(-there))
+        of_samples = 1.0 / (share * np.exp(here - log_integral) + (1.0 - share))
+        log_integral = float(np.log(of_others.mean() / of_samples.mean()))
+    error = np.sqrt(sum(np.var(part) / np.mean(part) ** 2 / len(part) for part in (of_others, of_samples)))
+    assert error < 0.08
+    assert log_integral == pytest.approx(0.0, abs=4.0 * error)
+
+
+@every_prior
+def test_samples_follow_the_density(name: str) -> None:
     """A Metropolis step that keeps the density must keep the samples as they are distributed."""
-    motion = prior.between(*views)
-    samples = motion.sample(20_000, rng)
-    centre = se3.translation(views[0].centroid_m)
-    step = rng.normal(size=(len(samples), 6)) * np.repeat([0.03, 0.006], 3)
-    moved = samples @ centre @ se3.exp(step) @ se3.inverse(centre)
-    accept = np.log(rng.random(len(samples))) < motion.log_density(moved) - motion.log_density(samples)
-    assert 0.005 < accept.mean() < 0.995
+    rng = np.random.default_rng(2)
+    samples = drawn(name)[:4000]
+    local = near(drawn(name), motion(name).log_density(drawn(name)))
+    nudges = Gaussian(np.eye(4), 0.3 * local.covariance, np.zeros(3)).sample(len(samples), rng)
+    moved = samples.copy()
+    moved[:, :3, :3] = samples[:, :3, :3] @ nudges[:, :3, :3]
+    place_m = samples[:, :3, :3] @ CENTRE_M + samples[:, :3, 3] + nudges[:, :3, 3]
+    moved[:, :3, 3] = place_m - moved[:, :3, :3] @ CENTRE_M
+    gain = motion(name).log_density(moved) - motion(name).log_density(samples)
+    accept = np.log(rng.random(len(samples))) < gain
+    assert 0.02 < accept.mean() < 0.995
     kept = np.where(accept[:, None, None], moved, samples)
-    fresh = motion.sample(20_000, rng)
-
-    def features(poses):
-        offset = poses[:, :3, :3] @ views[0].centroid_m + poses[:, :3, 3] - views[1].centroid_m
-        height = offset @ views[0].plane.normal
-        tilt = np.arccos(np.clip((poses[:, :3, :3] @ views[0].plane.normal) @ views[0].plane.normal, -1, 1))
-        return {
-            "angle": se3.rotation_angle(poses),
-            "offset": np.linalg.norm(offset, axis=1),
-            "height": height,
-            "tilt": tilt,
-            "x": offset[:, 0],
-        }
-
-    for name, values in features(kept).items():
-        probability = np.array(stats.ks_2samp(values, features(fresh)[name]))[1]
-        assert probability > 1e-3, name
+    fresh = readings(motion(name).sample(4000, rng))
+    for reading, values in readings(kept).items():
+        assert np.array(stats.ks_2samp(values, fresh[reading]))[1] > 1e-4, reading
 
 
-@pytest.mark.parametrize("prior", PRIORS, ids=IDS)
-def test_the_density_integrates_to_one(prior, views, rng):
-    """Its mean over a box of tangents about one sample's neighbourhood equals the share of samples that fall there."""
-    motion = prior.between(*views)
-    samples = motion.sample(400_000, rng)
-    centre = se3.translation(views[0].centroid_m)
-    # A box wide enough to hold many samples and narrow enough for the tangent's volume to be that of the group.
-    middle = samples[np.argmin(se3.rotation_angle(samples))]
-    half = np.repeat([np.radians(4.0), 0.012], 3)
-    xi = se3.log(se3.inverse(centre) @ se3.inverse(middle) @ samples @ centre)
-    share = np.mean((np.abs(xi) < half).all(axis=1))
-    box = rng.uniform(-half, half, (400_000, 6))
-    density = np.exp(motion.log_density(middle @ centre @ se3.exp(box) @ se3.inverse(centre)))
-    assert share * len(samples) > 100
-    assert np.mean(density) * np.prod(2 * half) == pytest.approx(share, rel=0.15)
-
-
-@pytest.mark.parametrize("prior", PRIORS, ids=IDS)
-def test_the_choice_of_camera_frame_does_not_matter(prior, views, rng):
-    turn = se3.exp(np.array([0.3, -0.5, 0.2, 0.1, -0.2, 0.3]))
-    plane = views[0].plane
-    normal = turn[:3, :3] @ plane.normal
-    moved_plane = Plane(normal, plane.offset_m - normal @ turn[:3, 3], plane.sigma_tilt_rad, plane.sigma_offset_m)
-    moved = [view(se3.transform(turn, v.points_m), moved_plane) for v in views]
-    samples = prior.between(*views).sample(500, rng)
+@every_prior
+def test_the_choice_of_camera_frame_does_not_matter(name: str) -> None:
+    case = CASES[name]
+    turn = se3.exp(np.array([0.3, -0.5, 0.2, 0.1, -0.2, 0.3]) * np.repeat([name != "features", 1], 3))
+    samples = drawn(name)[:500]
     np.testing.assert_allclose(
-        prior.between(*moved).log_density(turn @ samples @ se3.inverse(turn)),
-        prior.between(*views).log_density(samples),
-        atol=1e-6,
+        case.motion(turn).log_density(turn @ samples @ se3.inverse(turn)),
+        motion(name).log_density(samples),
+        atol=case.shaken,
     )
 
 
-def test_the_table_prior_holds_an_object_on_its_table(views, rng):
-    samples = TablePrior(sigma_tilt_deg=0.01, sigma_height_m=1e-5, max_shift_m=0.03).between(*views).sample(1000, rng)
-    plane = views[0].plane
-    before = plane.height_m(views[0].points_m)
-    for sample in samples[::100]:
-        after = plane.height_m(se3.transform(sample, views[0].points_m))
-        np.testing.assert_allclose(after, before, atol=0.003)  # what the plane's own tilt of 0.004 rad leaves
+@every_prior
+def test_evidence_is_all_of_the_density_or_what_is_known_without_the_guess(name: str) -> None:
+    far = se3.exp(np.random.default_rng(0).normal(size=(500, 6)) * np.repeat([0.3, 0.03], 3)) @ truth(np.eye(4))
+    poses = np.concatenate([drawn(name)[:500], far])
+    density, evidence = (of(poses) for of in (motion(name).log_density, motion(name).log_evidence))
+    assert motion(name).evidence is not CASES[name].proposes
+    np.testing.assert_array_equal(np.isfinite(density), np.isfinite(evidence))
+    if not CASES[name].proposes:
+        np.testing.assert_allclose(evidence, density)
 
 
-def test_without_a_table_the_table_prior_says_so(views):
-    bare = [view(v.points_m, None) for v in views]
-    with pytest.raises(InputError, match=r"no support plane.*--prior general"):
-        TablePrior().between(*bare)
+@pytest.mark.parametrize("name", ["velocity", "axes", "features", "turntable that has learnt", "velocity on a table"])
+def test_a_guess_carries_no_information(name: str) -> None:
+    """Weighted by evidence over density, samples of a guess are samples of what is known without it."""
+    samples = drawn(name)
+    log_weights = motion(name).log_evidence(samples) - motion(name).log_density(samples)
+    weights = np.exp(log_weights - log_weights.max())
+    weights /= weights.sum()
+    known = getattr(motion(name), "known").sample(6000, np.random.default_rng(7))  # noqa: B009
+    for reading, values in readings(samples).items():
+        expected = readings(known)[reading]
+        error = np.sqrt(np.sum(weights**2 * (values - weights @ values) ** 2) + np.var(expected) / len(expected))
+        assert weights @ values == pytest.approx(expected.mean(), abs=4.5 * error), reading
+
+
+@pytest.mark.parametrize(("name", "variance"), [("held", 0.5), ("velocity", 1.0)])
+def test_evidence_counts_once_and_guesses_not_at_all(name: str, variance: float) -> None:
+    """Images as sure of the turn as the prior halve its variance where the prior is evidence, else they stand alone."""
+    prior = CASES[name].prior(np.eye(4))
+    sigma_deg = 3.0
+    if isinstance(prior, priors.HeldPrior):
+        prior = dataclasses.replace(held(np.eye(4)), held_sigma_deg=sigma_deg)
+    elif isinstance(prior, priors.VelocityPrior):
+        prior = dataclasses.replace(prior, velocity_sigma_deg=sigma_deg)
+    density = prior.between(SOURCE, TARGET)
+    samples = density.sample(40_000, np.random.default_rng(8))
+    turn_deg = np.degrees(se3.log(se3.inverse(truth(np.eye(4))) @ samples)[:, 0])
+    log_weights = density.log_evidence(samples) - density.log_density(samples) - 0.5 * (turn_deg / sigma_deg) ** 2
+    weights = np.exp(log_weights - log_weights.max())
+    weights /= weights.sum()
+    found = weights @ (turn_deg - weights @ turn_deg) ** 2
+    assert found == pytest.approx(variance * sigma_deg**2, rel=0.06)
+
+
+@every_prior
+def test_priors_learn_and_grow_without_changing_what_they_are(name: str) -> None:
+    prior = CASES[name].prior(np.eye(4))
+    assert type(prior.learned(solution(np.eye(4)), ())) is type(prior)
+    assert type(prior.grown(3.0)) is type(prior)
+    assert np.isfinite(prior.grown(2.0).between(SOURCE, TARGET).log_density(turned(-np.radians(24.0))[None]))
+
+
+UNITLESS = {"bumps", "voxel", "feature_radius", "agreement", "min_points", "min_elongation", "friction_sigma"}
+
+
+def test_names_of_parameters_carry_units() -> None:
+    found = [kind for kind in vars(priors).values() if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
+    numbers = [
+        field.name
+        for kind in found
+        if issubclass(kind, AbstractPrior)
+        for field in dataclasses.fields(kind)
+        if str(field.type).startswith(("float", "tuple[float"))
+    ]
+    assert len(numbers) > 20
+    for name in set(numbers) - UNITLESS:
+        assert name.endswith(("_deg", "_m", "_s", "_share", "_direction")), name

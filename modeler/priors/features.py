@@ -1,0 +1,145 @@
+"""Three matches of FPFH features at a time: guesses at the motion of objects with shape to recognise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import KDTree
+
+from modeler.priors.bumps import Bumps
+from modeler.priors.general import GeneralPrior
+from modeler.priors.proposal import guided
+from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, Solution
+
+_DRAWS = 20_000  # triples looked at
+_JUDGED = 1000  # at most so many of their motions are put to the vote
+
+
+@dataclass(frozen=True)
+class FeaturesPrior(AbstractPrior):
+    """Triples of matching points lay the surfaces on each other; a bump about each good one proposes, no evidence.
+
+    Fast Point Feature Histograms (Rusu, Blodow and Beetz 2009) of thinned surfaces are matched; of many triples of
+    matches whose distances agree, those motions are kept with which most other matches agree.
+    """
+
+    known: AbstractPrior = field(default_factory=GeneralPrior)
+    """What is independently known of motions."""
+    features_sigma_deg: float = 4.0
+    """Standard deviation of the bump about each motion, about each axis."""
+    features_sigma_m: float = 0.006
+    """Standard deviation of the bump about each motion, in where the centroid goes, along each axis."""
+    bumps: int = 24
+    """Most motions that are kept."""
+    voxel: float = 1 / 25
+    """Edge of the thinning cubes, as a share of the object's size."""
+    feature_radius: float = 5.0
+    """Radius of a feature's neighbourhood, in cubes."""
+    agreement: float = 2.0
+    """Largest distance of matching points, in cubes."""
+    min_points: int = 30
+    """Fewest points a side after thinning; with fewer, features say nothing."""
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+        """Return the density of target_from_source: that of what is known, where no three matches agree."""
+        known = self.known.between(source, target)
+        if min(len(source.points_m), len(target.points_m)) < self.min_points:
+            return known
+        sizes_m = [2.0 * float(np.sqrt(np.sum(np.var(view.points_m, axis=0)))) for view in (source, target)]
+        voxel_m = self.voxel * max(sizes_m)
+        (first_m, first), (second_m, second) = (self._features(view, voxel_m) for view in (source, target))
+        if min(len(first_m), len(second_m)) < self.min_points:
+            return known
+        pairs = _nearest_both_ways(first, second)
+        motions, votes = self._motions(first_m[pairs[:, 0]], second_m[pairs[:, 1]], known, self.agreement * voxel_m)
+        if not len(motions):
+            return known
+        guess = Bumps(
+            motions,
+            votes**2 / np.sum(votes**2),
+            centre_m=source.centroid_m,
+            sigma_rad=float(np.radians(self.features_sigma_deg)),
+            sigma_m=self.features_sigma_m,
+            evidence=False,
+        )
+        return guided(known, [guess])
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> FeaturesPrior:
+        """Return the prior over what is known by now."""
+        return replace(self, known=self.known.learned(solution, edges))
+
+    def grown(self, steps: float) -> FeaturesPrior:
+        """Return the prior within limits that hold for several steps."""
+        return replace(self, known=self.known.grown(steps))
+
+    def _features(self, view: RayImage, voxel_m: float) -> tuple[Array, Array]:
+        """Return the points (n, 3) of a thinned surface and their features (n, 33)."""
+        import open3d as o3d  # slow to load, and only needed here
+
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(view.points_m))
+        cloud.normals = o3d.utility.Vector3dVector(view.normals)
+        cloud = cloud.voxel_down_sample(voxel_m)
+        cloud.normalize_normals()
+        search = o3d.geometry.KDTreeSearchParamHybrid(self.feature_radius * voxel_m, 100)
+        features = o3d.pipelines.registration.compute_fpfh_feature(cloud, search)  # pyright: ignore[reportCallIssue]
+        points_m, histograms = np.asarray(cloud.points), np.asarray(features.data).T
+        order = np.lexsort(points_m.T)  # Open3D's order is that of a hash table
+        return points_m[order], np.ascontiguousarray(histograms[order])
+
+    def _motions(self, source_m: Array, target_m: Array, known: AbstractMotion, reach_m: float) -> tuple[Array, Array]:
+        """Return motions (k, 4, 4) that matches (m, 3) agree with three at a time, and with how many each agrees (k,).
+
+        Args:
+            source_m: (m, 3) points of the source.
+            target_m: (m, 3) their partners.
+            known: whose support holds the motions.
+            reach_m: largest distance of partners that agree.
+        """
+        if len(source_m) < 3:
+            return np.zeros((0, 4, 4)), np.zeros(0)
+        rng = np.random.default_rng(0)  # the same views have the same density, whoever asks
+        triples = rng.integers(len(source_m), size=(_DRAWS, 3))
+        sides, others = (
+            np.linalg.norm(points[triples] - points[np.roll(triples, 1, axis=1)], axis=2)
+            for points in (source_m, target_m)
+        )
+        triples = triples[
+            ((np.abs(sides - others) < reach_m) & (np.minimum(sides, others) > 3.0 * reach_m)).all(axis=1)
+        ]
+        if not len(triples):
+            return np.zeros((0, 4, 4)), np.zeros(0)
+        motions = _laid(source_m[triples], target_m[triples])
+        motions = motions[np.isfinite(known.log_density(motions))][:_JUDGED]
+        carried = source_m @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
+        votes = np.sum(np.sum((carried - target_m) ** 2, axis=2) < reach_m**2, axis=1).astype(np.float64)
+        best = np.argsort(-votes, kind="stable")[: self.bumps]
+        best = best[votes[best] >= 3.0]  # its own three at least
+        return motions[best], votes[best]
+
+
+def _nearest_both_ways(first: Array, second: Array) -> npt.NDArray[np.int64]:
+    """Return pairs (m, 2) of rows that are each other's nearest; of all nearest ones where those are few."""
+    forth, back = (np.asarray(KDTree(to).query(of)[1]) for of, to in ((first, second), (second, first)))
+    pairs = np.column_stack([np.arange(len(first)), forth])
+    mutual = pairs[back[forth] == pairs[:, 0]]
+    return mutual if len(mutual) >= 12 else pairs
+
+
+def _laid(source_m: Array, target_m: Array) -> Array:
+    """Return the motions (n, 4, 4) that lay triangles (n, 3, 3) on triangles: middle on middle, side along side."""
+
+    def placed(triangles_m: Array) -> tuple[Array, Array]:
+        middle = triangles_m.mean(axis=1)
+        x = triangles_m[:, 1] - triangles_m[:, 0]
+        z = np.cross(x, triangles_m[:, 2] - triangles_m[:, 0])
+        x, z = (vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-12) for vector in (x, z))
+        return middle, np.stack([x, np.cross(z, x), z], axis=2)
+
+    (source_middle, source_axes), (target_middle, target_axes) = placed(source_m), placed(target_m)
+    poses = np.broadcast_to(np.eye(4), (len(source_m), 4, 4)).copy()
+    poses[:, :3, :3] = target_axes @ np.swapaxes(source_axes, 1, 2)
+    poses[:, :3, 3] = target_middle - (poses[:, :3, :3] @ source_middle[:, :, None])[:, :, 0]
+    return poses

@@ -1,0 +1,166 @@
+"""Somebody pokes the object along the table: where, which way and how far tells how it turns and shifts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from modeler import se3
+from modeler.priors.on_plane import OnPlane, on_plane
+from modeler.types import AbstractMotion, AbstractPrior, Array, InputError, RayImage
+
+_STEPS = 20  # into which a push is cut
+_PUSHES = 512  # of which the spread of outcomes is told
+_DIMENSIONS = 7
+
+
+@dataclass(frozen=True)
+class Poke:
+    """A straight push with a finger that does not slip on the object."""
+
+    point_m: tuple[float, float, float]
+    """Where the finger touches the object at the start, in camera coordinates."""
+    direction: tuple[float, float, float]
+    """Which way it moves, in camera coordinates, of any length; what of it is off the plane does not count."""
+    length_m: float
+    """How far it moves."""
+
+
+@dataclass(frozen=True)
+class PokePrior(AbstractPrior):
+    """Slow pushing on a plane with friction: how far the object turns depends on how far off its centre it is pushed.
+
+    The motion follows from where the contact lies from the centre of friction, and from c, the ratio of the friction's
+    greatest moment to its greatest force (Lynch, Maekawa and Tanie 1992), integrated over the push. What is not known
+    for sure (centre, c, contact, direction, length) is drawn many times.
+    """
+
+    poke: Poke | None = None
+    """The push between any two frames that are asked for."""
+    pokes: Mapping[int, Poke] = field(default_factory=dict)
+    """Pushes of a sequence, by the number of the first frame after each; it counts more than `poke`."""
+    poke_sigma_m: float = 0.005
+    """Standard deviation of the contact and of the push's length."""
+    poke_sigma_deg: float = 5.0
+    """Standard deviation of the push's direction."""
+    centre_sigma_m: float = 0.015
+    """Standard deviation of the centre of friction about the centroid of what is seen, in each direction."""
+    friction_sigma: float = 0.25
+    """Standard deviation of the log of c about the surface's root mean square distance from its centroid."""
+    sigma_tilt_deg: float = 0.2
+    """Standard deviation of the rotation out of the plane, on top of the plane's own uncertainty."""
+    sigma_height_m: float = 0.0007
+    """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
+
+    def between(self, source: RayImage, target: RayImage) -> PokeMotion:
+        """Return the density of target_from_source.
+
+        Raises:
+            InputError: where neither view shows a plane, or not exactly one push lies between them.
+        """
+        earlier, later = sorted((source, target), key=lambda view: view.index)
+        plane = on_plane(
+            earlier,
+            later,
+            turn_rad=np.pi / 4.0,
+            shift_m=0.05,
+            sigma_tilt_rad=np.radians(self.sigma_tilt_deg),
+            sigma_lift_m=self.sigma_height_m,
+        )
+        outcomes = self._outcomes(self._between(earlier.index, later.index), earlier, plane)
+        mean = outcomes.mean(axis=0)
+        covariance = np.cov(outcomes.T) + np.diag([1e-4, 1e-5, 1e-5]) ** 2
+        return PokeMotion(plane, mean, covariance, backwards=source is later)
+
+    def _between(self, earlier: int, later: int) -> Poke:
+        """Return the one push between two frames."""
+        if not self.pokes and self.poke is not None:
+            return self.poke
+        found = [poke for frame, poke in self.pokes.items() if earlier < frame <= later]
+        if len(found) != 1:
+            raise InputError(
+                f"{len(found) or 'no'} pokes are told between frames {earlier} and {later} where the prior needs one; "
+                "tell each poke, by the first frame after it, or use --prior table"
+            )
+        return found[0]
+
+    def _outcomes(self, poke: Poke, before: RayImage, plane: OnPlane) -> Array:
+        """Draw outcomes (n, 3) of a push: turn in rad, and where the centroid goes from the later one, in the plane."""
+        rng = np.random.default_rng(0)  # the same push has the same outcomes, whoever asks
+        noise = rng.normal(size=(_PUSHES, _DIMENSIONS))
+        in_plane = plane.axes[:2]
+        way = in_plane @ np.array(poke.direction)
+        way = way / np.linalg.norm(way)
+        along_way = np.array([way, [-way[1], way[0]]])  # all is reckoned along the push and across it
+        seen = before.points_m @ in_plane.T @ along_way.T
+        centre = seen.mean(axis=0) + self.centre_sigma_m * noise[:, :2]
+        radius_m = np.sqrt(np.sum(np.var(seen, axis=0))) * np.exp(self.friction_sigma * noise[:, 2])
+        contact = along_way @ in_plane @ np.array(poke.point_m) + self.poke_sigma_m * noise[:, 3:5]
+        bearing = np.radians(self.poke_sigma_deg) * noise[:, 5]
+        length_m = np.maximum(poke.length_m + self.poke_sigma_m * noise[:, 6], 0.0)
+        step = (length_m / _STEPS)[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+        turn, shift = pushed(contact - centre, step, radius_m)
+        # The centre of friction was carried by `shift`, the centroid turned about it as well.
+        lever = seen.mean(axis=0) - centre
+        cos, sin = np.cos(turn), np.sin(turn)
+        carried = np.stack([cos * lever[:, 0] - sin * lever[:, 1], sin * lever[:, 0] + cos * lever[:, 1]], axis=1)
+        there = (centre + shift + carried) @ along_way
+        return np.column_stack([turn, there - in_plane @ plane.target_centroid_m])
+
+
+@dataclass(frozen=True, eq=False)
+class PokeMotion(AbstractMotion):
+    """A Gaussian of turn and shift in the plane, with a Gaussian tilt and lift out of it."""
+
+    plane: OnPlane
+    """From the earlier view to the later."""
+    mean: Array
+    """(3,) turn in rad, then shift in m, of the motion forward in time."""
+    covariance: Array
+    """(3, 3)."""
+    backwards: bool
+    """Whether the motion asked for leads back in time."""
+    evidence: bool = True
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw motions (count, 4, 4)."""
+        drawn = self.mean + rng.normal(size=(count, 3)) @ np.linalg.cholesky(self.covariance).T
+        later_from_earlier = self.plane.motions(drawn[:, 0], drawn[:, 1:], rng)
+        return se3.inverse(later_from_earlier) if self.backwards else later_from_earlier
+
+    def log_density(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of motions (n, 4, 4)."""
+        # The uniform measure is the same forward and backward.
+        later_from_earlier = se3.inverse(target_from_source) if self.backwards else target_from_source
+        turn_rad, shift_m, out_of_plane = self.plane.coordinates(later_from_earlier)
+        root = np.linalg.cholesky(self.covariance)
+        deviation = np.column_stack([turn_rad, shift_m]) - self.mean
+        whitened = np.linalg.solve(root, deviation.T)
+        planar = -0.5 * np.sum(whitened**2, axis=0) - np.log((2.0 * np.pi) ** 1.5 * np.prod(np.diag(root)))
+        return planar + out_of_plane
+
+
+def pushed(contact_m: Array, step_m: Array, radius_m: Array) -> tuple[Array, Array]:
+    """Return how objects on a plane turn (n,) in rad and shift (n, 2) in m under a finger that does not slip.
+
+    A limit ellipsoid ties force f and moment m at the centre of friction to the twist: v ∝ f, ω ∝ m / c², m = x × f,
+    so that the contact's velocity v + ω ẑ × x is the finger's (Lynch, Maekawa and Tanie 1992).
+
+    Args:
+        contact_m: (n, 2) contact from the centre of friction.
+        step_m: (n, 2) the finger's motion in each of the steps.
+        radius_m: (n,) c, the ratio of the friction's greatest moment to its greatest force.
+    """
+    turn, shift, contact_m = np.zeros(len(contact_m)), np.zeros_like(contact_m), contact_m.copy()
+    squares = radius_m**2
+    for _ in range(_STEPS):
+        x, y = contact_m.T
+        u, w = step_m.T
+        total = squares + x**2 + y**2
+        along = np.stack([(squares + x**2) * u + x * y * w, x * y * u + (squares + y**2) * w], axis=1) / total[:, None]
+        turned = (x * along[:, 1] - y * along[:, 0]) / squares
+        shift, turn = shift + along, turn + turned
+        contact_m = contact_m + step_m - along  # the finger stays at the same place of the object
+    return turn, shift

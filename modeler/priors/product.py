@@ -1,0 +1,124 @@
+"""Two independent pieces of knowledge that both hold: the product of their densities."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from modeler.priors.gaussian import Gaussian, fitted
+from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, InputError, RayImage, Solution
+
+_DRAWS = 6000
+_ROUNDS = 5
+_GAUSSIAN_SHARE = 0.8
+_WIDER = 1.3  # of the Gaussian than of what it covers, so that weights stay bounded
+_OVERSAMPLING = 4
+
+
+@dataclass(frozen=True)
+class ProductPrior(AbstractPrior):
+    """Both of two priors hold, and neither was told by the other: a held object on a table, say."""
+
+    first: AbstractPrior
+    """One."""
+    second: AbstractPrior
+    """The other."""
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+        """Return the density of target_from_source.
+
+        Raises:
+            InputError: where one of the two does not apply, or they contradict each other.
+        """
+        product = multiplied(self.first.between(source, target), self.second.between(source, target), source.centroid_m)
+        if product is None:
+            raise InputError(
+                f"the two priors allow no common motion between frames {source.index} and {target.index}; "
+                "give larger sigmas or limits, or only one prior"
+            )
+        return product
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> ProductPrior:
+        """Return the product of what both learnt."""
+        return replace(self, first=self.first.learned(solution, edges), second=self.second.learned(solution, edges))
+
+    def grown(self, steps: float) -> ProductPrior:
+        """Return the product with limits that hold for several steps."""
+        return replace(self, first=self.first.grown(steps), second=self.second.grown(steps))
+
+
+@dataclass(frozen=True, eq=False)
+class Product(AbstractMotion):
+    """The normalised product of two densities, drawn by importance from a Gaussian fitted to it and from both."""
+
+    first: AbstractMotion
+    second: AbstractMotion
+    gaussian: Gaussian
+    """Covers the product."""
+    log_volume: float
+    """Log of the integral of the product."""
+
+    @property
+    def evidence(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether all of the density is evidence."""
+        return self.first.evidence and self.second.evidence
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw motions (count, 4, 4), by resampling a few times as many."""
+        drawn, log_weights = _weighted(self.first, self.second, self.gaussian, _OVERSAMPLING * count + 200, rng)
+        weights = np.exp(log_weights - log_weights.max())
+        cumulative = np.cumsum(weights)
+        positions = (np.arange(count) + rng.random()) / count * cumulative[-1]
+        chosen = np.minimum(np.searchsorted(cumulative, positions), len(drawn) - 1)
+        return drawn[rng.permutation(chosen)]
+
+    def log_density(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of motions (n, 4, 4); -inf outside."""
+        return (
+            self.first.log_density(target_from_source) + self.second.log_density(target_from_source) - self.log_volume
+        )
+
+    def log_evidence(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of what of both is independently known."""
+        known = self.first.log_evidence(target_from_source) + self.second.log_evidence(target_from_source)
+        return known - self.log_volume if self.evidence else known
+
+
+def multiplied(first: AbstractMotion, second: AbstractMotion, centre_m: Array) -> Product | None:
+    """Return the product of two densities; None where they have nothing in common.
+
+    A Gaussian is fitted to weighted draws of both, then to weighted draws of itself and both (population Monte Carlo).
+
+    Args:
+        first: one density.
+        second: another.
+        centre_m: (3,) point of the source about which the Gaussian is told.
+    """
+    rng = np.random.default_rng(0)  # the same two have the same product, whoever asks
+    gaussian, log_volume = None, -np.inf
+    for _ in range(_ROUNDS):
+        drawn, log_weights = _weighted(first, second, gaussian, _DRAWS, rng)
+        top = log_weights.max()
+        if not np.isfinite(top):
+            return None
+        weights = np.exp(log_weights - top)
+        log_volume = float(top + np.log(weights.mean()))
+        gaussian = fitted(drawn, weights / weights.sum(), centre_m, _WIDER)
+    assert gaussian is not None
+    return Product(first, second, gaussian, log_volume)
+
+
+def _weighted(
+    first: AbstractMotion, second: AbstractMotion, gaussian: Gaussian | None, count: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Draw motions (n, 4, 4) from two densities and a Gaussian, with log weights (n,) for the product of the two."""
+    parts: list[tuple[AbstractMotion, float]] = [(first, 0.5), (second, 0.5)]
+    if gaussian is not None:
+        rest = 0.5 * (1.0 - _GAUSSIAN_SHARE)
+        parts = [(first, rest), (second, rest), (gaussian, _GAUSSIAN_SHARE)]
+    drawn = np.concatenate([part.sample(int(np.ceil(share * count)), rng) for part, share in parts])
+    logs = [part.log_density(drawn) for part, _ in parts]
+    mixture = np.logaddexp.reduce([log + np.log(share) for log, (_, share) in zip(logs, parts, strict=True)], axis=0)
+    return drawn, logs[0] + logs[1] - mixture

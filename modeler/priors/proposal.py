@@ -1,0 +1,80 @@
+"""Guesses at a motion that only tell where to look: they guide a sampler within what is independently known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeler.types import AbstractMotion, Array
+
+_TRIED = 4096  # draws by which the share of a guess within the support is told
+_LEAST = 0.01  # a guess with less of its mass within the support is of no use
+
+
+@dataclass(frozen=True, eq=False)
+class Guided(AbstractMotion):
+    """A mixture of guesses and what is known, within the support of the latter, which alone is evidence.
+
+    The guesses' density is part of the mixture's, so that weights `exp(log_evidence - log_density)` take it out again.
+    The share that stays with what is known bounds those weights however wrong the guesses are (a defensive mixture).
+    """
+
+    known: AbstractMotion
+    """What is independently known, if only its limits."""
+    guesses: tuple[AbstractMotion, ...]
+    """Where the motion may be."""
+    inside: Array
+    """(k,) share of each guess' mass within the support of what is known."""
+    share: float
+    """Share (0..1) of all guesses together in the mixture; equal among them."""
+    evidence: bool = False
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw motions (count, 4, 4)."""
+        part = rng.integers(len(self.guesses), size=count)
+        part[rng.random(count) >= self.share] = -1
+        poses = np.empty((count, 4, 4))
+        of_known = part < 0
+        poses[of_known] = self.known.sample(int(of_known.sum()), rng)
+        for number, guess in enumerate(self.guesses):
+            places = np.flatnonzero(part == number)
+            while len(places):  # each round places a share `inside` of what is left, at least one percent
+                drawn = guess.sample(len(places), rng)
+                fits = np.isfinite(self.known.log_density(drawn))
+                poses[places[fits]] = drawn[fits]
+                places = places[~fits]
+        return poses
+
+    def log_density(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of motions (n, 4, 4); -inf outside what is known."""
+        total = self.known.log_density(target_from_source)
+        fits = np.isfinite(total)
+        poses = target_from_source if fits.all() else target_from_source[fits]
+        mixed = total[fits] + np.log1p(-self.share)
+        for guess, inside in zip(self.guesses, self.inside, strict=True):
+            log_share = np.log(self.share / (len(self.guesses) * inside))
+            mixed = np.logaddexp(mixed, guess.log_density(poses) + log_share)
+        total[fits] = mixed
+        return total
+
+    def log_evidence(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of what is independently known."""
+        return self.known.log_evidence(target_from_source)
+
+
+def guided(known: AbstractMotion, guesses: Sequence[AbstractMotion], share: float = 0.8) -> AbstractMotion:
+    """Return what is known, guided by those guesses that lie within its support; itself where none does.
+
+    Args:
+        known: what is independently known, if only its limits.
+        guesses: where the motion may be.
+        share: of all guesses together in the mixture, 0 to 1.
+    """
+    rng = np.random.default_rng(0)  # the same guesses have the same density, whoever asks
+    shares = [float(np.mean(np.isfinite(known.log_density(guess.sample(_TRIED, rng))))) for guess in guesses]
+    useful = [number for number, inside in enumerate(shares) if inside >= _LEAST]
+    if not useful:
+        return known
+    return Guided(known, tuple(guesses[number] for number in useful), np.array([shares[n] for n in useful]), share)

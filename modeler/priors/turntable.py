@@ -1,0 +1,137 @@
+"""A turntable turns the object by a commanded step about an axis: known, seen as the table's normal, or learnt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from modeler.priors.about_axis import AboutAxis, Axis
+from modeler.priors.axis_turn import AxisTurn
+from modeler.priors.common_axis import common_axis, turn_sense
+from modeler.priors.general import GeneralPrior, grown_limits
+from modeler.priors.on_plane import no_plane, support
+from modeler.priors.proposal import guided
+from modeler.priors.table import TablePrior
+from modeler.types import AbstractMotion, AbstractPrior, Edge, RayImage, Solution
+
+_UP = (0.0, -1.0, 0.0)  # against gravity for a camera held upright: y points down
+_BROAD_DEG, _GIVEN_DEG = 30.0, 1.0
+
+
+@dataclass(frozen=True)
+class TurntablePrior(AbstractPrior):
+    """A commanded step, known up to its error, about an axis that stays where it is before the camera.
+
+    From each frame to the next the object turns by `step_deg`, right-handed about the axis, which points up: away from
+    the table, against gravity. Between frames i and j it has turned by (j - i) steps, whose errors add up. The axis is
+    the one given, else the normal of the table where one is seen, else anywhere about the camera's up. Its position is
+    free within `max_shift_m` unless it is given.
+    """
+
+    step_deg: float
+    """Turn from one frame number to the next; negative: the other way round."""
+    step_sigma_deg: float = 1.0
+    """Standard deviation of one step."""
+    step_sign: Literal["known", "unknown"] = "known"
+    """Whether the sign of the step is meant; unknown: the table may turn either way, until several pairs tell."""
+    axis_direction: tuple[float, float, float] | None = None
+    """Direction of the axis in camera coordinates, of any length."""
+    axis_point_m: tuple[float, float, float] | None = None
+    """A point of the axis in camera coordinates."""
+    axis_sigma_deg: float | None = None
+    """Standard deviation of the axis' direction: 1 where it is given, the plane's own where a table is seen, else 30
+    about the camera's up (-y). 180 or more: any direction."""
+    axis_sigma_m: float = 0.005
+    """Standard deviation of the axis' point, across the axis, where one is given."""
+    max_shift_m: float = 0.05
+    """Largest distance, across the axis, between the target's centroid and the source's, carried over."""
+    wobble_deg: float = 0.2
+    """Standard deviation of the rotation that is no turn about the axis."""
+    wobble_m: float = 0.0007
+    """Standard deviation of the shift that no turn about the axis makes."""
+    needs_table: bool = False
+    """Whether views that show no table are refused: the product of table and step."""
+    learnt: Axis | None = None
+    """The axis that the pairs so far have in common, which tells where to look."""
+    newest: int | None = None
+    """The last frame of a sequence that is being built, from which on steps are evidence; None: no sequence."""
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+        """Return the density of target_from_source.
+
+        Raises:
+            InputError: where a table is needed and neither view shows one.
+        """
+        motion = self._motion(source, target, self._axis(source, target))
+        if self.learnt is not None:
+            motion = guided(motion, [self._motion(source, target, self.learnt)])
+        if self.newest is None or target.index == self.newest:
+            return motion
+        # The steps that lead to an earlier view count in the edges between; here they only tell where to look.
+        return guided(self._limits(source, target), [motion])
+
+    def grown(self, steps: float) -> TurntablePrior:
+        """Return the prior with room for the shift of several steps; their turn is counted by the frames' numbers."""
+        step_deg = min(max(abs(self.step_deg), 1.0), 180.0)
+        return replace(self, max_shift_m=grown_limits(step_deg, self.max_shift_m, steps)[1])
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> TurntablePrior:
+        """Return the prior that knows the axis and the sense of turning which the accepted pairs have in common."""
+        accepted = [edge for edge in edges if edge.accepted]
+        learnt = common_axis([edge.posterior for edge in accepted], np.radians(self.wobble_deg), self.wobble_m)
+        prior = replace(self, learnt=learnt, newest=max(solution.trajectory, default=None))
+        if self.step_sign == "known":
+            return prior
+        up = np.array(_UP if self.axis_direction is None else self.axis_direction)
+        sense = turn_sense([edge.posterior for edge in accepted], up)
+        return prior if sense == 0.0 else replace(prior, step_sign="known", step_deg=sense * abs(self.step_deg))
+
+    def _axis(self, source: RayImage, target: RayImage) -> Axis:
+        """Return what is known of the axis without comparing the images."""
+        plane = support(source, target)
+        if plane is None and self.needs_table:
+            raise no_plane(source, target)
+        if self.axis_direction is not None:
+            direction, sigma_rad = np.array(self.axis_direction), np.radians(_GIVEN_DEG)
+        elif plane is not None:
+            direction, sigma_rad = plane.normal, plane.sigma_tilt_rad
+        else:
+            direction, sigma_rad = np.array(_UP), np.radians(_BROAD_DEG)
+        if self.axis_sigma_deg is not None:
+            sigma_rad = np.radians(self.axis_sigma_deg) if self.axis_sigma_deg < 180.0 else np.inf
+        point_m = None if self.axis_point_m is None else np.array(self.axis_point_m)
+        return Axis(direction / np.linalg.norm(direction), float(sigma_rad), point_m, self.axis_sigma_m)
+
+    def _motion(self, source: RayImage, target: RayImage, axis: Axis) -> AboutAxis:
+        """Return turns by the commanded steps about an axis."""
+        expected = self._axis(source, target).direction
+        side = 1.0 if axis.direction @ expected >= 0.0 else -1.0  # a line that was learnt has no upper end
+        steps = target.index - source.index
+        turn = AxisTurn(
+            axis=side * axis.direction,
+            turn_rad=float(np.radians(steps * self.step_deg)),
+            sigma_turn_rad=float(np.radians(self.step_sigma_deg) * np.sqrt(max(abs(steps), 1))),
+            sigma_axis_rad=axis.sigma_direction_rad,
+            sigma_wobble_rad=float(np.radians(self.wobble_deg)),
+            either_way=self.step_sign == "unknown",
+        )
+        return AboutAxis(
+            turn=turn,
+            axis=axis,
+            source_centroid_m=source.centroid_m,
+            target_centroid_m=target.centroid_m,
+            max_shift_m=self.max_shift_m,
+            wobble_m=self.wobble_m,
+        )
+
+    def _limits(self, source: RayImage, target: RayImage) -> AbstractMotion:
+        """Return motions as far as the steps may reach, on the table where one is seen."""
+        steps = target.index - source.index
+        turn_deg = abs((steps * self.step_deg + 180.0) % 360.0 - 180.0)
+        reach_deg = min(turn_deg + 4.0 * self.step_sigma_deg * np.sqrt(abs(steps)) + 10.0, 180.0)
+        if support(source, target) is not None:
+            return TablePrior(max_rotation_deg=reach_deg, max_shift_m=self.max_shift_m).between(source, target)
+        return GeneralPrior(max_rotation_deg=reach_deg, max_offset_m=self.max_shift_m).between(source, target)

@@ -1,0 +1,61 @@
+"""The motion goes on at the pace of the last two frames: a guess, since the images already counted in their edges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from modeler import se3
+from modeler.priors.bumps import Bumps
+from modeler.priors.general import GeneralPrior
+from modeler.priors.proposal import guided
+from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, Solution
+
+_MOST_STEPS = 3.0  # beyond, it is anybody's guess
+
+
+@dataclass(frozen=True)
+class VelocityPrior(AbstractPrior):
+    """Constant velocity within what is known; it proposes and is no evidence."""
+
+    known: AbstractPrior = field(default_factory=GeneralPrior)
+    """What is independently known of motions."""
+    velocity_sigma_deg: float = 5.0
+    """Standard deviation of the change of rotation from one motion to the next, about each axis."""
+    velocity_sigma_m: float = 0.01
+    """Standard deviation of the change of the centroid's shift from one motion to the next, along each axis."""
+    trajectory: tuple[tuple[int, Array], ...] = field(default=(), compare=False)
+    """Frame numbers and object_from_camera (4, 4) of the poses so far, in order of frames."""
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+        """Return the density of target_from_source: that of what is known, until two frames have shown a pace."""
+        known = self.known.between(source, target)
+        poses = dict(self.trajectory)
+        if len(poses) < 2 or target.index not in poses or source.index in poses:
+            return known
+        (before, object_from_before), (last, object_from_last) = self.trajectory[-2:]
+        pace = (source.index - last) / (last - before)
+        if not 0.0 < pace <= _MOST_STEPS:
+            return known
+        twist = se3.log(se3.inverse(object_from_before) @ object_from_last)
+        predicted = se3.inverse(poses[target.index]) @ object_from_last @ se3.exp(pace * twist)
+        guess = Bumps(
+            predicted[None],
+            np.ones(1),
+            centre_m=source.centroid_m,
+            sigma_rad=float(np.radians(self.velocity_sigma_deg) * max(pace, 1.0)),
+            sigma_m=self.velocity_sigma_m * max(pace, 1.0),
+            evidence=False,
+        )
+        return guided(known, [guess])
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> VelocityPrior:
+        """Return the prior that goes on from the poses so far."""
+        trajectory = tuple(sorted(solution.trajectory.items(), key=lambda item: item[0]))
+        return replace(self, known=self.known.learned(solution, edges), trajectory=trajectory)
+
+    def grown(self, steps: float) -> VelocityPrior:
+        """Return the prior within limits that hold for several steps."""
+        return replace(self, known=self.known.grown(steps))
