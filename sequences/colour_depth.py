@@ -37,7 +37,7 @@ def open_colour_depth(path: Path, given: Given) -> PictureSequence:
             f"{path}: no intrinsics; add cam_K.txt (three rows of K), camera_intrinsic.json (Open3D's) or "
             "scene_camera.json (BOP's), or convert with --intrinsics FX FY CX CY."
         )
-    numbers, remarks = _told_numbers(list(depth)) or {stem: place for place, stem in enumerate(depth)}, []
+    numbers, remarks = told_numbers(list(depth)) or {stem: place for place, stem in enumerate(depth)}, []
     colour = _partners(path, COLOUR_FOLDERS, (".png", ".jpg", ".jpeg"), depth)
     masks = _partners(path, MASK_FOLDERS, (".png",), depth)
     for what, partners in (("colour image", colour), ("mask", masks)):
@@ -61,7 +61,7 @@ def open_colour_depth(path: Path, given: Given) -> PictureSequence:
     )
 
 
-def _told_numbers(stems: list[str]) -> dict[str, int] | None:
+def told_numbers(stems: list[str]) -> dict[str, int] | None:
     """Return the frame numbers that names are, or begin with; None where they do not tell."""
     for numbered in (stems, [re.split(r"[^0-9]", stem)[0] for stem in stems]):
         numbers = [frame_number(stem) for stem in numbered]
@@ -89,7 +89,7 @@ def _partners(
         return {}
     found = pictures(folder, suffixes, root)
     same = {stem: found[stem] for stem in depth if stem in found}
-    ours, theirs = _told_numbers(list(depth)) or {}, _told_numbers(list(found)) or {}
+    ours, theirs = told_numbers(list(depth)) or {}, told_numbers(list(found)) or {}
     named = {number: stem for stem, number in theirs.items()}
     alike = {stem: found[named[number]] for stem, number in ours.items() if number in named}
     best = alike if len(alike) > len(same) else same

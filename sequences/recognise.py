@@ -12,8 +12,9 @@ from sequences.folders import entries
 from sequences.given import Given
 from sequences.tum import open_tum
 
-FORMATS = "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder, or a ROS bag"
+FORMATS = "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder, organised clouds, or a ROS bag"
 BAGS = (".bag", ".mcap", ".db3")
+CLOUDS = (".pcd", ".ply")
 
 
 def open_sequence(path: str | Path, given: Given | None = None) -> AbstractSequence:
@@ -40,6 +41,10 @@ def _open(path: Path, given: Given) -> AbstractSequence:
         from sequences.ros import open_ros
 
         return open_ros(path, given)
+    if (path.is_file() and path.suffix.lower() in CLOUDS) or _holds_clouds(path):
+        from sequences.clouds import open_clouds
+
+        return open_clouds(path, given)
     if not path.is_dir():
         raise InputError(f"{path}: no such folder; a file of this kind holds no sequence, give {FORMATS}.")
     if (path / "scene_camera.json").exists():
@@ -49,6 +54,13 @@ def _open(path: Path, given: Given) -> AbstractSequence:
     if (path / "depth").is_dir():
         return open_colour_depth(path, given)
     raise InputError(f"{path}: {_advice(path)}")
+
+
+def _holds_clouds(path: Path) -> bool:
+    """Return whether a folder holds clouds and no depth images."""
+    if not path.is_dir() or any((path / mark).exists() for mark in ("scene_camera.json", "depth.txt", "depth")):
+        return False
+    return any(entry.suffix.lower() in CLOUDS for entry in entries(path))
 
 
 def _advice(path: Path) -> str:

@@ -1,0 +1,197 @@
+"""Organised point clouds (PCD, PLY): a point a pixel, from which the depth image and its camera are taken back."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.types import Array, Camera, Frame, InputError
+from sequences.base import span
+from sequences.colour_depth import told_numbers
+from sequences.folders import pictures
+from sequences.given import Given, Intrinsics, sane
+from sequences.images import MAX_PIXELS
+from sequences.recording import AbstractRecording
+
+SUFFIXES = (".pcd", ".ply")
+MAX_OFF_PX = 1.0
+"""Points that lie farther (half of them) from their pixels were not seen by a pinhole camera."""
+_HEADER_BYTES = 65536
+
+
+@final
+@dataclass(frozen=True)
+class CloudSequence(AbstractRecording):
+    """A cloud a frame, in camera coordinates."""
+
+    clouds: Mapping[int, Path]
+    """By frame number, ascending."""
+    unit_mm: float
+    """Millimetres per unit of the coordinates."""
+    given: Intrinsics | None
+    """Intrinsics where somebody says them."""
+
+    def __post_init__(self) -> None:
+        """Check the first cloud's header and `sequence.json`.
+
+        Raises:
+            InputError: where they cannot be used.
+        """
+        _ = self.name, self.sensor(), self.motion, organised(self.clouds[self.indices[0]])
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Frame numbers, ascending."""
+        return tuple(self.clouds)
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`: each point falls into the pixel that sees it, the nearest counts."""
+        path = self.clouds.get(index)
+        if path is None:
+            raise InputError(f"{self.path}: has no frame {index}; its frames are {span(self.indices)}.")
+        points, colours = _points(path)
+        camera, size = self._camera, (self._camera.height, self._camera.width)
+        if points.shape[:2] != size:
+            raise InputError(
+                f"{path}: has {points.shape[1]} x {points.shape[0]} points where the first cloud has "
+                f"{size[1]} x {size[0]}; all clouds of a sequence must have one size."
+            )
+        z_m = points[..., 2] * (self.unit_mm / 1000.0)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            columns = np.rint(points[..., 0] / points[..., 2] * camera.fx + camera.cx)
+            rows = np.rint(points[..., 1] / points[..., 2] * camera.fy + camera.cy)
+            seen = (z_m > 0.0) & (columns >= 0) & (columns < size[1]) & (rows >= 0) & (rows < size[0])
+        where = rows[seen].astype(np.intp), columns[seen].astype(np.intp)
+        depth_m = np.full(size, np.inf)
+        np.minimum.at(depth_m, where, z_m[seen])
+        colour = None
+        if colours is not None:
+            colour = np.zeros((*size, 3), np.uint8)
+            colour[where] = colours[seen]
+        depth = np.where(np.isinf(depth_m), np.nan, depth_m).astype(np.float32)
+        return Frame(index, float(index), depth, camera, None, colour)
+
+    def truth(self) -> dict[int, Array] | None:
+        """Return None: clouds do not tell the object's pose."""
+        return None
+
+    @property
+    def layout(self) -> str:
+        """What the sequence is stored as."""
+        kinds = sorted({path.suffix.lower()[1:].upper() for path in self.clouds.values()})
+        return f"organised clouds ({', '.join(kinds)})"
+
+    @property
+    def depth_unit(self) -> str:
+        """What one unit of the coordinates is."""
+        return "m (the coordinates)" if self.unit_mm == 1000.0 else f"{self.unit_mm:g} mm (--depth-scale-mm)"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Where the intrinsics come from."""
+        return () if self.given is not None else ("intrinsics are fitted to the points of the first cloud",)
+
+    @cached_property
+    def _camera(self) -> Camera:
+        path = self.clouds[self.indices[0]]
+        points, _ = _points(path)
+        intrinsics = fitted(points, path) if self.given is None else self.given
+        return Camera(points.shape[1], points.shape[0], *intrinsics)
+
+
+def open_clouds(path: Path, given: Given) -> CloudSequence:
+    """Open a folder of organised clouds, or one such file.
+
+    Raises:
+        InputError: where it is not readable as such.
+    """
+    found = pictures(path, SUFFIXES, path) if path.is_dir() else {path.stem: path}
+    numbers = told_numbers(list(found)) or {stem: place for place, stem in enumerate(found)}
+    clouds = dict(sorted((numbers[stem], cloud) for stem, cloud in found.items()))
+    unit_mm = 1000.0 if given.depth_scale_mm is None else given.depth_scale_mm
+    return CloudSequence(path, clouds, unit_mm, given.intrinsics)
+
+
+def organised(path: Path) -> tuple[int, int]:
+    """Return the (width, height) of a cloud as its header says.
+
+    Raises:
+        InputError: where it is no cloud or is not organised as an image.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEADER_BYTES)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
+    if path.suffix.lower() == ".pcd":
+        end, width, height = r"(?m)^DATA\s+\w+", r"(?m)^WIDTH\s+(\d{1,9})\s*$", r"(?m)^HEIGHT\s+(\d{1,9})\s*$"
+        count = r"(?m)^POINTS\s+(\d{1,12})\s*$"
+    else:
+        end, count = r"(?m)^end_header\s*$", r"(?m)^element\s+vertex\s+(\d{1,12})\s*$"
+        width, height = (rf"(?m)^(?:obj_info|comment)\s+(?:{names})\s+(\d{{1,9}})\s*$" for names in _PLY_SIZES)
+    text = head.decode("latin-1")
+    stop = re.search(end, text)
+    if stop is None:
+        raise InputError(f"{path}: has no header of a {path.suffix[1:].upper()} file; save it anew.")
+    sizes = [re.search(pattern, text[: stop.end()]) for pattern in (width, height, count)]
+    columns, rows, points = (int(found[1]) if found else 0 for found in sizes)
+    if columns < 2 or rows < 2 or columns * rows != points:
+        raise InputError(
+            f"{path}: is not organised as an image, of so many columns and rows; save the camera's cloud as it comes "
+            "(PCD with WIDTH and HEIGHT, PLY with obj_info num_cols and num_rows), or its depth image."
+        )
+    if points > MAX_PIXELS:
+        raise InputError(f"{path}: has more than {MAX_PIXELS // 1_000_000} million points; thin it out.")
+    if "binary_compressed" not in stop[0] and path.stat().st_size < stop.end() + 2 * points:
+        raise InputError(f"{path}: is cut off, or has fewer points than its header says; save it anew.")
+    return columns, rows
+
+
+_PLY_SIZES = ("num_cols|width|cols", "num_rows|height|rows")
+
+
+def fitted(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
+    """Return the intrinsics of the camera that saw points (h, w, 3), by least squares over all of them.
+
+    Raises:
+        InputError: where no pinhole camera that looks along z saw them.
+    """
+    rows, columns = np.nonzero(np.isfinite(points).all(axis=2) & (points[..., 2] > 0.0))
+    if rows.size < 100:
+        raise InputError(f"{path}: has only {rows.size} points before the camera; z must point forward, in m.")
+    found, off_px = [], []
+    for axis, pixels in ((0, columns), (1, rows)):
+        slope = points[rows, columns, axis] / points[rows, columns, 2]
+        design = np.stack([slope, np.ones(slope.size)], axis=1)
+        line, *_ = np.linalg.lstsq(design, pixels.astype(np.float64), rcond=None)
+        found.append(line)
+        off_px.append(float(np.median(np.abs(design @ line - pixels))))
+    (fx, cx), (fy, cy) = ((float(slope), float(start)) for slope, start in found)
+    if max(off_px) > MAX_OFF_PX or not sane((fx, fy, cx, cy)):
+        raise InputError(
+            f"{path}: its points are not on the rays of a pinhole camera (off by {max(off_px):.1f} px); save them in "
+            "camera coordinates (x right, y down, z forward), or give --intrinsics FX FY CX CY."
+        )
+    return fx, fy, cx, cy
+
+
+def _points(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8] | None]:
+    """Return the points (h, w, 3) of a cloud, NaN where there is none, and their colours (h, w, 3)."""
+    import open3d as o3d  # takes a second
+
+    width, height = organised(path)
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
+    points, colours = np.asarray(cloud.points), np.asarray(cloud.colors)
+    if len(points) != width * height:
+        raise InputError(f"{path}: is cut off or broken, {len(points)} points could be read; save it anew.")
+    if not len(colours):
+        return points.reshape(height, width, 3), None
+    return points.reshape(height, width, 3), np.rint(colours * 255.0).astype(np.uint8).reshape(height, width, 3)
