@@ -12,7 +12,7 @@ from viz import entities, images, poses
 
 _BACKGROUND: Final = (24, 26, 30)
 _ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object towards the eye; the camera is at -z, up is -y
-_FROM_THE_SIDE: Final = np.array([-0.8, -0.35, -0.5])  # errors along the camera's own axis show from here
+FROM_THE_SIDE: Final = np.array([-0.8, -0.35, -0.5])  # errors along the camera's own axis show from here
 
 
 def layout(first: RayImage | None) -> rrb.Blueprint:
@@ -81,7 +81,7 @@ def _closure(first: RayImage | None) -> tuple[rrb.View, rrb.View]:
 
 def _pair(first: RayImage | None) -> rrb.Container:
     """Return the newest pair before and after alignment, and the posterior larger than life."""
-    eye = _near(first, _FROM_THE_SIDE, 3.7)
+    eye = _near(first, FROM_THE_SIDE, 3.7)
     before = [entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_CAPTION]
     after = [entities.PAIR_TARGET, entities.PAIR_AFTER, entities.PAIR_AXES, entities.PAIR_DRAWS]
     ghosts = [entities.GHOSTS, entities.GHOST_MEANS, entities.GHOST_TIPS, entities.GHOST_LABELS]

@@ -1,36 +1,29 @@
-"""How sure the poses were before any loop was closed: edge after edge, errors only add up."""
+"""Where the poses were, and how sure, before any loop was closed: edge after edge, errors only add up."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import Final
 
 import numpy as np
 
 from modeler import se3
-from modeler.types import Array, Edge, Step
+from modeler.types import Edge, PoseGaussian
 
-_GAUGE: Final = 1e-18 * np.eye(6)  # the first pose is where it is by definition
+_GAUGE: Final = PoseGaussian(np.eye(4), 1e-18 * np.eye(6))  # the first pose is where it is by definition
 
 
-def covariances(step: Step) -> dict[int, Array]:
-    """Return the covariance (6, 6) of each pose of the pairwise chain, by frame number, of first order.
+def poses(edges: Iterable[Edge], root: int) -> dict[int, PoseGaussian]:
+    """Return object_from_camera of each frame that accepted edges reach from `root`, by dead reckoning.
 
-    A frame is reached along accepted edges from the first, by odometry where there is any.
+    Covariances are of first order. A frame is reached by odometry where there is any.
     """
-    chain = step.solution.odometry
-    if not chain:
-        return {}
-    found = {next(iter(chain)): _GAUGE}  # the chain is walked outwards from its root
-    waiting = sorted((edge for edge in step.edges_so_far if edge.accepted), key=lambda edge: edge.kind != "odometry")
-    while reaching := next((edge for edge in waiting if (edge.source in found) != (edge.target in found)), None):
-        frame, covariance = _onwards(reaching, found)
-        found[frame] = covariance
-    return {frame: covariance for frame, covariance in found.items() if frame in chain}
-
-
-def _onwards(edge: Edge, found: Mapping[int, Array]) -> tuple[int, Array]:
-    """Return the frame that an edge leads to from a frame already found, and the covariance of its pose."""
-    pose = edge.posterior.pose if edge.target in found else edge.posterior.pose.inverse()
-    start, end = (edge.target, edge.source) if edge.target in found else (edge.source, edge.target)
-    return end, se3.composed_covariance(found[start], pose.mean, pose.covariance)
+    found = {root: _GAUGE}
+    waiting = sorted((edge for edge in edges if edge.accepted), key=lambda edge: edge.kind != "odometry")
+    while onwards := next((edge for edge in waiting if (edge.source in found) != (edge.target in found)), None):
+        known, new, pose = onwards.target, onwards.source, onwards.posterior.pose
+        if new in found:
+            known, new, pose = new, known, pose.inverse()
+        covariance = se3.composed_covariance(found[known].covariance, pose.mean, pose.covariance)
+        found[new] = PoseGaussian(found[known].mean @ pose.mean, covariance)
+    return found

@@ -110,16 +110,17 @@ def coarsened(vertices: Array, triangles: npt.NDArray[np.int64], limit: int) -> 
         triangles: (t, 3) vertex numbers.
         limit: how many triangles may remain.
     """
-    extent_m = float(np.ptp(vertices[:, :3], axis=0).max()) if len(vertices) else 0.0
-    # A closed surface of the object's extent has about 6 extent²/cell² faces of two triangles.
-    cell_m = extent_m * math.sqrt(12.0 / limit)
+    a, b, c = np.moveaxis(vertices[triangles, :3], 1, 0)
+    area_m2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    cell_m = max(math.sqrt(1.5 * area_m2 / limit), 1e-9)  # cells hold about so much surface, of two triangles
     merged, kept = vertices, triangles
     while len(kept) > limit:
         cells = np.floor((vertices[:, :3] - vertices[:, :3].min(axis=0)) / cell_m).astype(np.int64)
-        _, cell_of, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-        cell_of = cell_of.reshape(-1)
+        _, rows, columns = cells.max(axis=0) + 1
+        numbers = (cells[:, 0] * rows + cells[:, 1]) * columns + cells[:, 2]
+        _, cell_of, count = np.unique(numbers, return_inverse=True, return_counts=True)
         merged = np.stack([np.bincount(cell_of, column) for column in vertices.T], axis=1) / count[:, None]
         kept = cell_of[triangles]
         kept = kept[(kept[:, 0] != kept[:, 1]) & (kept[:, 1] != kept[:, 2]) & (kept[:, 2] != kept[:, 0])]
-        cell_m *= 1.25
+        cell_m *= 1.15
     return merged, kept

@@ -96,7 +96,7 @@ UNCERTAINTY_RGB: Final[Rgb] = (255, 225, 90)
 AXIS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((230, 70, 70), (80, 200, 80), (90, 130, 255))
 
 LEGEND_TEXT: Final = """\
-**Image column.** The frame as the camera saw it, all but the object dimmed; its depth; and, lowest, what the *last* view
+**Image column.** The frame as the camera saw it, all but the object dimmed; its depth; and, lowest, what the last view
 saw (blue: object, grey: background, black: no measurement) with the new view's points in it: orange they agree with the
 surface measured there, brown they are hidden behind it, **pink they hang in front of what was measured**, which no true
 motion makes them do.

@@ -38,11 +38,11 @@ def drawing(step: Step) -> Drawing:
     factor = magnification(step.edges_so_far, poses.distance_m(step))
     shown = poses.shown(step)
     after = {frame: step.solution.covariances[frame] for frame in shown if frame in step.solution.covariances}
-    before = chain.covariances(step)
+    # The chain is walked outwards from its root.
+    before = chain.poses(step.edges_so_far, next(iter(step.solution.odometry))) if step.solution.odometry else {}
     yield from _of_poses(step, _AFTER, step.solution.trajectory, after, factor)
-    yield from _of_poses(
-        step, _BEFORE, step.solution.odometry, {frame: before[frame] for frame in shown if frame in before}, factor
-    )
+    chained = {k: before[k].covariance for k in shown if k in before and k in step.solution.odometry}
+    yield from _of_poses(step, _BEFORE, step.solution.odometry, chained, factor)
     yield from _of_edges(step)
 
 

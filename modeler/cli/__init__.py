@@ -8,6 +8,7 @@ import logging
 import sys
 from collections.abc import Sequence
 
+from modeler.cli.interrupt import terminable
 from modeler.cli.usage import parsed
 
 INTERRUPTED = 130
@@ -25,7 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from modeler.types import InputError
 
     try:
-        return command.run()
+        with terminable():
+            return command.run()
     except InputError as error:
         print(f"modeler: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

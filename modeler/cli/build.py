@@ -30,6 +30,8 @@ class Build:
     """Watch in the Rerun viewer."""
     web: bool = False
     """Watch in the browser, served on 127.0.0.1 only."""
+    connect: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="(default: none)")] = None
+    """Watch in a Rerun viewer that is already open: rerun+http://HOST:PORT/proxy."""
     prior: PriorOptions = field(default_factory=PriorOptions)
     method: MethodOptions = field(default_factory=MethodOptions)
     selection: FrameOptions = field(default_factory=FrameOptions)

@@ -43,7 +43,14 @@ def build(options: Build) -> int:
     modeler = replace(modeler, registrar=Remembered(modeler.registrar, known))
     scene = compose.scene(modeler, whole)
     folder = RunFolder.open(options.out, overwrite=options.overwrite, resume=options.resume)
-    stream = open_stream(frames.name, save=folder.path / "recording.rrd", spawn=options.view, web=options.web)
+    stream = open_stream(
+        frames.name,
+        save=folder.path / "recording.rrd",
+        spawn=options.view,
+        web=options.web,
+        connect=options.connect,
+        facts={"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings},
+    )
     seconds = {"scene": time.perf_counter() - began, "registration": 0.0, "total": 0.0}
     report: Mapping[str, Any] = {}
     try:

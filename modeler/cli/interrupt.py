@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import sys
 from collections.abc import Iterable, Iterator
@@ -9,6 +10,23 @@ from types import FrameType, TracebackType
 from typing import TypeVar
 
 T = TypeVar("T")
+
+TERMINATED = 128 + signal.SIGTERM
+"""Exit status after SIGTERM, as shells have it."""
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """Let a request to terminate end the program as an error would, so that it puts in order what it leaves."""
+    before = signal.signal(signal.SIGTERM, _leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(TERMINATED)
 
 
 class Interrupt:

@@ -17,6 +17,7 @@ from modeler.cli.export import Export
 from modeler.cli.info import Info
 from modeler.cli.register import Register
 from modeler.cli.render import Render
+from modeler.cli.report import Report
 from modeler.cli.view import View
 
 Command = (
@@ -27,6 +28,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Export, tyro.conf.subcommand("export")]
 )
 
@@ -40,7 +42,7 @@ _HELP_INDENT = " " * 8  # deeper than what went wrong stands the help of an opti
 _DESCRIPTION = "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr."
 
 
-def parsed(arguments: Sequence[str]) -> Build | Info | Convert | Register | Evaluate | Render | View | Export:
+def parsed(arguments: Sequence[str]) -> Build | Info | Convert | Register | Evaluate | Render | View | Report | Export:
     """Return the command that the arguments (after the program's name) ask for.
 
     Raises:

@@ -1,0 +1,165 @@
+"""The page about a run: whole, true to the run, and in need of nothing else."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from turning_box import CENTRE_M, HALF_M, object_from_camera, steps
+
+from modeler import se3
+from modeler.export import RunFolder, RunMeta
+from modeler.types import Array, InputError
+from viz.report import write_page
+from viz.report.mesh import read_mesh, scene
+from viz.report.result import Result
+from viz.stream import open_stream
+
+COUNT, LOST = 6, 3
+TRUTH = {k: se3.inverse(object_from_camera(k)) for k in range(COUNT)}
+ODD_NAME = 'a <b> & "c"'
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = RunFolder.open(tmp_path_factory.mktemp("report") / "run")
+    stream = open_stream("box", save=folder.path / "recording.rrd")
+    meta = RunMeta(sequence=ODD_NAME, seed=7, prior="table", settings={"max_shift_m": 0.05}, seconds={"total": 12.3})
+    for step in steps(COUNT, lost=LOST):
+        folder.write(step, meta)
+        stream(step)
+    stream.close()
+    return folder.path
+
+
+@pytest.fixture(scope="module")
+def page(run: Path) -> str:
+    write_page(run, run / "page.html", TRUTH)
+    return (run / "page.html").read_text(encoding="utf-8")
+
+
+class Elements(HTMLParser):
+    """Collects what a browser would load, and checks that elements close in order."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.addresses: list[str] = []
+        self.headings: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in ("meta", "img", "input", "br"):
+            self.open.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] in ("h1", "h2", "h3"):
+            self.headings.append(data)
+
+
+def test_the_page_is_whole_and_needs_no_network(page: str) -> None:
+    elements = Elements(page)
+    assert elements.open == []
+    assert all(address.startswith("data:image/") for address in elements.addresses)
+    assert not re.search(r"https?://|@import|\bfetch\(|XMLHttpRequest", page.replace("http://www.w3.org/", ""))
+    assert "default-src 'none'" in page
+
+
+def test_every_section_is_there(page: str) -> None:
+    headings = Elements(page).headings
+    assert ODD_NAME in headings
+    wanted = ["Model", "Camera around the object", "Uncertainty", "Errors against ground truth"]
+    assert [heading for heading in headings if heading in wanted] == wanted
+    assert {"Are the covariances true?", "Pairs", "Settings"} <= set(headings)
+
+
+def test_every_pair_is_told_with_its_pictures(page: str, run: Path) -> None:
+    result = Result.read(run)
+    headings = Elements(page).headings
+    for edge in result.edges:
+        (words,) = [text for text in headings if text.startswith(f"{edge.source} → {edge.target}:")]
+        assert ("rejected" in words) == (not edge.accepted)
+    assert page.count("data:image/jpeg") - 1 == 3 * sum(edge.kind == "odometry" for edge in result.edges)
+    assert "5 of 6" in page
+    assert f"frame {LOST} was left out" in page
+
+
+def test_settings_and_names_are_text_and_nothing_more(page: str) -> None:
+    assert "<b> &" not in page
+    assert "<th>max shift m</th><td>0.05</td>" in page
+    assert "<th>seed</th><td>7</td>" in page
+
+
+def unpacked(text: str, kind: str) -> Array:
+    return np.frombuffer(base64.b64decode(text), dtype=kind).astype(np.float64).reshape(-1, 3)
+
+
+def test_the_viewer_gets_the_mesh_of_the_run(page: str, run: Path) -> None:
+    (data,) = re.findall(r"<script type='application/json' id='scene'>(.*?)</script>", page, re.DOTALL)
+    drawn = json.loads(data)
+    radius_m = np.linalg.norm(HALF_M)
+    corners = unpacked(drawn["positions"], "<i2") / 32767 * radius_m + CENTRE_M
+    np.testing.assert_allclose(np.abs(corners - CENTRE_M), np.tile(HALF_M, (8, 1)), atol=1e-5)
+    triangles = unpacked(drawn["triangles"], "<u4").astype(int)
+    assert drawn["count"] == triangles.size == 36
+    a, b, c = np.moveaxis(corners[triangles], 1, 0)
+    assert (np.sum(np.cross(b - a, c - a) * (a - CENTRE_M), axis=1) > 0).all()  # seen from outside
+    normals = unpacked(drawn["normals"], "i1")
+    assert (np.sum(normals * (corners - CENTRE_M), axis=1) > 0).all()
+    assert len(unpacked(drawn["colours"], "u1")) == 8
+    tips = unpacked(drawn["lines"], "<f4").reshape(COUNT - 1, -1, 3)[:, 0] * radius_m + CENTRE_M
+    poses = [pose.mean[:3, 3] for pose in Result.read(run).poses.values()]
+    np.testing.assert_allclose(tips, poses, atol=1e-6)
+
+
+def test_a_mesh_without_colour_is_drawn_plain(run: Path, tmp_path: Path) -> None:
+    folder = RunFolder.open(tmp_path / "grey")
+    for step in steps(2, colour=False):
+        folder.write(step, RunMeta("box", 0, "general"))
+    mesh = read_mesh(tmp_path / "grey" / "model.ply")
+    assert mesh is not None
+    assert scene(mesh, [])["colours"] is None
+
+
+def test_without_truth_recording_or_mesh_the_page_says_so(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_bytes((run / "report.json").read_bytes())
+    write_page(tmp_path, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert Elements(page).open == []
+    assert "The true motion is not known here" in page
+    assert "recording.rrd is missing" in page
+    assert "left no mesh" in page
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path, run: Path) -> None:
+    with pytest.raises(InputError, match=r"report\.json"):
+        write_page(tmp_path, tmp_path / "page.html")
+    report = json.loads((run / "report.json").read_bytes())
+    (tmp_path / "report.json").write_text(json.dumps(report | {"poses": []}))
+    with pytest.raises(InputError, match="no frame"):
+        write_page(tmp_path, tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_the_same_run_makes_the_same_page(run: Path, page: str, tmp_path: Path) -> None:
+    write_page(run, tmp_path / "again.html", TRUTH)
+    assert (tmp_path / "again.html").read_text(encoding="utf-8") == page
+
+
+def test_the_chain_of_the_page_is_the_chain_of_the_run(run: Path) -> None:
+    result = Result.read(run, TRUTH)
+    odometry = np.loadtxt(run / "odometry.txt")
+    np.testing.assert_allclose([pose.mean[:3, 3] for pose in result.chain.values()], odometry[:, 1:4], atol=1e-9)
+    for frame in result.poses:
+        true = result.true_pose(frame)
+        assert true is not None
+        np.testing.assert_allclose(true, object_from_camera(frame), atol=1e-12)

@@ -1,0 +1,97 @@
+"""The fused mesh, coarse enough for a page, as the viewer in the page takes it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.types import Array
+from viz.clouds import coarsened
+
+_TRIANGLES: Final = 60_000
+_STEPS: Final = 32767  # of a coordinate from the centre to the farthest vertex: 16-bit whole numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles with what is known of their corners."""
+
+    vertices_m: Array
+    """(v, 3) in the object frame."""
+    normals: Array
+    """(v, 3)."""
+    triangles: npt.NDArray[np.int64]
+    """(t, 3) vertex numbers."""
+    colours: npt.NDArray[np.uint8] | None
+    """(v, 3) RGB, where the input had colour."""
+    total: int
+    """Number of triangles before the mesh was made coarser."""
+
+    @property
+    def centre_m(self) -> Array:
+        """Return the middle (3,) of the box around the mesh."""
+        return 0.5 * (self.vertices_m.min(axis=0) + self.vertices_m.max(axis=0))
+
+    @property
+    def radius_m(self) -> float:
+        """Return the distance of the farthest vertex from the centre."""
+        return float(np.linalg.norm(self.vertices_m - self.centre_m, axis=1).max())
+
+
+def read_mesh(path: Path) -> Mesh | None:
+    """Return the mesh of a PLY file; None where there is none, or it has no triangles."""
+    import trimesh  # slow to load
+    from trimesh.visual import ColorVisuals
+
+    if not path.is_file():
+        return None
+    mesh = trimesh.load(path, process=False)
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        return None
+    attributes = [np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)]
+    visual = mesh.visual
+    coloured = isinstance(visual, ColorVisuals) and visual.kind == "vertex"
+    if isinstance(visual, ColorVisuals) and coloured:
+        attributes.append(np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3])
+    triangles = np.asarray(mesh.faces, dtype=np.int64)
+    vertices, kept = coarsened(np.concatenate(attributes, axis=1, dtype=np.float64), triangles, _TRIANGLES)
+    used, kept = np.unique(kept, return_inverse=True)
+    vertices = vertices[used]
+    return Mesh(
+        vertices_m=vertices[:, :3],
+        normals=vertices[:, 3:6] / np.maximum(np.linalg.norm(vertices[:, 3:6], axis=1, keepdims=True), 1e-12),
+        triangles=kept.reshape(-1, 3),
+        colours=np.rint(vertices[:, 6:]).astype(np.uint8) if coloured else None,
+        total=len(triangles),
+    )
+
+
+def scene(mesh: Mesh, strips_m: list[Array]) -> Mapping[str, Any]:
+    """Return what the viewer draws, in values that JSON holds.
+
+    Args:
+        mesh: the model.
+        strips_m: lines around it, each (n, 3): cameras.
+    """
+    places = np.rint((mesh.vertices_m - mesh.centre_m) / mesh.radius_m * _STEPS).astype("<i2")
+    lines = [np.repeat(strip, 2, axis=0)[1:-1] for strip in strips_m]
+    segments = np.concatenate([np.zeros((0, 3)), *lines])
+    return {
+        "positions": _packed(places),
+        "normals": _packed(np.rint(127.0 * mesh.normals).astype("i1")),
+        "colours": None if mesh.colours is None else _packed(mesh.colours),
+        "triangles": _packed(mesh.triangles.astype("<u4")),
+        "lines": _packed(((segments - mesh.centre_m) / mesh.radius_m).astype("<f4")),
+        "count": int(mesh.triangles.size),
+    }
+
+
+def _packed(array: npt.NDArray[Any]) -> str:
+    """Return the bytes of an array as text."""
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()

@@ -1,0 +1,243 @@
+"""The page itself."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Final
+
+import numpy as np
+from PIL import Image
+
+from modeler import evaluation, se3
+from modeler.export import write_atomically
+from modeler.types import Array, Edge
+from viz.pictures import look_at, shade
+from viz.report import plots
+from viz.report.mesh import Mesh, read_mesh, scene
+from viz.report.pairs import Thumbnails, thumbnails
+from viz.report.result import Result, sd_of
+
+_SHAPE_POINTS: Final = 6_000
+_CAMERA_SHARE: Final = 0.12  # length of a drawn camera, as a share of its distance
+_ABOVE_LEFT: Final = np.array([-0.5, -0.5, -0.75])
+
+
+def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -> None:
+    """Write a page about a run that needs nothing but itself.
+
+    Args:
+        run: the run folder.
+        out: file to write.
+        truth: camera_from_model (4, 4) by frame number, where it is known.
+
+    Raises:
+        InputError: where the folder holds no run, no frame was accepted, or the file cannot be written.
+    """
+    result = Result.read(run, truth)
+    mesh = read_mesh(run / "model.ply")
+    centre_m = se3.transform(result.poses[result.first].mean, np.zeros((1, 3)))[0] if mesh is None else mesh.centre_m
+    parts = [_head(result, mesh), *_model(result, mesh), *_trajectory(result, mesh, centre_m)]
+    parts += [*_accuracy(result, centre_m), *_pairs(result, thumbnails(run / "recording.rrd"), centre_m)]
+    parts.append(_settings(result))
+    page = Template(_asset("page.html")).substitute(
+        title=escape(f"{_name(result)}: model report"), body="\n".join(parts)
+    )
+    write_atomically(out, page)
+
+
+def _head(result: Result, mesh: Mesh | None) -> str:
+    """Return name, verdict and the figures that matter most."""
+    report = result.report
+    reasons = "".join(f"<li>{escape(reason)}</li>" for reason in report["reasons"])
+    verdict = (
+        '<p class="verdict">Nothing speaks against this model: every frame was placed and every check passed.</p>'
+        if report["trustworthy"]
+        else f'<div class="verdict no">This model is not to be trusted:<ul>{reasons}</ul></div>'
+    )
+    closed = sum(edge.kind == "closure" and edge.accepted for edge in result.edges)
+    total_s = report["seconds"].get("total")
+    figures = [
+        (f"{len(result.poses)} of {len(report['frames'])}", "frames placed"),
+        (str(closed), "loop closed" if closed == 1 else "loops closed"),
+        ("none" if mesh is None else f"{mesh.total:,}", "triangles"),
+        ("unknown" if total_s is None else f"{total_s:.0f} s", "to build"),
+    ]
+    if result.true_pose(result.first) is not None:
+        poses = {k: pose.mean for k, pose in result.poses.items() if result.true_pose(k) is not None}
+        off = evaluation.trajectory_errors(poses, result.truth, np.zeros(3))
+        figures.append((f"{off.max_rotation_deg:.2f}°", "largest rotation error"))
+    cells = "".join(f"<div><b>{value}</b>{words}</div>" for value, words in figures)
+    where = escape(str(report["sequence"]))
+    return (
+        f"<h1>{escape(_name(result))}</h1><p class='quiet'>{where}, prior {escape(report['prior'])}, seed "
+        f"{report['seed']}</p>{verdict}<div class='figures'>{cells}</div>"
+    )
+
+
+def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
+    """Return the mesh in its viewer, over a picture of it for browsers that draw no surfaces."""
+    if mesh is None:
+        return ["<h2>Model</h2><p>The run left no mesh.</p>"]
+    cameras = [_pyramid(pose.mean) for pose in result.poses.values()]
+    data = json.dumps(scene(mesh, cameras))
+    colour = "<label><input type='checkbox' id='coloured' checked> colour</label>" if mesh.colours is not None else ""
+    made_coarser = "" if len(mesh.triangles) == mesh.total else f", shown with {len(mesh.triangles):,}"
+    return [
+        "<h2>Model</h2><figure><div class='stage'>"
+        f"<canvas id='mesh' style='background-image:url({_poster(mesh)})'></canvas>"
+        f"<div class='switches'>{colour}<label><input type='checkbox' id='cameras'> cameras</label></div></div>"
+        f"<figcaption id='mesh-note'>The fused mesh, {mesh.total:,} triangles{made_coarser}. Drag to turn, wheel to "
+        "zoom, Shift and drag to move, double click to start over. Insides of open surfaces are reddish.</figcaption>"
+        "</figure>",
+        f"<script type='application/json' id='scene'>{data}</script>",
+        f"<script>{_asset('mesh_viewer.js')}</script>",
+    ]
+
+
+def _trajectory(result: Result, mesh: Mesh | None, centre_m: Array) -> Sequence[str]:
+    """Return where the camera was and how sure that is."""
+    shape_m = np.zeros((0, 3)) if mesh is None else mesh.vertices_m
+    shape_m = shape_m[:: max(len(shape_m) // _SHAPE_POINTS, 1)]
+    return [
+        "<h2>Camera around the object</h2>",
+        _figure(
+            plots.trajectory(result, shape_m),
+            "Positions of the camera in the object frame; the black dot is the first frame. Ellipses hold three "
+            "standard deviations of the position, to scale.",
+        ),
+        "<h2>Uncertainty</h2>",
+        _figure(
+            plots.uncertainty(result, centre_m),
+            "Standard deviation along the worst axis: of each edge, and of each pose relative to the first along the "
+            "chain of edges and after optimisation. What loop closure is worth is the gap between the two lines.",
+        ),
+    ]
+
+
+def _accuracy(result: Result, centre_m: Array) -> Sequence[str]:
+    """Return errors and coverage where the truth is known."""
+    if result.true_pose(result.first) is None or not plots.edge_estimates(result):
+        return [
+            "<h2>Errors</h2><p>The true motion is not known here (no scene_gt.json beside the sequence, or the "
+            "sequence has moved): there are no errors to show.</p>"
+        ]
+    nees = [evaluation.nees(pose, truth) for pose, truth in plots.edge_estimates(result)]
+    inside = evaluation.coverage(nees)[0.95]
+    return [
+        "<h2>Errors against ground truth</h2>",
+        _figure(
+            plots.errors(result, centre_m),
+            "Lines are errors relative to the first frame, bands the standard deviation that the result states along "
+            "its worst axis. Errors well above their band would mean a result too sure of itself.",
+        ),
+        "<h2>Are the covariances true?</h2>",
+        _figure(
+            plots.coverage(result),
+            "Share of truths inside the region of a given probability. On the diagonal: calibrated; below: too sure; "
+            f"above: too modest; grey: what chance allows. Of {len(nees)} edges {100.0 * inside:.0f} % have the truth "
+            "inside their 95 % region.",
+            style="half",
+            kind="png",
+        ),
+    ]
+
+
+def _pairs(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Array) -> Sequence[str]:
+    """Return every pair with its pictures, its outcome and why it was or was not joined."""
+    note = (
+        "From left: the frame; its surface (<span class='orange'>orange</span>) and that of the view it is registered "
+        "to (<span class='teal'>teal</span>) before and after alignment."
+        if pictures
+        else "There are no pictures, for recording.rrd is missing."
+    )
+    cards = [_pair(result, edge, pictures.get(edge.source), centre_m) for edge in result.edges]
+    return [f"<h2>Pairs</h2><p class='quiet'>{note}</p><div class='pairs'>{''.join(cards)}</div>"]
+
+
+def _pair(result: Result, edge: Edge, pictures: Thumbnails | None, centre_m: Array) -> str:
+    posterior = edge.posterior
+    shown = ""
+    if pictures is not None and edge.kind == "odometry":
+        images = [image for image in (pictures.colour, pictures.before, pictures.after) if image is not None]
+        shown = "".join(f"<img src='{_data(image, 'jpeg')}' alt=''>" for image in images)
+        shown = f"<div class='pictures'>{shown}</div>"
+    seen_m = centre_m
+    if edge.source in result.poses:
+        seen_m = se3.transform(se3.inverse(result.poses[edge.source].mean), centre_m[None])[0]
+    sd = sd_of(posterior.pose, seen_m)
+    facts = {
+        "rotation sd {:.2g}°": sd.rotation_deg,
+        "translation sd {:.2g} mm": sd.translation_mm,
+        "overlap {:.0f} %": 100.0 * posterior.overlap,
+        "{:.0f} effective samples": posterior.effective_samples,
+        "{:.2g} s": posterior.seconds,
+    }
+    truth = result.true_motion(edge)
+    if truth is not None:
+        facts |= {
+            "rotation off by {:.2f}°": evaluation.rotation_error_deg(posterior.pose.mean, truth),
+            "translation by {:.1f} mm": 1000.0 * evaluation.translation_error_m(posterior.pose.mean, truth, seen_m),
+        }
+    words = ", ".join(form.format(value) for form, value in facts.items() if np.isfinite(value))
+    verdict = edge.kind if edge.accepted else f"{edge.kind}, rejected"
+    return (
+        f"<div class='pair{'' if edge.accepted else ' no'}'><h3>{edge.source} → {edge.target}: {verdict}, "
+        f"{posterior.outcome.label}</h3>{shown}<p>{words}.</p><p class='quiet'>{escape(edge.reason)}</p></div>"
+    )
+
+
+def _settings(result: Result) -> str:
+    """Return what the run was asked to do, with what, and what became of its frames."""
+    report = result.report
+    rows = {"sequence": report["sequence"], "seed": report["seed"], "prior": report["prior"], **report["settings"]}
+    rows |= {f"seconds, {part}": f"{seconds:.1f}" for part, seconds in report["seconds"].items() if seconds is not None}
+    rows |= {f"version of {name}": version for name, version in report["versions"].items()}
+    lost = [frame for frame in report["frames"] if frame["outcome"] != "accepted"]
+    rows |= {f"frame {frame['id']} left out": frame["outcome"] for frame in lost}
+    lines = "".join(
+        f"<tr><th>{escape(str(key).replace('_', ' '))}</th><td>{escape(str(value))}</td></tr>"
+        for key, value in rows.items()
+    )
+    return f"<h2>Settings</h2><table>{lines}</table>"
+
+
+def _name(result: Result) -> str:
+    return Path(str(result.report["sequence"])).name or "model"
+
+
+def _pyramid(object_from_camera: Array) -> Array:
+    """Return a camera (n, 3) as one line in the object frame."""
+    size_m = _CAMERA_SHARE * max(float(np.linalg.norm(object_from_camera[:3, 3])), 0.3)
+    corners = size_m * np.array([[-0.55, -0.4, 1.0], [0.55, -0.4, 1.0], [0.55, 0.4, 1.0], [-0.55, 0.4, 1.0]])
+    tip = np.zeros(3)
+    outline = [tip, *corners, corners[0], tip, corners[1], corners[2], tip, corners[3]]
+    return se3.transform(object_from_camera, np.array(outline))
+
+
+def _poster(mesh: Mesh) -> str:
+    """Return a picture of the mesh that stands still, as a data address."""
+    camera = look_at(mesh.centre_m, _ABOVE_LEFT, 4.2 * mesh.radius_m, np.array([0.0, -1.0, 0.0]))
+    picture = shade(mesh.vertices_m, mesh.triangles, mesh.colours, camera, (460, 1048))
+    content = io.BytesIO()
+    Image.fromarray(picture).save(content, "JPEG", quality=85)
+    return _data(content.getvalue(), "jpeg")
+
+
+def _figure(picture: bytes, caption: str, *, style: str = "", kind: str = "svg+xml") -> str:
+    image = f"<img class='{style}' src='{_data(picture, kind)}' alt=''>"
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
+
+
+def _data(content: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _asset(name: str) -> str:
+    return (resources.files("viz.report") / name).read_text(encoding="utf-8")

@@ -1,0 +1,113 @@
+"""What a run folder says, in the nouns of the package."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from modeler import se3
+from modeler.export import RunFolder, posteriors_of
+from modeler.types import Array, Edge, InputError, PoseGaussian
+from viz import chain
+from viz.readings import worst_axis_sd
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A finished or interrupted run, with the true motion where it is known."""
+
+    path: Path
+    """The run folder."""
+    report: Mapping[str, Any]
+    """`report.json`."""
+    truth: Mapping[int, Array]
+    """camera_from_model (4, 4) by frame number; empty where it is not known."""
+
+    @classmethod
+    def read(cls, path: Path, truth: Mapping[int, Array] | None = None) -> Result:
+        """Read a run folder.
+
+        Raises:
+            InputError: where there is no run, or no frame of it was accepted.
+        """
+        report = RunFolder(path).report()
+        if not report["poses"]:
+            raise InputError(f"{path}: no frame of this run was accepted; report.json says why")
+        return cls(path, report, truth or {})
+
+    @cached_property
+    def edges(self) -> list[Edge]:
+        """Every edge, in order."""
+        posteriors = posteriors_of(self.report)
+        return [
+            Edge(posteriors[edge["source"], edge["target"]], edge["kind"], edge["accepted"], edge["reason"])
+            for edge in self.report["edges"]
+        ]
+
+    @cached_property
+    def poses(self) -> dict[int, PoseGaussian]:
+        """object_from_camera after optimisation, by frame number."""
+        return {
+            pose["id"]: PoseGaussian(
+                np.array(pose["object_from_camera"], dtype=np.float64).reshape(4, 4),
+                np.array([np.nan if value is None else value for value in pose["covariance"]]).reshape(6, 6),
+            )
+            for pose in self.report["poses"]
+        }
+
+    @cached_property
+    def chain(self) -> dict[int, PoseGaussian]:
+        """object_from_camera of the pairwise chain alone, by frame number."""
+        reached = chain.poses(self.edges, self.first)
+        return {frame: reached[frame] for frame in self.poses if frame in reached}
+
+    @property
+    def first(self) -> int:
+        """Number of the first accepted frame, in whose camera frame the object is."""
+        return next(iter(self.poses))
+
+    def true_pose(self, frame: int) -> Array | None:
+        """Return the true object_from_camera (4, 4) of a frame; None where it is not known."""
+        if frame not in self.truth or self.first not in self.truth:
+            return None
+        return self.truth[self.first] @ se3.inverse(self.truth[frame])
+
+    def true_motion(self, edge: Edge) -> Array | None:
+        """Return the true target_from_source (4, 4) of an edge; None where it is not known."""
+        if edge.source not in self.truth or edge.target not in self.truth:
+            return None
+        return self.truth[edge.target] @ se3.inverse(self.truth[edge.source])
+
+
+@dataclass(frozen=True)
+class Sd:
+    """How sure a motion is, along its worst axes."""
+
+    rotation_deg: float
+    """Standard deviation of the rotation."""
+    translation_mm: float
+    """Standard deviation of the object's centre."""
+
+
+def sd_of(pose: PoseGaussian, centre_m: Array) -> Sd:
+    """Return how sure a motion is; NaN where its covariance is not finite.
+
+    Args:
+        pose: with ξ in the coordinates in which `centre_m` is given.
+        centre_m: (3,) the object's centre.
+    """
+    if not np.isfinite(pose.covariance).all():
+        return Sd(float("nan"), float("nan"))
+    jacobian = np.concatenate([-se3.hat(centre_m), np.eye(3)], axis=1)
+    shift = worst_axis_sd(jacobian @ pose.covariance @ jacobian.T)
+    return Sd(float(np.degrees(worst_axis_sd(pose.covariance[:3, :3]))), 1000.0 * shift)
+
+
+def sds(poses: Mapping[int, PoseGaussian], centre_m: Array) -> Sequence[Sd]:
+    """Return how sure poses object_from_camera are, the object's centre (3,) given in the object frame."""
+    return [sd_of(pose, se3.transform(se3.inverse(pose.mean), centre_m[None])[0]) for pose in poses.values()]
