@@ -14,8 +14,9 @@ from scipy.spatial import KDTree
 
 from modeler import se3
 from modeler.fusion import Fuser, own_covariances, surface
+from modeler.fusion.grid import Field, Grid
 from modeler.fusion.stack import posed, spread, stack
-from modeler.kernels import fusion, isosurface, thinning
+from modeler.kernels import closing, fusion, isosurface, thinning
 from modeler.kernels.surfels import surfels
 from modeler.rays import Sensor
 from modeler.types import Frame, InputError, ObjectModel, RayImage, Solution
@@ -535,6 +536,81 @@ def test_what_stands_right_before_the_background_is_carved():
     # Of 40 mm there is left what others see within a margin of two pixels beside the brick, 15 mm on a table seen flat.
     assert BRICK.distance(model.vertices_m).max() < 0.018
     assert BRICK.distance(model.points_m).max() < 0.018
+
+
+# Closing what nobody saw.
+
+
+def test_cells_that_a_view_looks_through_or_that_lie_below_its_table_are_known_empty():
+    free_m = np.full((2, 40, 40), 0.8, dtype=np.float32)
+    free_m[1] = 0.0
+    poses = np.tile(np.eye(4)[:3], (2, 1, 1))
+    lenses = np.tile([20.0, 20.0, 19.5, 19.5], (2, 1))
+    planes = np.array([[np.nan] * 4, [0.0, -1.0, 0.0, 0.1]])  # y points down: the table is 0.1 m below
+    shape = np.array([10, 10, 10])
+    counts = closing.looked_through(np.array([-0.25, -0.25, 0.5]), 0.05, shape, 0.05, free_m, poses, lenses, planes)
+    centres = np.array([-0.25, -0.25, 0.5]) + 0.05 * (np.argwhere(np.ones(shape)) + 0.5)
+    expected = (centres[:, 2] < 0.75).astype(int) + (centres[:, 1] > 0.15)
+    assert np.array_equal(counts.ravel(), expected)
+
+
+def test_the_smallest_surface_across_an_open_tube_is_flat():
+    size = 30
+    start, fixed = np.ones((size, size, size), dtype=np.float32), np.zeros((size, size, size), dtype=bool)
+    x, y, z = np.meshgrid(*[np.arange(size)] * 3, indexing="ij")
+    for axis in (x, y, z):
+        fixed |= (axis == 0) | (axis == size - 1)
+    radius = np.hypot(x - 14.5, y - 14.5)
+    wall = (z >= 8) & (z < 24) & (np.abs(radius - 8.0) <= 2.0)
+    lid = (z >= 22) & (z < 26) & (radius < 10.0)
+    fixed |= wall | lid
+    start[(wall & (radius < 8.0)) | (lid & (z < 24) & (radius < 8.0))] = -1.0
+    start[~fixed & (radius < 8.0)] = -1.0  # spills out of the open end, as far as it goes
+    decided = closing.smallest(start, fixed, 600)
+    assert np.array_equal(decided[fixed], start[fixed])
+    core = radius < 5.0
+    assert (decided[core & (z >= 10) & (z < 22)] < -0.5).all()
+    assert (decided[core & (z < 6)] > 0.5).all()
+
+
+def test_a_watertight_model_is_closed_and_marks_what_it_made_up():
+    for body in (BALL, BRICK, PLATE):
+        views, trajectory = tabletop.views(body, POSES), tabletop.trajectory(POSES)
+        model = FUSER.scanned(views, trajectory).model(watertight=True)
+        mesh = trimesh.Trimesh(model.vertices_m, model.triangles, process=False)
+        assert mesh.is_watertight
+        assert mesh.is_winding_consistent
+        assert np.array_equal(edge_uses(model.triangles), np.ones((len(mesh.edges_unique), 2)))
+        assert mesh.body_count == 1
+        assert model.vertex_views is not None
+        assert model.vertex_sigmas_m is not None
+        made_up = model.vertex_views == 0
+        assert np.isinf(model.vertex_sigmas_m[made_up]).all()
+        assert np.quantile(np.abs(body.distance(model.vertices_m[~made_up])), 0.95) < 0.5 * VOXEL_M
+        assert np.abs(body.distance(model.vertices_m)).max() < 0.025
+    # Of a brick, the bottom was made up, and lies where it is.
+    brick = FUSER.scanned(tabletop.views(BRICK, POSES), tabletop.trajectory(POSES)).model(watertight=True)
+    assert brick.vertex_views is not None
+    under = brick.vertices_m[:, 2] < -BRICK.half_m[2] + 1e-3
+    core = (np.abs(brick.vertices_m[:, :2]) < 0.04).all(axis=1) & (brick.vertices_m[:, 2] < 0.0)
+    assert (brick.vertex_views[core] == 0).all()
+    assert np.abs(brick.vertices_m[core, 2] + BRICK.half_m[2]).max() < 3.0 * VOXEL_M
+    assert under.any()
+    volume = trimesh.Trimesh(brick.vertices_m, brick.triangles, process=False).volume
+    assert volume == pytest.approx(8.0 * np.prod(BRICK.half_m), rel=0.06)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_edge_of_a_zero_level_has_more_than_two_triangles(seed):
+    rng = np.random.default_rng(seed)
+    values = gaussian_filter(rng.normal(size=(24, 24, 24)), 0.6).astype(np.float32)
+    weights = np.zeros(values.shape, dtype=np.float32)
+    weights[1:-1, 1:-1, 1:-1] = 1.0
+    field = Field(Grid(np.zeros(3), 1.0, np.array([6, 6, 6])), values, weights, np.argwhere(weights > 0.0))
+    _, torn = isosurface.extract(values, weights, field.known, isosurface.PIECES)
+    assert edge_uses(torn).max() > 1
+    _, triangles = surface.extracted(field)
+    assert edge_uses(triangles).max() == 1
 
 
 # Rendered sequences with the noise and the flaws of a depth camera.

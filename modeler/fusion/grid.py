@@ -92,3 +92,16 @@ def filled(field: Field) -> Field:
     values[tuple(cells.T)] = means
     weights[tuple(cells.T)] = FAINT
     return Field(field.grid, values, weights, np.argwhere(weights > 0.0))
+
+
+def crossed(values_m: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
+    """Return the cells (n, 3), by their lowest voxel, in ascending order, whose eight voxels differ in sign."""
+    inside = values_m < 0.0
+    some, every = inside, inside
+    for axis in range(3):
+        low = [slice(None)] * 3
+        high = [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        some = some[tuple(low)] | some[tuple(high)]
+        every = every[tuple(low)] & every[tuple(high)]
+    return np.argwhere(some & ~every)

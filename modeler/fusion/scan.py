@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from modeler.fusion import cloud, grid, surface, tones
+from modeler.fusion import closing, cloud, grid, surface, tones
 from modeler.fusion.stack import Stack
 from modeler.fusion.testimony import Testimony, heard
-from modeler.types import Array, ObjectModel
+from modeler.types import Array, BoolArray, ObjectModel
 
 if TYPE_CHECKING:
     from modeler.fusion.fuser import Fuser
@@ -36,9 +36,13 @@ class Scan:
     sigma_m: float
     """Standard deviation of what one view says of the surface head-on."""
 
-    def model(self) -> ObjectModel:
-        """Return cloud and mesh."""
-        vertices, triangles = self._mesh()
+    def model(self, *, watertight: bool = False) -> ObjectModel:
+        """Return cloud and mesh.
+
+        Args:
+            watertight: close the mesh with made-up surface, whose vertices no view saw and whose deviation is infinite.
+        """
+        vertices, triangles, seen = self._mesh(watertight=watertight)
         normals = surface.normals_of(vertices, triangles)
         told = self.asked(vertices, normals)
         points, normals_of_points = cloud.thinned(
@@ -51,6 +55,7 @@ class Scan:
         told_of_points = self.asked(points, normals_of_points)
         kept = self._believed(told_of_points) & cloud.crowded(points, 2.0 * self.box.voxel_m, LONELY)
         coloured = bool(self.seen.coloured.any())
+        known = told.coloured & seen
         return ObjectModel(
             points_m=points[kept],
             normals=normals_of_points[kept],
@@ -58,9 +63,9 @@ class Scan:
             vertices_m=vertices,
             triangles=triangles,
             vertex_normals=normals,
-            vertex_colours=surface.spread_colours(told.colours, told.coloured, triangles) if coloured else None,
-            vertex_views=told.views,
-            vertex_sigmas_m=told.sigmas_m,
+            vertex_colours=surface.spread_colours(told.colours, known, vertices) if coloured else None,
+            vertex_views=np.where(seen, told.views, 0),
+            vertex_sigmas_m=np.where(seen, told.sigmas_m, np.inf),
         )
 
     def asked(self, points_m: Array, normals: Array) -> Testimony:
@@ -83,23 +88,33 @@ class Scan:
             gains=gains,
         )
 
-    def _believed(self, told: Testimony) -> np.ndarray:
+    def _believed(self, told: Testimony) -> BoolArray:
         """Return which points (n,) more views see than see through."""
         return told.support > self.how.empty_weight * told.emptiness
 
-    def _mesh(self) -> tuple[Array, surface.Triangles]:
-        """Return vertices (v, 3) and triangles (t, 3) of the surface that the views support."""
+    def _mesh(self, *, watertight: bool) -> tuple[Array, surface.Triangles, BoolArray]:
+        """Return vertices (v, 3) and triangles (t, 3) of the surface, and which vertices the views support."""
         field = grid.measure(self.box, self.seen, tau_m=self.tau_m, empty_weight=self.how.empty_weight)
         for _ in range(self.how.closing):
             field = grid.filled(field)
         vertices, triangles = surface.extracted(field)
+        kept = self._kept(vertices, triangles)
+        shown = triangles[np.all(kept[triangles], axis=1)]
+        shown = shown[surface.large_pieces(vertices, shown, self.how.min_piece)]
+        used, compact = surface.compacted(shown, len(vertices))
+        if not watertight:
+            return surface.fair(vertices[used], compact, self.how.fairing), compact, np.ones(len(used), dtype=bool)
+        unused = np.ones(len(vertices), dtype=bool)
+        unused[used] = False
+        field = closing.without(field, vertices[unused], vertices[used], self.tau_m)
+        whole = closing.enclosing(field, self.seen, self.tau_m)
+        return closing.tidied(*surface.extracted(whole), vertices[used], self.box.voxel_m, self.how.fairing)
+
+    def _kept(self, vertices: Array, triangles: surface.Triangles) -> BoolArray:
+        """Return which vertices (v,) of the zero level are surface: supported, not seen through, and no frill."""
         told = self._heard(vertices, surface.normals_of(vertices, triangles), np.zeros((len(self.seen.index), 4)))
         # Gaps in what is believed are closed, but not with what several views see through.
         empty = told.emptiness * self.how.empty_weight > told.support + self.how.empty_weight
         marked = (told.support > self.how.min_support) & self._believed(told)
         marked = surface.closed(marked, triangles, self.how.closing) & ~empty
-        kept = surface.opened(marked, triangles, self.how.opening)
-        triangles = triangles[np.all(kept[triangles], axis=1)]
-        triangles = triangles[surface.large_pieces(vertices, triangles, self.how.min_piece)]
-        used, triangles = surface.compacted(triangles, len(vertices))
-        return surface.fair(vertices[used], triangles, self.how.fairing), triangles
+        return surface.opened(marked, triangles, self.how.opening)

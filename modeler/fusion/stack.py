@@ -38,6 +38,8 @@ class Stack:
     """(f, 3, 4) camera_from_object."""
     lenses: Array
     """(f, 4) fx, fy, cx, cy of the pixels as stacked."""
+    planes: Array
+    """(f, 4) normal and offset in m of the plane on which the object stands, in the object frame; NaN = none seen."""
     points_m: Array
     """(n, 3) surface points."""
     normals: Array
@@ -166,6 +168,14 @@ def _cut(view: RayImage, window: tuple[slice, slice], *, margin_px: int, min_cos
     )
 
 
+def _plane(view: RayImage, object_from_camera: Array) -> Array:
+    """Return normal and offset (4,) of a view's support plane in the object frame, NaN where there is none."""
+    if view.plane is None:
+        return np.full(4, np.nan)
+    normal = object_from_camera[:3, :3] @ view.plane.normal
+    return np.append(normal, view.plane.offset_m - normal @ object_from_camera[:3, 3])
+
+
 def _pose_variances(cut: _Cut, view: RayImage, covariances: Mapping[int, Array] | None) -> Array:
     """Return the variances (n,) of points along their normals that the pose's error makes, against a pixel's own."""
     covariance = None if covariances is None else covariances.get(view.index)
@@ -241,6 +251,7 @@ def stack(
         coloured=np.array([cut.colour is not None for cut in cuts]),
         poses=np.stack([se3.inverse(pose)[:3] for _, pose in pairs]),
         lenses=np.stack([cut.lens for cut in cuts]),
+        planes=np.stack([_plane(view, pose) for view, pose in pairs]),
         points_m=points_m,
         normals=np.concatenate([cut.normals @ pose[:3, :3].T for cut, (_, pose) in zip(cuts, pairs, strict=True)]),
         weights=weights,

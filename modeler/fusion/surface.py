@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from modeler.fusion.grid import Field
 from modeler.kernels import isosurface
@@ -14,8 +15,31 @@ from modeler.types import Array, BoolArray
 Triangles = npt.NDArray[np.int64]
 
 
+PINCHES = 50  # rounds after which sheets that touch are left touching
+NEAREST = 6  # vertices that lend their colour to one that has none
+HAIR = 1e-2  # how far inside a voxel is put, in voxels
+
+
+def parted(field: Field) -> Field:
+    """Return the field with the gap closed between sheets of the zero level that touch along an edge."""
+    values, known = field.values_m, field.known
+    for _ in range(PINCHES):
+        voxels = isosurface.pinched(values, field.weights, known, isosurface.PIECES)
+        if not len(voxels):
+            break
+        if values is field.values_m:
+            values = values.copy()
+        values[tuple(voxels.T)] = -HAIR * field.grid.voxel_m
+        # What is crossed now was crossed before, or lies around a voxel that was put inside.
+        around = (voxels[:, None] - np.argwhere(np.ones((2, 2, 2)))).reshape(-1, 3)
+        keys = (np.ravel_multi_index(tuple(cells.T), values.shape) for cells in (known, around))
+        known = np.stack(np.unravel_index(np.union1d(*keys), values.shape), axis=1)
+    return field if values is field.values_m else Field(field.grid, values, field.weights, known)
+
+
 def extracted(field: Field) -> tuple[Array, Triangles]:
-    """Return vertices (v, 3) in m and triangles (t, 3) of the field's zero level."""
+    """Return vertices (v, 3) in m and triangles (t, 3) of the zero level; no edge has more than two triangles."""
+    field = parted(field)
     vertices, triangles = isosurface.extract(field.values_m, field.weights, field.known, isosurface.PIECES)
     return field.grid.origin_m + (vertices + 0.5) * field.grid.voxel_m, triangles
 
@@ -45,12 +69,26 @@ def large_pieces(vertices_m: Array, triangles: Triangles, min_share: float) -> B
     """Return which triangles (t,) belong to connected pieces with at least `min_share` of the largest piece's area."""
     if not len(triangles):
         return np.zeros(0, dtype=bool)
-    ones = np.ones(2 * len(triangles), dtype=bool)
-    pairs = np.concatenate([triangles[:, :2], triangles[:, 1:]])
-    links = coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(len(vertices_m), len(vertices_m)))
-    piece = connected_components(links, directed=False)[1][triangles[:, 0]]
+    piece = _piece(triangles, len(vertices_m))
     area = np.bincount(piece, weights=areas_of(vertices_m, triangles))
     return (area >= min_share * area.max())[piece]
+
+
+def solid_pieces(vertices_m: Array, triangles: Triangles) -> BoolArray:
+    """Return which triangles (t,) of closed pieces bound the largest volume; bubbles inside and crumbs do not."""
+    if not len(triangles):
+        return np.zeros(0, dtype=bool)
+    piece = _piece(triangles, len(vertices_m))
+    volume = np.bincount(piece, weights=np.linalg.det(vertices_m[triangles] - vertices_m.mean(axis=0)))
+    return piece == np.argmax(volume)
+
+
+def _piece(triangles: Triangles, count: int) -> npt.NDArray[np.int64]:
+    """Return the number of the connected piece of each triangle (t,)."""
+    ones = np.ones(2 * len(triangles), dtype=bool)
+    pairs = np.concatenate([triangles[:, :2], triangles[:, 1:]])
+    links = coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(links, directed=False)[1][triangles[:, 0]]
 
 
 def rim(triangles: Triangles) -> npt.NDArray[np.int64]:
@@ -110,22 +148,32 @@ def fair(vertices_m: Array, triangles: Triangles, passes: int) -> Array:
     return vertices_m
 
 
-def spread_colours(colours: npt.NDArray[np.uint8], known: BoolArray, triangles: Triangles) -> npt.NDArray[np.uint8]:
-    """Return RGB (v, 3) with unknown ones taken from their neighbours, ring by ring."""
-    values, known = colours.astype(np.float64), known.copy()
+def spanned(vertices_m: Array, triangles: Triangles, free: BoolArray, passes: int) -> Array:
+    """Return vertices (v, 3) of which the free ones have moved towards the mean of their neighbours."""
+    count = len(vertices_m)
     pairs = np.concatenate([triangles[:, :2], triangles[:, 1:], triangles[:, [2, 0]]])
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
-    while True:
-        pairs = pairs[~known[pairs[:, 0]]]
-        telling = pairs[known[pairs[:, 1]]]
-        if not len(telling):
-            return np.rint(values).astype(np.uint8)
-        counts = np.bincount(telling[:, 0], minlength=len(values))
-        reached = counts > 0
-        for c in range(3):
-            sums = np.bincount(telling[:, 0], weights=values[telling[:, 1], c], minlength=len(values))
-            values[reached, c] = sums[reached] / counts[reached]
-        known |= reached
+    pairs = pairs[free[pairs[:, 0]]]
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
+    links.data[:] = 1.0
+    mean = diags_array(1.0 / np.maximum(links.sum(axis=1), 1.0)) @ links
+    for _ in range(passes):
+        vertices_m = np.where(free[:, None], mean @ vertices_m, vertices_m)
+    return vertices_m
+
+
+def spread_colours(colours: npt.NDArray[np.uint8], known: BoolArray, vertices_m: Array) -> npt.NDArray[np.uint8]:
+    """Return RGB (v, 3) where vertices of unknown colour take that of the few nearest known ones."""
+    if known.all() or not known.any():
+        return colours
+    lenders = [rank for rank in range(1, NEAREST + 1) if rank <= np.count_nonzero(known)]
+    near_m, near = KDTree(vertices_m[known]).query(vertices_m[~known], k=lenders)
+    weights = 1.0 / (near_m + 1e-6)
+    spread = colours.copy()
+    spread[~known] = np.rint(
+        np.einsum("nk,nkc->nc", weights / weights.sum(axis=1, keepdims=True), colours[known][near])
+    )
+    return spread
 
 
 def compacted(triangles: Triangles, count: int) -> tuple[npt.NDArray[np.int64], Triangles]:

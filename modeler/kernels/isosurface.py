@@ -201,3 +201,88 @@ def extract(values, totals, cells, pieces):
                 triangles[count, 2] = corner[(shift + 2 + half) % 4]
                 count += 1
     return vertices, triangles[:count]
+
+
+@njit(cache=True)
+def pinched(values, totals, cells, pieces):
+    """Return the voxels (m, 3) to be put inside so that no edge of the zero level has more than two triangles.
+
+    Where the corners of a face between two cells differ along its diagonals, two sheets meet in it. If each cell
+    joins them in one piece, both sheets share the edge between the two vertices; with one more corner inside, they do
+    not meet. Putting voxels inside may pinch elsewhere: to be repeated until nothing is returned.
+
+    Args:
+        values: (x, y, z) float32, negative inside.
+        totals: (x, y, z) float32, 0 = unknown.
+        cells: (n, 3) voxels that are the lowest corner of a cell to look at.
+        pieces: `PIECES`.
+    """
+    found = np.empty((3 * len(cells), 3), dtype=np.int64)
+    count = 0
+    for n in range(len(cells)):
+        for axis in range(3):
+            i, j, k = cells[n, 0], cells[n, 1], cells[n, 2]
+            p, q, r = i + (axis == 0), j + (axis == 1), k + (axis == 2)  # the cell on the other side of the face
+            if p + 1 >= values.shape[0] or q + 1 >= values.shape[1] or r + 1 >= values.shape[2]:
+                continue
+            case = _case(values, totals, i, j, k)
+            beyond = _case(values, totals, p, q, r)
+            if case < 0 or beyond < 0:
+                continue
+            step = 4 >> axis
+            one, two = 4 >> ((axis + 1) % 3), 4 >> ((axis + 2) % 3)
+            a, b = bool(case & (1 << step)), bool(case & (1 << (step | one)))
+            c, d = bool(case & (1 << (step | one | two))), bool(case & (1 << (step | two)))
+            if a != c or b != d or a == b:
+                continue
+            # The face's edges along the two other axes, as each cell numbers them.
+            joined = True
+            for cell in range(2):
+                level = 1 - cell
+                table = pieces[case] if cell == 0 else pieces[beyond]
+                first = -1
+                for other in range(3):
+                    if other == axis:
+                        continue
+                    for side in range(2):
+                        # Offsets along the two axes beside `other`, in ascending order.
+                        if axis < 3 - other - axis:
+                            edge = 4 * other + 2 * level + side
+                        else:
+                            edge = 4 * other + 2 * side + level
+                        piece = table[edge]
+                        if first < 0:
+                            first = piece
+                        elif piece != first:
+                            joined = False
+            if not joined:
+                continue
+            # Of the two corners outside, the one that is less so.
+            best, least = -1, np.inf
+            for corner in range(4):
+                number = step | (one if corner == 1 or corner == 2 else 0) | (two if corner >= 2 else 0)
+                if case & (1 << number):
+                    continue
+                value = values[i + (number >> 2), j + ((number >> 1) & 1), k + (number & 1)]
+                if value < least:
+                    best, least = number, value
+            found[count, 0], found[count, 1], found[count, 2] = (
+                i + (best >> 2),
+                j + ((best >> 1) & 1),
+                k + (best & 1),
+            )
+            count += 1
+    return found[:count]
+
+
+@njit(cache=True)
+def _case(values, totals, i, j, k):
+    """Return the signs of a cell's corners as bits, 1 = inside; -1 where a corner is unknown."""
+    case = 0
+    for c in range(8):
+        a, b, d = i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1)
+        if totals[a, b, d] == 0.0:
+            return -1
+        if values[a, b, d] < 0.0:
+            case |= 1 << c
+    return case

@@ -1,0 +1,103 @@
+"""Making up the surface that nobody saw, so that the model encloses a volume."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
+from scipy.spatial import KDTree
+
+from modeler.fusion import surface
+from modeler.fusion.grid import FAINT, Field, crossed
+from modeler.fusion.stack import Stack
+from modeler.kernels import closing
+from modeler.types import Array, BoolArray
+
+CELLS = 80**3  # the unseen is decided on a grid of no more cells
+ROUNDS = 400
+SPANNING = 60  # steps towards the neighbours' mean that made-up vertices take
+OUTER = 3  # layers of voxels at the border that are outside
+
+
+def without(field: Field, rejected_m: Array, kept_m: Array, reach_m: float) -> Field:
+    """Return the field that knows nothing around rejected surface points (n, 3), unless kept ones (m, 3) are near."""
+    grid, reach = field.grid, int(np.ceil(reach_m / field.grid.voxel_m)) + 1
+    near = [np.zeros(grid.shape, dtype=bool) for _ in range(2)]
+    for marks, points_m in zip(near, (rejected_m, kept_m), strict=True):
+        voxels = np.floor((points_m - grid.origin_m) / grid.voxel_m).astype(np.int64)
+        marks[tuple(np.clip(voxels, 0, grid.shape - 1).T)] = True
+    size = 2 * reach + 1
+    forgotten = maximum_filter(near[0], size=size) & np.logical_not(maximum_filter(near[1], size=size))
+    weights = np.where(forgotten, np.float32(0.0), field.weights)
+    return Field(grid, field.values_m, weights, np.argwhere(weights > 0.0))
+
+
+def enclosing(field: Field, seen: Stack, tau_m: float) -> Field:
+    """Return the field with all that is unknown decided: outside or inside.
+
+    What a view looks through or knows to be below the table is outside; the rest is parted where the surface between
+    inside and outside is smallest, as a soap film across the rims of what was seen.
+    """
+    grid = field.grid
+    stride = max(1, int(np.ceil((float(np.prod(grid.shape)) / CELLS) ** (1.0 / 3.0))))
+    blocks = -(-grid.shape // stride)
+    pad = [(0, int(n)) for n in blocks * stride - grid.shape]
+    known = np.pad((field.weights > 0.0).astype(np.float32), pad)
+    values = np.pad(np.where(field.weights > 0.0, field.values_m, 0.0), pad)
+    shares, sums = (_pooled(array, blocks, stride) for array in (known, values))
+    cell_m = stride * grid.voxel_m
+    share = np.maximum(shares, 1e-6)
+    level = np.clip(sums / share / cell_m, -1.0, 1.0).astype(np.float32)
+    empty = closing.looked_through(
+        grid.origin_m, cell_m, blocks, tau_m, seen.free_m, seen.poses, seen.lenses, seen.planes
+    )
+    sure = shares > 0.5
+    outside = ~sure & ((empty > 0) | _shell(blocks))
+    fixed = sure | outside | _shell(blocks)
+    start = np.where(sure, level, np.where(outside, 1.0, -1.0)).astype(np.float32)
+    start[_shell(blocks)] = 1.0
+    decided = closing.smallest(start, fixed, ROUNDS)
+    smooth = np.where(sure, decided, gaussian_filter(decided, 0.7))
+    # To the voxels: the centre of voxel v lies at (v + ½) / stride - ½ of a cell.
+    places = [(np.arange(int(n)) + 0.5) / stride - 0.5 for n in grid.shape]
+    made_up = np.empty(grid.shape, dtype=np.float32)
+    for x, place in enumerate(places[0]):
+        at = np.meshgrid([place], places[1], places[2], indexing="ij")
+        made_up[x] = map_coordinates(smooth, at, order=1, mode="nearest")[0] * cell_m
+    whole = np.where(field.weights > 0.0, field.values_m, made_up)
+    whole[_shell(grid.shape, OUTER)] = tau_m
+    whole[whole == 0.0] = FAINT * grid.voxel_m
+    return Field(grid, whole, np.maximum(field.weights, np.float32(FAINT)), crossed(whole))
+
+
+def tidied(
+    vertices_m: Array, triangles: surface.Triangles, shown_m: Array, voxel_m: float, passes: int
+) -> tuple[Array, surface.Triangles, BoolArray]:
+    """Return vertices (v, 3) and triangles (t, 3) without bubbles, smoothed, and which vertices (v,) views show.
+
+    Args:
+        vertices_m: (v, 3) of closed surfaces.
+        triangles: (t, 3).
+        shown_m: (n, 3) vertices of what the views show.
+        voxel_m: side of a voxel.
+        passes: of smoothing what is shown; the rest is smoothed until it spans its rims.
+    """
+    triangles = triangles[surface.solid_pieces(vertices_m, triangles)]
+    used, triangles = surface.compacted(triangles, len(vertices_m))
+    vertices_m = vertices_m[used]
+    shown = KDTree(shown_m).query(vertices_m, distance_upper_bound=voxel_m)[0] < voxel_m
+    vertices_m = surface.fair(vertices_m, triangles, passes)
+    return surface.spanned(vertices_m, triangles, ~shown, SPANNING), triangles, shown
+
+
+def _pooled(array: npt.NDArray[np.floating], blocks: npt.NDArray[np.int64], stride: int) -> npt.NDArray[np.floating]:
+    """Return the means of blocks of `stride` along each axis."""
+    x, y, z = (int(n) for n in blocks)
+    return array.reshape(x, stride, y, stride, z, stride).mean(axis=(1, 3, 5))
+
+
+def _shell(shape: npt.NDArray[np.int64], layers: int = 1) -> BoolArray:
+    """Return which cells of a grid lie in the outermost layers."""
+    shell = np.ones(shape, dtype=bool)
+    shell[layers:-layers, layers:-layers, layers:-layers] = False
+    return shell

@@ -1,0 +1,88 @@
+"""Kernels that decide what nobody saw: what views look through, and the smallest surface that closes the rest."""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from modeler.kernels.fusion import project
+
+
+@njit(cache=True, parallel=True)
+def looked_through(origin, cell_m, shape, margin_m, free_m, poses, lenses, planes):
+    """Return how many views know cells of a grid to be empty, (x, y, z) uint8.
+
+    A view knows it of what it looks through, and of what lies below the plane on which the object stands.
+
+    Args:
+        origin: (3,) lowest corner of the grid in m.
+        cell_m: side of a cell; its centre is looked at.
+        shape: (3,) cells along each axis.
+        margin_m: how far in front of the end of the empty space, and below the plane, a cell must lie.
+        free_m: (f, h, w) float32 depth up to which the space along a pixel is empty.
+        poses: (f, 3, 4) camera_from_object.
+        lenses: (f, 4) fx, fy, cx, cy.
+        planes: (f, 4) normal and offset in the object frame, NaN where no plane is seen.
+    """
+    frames, height, width = free_m.shape
+    counts = np.zeros((shape[0], shape[1], shape[2]), dtype=np.uint8)
+    for i in prange(shape[0]):
+        x = origin[0] + (i + 0.5) * cell_m
+        for j in range(shape[1]):
+            y = origin[1] + (j + 0.5) * cell_m
+            for k in range(shape[2]):
+                z = origin[2] + (k + 0.5) * cell_m
+                count = 0
+                for f in range(frames):
+                    if planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z + planes[f, 3] < -margin_m:
+                        count += 1
+                        continue
+                    u, v, depth = project(poses[f], lenses[f], x, y, z)
+                    if depth > 0.0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
+                        count += depth < free_m[f, int(v + 0.5), int(u + 0.5)] - margin_m
+                counts[i, j, k] = min(count, 255)
+    return counts
+
+
+@njit(cache=True, parallel=True)
+def smallest(start, fixed, rounds):
+    """Return a field (x, y, z) whose zero level has little area, and which keeps its fixed values.
+
+    Minimises the total variation of u in [-1, 1] (Chambolle and Pock 2011, "A first-order primal-dual algorithm",
+    algorithm 1 with θ = 1). The total variation of a field that jumps between -1 and 1 is twice the area of the jump.
+
+    Args:
+        start: (x, y, z) float32 in [-1, 1].
+        fixed: (x, y, z) bool; the outermost cells must be fixed.
+        rounds: of descent.
+    """
+    nx, ny, nz = start.shape
+    u, ahead = start.copy(), start.copy()
+    px, py, pz = np.zeros_like(start), np.zeros_like(start), np.zeros_like(start)
+    step = np.float32(1.0 / math.sqrt(12.0))  # τ σ ‖∇‖² <= 1, with ‖∇‖² <= 12 in three dimensions
+    for _ in range(rounds):
+        for i in prange(nx - 1):
+            for j in range(ny - 1):
+                for k in range(nz - 1):
+                    here = ahead[i, j, k]
+                    a = px[i, j, k] + step * (ahead[i + 1, j, k] - here)
+                    b = py[i, j, k] + step * (ahead[i, j + 1, k] - here)
+                    c = pz[i, j, k] + step * (ahead[i, j, k + 1] - here)
+                    size = a * a + b * b + c * c
+                    if size > 1.0:
+                        size = np.float32(1.0) / np.float32(math.sqrt(size))
+                        a, b, c = a * size, b * size, c * size
+                    px[i, j, k], py[i, j, k], pz[i, j, k] = a, b, c
+        for i in prange(1, nx - 1):
+            for j in range(1, ny - 1):
+                for k in range(1, nz - 1):
+                    if fixed[i, j, k]:
+                        continue
+                    divergence = (
+                        px[i, j, k] - px[i - 1, j, k] + py[i, j, k] - py[i, j - 1, k] + pz[i, j, k] - pz[i, j, k - 1]
+                    )
+                    old = u[i, j, k]
+                    new = min(np.float32(1.0), max(np.float32(-1.0), old + step * divergence))
+                    u[i, j, k] = new
+                    ahead[i, j, k] = np.float32(2.0) * new - old
+    return u
