@@ -11,6 +11,8 @@ from sequences.given import Given as Given
 from sequences.recognise import open_sequence as open_sequence
 from sequences.survey import Survey as Survey
 from sequences.survey import survey as survey
+from sequences.watch import Patience as Patience
+from sequences.watch import watch as watch
 
 
 def bundled(name: str) -> Path:

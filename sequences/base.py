@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -79,6 +79,15 @@ class AbstractSequence(ABC):
     def notes(self) -> tuple[str, ...]:
         """What the reader assumed, or left out, that somebody should know; a sentence each."""
         return ()
+
+    @property
+    def live(self) -> bool:
+        """Whether more frames come than `indices` tells, so that iterating takes as long as they take to come."""
+        return False
+
+    def until(self, stop: Callable[[], bool]) -> AbstractSequence:
+        """Return the sequence that, where it is live, ends as soon as `stop` says so."""
+        return self
 
     def __len__(self) -> int:
         """Return the number of frames."""

@@ -19,13 +19,17 @@ class Build:
     """
 
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SEQUENCE")]
-    """BOP scene folder: depth/, scene_camera.json, optionally rgb/, mask_visib/, sequence.json."""
+    """BOP scene, TUM RGB-D, Open3D or BundleSDF folder, organised clouds, or a ROS bag; see `modeler info`."""
     out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
     """Run folder to make: model.ply, cloud.ply, trajectory.txt, graph.g2o, report.json, recording.rrd and more."""
     overwrite: bool = False
     """Replace the results of an earlier run in the folder."""
     resume: bool = False
     """Go on with an interrupted run of the same options: pairs that it has registered are not registered again."""
+    watch: bool = False
+    """Another program is still writing into SEQUENCE: take the frames as they come."""
+    idle_s: Annotated[float, tyro.conf.arg(metavar="S")] = 10.0
+    """With --watch: the sequence is over when nothing has come for so long (or a file `done` has, or after Ctrl-C)."""
     view: bool = False
     """Watch in the Rerun viewer."""
     web: bool = False

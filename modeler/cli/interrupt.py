@@ -49,6 +49,11 @@ class Interrupt:
         """Hand Ctrl-C back."""
         signal.signal(signal.SIGINT, self._before)
 
+    @property
+    def asked(self) -> bool:
+        """Whether Ctrl-C was pressed."""
+        return self._asked
+
     def until(self, items: Iterable[T]) -> Iterator[T]:
         """Yield items until Ctrl-C."""
         for item in items:

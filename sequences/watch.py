@@ -1,0 +1,218 @@
+"""A folder that another program is still writing frames into."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import final
+
+from modeler.types import Array, Frame, InputError
+from sequences.base import AbstractSequence
+from sequences.given import Given
+from sequences.recognise import open_sequence
+from sequences.survey import survey
+
+END = "done"
+"""A file of this name in the folder says that no frame will follow."""
+POLL_S = 0.05
+"""How often the folder is looked at."""
+
+
+@final
+@dataclass(frozen=True)
+class Patience:
+    """How long to wait for what."""
+
+    idle_s: float = 10.0
+    """When nothing has come for so long, the sequence is over."""
+    settle_s: float = 0.5
+    """The newest frame is taken once the folder has not changed for so long: its colour and mask may come late."""
+    first: int = 3
+    """So many frames are awaited before anything is said of the sequence."""
+
+
+@final
+@dataclass(frozen=True)
+class WatchedSequence(AbstractSequence):
+    """The frames in a folder, and those that will come, each once it is complete.
+
+    What is not iterated over, such as `indices` and `name`, is as it was when the sequence was opened.
+    """
+
+    path: Path
+    """The folder, in any layout of pictures."""
+    seen: AbstractSequence
+    """What was there when it was opened."""
+    given: Given = field(default_factory=Given)
+    """What a person says of it."""
+    patience: Patience = field(default_factory=Patience)
+    """How long to wait."""
+    every: int = 1
+    """Keep the first frame and every so many-th after it."""
+    kept: slice = field(default_factory=lambda: slice(None, None))
+    """Keep these frame numbers."""
+    stop: Callable[[], bool] = lambda: False
+    """Asked while waiting: whether to come to an end."""
+
+    @property
+    def name(self) -> str:
+        """What the sequence is called."""
+        return self.seen.name
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Frame numbers so far."""
+        wanted = [index for index in self.seen.indices if self._wants(index)]
+        return tuple(wanted[:: self.every])
+
+    @property
+    def live(self) -> bool:
+        """True: more frames come."""
+        return True
+
+    def frame(self, index: int) -> Frame:
+        """Return a frame that was there when the sequence was opened."""
+        return self.seen.frame(index)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield each frame when it is complete, until none has come for a while.
+
+        Raises:
+            InputError: where what is there when it ends cannot be read.
+        """
+        wanted = -1
+        for frame in arriving(self.path, self.given, self.patience, self.stop):
+            if self.kept.stop is not None and frame.index >= self.kept.stop:
+                return
+            if not self._wants(frame.index):
+                continue
+            wanted += 1
+            if wanted % self.every == 0:
+                yield frame
+
+    def until(self, stop: Callable[[], bool]) -> WatchedSequence:
+        """Return the sequence that ends when it is asked to."""
+        return replace(self, stop=stop)
+
+    def select(self, every: int = 1, frames: slice | None = None) -> WatchedSequence:
+        """Return a part of the sequence, of what has come and of what will.
+
+        Raises:
+            InputError: where `every` keeps nothing.
+        """
+        if every < 1:
+            raise InputError(f"--every {every} keeps no frame; give a whole number of at least 1.")
+        return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
+
+    def truth(self) -> dict[int, Array] | None:
+        """Return the true poses of the frames that were there when it was opened."""
+        return self.seen.truth()
+
+    def sensor(self) -> tuple[float, float] | None:
+        """Return the sensor's noise `(sigma_wh, sigma_r_m)`; None where the sequence does not say."""
+        return self.seen.sensor()
+
+    @property
+    def motion(self) -> Mapping[str, object] | None:
+        """What is known of the motion; None where nothing is."""
+        return self.seen.motion
+
+    @property
+    def robot_path(self) -> Path | None:
+        """The trajectory of the hand that holds the object; None where there is none."""
+        return self.seen.robot_path
+
+    @property
+    def model_path(self) -> Path | None:
+        """The true surface as a mesh in m; None where it is not known."""
+        return self.seen.model_path
+
+    @property
+    def layout(self) -> str:
+        """What the sequence is stored as."""
+        return f"{self.seen.layout}, being written"
+
+    @property
+    def depth_unit(self) -> str:
+        """What one unit of stored depth is."""
+        return self.seen.depth_unit
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the reader assumed, or left out."""
+        return self.seen.notes
+
+    def _wants(self, index: int) -> bool:
+        low, high = self.kept.start, self.kept.stop
+        return (low is None or index >= low) and (high is None or index < high)
+
+
+def arriving(path: Path, given: Given, patience: Patience, stop: Callable[[], bool]) -> Iterator[Frame]:
+    """Yield frames of ascending numbers, each once it is complete, until none has come for a while.
+
+    Raises:
+        InputError: where what is there when it ends cannot be read.
+    """
+    last, state = -1, None
+    came_s = changed_s = time.monotonic()
+    while not stop():
+        now, before, state = time.monotonic(), state, _state(path)
+        changed_s = changed_s if state == before else now
+        ended = (path / END).exists()
+        settled = ended or now - changed_s >= patience.settle_s
+        fault = None
+        try:
+            for frame in _after(last, path, given, with_newest=settled):
+                yield frame
+                last, came_s = frame.index, time.monotonic()  # which the taker may have spent long with
+                if stop():
+                    return
+        except InputError as error:
+            fault = error  # half-written, perhaps
+        if time.monotonic() - max(came_s, changed_s) >= patience.idle_s or (ended and settled):
+            if fault is not None:
+                raise fault
+            return
+        time.sleep(POLL_S)
+
+
+def watch(path: str | Path, given: Given | None = None, patience: Patience | None = None) -> WatchedSequence:
+    """Wait for the first frames in a folder, which need not be there yet, and return the sequence that they begin.
+
+    Raises:
+        InputError: where no readable frame comes in time.
+    """
+    path, given, patience = Path(path), given or Given(), patience or Patience()
+    first: list[int] = []
+    for frame in arriving(path, given, patience, lambda: len(first) == patience.first):
+        first.append(frame.index)
+    if not first:
+        raise InputError(f"{path}: no frame has come in {patience.idle_s:g} s; start the program that writes them.")
+    seen = open_sequence(path, given).select(frames=slice(None, first[-1] + 1))
+    survey(seen, truth=False)
+    return WatchedSequence(path, seen, given, patience)
+
+
+def _after(last: int, path: Path, given: Given, *, with_newest: bool) -> Iterator[Frame]:
+    """Read the frames whose numbers follow `last`."""
+    sequence = open_sequence(path, given)
+    indices = sequence.indices if with_newest else sequence.indices[:-1]
+    return (sequence.frame(index) for index in indices if index > last)
+
+
+def _state(path: Path) -> object:
+    """Return what changes when a file in a folder or in one of its folders is made, grows or goes."""
+    found = []
+    try:
+        for entry in os.scandir(path):
+            status = entry.stat()
+            found.append((entry.name, status.st_mtime_ns, status.st_size))
+            if entry.is_dir():
+                newest = max((inner.stat().st_mtime_ns for inner in os.scandir(entry.path)), default=0)
+                found.append((entry.name, newest, 0))
+    except OSError:
+        pass  # something went away between two looks
+    return sorted(found)

@@ -1,0 +1,141 @@
+"""Frames taken while another program writes them."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import small_frames, write_bundlesdf, write_tum
+
+from modeler.types import Frame, InputError
+from sequences import BopSequence, Patience, open_sequence, watch, write_bop
+
+QUICK = Patience(idle_s=1.0, settle_s=0.2, first=2)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return small_frames(5)
+
+
+@pytest.fixture
+def writing() -> Iterator[Callable[[Callable[[], None]], None]]:
+    """Return what runs a function beside the test, and make sure that it comes to an end."""
+    threads: list[threading.Thread] = []
+
+    def start(target: Callable[[], None]) -> None:
+        threads.append(threading.Thread(target=target))
+        threads[-1].start()
+
+    yield start
+    for thread in threads:
+        thread.join(timeout=20)
+        assert not thread.is_alive()
+
+
+def copy_in_halves(source: Path, target: Path) -> None:
+    """Write a file as slow programs do: half of it first."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    content = source.read_bytes()
+    with target.open("wb") as file:
+        file.write(content[: len(content) // 2])
+        file.flush()
+        time.sleep(0.03)
+        file.write(content[len(content) // 2 :])
+
+
+def test_frames_are_taken_whole_as_they_come(
+    tmp_path: Path, frames: list[Frame], writing: Callable[[Callable[[], None]], None]
+) -> None:
+    """Depth first, then mask and colour, the camera entries last, every file in two halves."""
+    done, live = tmp_path / "done", tmp_path / "live"
+    write_bop(done, frames, depth_scale_mm=1.0)
+
+    def write() -> None:
+        time.sleep(0.1)  # the folder is not there yet
+        for index in range(len(frames)):
+            copy_in_halves(done / "depth" / f"{index:06d}.png", live / "depth" / f"{index:06d}.png")
+            copy_in_halves(done / "rgb" / f"{index:06d}.png", live / "rgb" / f"{index:06d}.png")
+            name = f"{index:06d}_000000.png"
+            copy_in_halves(done / "mask_visib" / name, live / "mask_visib" / name)
+            copy_in_halves(done / "scene_camera.json", live / "scene_camera.json")
+
+    writing(write)
+    sequence = watch(live, patience=QUICK)
+    assert sequence.live
+    assert 2 <= len(sequence) <= len(frames)
+    taken = list(sequence)
+    assert [frame.index for frame in taken] == [0, 1, 2, 3, 4]
+    for read, wrote in zip(taken, frames, strict=True):
+        np.testing.assert_allclose(read.depth_m, wrote.depth_m, atol=1e-6)
+        np.testing.assert_array_equal(read.mask, wrote.mask)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(read.colour, wrote.colour)  # type: ignore[arg-type]
+
+
+def test_a_list_that_grows_is_followed(
+    tmp_path: Path, frames: list[Frame], writing: Callable[[Callable[[], None]], None]
+) -> None:
+    write_tum(tmp_path / "s", frames)
+    lines = (tmp_path / "s" / "depth.txt").read_text().splitlines()
+
+    def write() -> None:
+        for count in range(4, len(lines) + 1):
+            (tmp_path / "s" / "depth.txt").write_text("\n".join(lines[:count]))
+            time.sleep(0.15)
+        (tmp_path / "s" / "done").touch()
+
+    (tmp_path / "s" / "depth.txt").write_text("\n".join(lines[:4]))
+    writing(write)
+    began = time.monotonic()
+    sequence = watch(tmp_path / "s", patience=Patience(idle_s=15.0, settle_s=0.05, first=2))
+    assert [frame.index for frame in sequence] == [0, 1, 2, 3, 4]
+    assert time.monotonic() - began < 10.0  # `done` ends it, not patience
+
+
+def test_what_was_there_before_comes_first_and_selection_holds(tmp_path: Path, frames: list[Frame]) -> None:
+    write_bundlesdf(tmp_path / "s", frames)
+    (tmp_path / "s" / "done").touch()
+    sequence = watch(tmp_path / "s", patience=QUICK)
+    assert [frame.index for frame in sequence.select(every=2)] == [0, 2, 4]
+    assert [frame.index for frame in sequence.select(frames=slice(1, 4)).select(every=2)] == [1, 3]
+    assert sequence.select(every=2).indices == (0,)  # of the two that were awaited
+    assert sequence.name == "s"
+    assert "being written" in sequence.layout
+    with pytest.raises(InputError, match="at least 1"):
+        sequence.select(every=0)
+
+
+def test_it_ends_when_asked(tmp_path: Path, frames: list[Frame]) -> None:
+    write_bop(tmp_path / "s", frames)
+    sequence = watch(tmp_path / "s", patience=Patience(idle_s=60.0, settle_s=0.0, first=1))
+    taken: list[int] = []
+    for frame in sequence.until(lambda: len(taken) == 2):
+        taken.append(frame.index)
+    assert taken == [0, 1]
+
+
+def test_an_ordinary_sequence_is_not_live(tmp_path: Path, frames: list[Frame]) -> None:
+    write_bop(tmp_path / "s", frames)
+    sequence = open_sequence(tmp_path / "s")
+    assert isinstance(sequence, BopSequence)
+    assert not sequence.live
+    assert sequence.until(lambda: True) is sequence
+
+
+def test_nothing_or_nothing_readable_is_one_line(tmp_path: Path, frames: list[Frame]) -> None:
+    brief = Patience(idle_s=0.3, settle_s=0.05, first=2)
+    with pytest.raises(InputError, match="no such folder"):
+        watch(tmp_path / "nowhere", patience=brief)
+    write_bop(tmp_path / "s", frames)
+    (tmp_path / "s" / "depth" / "000001.png").write_bytes(b"\x89PNG half")
+    with pytest.raises(InputError, match=r"000001\.png: is not a readable"):
+        watch(tmp_path / "s", patience=brief)
+    shutil.rmtree(tmp_path / "s" / "depth")
+    (tmp_path / "s" / "depth").mkdir()
+    with pytest.raises(InputError, match="holds no depth image"):
+        watch(tmp_path / "s", patience=brief)
