@@ -13,6 +13,7 @@ from modeler.cli.build import Build
 from modeler.cli.console import Console
 from modeler.cli.interrupt import Interrupt
 from modeler.cli.remembered import Remembered
+from modeler.cli.watching import watched
 from modeler.export import RunFolder, RunMeta
 from modeler.types import InputError
 from sequences import AbstractSequence, frame_range, survey
@@ -28,14 +29,17 @@ def build(options: Build) -> int:
     if options.resume and options.overwrite:
         raise InputError("--resume keeps what --overwrite deletes; give one of them")
     began = time.perf_counter()
-    whole = compose.open_sequence(options.sequence)
+    path = options.sequence
+    whole = watched(path, options.idle_s) if options.watch else compose.open_sequence(path)
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
-    survey(frames, truth=False)  # what cannot be read is found before anything is made
+    if not frames.live:
+        survey(frames, truth=False)  # what cannot be read is found before anything is made
     modeler = compose.modeler(whole, options.prior, options.method, options.where)
+    prior, remark = compose.told_prior(options.prior, whole)
     meta = RunMeta(
         sequence=str(options.sequence),
         seed=options.method.seed,
-        prior=options.prior.prior,
+        prior=prior,
         settings=options.settings(),
         closure_expected=_comes_back(frames, modeler.closer.max_angle_deg),
     )
@@ -51,11 +55,13 @@ def build(options: Build) -> int:
         connect=options.connect,
         facts={"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings},
     )
+    if remark:
+        print(f"modeler: {remark}", file=sys.stderr)
     seconds = {"scene": time.perf_counter() - began, "registration": 0.0, "total": 0.0}
     report: Mapping[str, Any] = {}
     try:
         with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
-            for step in modeler.run(interrupt.until(frames), scene):
+            for step in modeler.run(interrupt.until(frames.until(lambda: interrupt.asked)), scene):
                 seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
                 seconds["total"] = time.perf_counter() - began
                 meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)

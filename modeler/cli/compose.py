@@ -6,11 +6,11 @@ from pathlib import Path
 
 import sequences
 from modeler import registration
+from modeler.cli import nonvisual
 from modeler.cli.options import Method, MethodOptions, ObjectOptions, PriorOptions
 from modeler.closure import Closer
 from modeler.fusion import Fuser
 from modeler.pipeline import Modeler
-from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import AbstractPrior, AbstractRegistrar, InputError
@@ -34,7 +34,7 @@ def modeler(
     return Modeler(
         segmenter=segmenter(where),
         sensor=Sensor() if noise is None else Sensor(*noise),
-        prior=prior(prior_options),
+        prior=prior(prior_options, sequence),
         registrar=registrar(method.method),
         closer=Closer(),
         fuser=Fuser(),
@@ -63,17 +63,19 @@ def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
     return modeler.segmenter.scene([sequence.frame(index) for index in telling(sequence.indices)])
 
 
-def prior(options: PriorOptions) -> AbstractPrior:
-    """Return the prior asked for.
+def prior(options: PriorOptions, sequence: AbstractSequence | None = None) -> AbstractPrior:
+    """Return the prior asked for, or that `sequence.json` asks for.
 
     Raises:
-        InputError: where a parameter cannot be used.
+        InputError: where there is no such prior, a parameter cannot be used, or the sequence lacks what it needs.
     """
-    match options.prior:
-        case "general":
-            return GeneralPrior(**options.given("max_rotation_deg", "max_offset_m"))
-        case "table":
-            return TablePrior(**options.given("max_rotation_deg", "max_shift_m"))
+    return nonvisual.prior(options, sequence)
+
+
+def told_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
+    """Return the name of the prior, and a remark for the user where it was the sequence that chose it."""
+    name = nonvisual.prior_name(options, sequence)
+    return name, "" if options.prior is not None or name == "general" else f"prior {name}, as sequence.json says"
 
 
 def registrar(method: Method) -> AbstractRegistrar:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import get_args
 
 from modeler import experiment
@@ -26,16 +27,18 @@ def evaluate(options: Evaluate) -> int:
         raise InputError("no sequence to evaluate; name at least one folder")
     if options.points is not None and options.points < 1:
         raise InputError(f"--points {options.points} leaves nothing; give a whole number from 1 on")
+    kept = frame_range(options.selection.frames)
+    recorded = [compose.open_sequence(path).select(options.selection.every, kept) for path in options.sequences]
+    # Tables are compared with each other: all sequences have the same prior, `general` if none is asked for.
+    prior = replace(options.prior, prior=options.prior.prior or "general")
     plan = Experiment(
         methods=_methods(options.methods),
-        prior=compose.prior(options.prior),
+        prior=compose.prior(prior, recorded[0] if len(recorded) == 1 else None),
         pairing=Pairing(_offsets(options.offsets), both_ways=options.both_ways, closed=options.closed),
         segmenter=compose.segmenter(options.where),
         points=options.points,
         seed=compose.seed(options.seed),
     )
-    kept = frame_range(options.selection.frames)
-    recorded = [compose.open_sequence(path).select(options.selection.every, kept) for path in options.sequences]
     with bar() as progress:
         task = progress.add_task("", total=sum(plan.size(sequence) for sequence in recorded))
         rows = experiment.evaluate(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Collection
 from dataclasses import dataclass, fields
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -35,41 +35,100 @@ class ObjectOptions:
     """Take nothing farther away than this for the object."""
 
 
+_Three = tuple[float, float, float]
+
+
 @dataclass(frozen=True)
 class PriorOptions:
     """What is known of the motion between two frames."""
 
-    prior: Literal["general", "table"] = "general"
-    """general: any motion within limits of rotation and shift. table: the object stays on the table it stands on."""
+    prior: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME[+NAME]"), _default("as sequence.json says, else general")
+    ] = None
+    """general: any motion within limits of rotation and shift. table: the object stays on the table it stands on.
+    turntable: it turns by a commanded step about one axis. held: a robot's hand carries it (robot.txt). poke: somebody
+    pushes it along the table. Guesses that only tell where to look: velocity, the motion goes on; axes, long objects
+    stay aligned; features, matching shape. What is joined by + holds together: held+table, features+table."""
     max_rotation_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), _default("50")] = None
     """Largest rotation between two frames (general, table)."""
     max_offset_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("0.04")] = None
-    """Largest distance between the centroids of what two frames see (general)."""
+    """Largest distance between the centroids of what two frames see (general, held)."""
     max_shift_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("0.05")] = None
-    """Largest shift of the object on the table (table)."""
+    """Largest shift of the object on the table, or across the axis (table, turntable)."""
+    step_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), _default("as sequence.json says")] = None
+    """Turn from one frame number to the next, right-handed about the axis, which points up (turntable)."""
+    step_sigma_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), _default("1")] = None
+    """Standard deviation of one step (turntable)."""
+    step_sign: Annotated[
+        Literal["known", "unknown"] | None,
+        _default("known if the step is negative, or the axis or sequence.json given"),
+    ] = None
+    """Whether the sign of the step is meant, or the table may turn either way (turntable)."""
+    axis_direction: Annotated[
+        _Three | None, tyro.conf.arg(metavar="X Y Z"), _default("normal to the table where one is seen, else about up")
+    ] = None
+    """Direction of the axis in camera coordinates: x right, y down, z forward (turntable)."""
+    axis_point_m: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), _default("anywhere")] = None
+    """A point of the axis in camera coordinates (turntable)."""
+    axis_sigma_deg: Annotated[
+        float | None, tyro.conf.arg(metavar="DEG"), _default("1 if given, the plane's if seen, else 30 about up")
+    ] = None
+    """Standard deviation of the axis' direction; 180: any direction (turntable)."""
+    axis_sigma_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("0.005")] = None
+    """Standard deviation of the axis' point (turntable)."""
+    held_sigma_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), _default("3")] = None
+    """Standard deviation of slip and calibration error in the rotation of one motion, about each axis (held)."""
+    held_sigma_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("0.008")] = None
+    """Standard deviation of slip and calibration error in the shift of one motion, along each axis (held)."""
+    max_gap_s: Annotated[float | None, tyro.conf.arg(metavar="S"), _default("1")] = None
+    """Poses of the hand farther apart in time than this are not interpolated (held)."""
+    poke_point_m: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), _default("as sequence.json says")] = None
+    """Where the finger touches the object before it pushes, in camera coordinates (poke)."""
+    poke_direction: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), _default("as sequence.json says")] = None
+    """Which way the finger moves, in camera coordinates (poke)."""
+    poke_length_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("as sequence.json says")] = None
+    """How far the finger pushes (poke)."""
+    velocity_sigma_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), _default("5")] = None
+    """Standard deviation of the change of rotation from one motion to the next, about each axis (velocity)."""
+    velocity_sigma_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("0.01")] = None
+    """Standard deviation of the change of shift from one motion to the next, along each axis (velocity)."""
 
-    def given(self, *accepted: str) -> dict[str, float]:
+    def given(self, name: str, accepted: Collection[str]) -> dict[str, Any]:
         """Return the parameters that were given, by field name.
 
         Args:
-            accepted: names of the parameters that the prior has.
+            name: the prior's.
+            accepted: names of the parameters that it has.
 
         Raises:
             InputError: where a parameter of another prior was given, or a value that is none.
         """
         from modeler.types import InputError
 
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "prior"}
-        given = {name: value for name, value in values.items() if value is not None}
-        for name in given.keys() - set(accepted):
-            raise InputError(
-                f"{_flag(name)} is no parameter of --prior {self.prior}; leave it out or change the prior."
-            )
-        for name, value in given.items():
-            if not 0.0 < value < math.inf or (name == "max_rotation_deg" and value > 180.0):
-                limit = "at most 180" if name == "max_rotation_deg" else "finite"
-                raise InputError(f"{_flag(name)} {value:g} is out of range; give a positive number, {limit}.")
+        given = self.parameters()
+        for parameter in sorted(given.keys() - set(accepted)):
+            raise InputError(f"{_flag(parameter)} is no parameter of --prior {name}; leave it out or change the prior.")
+        for parameter, value in given.items():
+            most = 180.0 if parameter.endswith("_deg") else 1e4
+            if isinstance(value, str):
+                continue
+            if isinstance(value, tuple):
+                if not all(abs(number) <= 100.0 for number in value) or not (parameter.endswith("_m") or any(value)):
+                    told = " ".join(f"{number:g}" for number in value)
+                    raise InputError(f"{_flag(parameter)} {told} is out of range; give three numbers, not all 0.")
+            elif parameter == "step_deg":
+                if not 0.0 < abs(value) <= 360.0:
+                    raise InputError(f"--step-deg {value:g} is out of range; give a turn of -360 to 360, but not 0.")
+            elif not 0.0 < value <= most:
+                raise InputError(
+                    f"{_flag(parameter)} {value:g} is out of range; give a positive number, at most {most:g}."
+                )
         return given
+
+    def parameters(self) -> dict[str, Any]:
+        """Return all parameters that were given, by field name."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "prior"}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 Method = Literal["visibility", "paper", "icp", "gicp", "fpfh", "fpfh-icp"]

@@ -50,5 +50,7 @@ class Register:
         edge = Edge(posterior, "odometry", posterior.usable, posterior.outcome.advice)
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}
         print(json.dumps(record, allow_nan=False))
-        print(f"modeler: {posterior.outcome.label} after {posterior.seconds:.2f} s", file=sys.stderr)
+        _, remark = compose.told_prior(self.prior, sequence)
+        said = [f"{posterior.outcome.label} after {posterior.seconds:.2f} s", *([remark] if remark else [])]
+        print(f"modeler: {'; '.join(said)}", file=sys.stderr)
         return 0 if posterior.usable else 3
