@@ -101,3 +101,16 @@ def silhouette_distance(mask):
     rows, columns = np.nonzero(mask)
     grid = np.indices(mask.shape)
     return np.sqrt(((grid[:, :, :, None] - np.stack([rows, columns])[:, None, None, :]) ** 2).sum(axis=0).min(axis=-1))
+
+
+def point_to_plane_equations(found, centre_m):
+    """Twin of `kernels.matching.normal_equations` for the rows of `kernels.matching.matches` under one pose."""
+    gradient, matrix = np.zeros(6), np.zeros((6, 6))
+    for row in found:
+        position, own, other, residual, weight = row[:3], row[3:6], row[6:9], row[9], row[10]
+        if weight > 0.0:
+            normal = 0.5 * (own + other)
+            derivative = np.concatenate([np.cross(position - centre_m, normal), normal])
+            gradient -= weight * residual * derivative
+            matrix += weight * np.outer(derivative, derivative)
+    return gradient, matrix

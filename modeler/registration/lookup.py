@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from modeler.kernels import matching
 from modeler.kernels import visibility as kernel
 from modeler.types import Array, RayImage
 
@@ -48,6 +49,17 @@ class Lookup:
     def matched_residuals(self, pose: Array, blur_m: float) -> Array:
         """Return squared distances (k,) in m² of matching points beyond their own variance, under one pose (12,)."""
         return kernel.matched_residuals(pose, self._columns, self._cells, self._intrinsics, self._model(blur_m))
+
+    def matches(self, pose: Array, surface_m: float) -> Array:
+        """Return what each point finds under one pose (12,): `kernels.matching.matches`."""
+        return matching.matches(pose, self._columns, self._cells, self._intrinsics, np.array(FACING), surface_m)
+
+    def normal_equations(self, poses: Array, centres_m: Array, surface_m: float) -> Array:
+        """Return the normal equations (m, 27) of matching points under poses (m, 12) about centres (m, 3)."""
+        facing = np.array(FACING)
+        return matching.normal_equations(
+            poses, centres_m, self._columns, self._cells, self._intrinsics, facing, surface_m
+        )
 
     @property
     def _columns(self) -> Array:

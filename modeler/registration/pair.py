@@ -31,7 +31,7 @@ class Pair:
         With `lead` it leans towards poses where surface with relief matches, so that blurred levels do not settle for
         the many poses that merely contradict nothing.
         """
-        stride = 1 if blur_m < 0.003 else 2 if blur_m < 0.006 else 4  # blunt comparisons need fewer points
+        stride = 2 if blur_m < 0.003 else 4 if blur_m < 0.006 else 8  # blunt comparisons need fewer points
         weight = stride * self.effective_points / (len(self.forward.points) + len(self.backward.points))
 
         forward, backward = self.forward.at(blur_m, stride, lead=lead), self.backward.at(blur_m, stride, lead=lead)

@@ -10,6 +10,7 @@ from modeler.registration.annealing import AnnealedSampler, Level, Population
 from modeler.registration.lookup import Lookup
 from modeler.registration.pair import Pair
 from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
+from modeler.registration.refinement import Refiner
 from modeler.registration.surface import measured_share, relief_m, spread_points
 from modeler.types import AbstractMotion, AbstractRegistrar, Outcome, PoseGaussian, Posterior, RayImage
 
@@ -22,7 +23,7 @@ class VisibilityRegistrar(AbstractRegistrar):
     neighbouring points err alike, and sampled by annealing from a blurred likelihood to the sharp one.
     """
 
-    points: int = 300
+    points: int = 600
     """Surface points taken from each view."""
     effective_points: float = 40.0
     """Number of independent measurements that the points of both views together are worth."""
@@ -46,6 +47,8 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Cost (nats) of normals at right angles."""
     sampler: AnnealedSampler = field(default_factory=AnnealedSampler)
     """How the posterior is explored."""
+    refiner: Refiner = field(default_factory=Refiner)
+    """How samples are sharpened by the surface that matches."""
     min_points: int = 60
     """Fewer surface points than this in a view are not registered."""
     min_overlap: float = 0.35
@@ -78,17 +81,20 @@ class VisibilityRegistrar(AbstractRegistrar):
         levels: list[Level] = [partial(pair.level, blur_m) for blur_m in self.blurs_m]
         levels.append(lambda poses: pair.level(pair.surface_noise_m(poses, self.blurs_m[-1]), poses, lead=False))
         population = sampler.run(motion, levels, source.centroid_m, rng)
-        weights = np.full(len(population.poses), 1.0 / len(population.poses))
-        pose = weighted_gaussian(population.poses, weights, source.centroid_m)
-        overlap = pair.overlap(pose.mean)
         at_limit = share_at_limit(motion, population.poses, source.centroid_m, rng)
+        refined = self.refiner.refine(pair, population.poses, rng, fine_m=self.blurs_m[-1])
+        inside = np.isfinite(motion.log_density(refined))
+        samples = np.where(inside[:, None, None], refined, population.poses)
+        weights = np.full(len(samples), 1.0 / len(samples))
+        pose = weighted_gaussian(samples, weights, source.centroid_m)
+        overlap = pair.overlap(pose.mean)
         return Posterior(
             source=source.index,
             target=target.index,
             pose=pose,
             outcome=self._outcome(population, pose, overlap, at_limit=at_limit),
             overlap=overlap,
-            samples=population.poses,
+            samples=samples,
             weights=weights,
             effective_samples=population.effective_samples,
             pareto_k=population.pareto_k,

@@ -1,0 +1,175 @@
+"""What matching surface says of the motion, and how sure it is: sharpens samples where it says much.
+
+A likelihood that multiplies hundreds of points is too sure of what they have in common, so that the sampled one is
+tempered: right for what the images hardly determine, far too wide for what they determine well. There the classical
+way is exact: point-to-plane equations, and the covariance of their solution from how the equations scatter between
+patches of the surface (Godambe 1960: sensitivity J, variability V, information J V⁻¹ J).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeler import se3
+from modeler.kernels import matching
+from modeler.registration.lookup import Lookup
+from modeler.registration.pair import Pair
+from modeler.registration.posterior import rows
+from modeler.types import Array
+
+_UPPER = np.triu_indices(6)
+
+
+@dataclass(frozen=True)
+class Refiner:
+    """Moves each sample of a tempered posterior to where matching surface and the sample together put it."""
+
+    halvings: int = 5
+    """The surface is cut in two so many times: 2⁵ patches, whose errors are taken to be independent."""
+    min_matches: float = 6.0
+    """A patch holds at least so many matching points; with fewer in all, there are fewer patches."""
+    min_patches: int = 16
+    """With fewer patches than this nothing is refined: the scatter of six equations would not be known."""
+    caution: float = 2.0
+    """By so many standard errors the sensitivity is lowered, so that noise does not pass for knowledge."""
+
+    def refine(self, pair: Pair, poses: Array, rng: np.random.Generator, *, fine_m: float) -> Array:
+        """Return the refined samples (n, 4, 4): those of posterior × matching surface, if both were Gaussian.
+
+        Each sample takes its own Gauss-Newton step, as far as the surface is surer than the samples' spread, and a
+        share of the surface's uncertainty (randomised maximum likelihood: Oliver, He and Reynolds 1996). Where the
+        surface says nothing, about the axis of a can, samples stay as they are.
+
+        Args:
+            pair: the two views.
+            poses: (n, 4, 4) samples of target_from_source.
+            rng: source of all randomness.
+            fine_m: least blur in m at which surfaces are told apart.
+        """
+        centre_m = pair.backward.image.centroid_m
+        centre = se3.translation(centre_m)
+        mean = se3.mean(poses @ centre, np.full(len(poses), 1.0 / len(poses)))[0] @ se3.inverse(centre)
+        xi = se3.log(se3.inverse(mean @ centre) @ poses @ centre)
+        covariance = xi.T @ xi / len(xi) + np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
+        spread = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+        mode, noise_m = _mode(pair, mean, spread, centre_m, fine_m=fine_m)
+        basis, information = self._information(pair, mode, noise_m, spread, centre_m)
+        scales, axes = np.linalg.eigh(information)
+        root = axes * np.sqrt(np.maximum(scales, 0.0))
+        narrowed = np.linalg.inv(np.eye(6) + information)
+        to_basis = np.linalg.inv(basis)
+        step = _steps(pair, poses, noise_m, spread, centre_m) @ to_basis.T @ information
+        scatter = rng.normal(size=(len(poses), 6)) @ root.T
+        moved = (step + scatter) @ narrowed.T @ basis.T
+        return poses @ centre @ se3.exp(moved) @ se3.inverse(centre)
+
+    def _information(
+        self, pair: Pair, mode: Array, noise_m: float, spread: Array, centre_m: Array
+    ) -> tuple[Array, Array]:
+        """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) about the coordinates in it."""
+        places, by_own, by_other, residuals, weights = _equations(pair, mode, noise_m, centre_m)
+        halvings = min(self.halvings, int(np.log2(max(len(places) / self.min_matches, 1.0))))
+        if 2**halvings < self.min_patches:
+            return spread, np.zeros((6, 6))
+        by_own, by_other = by_own @ spread, by_other @ spread
+        # The noise of either surface's normals would add up in its own square; in their product it averages out.
+        products = 0.5 * weights[:, None, None] * (by_own[:, :, None] * by_other[:, None, :])
+        sensitivity, axes = np.linalg.eigh((products + products.transpose(0, 2, 1)).sum(axis=0))
+        patches, count = _patches(places, halvings), 2**halvings
+        scores, parts = np.zeros((count, 6)), np.zeros((count, 6))
+        np.add.at(scores, patches, 0.5 * (by_own + by_other) @ axes * (weights * residuals)[:, None])
+        np.add.at(parts, patches, (by_own @ axes) * (by_other @ axes) * weights[:, None])
+        variability = scores.T @ scores * count / (count - 1.0)
+        error = np.std(parts, axis=0, ddof=1) * np.sqrt(count)
+        sure = np.diag(np.maximum(sensitivity - self.caution * error, 0.0))
+        variability += 1e-9 * max(np.trace(variability), 1e-300) * np.eye(6)
+        information = sure @ np.linalg.solve(variability, sure)
+        return spread @ axes, np.asarray(0.5 * (information + information.T), dtype=np.float64)
+
+
+def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: float) -> tuple[Array, float]:
+    """Return where matching surface and the spread (6, 6) of the samples about their mean settle, and the noise."""
+    precision = np.linalg.inv(spread @ spread.T)
+    centre = se3.translation(centre_m)
+    pose, noise_m = start, pair.surface_noise_m(start[None], fine_m)
+    for _ in range(8):
+        gradient, matrix = _normal_equations(pair, pose[None], noise_m, centre_m)
+        away = se3.log(se3.inverse(start @ centre) @ pose @ centre)
+        step = np.linalg.solve(matrix[0] + precision, gradient[0] - precision @ away)
+        pose = pose @ centre @ se3.exp(step) @ se3.inverse(centre)
+        noise_m = pair.surface_noise_m(pose[None], fine_m)
+        if np.abs(step).max() < 1e-6:
+            break
+    return pose, noise_m
+
+
+def _steps(pair: Pair, poses: Array, noise_m: float, spread: Array, centre_m: Array) -> Array:
+    """Return the Gauss-Newton steps (n, 6) of motions, held by the samples' spread where nothing else holds them."""
+    gradient, matrix = _normal_equations(pair, poses, noise_m, centre_m)
+    held = matrix + np.linalg.inv(spread @ spread.T)
+    return np.asarray(np.linalg.solve(held, gradient[:, :, None])[:, :, 0], dtype=np.float64)
+
+
+def _normal_equations(pair: Pair, poses: Array, noise_m: float, centre_m: Array) -> tuple[Array, Array]:
+    """Return gradients (n, 6) and matrices (n, 6, 6) for ξ of target_from_source (n, 4, 4) about a centre.
+
+    Carried forward, a point moves by (R ω, R v) about the carried centre; carried back, by -ξ about the centre.
+    """
+    rotation = poses[:, :3, :3]
+    carried_m = rotation @ centre_m + poses[:, :3, 3]
+    there = pair.forward.normal_equations(rows(poses), carried_m, noise_m)
+    back = pair.backward.normal_equations(rows(se3.inverse(poses)), np.tile(centre_m, (len(poses), 1)), noise_m)
+    both = np.zeros((len(poses), 6, 6))
+    both[:, :3, :3] = both[:, 3:, 3:] = rotation
+    gradient = (there[:, None, matching.GRADIENT] @ both)[:, 0] - back[:, matching.GRADIENT]
+    matrix = both.transpose(0, 2, 1) @ _symmetric(there) @ both + _symmetric(back)
+    return gradient, matrix
+
+
+def _symmetric(equations: Array) -> Array:
+    """Return the matrices (n, 6, 6) of normal equations (n, 27)."""
+    full = np.zeros((len(equations), 6, 6))
+    full[:, _UPPER[0], _UPPER[1]] = full[:, _UPPER[1], _UPPER[0]] = equations[:, matching.MATRIX]
+    return full
+
+
+def _equations(pair: Pair, pose: Array, noise_m: float, centre_m: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the matching points' equations in the source's frame, about the centre.
+
+    Returns:
+        Positions (n, 3), derivatives of the residuals by ξ with the point's own normal and with the other surface's
+        (n, 6), residuals (n,) in m and weights (n,) in 1/m².
+    """
+    parts = []
+    directions: list[tuple[Lookup, Array, float]] = [
+        (pair.forward, pose, 1.0),
+        (pair.backward, se3.inverse(pose), -1.0),
+    ]
+    for lookup, there, sign in directions:
+        found = lookup.matches(rows(there[None])[0], noise_m)
+        found = found[found[:, matching.WEIGHT] > 0.0]
+        to_source = np.eye(4) if sign < 0.0 else se3.inverse(pose)
+        arms = se3.transform(to_source, found[:, matching.POSITION]) - centre_m
+        own, other = (found[:, k] @ to_source[:3, :3].T for k in (matching.OWN, matching.OTHER))
+        derivatives = [sign * np.hstack([np.cross(arms, normals), normals]) for normals in (own, other)]
+        parts.append((arms, *derivatives, found[:, matching.RESIDUAL], found[:, matching.WEIGHT]))
+    arms, by_own, by_other, residuals, weights = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return arms, by_own, by_other, residuals, weights
+
+
+def _patches(points_m: Array, halvings: int) -> np.ndarray:
+    """Return the patch number (n,) of each point (n, 3): halves of halves, each cut across its longest side."""
+    patches = np.zeros(len(points_m), dtype=np.int64)
+    groups = [np.arange(len(points_m))]
+    for _ in range(halvings):
+        cut = []
+        for group in groups:
+            side = int(np.argmax(np.ptp(points_m[group], axis=0)))
+            ordered = group[np.argsort(points_m[group, side], kind="stable")]
+            cut += [ordered[: len(ordered) // 2], ordered[len(ordered) // 2 :]]
+        groups = cut
+    for number, group in enumerate(groups):
+        patches[group] = number
+    return patches

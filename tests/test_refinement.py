@@ -1,0 +1,103 @@
+"""Sharpening by matching surface: its equations against a plain twin, and what it may and may not make sure."""
+
+import numpy as np
+import pytest
+from naive import point_to_plane_equations
+
+from modeler import se3
+from modeler.evaluation import rotation_error_deg, true_motion
+from modeler.kernels import matching
+from modeler.rays import Sensor
+from modeler.registration.posterior import rows, weighted_gaussian
+from modeler.registration.refinement import Refiner
+from modeler.registration.visibility import VisibilityRegistrar
+from sequences import bundled, open_sequence
+
+
+def bundled_pair(name):
+    """The first two frames of a bundled sequence compared, and the true motion from 1 to 0."""
+    sequence = open_sequence(bundled(name))
+    truth = sequence.truth()
+    target, source = (Sensor(*sequence.sensor()).ray_image(sequence.frame(index)) for index in (0, 1))
+    pair = VisibilityRegistrar().pair(source, target, np.random.default_rng(0))
+    return pair, true_motion(truth, target=0, source=1), source.centroid_m
+
+
+def scattered(truth, centre_m, sigmas, rng, count=400):
+    """Motions around the truth: (6,) standard deviations of ξ about the centre."""
+    centre = se3.translation(centre_m)
+    return truth @ centre @ se3.exp(rng.normal(size=(count, 6)) * sigmas) @ se3.inverse(centre)
+
+
+def sigmas_about(poses, centre_m):
+    """Root mean square rotation (rad) and translation (m) about their mean at the centre."""
+    pose = weighted_gaussian(poses, np.full(len(poses), 1.0 / len(poses)), centre_m)
+    to_centre = se3.adjoint(se3.translation(-centre_m))
+    variances = np.diag(to_centre @ pose.covariance @ to_centre.T)
+    return pose.mean, np.sqrt(variances[:3].sum()), np.sqrt(variances[3:].sum())
+
+
+def test_normal_equations_are_those_of_the_matching_points(rng):
+    pair, truth, centre_m = bundled_pair("box")
+    poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng, count=5)
+    centres_m = rng.normal(size=(5, 3))
+    fast = pair.forward.normal_equations(rows(poses), centres_m, 0.001)
+    for pose, centre, equations in zip(poses, centres_m, fast, strict=True):
+        gradient, matrix = point_to_plane_equations(pair.forward.matches(rows(pose[None])[0], 0.001), centre)
+        np.testing.assert_allclose(equations[matching.GRADIENT], gradient, rtol=1e-6, atol=1e-6 * abs(gradient).max())
+        np.testing.assert_allclose(equations[matching.MATRIX], matrix[np.triu_indices(6)], rtol=1e-6, atol=1e-3)
+
+
+def test_matches_are_near_and_face_alike(rng):
+    pair, truth, centre_m = bundled_pair("flashlight")
+    pose = scattered(truth, centre_m, np.repeat([0.02, 0.002], 3), rng, count=1)[0]
+    found = pair.forward.matches(rows(pose[None])[0], 0.001)
+    carried = se3.transform(pose, pair.forward.points[:, :3])
+    np.testing.assert_allclose(found[:, matching.POSITION], carried, atol=1e-12)
+    good = found[found[:, matching.WEIGHT] > 0]
+    assert 0.3 * len(found) < len(good) < len(found)
+    assert (np.sum(good[:, matching.OWN] * good[:, matching.OTHER], axis=1) >= matching.MIN_AGREEMENT - 1e-6).all()
+    assert (good[:, matching.RESIDUAL] ** 2 * good[:, matching.WEIGHT] <= matching.MAX_SIGMAS**2).all()
+
+
+def test_what_the_surface_determines_is_sharpened(rng):
+    pair, truth, centre_m = bundled_pair("box")
+    poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
+    mean, turn_rad, shift_m = sigmas_about(Refiner().refine(pair, poses, rng, fine_m=0.001), centre_m)
+    _, turn_before_rad, shift_before_m = sigmas_about(poses, centre_m)
+    assert turn_rad < 0.5 * turn_before_rad
+    assert shift_m < shift_before_m
+    assert rotation_error_deg(mean, truth) < np.degrees(3.0 * turn_rad)
+
+
+def test_the_roll_of_a_tube_is_not(rng):
+    """A body of revolution: turning it about its axis moves no surface, and noise must not pass for knowledge."""
+    pair, truth, centre_m = bundled_pair("tube")
+    view = pair.backward.image
+    arms = view.points_m - centre_m
+    axis = np.linalg.svd(arms, full_matrices=False)[2][0]
+    # About its own axis, which is behind the surface seen: the shift that lets surface slide along itself.
+    shift, *_ = np.linalg.lstsq(view.normals, -np.sum(view.normals * np.cross(axis, arms), axis=1))
+    roll = np.concatenate([axis, shift])
+    poses = scattered(truth, centre_m, np.repeat([0.003, 0.0003], 3), rng)
+    centre = se3.translation(centre_m)
+    poses = poses @ centre @ se3.exp(rng.normal(size=(len(poses), 1)) * 0.2 * roll) @ se3.inverse(centre)
+    refined = Refiner().refine(pair, poses, rng, fine_m=0.001)
+    xi = se3.log(se3.inverse(truth @ centre) @ refined @ centre)
+    assert np.std(xi[:, :3] @ axis) > 0.12
+
+
+def test_too_few_matches_leave_the_samples_alone(rng):
+    pair, truth, centre_m = bundled_pair("box")
+    poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
+    refined = Refiner(min_patches=10_000).refine(pair, poses, rng, fine_m=0.001)
+    np.testing.assert_allclose(refined, poses, atol=1e-9)
+
+
+@pytest.mark.parametrize("fields", [{"caution": 0.0}, {"caution": 4.0}])
+def test_caution_widens(fields, rng):
+    pair, truth, centre_m = bundled_pair("box")
+    poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
+    plain = sigmas_about(Refiner().refine(pair, poses, np.random.default_rng(1), fine_m=0.001), centre_m)
+    other = sigmas_about(Refiner(**fields).refine(pair, poses, np.random.default_rng(1), fine_m=0.001), centre_m)
+    assert (other[1] > plain[1]) == (fields["caution"] > 2.0)
