@@ -591,6 +591,19 @@ def test_a_viewer_that_dies_does_not_stop_the_run(run: list[Step], tmp_path: Pat
     assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
 
 
+def test_a_viewer_that_is_already_open_may_be_closed_while_the_run_goes_on(run: list[Step], tmp_path: Path) -> None:
+    served = viewer.start_web()
+    stream = open_stream("box", save=tmp_path / "r.rrd", connect=served.sink)
+    assert stream.viewers == ()  # it is not ours to end
+    stream(run[0])
+    assert served.process.poll() is None
+    served.stop()
+    for step in run[1:]:
+        stream(step)
+    stream.close()
+    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
+
+
 def test_a_viewer_that_freezes_does_not_stop_the_run(
     run: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -673,6 +686,31 @@ def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp
         assert command.wait(timeout=10.0) == 0
     with pytest.raises(ProcessLookupError):
         os.kill(server, 0)
+
+
+def test_a_run_that_is_terminated_leaves_a_whole_recording_and_no_server(tmp_path: Path) -> None:
+    program = (
+        "import sys, pathlib, time; from modeler.cli.interrupt import terminable; from turning_box import steps;"
+        "from viz.stream import open_stream\n"
+        "with terminable():\n"
+        "    stream = open_stream('box', save=pathlib.Path(sys.argv[1]), web=True)\n"
+        "    try:\n"
+        "        stream(next(steps(1)))\n"
+        "        print(stream.viewers[0].process.pid, flush=True)\n"
+        "        time.sleep(60)\n"
+        "    finally:\n"
+        "        stream.close()\n"
+    )
+    arguments = [sys.executable, "-c", program, str(tmp_path / "r.rrd")]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, env=environment) as command:
+        assert command.stdout is not None
+        server = int(command.stdout.readline())
+        command.terminate()
+        assert command.wait(timeout=20.0) == 128 + signal.SIGTERM
+    with pytest.raises(ProcessLookupError):
+        os.kill(server, 0)
+    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == {0}
 
 
 def test_rerun_is_not_imported_before_it_is_needed() -> None:

@@ -81,7 +81,7 @@ def _closure(first: RayImage | None) -> tuple[rrb.View, rrb.View]:
 
 def _pair(first: RayImage | None) -> rrb.Container:
     """Return the newest pair before and after alignment, and the posterior larger than life."""
-    eye = _near(first, FROM_THE_SIDE, 3.7)
+    eye = _near(first, FROM_THE_SIDE, 4.2)
     before = [entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_CAPTION]
     after = [entities.PAIR_TARGET, entities.PAIR_AFTER, entities.PAIR_AXES, entities.PAIR_DRAWS]
     ghosts = [entities.GHOSTS, entities.GHOST_MEANS, entities.GHOST_TIPS, entities.GHOST_LABELS]

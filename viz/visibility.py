@@ -74,7 +74,7 @@ def drawing(step: Step) -> Drawing:
             yield path, rr.Points2D(chosen / stride, colors=rgb, radii=radius, draw_order=10.0 + order)
     if len(target.pixels):
         row, column = target.pixels.max(axis=0)[0], target.pixels.mean(axis=0)[1]
-        below = np.array([column, row + 0.25 * np.ptp(target.pixels, axis=0).max()]) / stride
+        below = np.array([column, row + 0.12 * np.ptp(target.pixels, axis=0).max()]) / stride
         style = {"colors": (200, 200, 200), "radii": rr.Radius.ui_points(0.0), "show_labels": True}
         yield entities.VISIBILITY_CAPTION, rr.Points2D(below, labels=caption(shown), **style)
 

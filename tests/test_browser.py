@@ -1,0 +1,90 @@
+"""What a browser makes of the page about a run and of the viewer that the run is streamed to: the model, drawn."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import chromium
+import numpy as np
+import numpy.typing as npt
+import pytest
+from turning_box import object_from_camera, steps
+
+from modeler import se3
+from modeler.export import RunFolder, RunMeta
+from viz import viewer
+from viz.report import write_page
+from viz.stream import open_stream
+
+pytestmark = pytest.mark.skipif(chromium.EXECUTABLE is None, reason="Chromium is not installed")
+COUNT = 4
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = RunFolder.open(tmp_path_factory.mktemp("browser") / "run")
+    stream = open_stream("box", save=folder.path / "recording.rrd")
+    for step in steps(COUNT):
+        folder.write(step, RunMeta("box", 0, "table"))
+        stream(step)
+    stream.close()
+    write_page(folder.path, folder.path / "report.html", {k: se3.inverse(object_from_camera(k)) for k in range(COUNT)})
+    return folder.path
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[chromium.Page]:
+    with chromium.Page(tmp_path / "profile", 1600, 1000) as page:
+        yield page
+
+
+def coloured(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
+    """Return which pixels (h, w) are far from grey."""
+    return np.ptp(picture.astype(int), axis=2) > 40
+
+
+def test_the_report_draws_the_model_and_turns_it(run: Path, page: chromium.Page) -> None:
+    page.open((run / "report.html").as_uri())
+    page.wait_for("document.getElementById('mesh')?.dataset.drawn == '12'")
+    left, top, width, height = (
+        page.value(f"document.getElementById('mesh').getBoundingClientRect().{side}")
+        for side in ("left", "top", "width", "height")
+    )
+    inside = np.s_[round(top) : round(top + height), round(left) : round(left + width)]
+    before = page.picture()[inside].astype(int)
+    drawn = np.abs(before - before[2, 2]).max(axis=2) > 25
+    assert 0.03 < drawn.mean() < 0.6
+    rows, columns = np.nonzero(drawn)
+    assert abs(rows.mean() / drawn.shape[0] - 0.5) < 0.1
+    assert abs(columns.mean() / drawn.shape[1] - 0.5) < 0.1
+    middle = (left + 0.5 * width, top + 0.5 * height)
+    page.drag(middle, (middle[0] + 120.0, middle[1] + 40.0))
+    after = page.picture()[inside].astype(int)
+    assert np.mean(np.abs(after - before).max(axis=2) > 25) > 0.01
+    page.value("document.getElementById('cameras').click()")
+    with_cameras = page.picture()[inside].astype(int)
+    assert np.any(np.abs(with_cameras - after).max(axis=2) > 25)
+    broken = page.value("[...document.images].filter((image) => !image.naturalWidth).length")
+    assert broken == 0
+    assert page.value("document.images.length") > 5
+    assert page.complaints == []
+    assert all(address.startswith(("file:", "data:")) for address in page.requested)
+
+
+@pytest.mark.skipif("MODELER_SLOW" not in os.environ, reason="half a minute; set MODELER_SLOW=1 to run it")
+def test_the_web_viewer_draws_the_run(run: Path, page: chromium.Page) -> None:
+    served = viewer.view(run, web=True)
+    try:
+        page.open(f"{served.address}&renderer=webgl")
+        deadline = time.monotonic() + 90.0
+        while coloured(page.picture()).mean() < 0.02:  # depth, clouds and graph: an empty layout has less
+            assert time.monotonic() < deadline, page.complaints
+            time.sleep(1.0)
+    finally:
+        served.stop()
+    # The viewer asks its makers' servers for fonts and news; without a network that is an error, but none of ours.
+    theirs = ("https://", "TypeError: Failed to fetch")
+    assert [words for words in page.complaints if not any(mark in words for mark in theirs)] == []
