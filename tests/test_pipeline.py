@@ -154,7 +154,7 @@ def test_a_frame_that_cannot_be_registered_is_left_out_with_advice() -> None:
     assert steps[2].outcome == f"no overlap: {Outcome.NO_OVERLAP.advice}"
     assert steps[2].view is not None
     assert list(steps[-1].views) == list(steps[-1].solution.trajectory) == [0, 1, 3]
-    assert registrar.asked[-1] == (3, 1)
+    assert (3, 1) in registrar.asked
 
 
 def test_a_frame_to_which_the_prior_does_not_apply_is_left_out() -> None:

@@ -1,0 +1,3 @@
+"""Which pairs of views to register, and which of their posteriors become edges of the graph."""
+
+from modeler.closure.closer import Closer as Closer

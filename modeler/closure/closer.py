@@ -1,0 +1,264 @@
+"""What a new view is registered against besides the previous one, and the judgement of the results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeler import se3
+from modeler.closure.prospects import Outlook
+from modeler.closure.verdict import Agreement, agreement, flaw, modes
+from modeler.closure.ways import along, ways
+from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, RayImage, Solution
+
+
+@dataclass(frozen=True)
+class Closer:
+    """Chooses what a new view is registered against and judges the results, in words.
+
+    Every view is registered against the previous one. Further views are tried where an edge to them would tell much:
+    where the object comes back after having turned away, or where many small steps can be spanned by a large one. A
+    result is accepted where it agrees with what the other edges predict. Pairwise covariances hold no systematic
+    error, which adds up along a chain instead of averaging out, so the test is wider than they say; see the fields.
+    """
+
+    max_angle_deg: float = 45.0
+    """Largest predicted rotation in degrees to an earlier view for it to be tried as a closure."""
+    away_deg: float = 90.0
+    """How far in degrees the object must have turned away from an earlier view before it counts as coming back."""
+    max_closures: int = 2
+    """At most so many views besides the previous one are tried for a frame; 0 = never close."""
+    min_gain_nats: float = 6.6
+    """Least information that an edge must promise: the default makes six directions three times as sure, 6 log 3."""
+    max_relocations: int = 4
+    """At most so many earlier views are tried for a frame that the previous view does not place."""
+    min_overlap: float = 0.4
+    """Smallest overlap (0..1) of an edge to any but the previous view, predicted and found."""
+    sigma_scale: float = 2.0
+    """How many times the standard deviations of edges may understate their random errors."""
+    drift_deg: float = 0.15
+    """Systematic rotation error of an edge in degrees; along a chain it adds up."""
+    drift_m: float = 0.00025
+    """Systematic translation error of an edge in m, at the object; along a chain it adds up."""
+
+    def closures(
+        self,
+        base: Posterior,
+        views: Mapping[int, RayImage],
+        solution: Solution,
+        known: Sequence[Edge],
+        *,
+        last: bool = False,
+    ) -> tuple[int, ...]:
+        """Return the views to register a frame against besides the one that places it, best first.
+
+        Args:
+            base: the registration that places the frame.
+            views: the accepted views, in order of acceptance.
+            solution: the poses so far.
+            known: every edge judged so far.
+            last: whether this is the last frame: it is tried against the first wherever that is in reach.
+        """
+        frames = [frame for frame in views if frame in solution.trajectory]
+        if self.max_closures == 0 or len(frames) < 2:
+            return ()
+        poses = np.stack([solution.trajectory[frame] for frame in frames])
+        expected = solution.trajectory[base.target] @ modes(base)[0][1].mean
+        angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ expected))
+        near = [number for number in np.flatnonzero(angle_deg <= self.max_angle_deg) if frames[number] != base.target]
+        outlook = Outlook(
+            solution, views, known, base.target, expected, self._systematic(1, views[base.target].centroid_m)
+        )
+        chosen, spanned = [], False
+        for prospect in outlook.prospects([frames[number] for number in near], angle_deg[near]):
+            if prospect.gain_nats < self.min_gain_nats or prospect.overlap < self.min_overlap:
+                continue
+            back = self._came_back(prospect.frame, base.source, base, solution, known)
+            if back or not spanned:  # one large step over many small ones is enough
+                chosen.append(prospect.frame)
+            spanned = spanned or not back
+        if frames[0] in chosen or (
+            last and 0 in near and self._came_back(frames[0], base.source, base, solution, known)
+        ):
+            chosen = [frames[0], *(frame for frame in chosen if frame != frames[0])]  # to close on the first is best
+        return tuple(chosen[: self.max_closures])
+
+    def relocation(
+        self,
+        posteriors: Sequence[Posterior],
+        views: Mapping[int, RayImage],
+        solution: Solution,
+    ) -> int | None:
+        """Return the earlier view to register a lost frame against next; None: it is given up.
+
+        A posterior that stands alone wants a witness: the view nearest to where it puts the frame. Otherwise the view
+        nearest to where the motion leads comes first, then those farthest from all views tried.
+
+        Args:
+            posteriors: what was tried for the frame, the previous view first.
+            views: the accepted views, in order of acceptance.
+            solution: the poses so far.
+        """
+        tried = [posterior.target for posterior in posteriors]
+        frames = [frame for frame in views if frame in solution.trajectory]
+        left = [frame for frame in frames if frame not in tried]
+        if not left or len(tried) > self.max_relocations:
+            return None
+        poses = np.stack([solution.trajectory[frame] for frame in left])
+        for posterior in filter(self._stands, posteriors):
+            placed = solution.trajectory[posterior.target] @ posterior.pose.mean
+            angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ placed))
+            if angle_deg.min() <= self.max_angle_deg:
+                return left[int(np.argmin(angle_deg))]
+        if len(tried) == 1:
+            expected = _continued(solution, frames, posteriors[0].source)
+            return left[int(np.argmin(se3.rotation_angle(se3.inverse(poses) @ expected)))]
+        apart = [se3.rotation_angle(se3.inverse(solution.trajectory[frame]) @ poses) for frame in tried]
+        return left[int(np.argmax(np.min(apart, axis=0)))]
+
+    def base(
+        self,
+        posteriors: Sequence[Posterior],
+        views: Mapping[int, RayImage],
+        solution: Solution,
+        known: Sequence[Edge] = (),
+        *,
+        steps: int = 1,
+    ) -> tuple[Posterior | None, str]:
+        """Return the posterior that places a frame, and why: the previous view's, or else another's.
+
+        Another view's places the frame where the motion going on would, roughly, have taken it; or, with a witness,
+        farther away, the more frames were lost.
+
+        Args:
+            posteriors: registrations of the frame, the previous view first.
+            views: the accepted views, in order of acceptance.
+            solution: the poses so far.
+            known: every edge judged so far.
+            steps: how many frames lie between the previous view and this frame, this one counted.
+        """
+        if not posteriors:
+            return None, ""
+        odometry, *others = posteriors
+        if flaw(odometry) is None:
+            return odometry, f"joins the previous view: {odometry.outcome.label}, overlap {odometry.overlap:.2f}"
+        frames = [frame for frame in views if frame in solution.trajectory]
+        expected = _continued(solution, frames, odometry.source)
+        standing = sorted(filter(self._stands, others), key=lambda posterior: -posterior.overlap)
+        for posterior in standing:
+            reason = f"joins in place of the failed previous view: overlap {posterior.overlap:.2f}"
+            measured = solution.trajectory[posterior.target] @ posterior.pose.mean
+            off_deg = float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ measured)))
+            if off_deg <= self.max_angle_deg:
+                return posterior, f"{reason}, {off_deg:.0f}° from the motion going on"
+            for witness in standing if off_deg <= steps * self.max_angle_deg else ():
+                if witness is not posterior and self._agreement(witness, posterior, views, solution, known).agrees:
+                    return posterior, f"{reason}, frame {witness.target} agrees"
+        return None, ""
+
+    def edges(
+        self,
+        posteriors: Sequence[Posterior],
+        views: Mapping[int, RayImage],
+        solution: Solution,
+        known: Sequence[Edge] = (),
+        *,
+        steps: int = 1,
+    ) -> tuple[Edge, ...]:
+        """Return one judged edge per posterior, in their order. The frame joins the graph if any is accepted.
+
+        Edges to views that the object had turned away from are closures, the others odometry.
+
+        Args:
+            posteriors: registrations of one new frame, against the previous view first.
+            views: the accepted views, in order of acceptance.
+            solution: the poses so far.
+            known: every edge judged so far.
+            steps: how many frames lie between the previous view and this frame, this one counted.
+        """
+        base, base_reason = self.base(posteriors, views, solution, known, steps=steps)
+        edges = []
+        for number, posterior in enumerate(posteriors):
+            back = number > 0 and self._came_back(posterior.target, posterior.source, base, solution, known)
+            if posterior is base:
+                accepted, reason = True, base_reason
+            elif (found := flaw(posterior, self.min_overlap if number else None)) is not None:
+                accepted, reason = False, found
+            elif base is None:
+                accepted, reason = False, "neither the previous view nor another one places the frame with certainty"
+            else:
+                agreed = self._agreement(posterior, base, views, solution, known)
+                agreeing = "closes the loop" if back else "spans several steps"
+                verdict = agreeing if agreed.agrees else "contradicts the chain"
+                accepted, reason = agreed.agrees, f"{verdict}: {agreed.words}"
+            edges.append(Edge(posterior, "closure" if back else "odometry", accepted, reason))
+        return tuple(edges)
+
+    def _came_back(
+        self, target: int, source: int, base: Posterior | None, solution: Solution, known: Sequence[Edge]
+    ) -> bool:
+        """Return whether the object turned well away from a view before another frame, or on the way between the two.
+
+        Args:
+            target: number of the view.
+            source: number of the other frame.
+            base: the registration that places it.
+            solution: the poses so far.
+            known: every edge judged so far.
+        """
+        frames = {frame for frame in solution.trajectory if min(target, source) < frame < max(target, source)}
+        if base is not None:
+            frames |= set(along(ways(known, base.target), target))
+        poses = np.stack([solution.trajectory[frame] for frame in (target, *frames)])
+        return bool(se3.rotation_angle(se3.inverse(poses[0]) @ poses).max() >= np.radians(self.away_deg))
+
+    def _stands(self, posterior: Posterior) -> bool:
+        """Return whether a registration could place a frame without the previous view."""
+        return posterior.outcome is Outcome.CONVERGED and flaw(posterior, self.min_overlap) is None
+
+    def _agreement(
+        self,
+        posterior: Posterior,
+        base: Posterior,
+        views: Mapping[int, RayImage],
+        solution: Solution,
+        known: Sequence[Edge],
+    ) -> Agreement:
+        """Return how well a registration agrees with the way through the graph and along `base`."""
+        way = solution.relative_gaussian(posterior.target, base.target)
+        predictions = [
+            (
+                weight,
+                PoseGaussian(way.mean @ pose.mean, se3.composed_covariance(way.covariance, pose.mean, pose.covariance)),
+            )
+            for weight, pose in modes(base)
+        ]
+        centroid_m = se3.transform(se3.inverse(modes(base)[0][1].mean), views[base.target].centroid_m[None])[0]
+        surest = ways(known, base.target).get(posterior.target)
+        length = abs(list(views).index(base.target) - list(views).index(posterior.target))
+        length = length if surest is None else surest.edges
+        return agreement(
+            posterior,
+            predictions,
+            systematic=self._systematic(1 + length, centroid_m),
+            scale=self.sigma_scale,
+            centroid_m=centroid_m,
+        )
+
+    def _systematic(self, length: int, centroid_m: Array) -> Array:
+        """Return the covariance (6, 6) of the systematic error of a chain of `length` edges, seen from its end."""
+        sigmas = length * np.repeat([np.radians(self.drift_deg), self.drift_m], 3)
+        camera_from_object = se3.adjoint(se3.translation(centroid_m))
+        return camera_from_object @ np.diag(sigmas**2) @ camera_from_object.T
+
+
+def _continued(solution: Solution, frames: Sequence[int], source: int) -> Array:
+    """Return object_from_camera (4, 4) of a new frame if the last motion between `frames` goes on at its pace."""
+    last = frames[-1]
+    if len(frames) < 2:
+        return solution.trajectory[last]
+    before = frames[-2]
+    pace = min(max((source - last) / (last - before), 0.0), 3.0)  # beyond three steps it is anybody's guess
+    return solution.trajectory[last] @ se3.exp(pace * se3.log(solution.relative(before, last)))

@@ -1,0 +1,86 @@
+"""Which earlier views a new one should be registered against: those whose edge would tell most."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeler import se3
+from modeler.closure.ways import ways
+from modeler.types import Array, Edge, RayImage, Solution
+
+_ASKED = 6  # views whose motion's covariance is worked out: the most promising by a bound that costs little
+_WITNESSES = 200  # points of a view asked whether the new view should see them
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """An earlier view, and what an edge to it would be worth."""
+
+    frame: int
+    """Number of the view."""
+    angle_deg: float
+    """Predicted rotation between the two."""
+    overlap: float
+    """Share (0..1) of the earlier view's surface that should face the new one's camera."""
+    gain_nats: float
+    """Information that the edge is expected to add to what is known of the motion between the two."""
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What is expected of a new view's place among the earlier ones."""
+
+    solution: Solution
+    """The poses so far."""
+    views: Mapping[int, RayImage]
+    """The accepted views."""
+    edges: Sequence[Edge]
+    """Every edge judged so far."""
+    previous: int
+    """The view that the new one hangs on."""
+    expected: Array
+    """object_from_camera (4, 4) of the new view."""
+    systematic: Array
+    """Covariance (6, 6) of an edge's systematic error, in the camera of the view that the new one hangs on."""
+
+    def prospects(self, frames: Sequence[int], angle_deg: Array) -> list[Prospect]:
+        """Return the most promising of `frames`, whose predicted rotations to the new view are `angle_deg` (n,).
+
+        An edge of covariance R between two frames whose motion is known with covariance P adds ½ log |1 + P R⁻¹| nats,
+        if it is found. R is taken to be that of the newest edge, more where less surface is shared, and the chance to
+        find it to be what a sphere shows again after such a turn, (1 + cos θ) / 2. The surest way through the graph
+        bounds P, so that P itself is worked out for a few frames only, however long the sequence.
+        """
+        newest = next((edge for edge in reversed(self.edges) if edge.accepted and edge.source == self.previous), None)
+        if newest is None:
+            return []
+        one_edge = newest.posterior.pose.covariance
+        reach = ways(self.edges, self.previous)
+        variance_rad2 = float(np.trace(one_edge[:3, :3]))
+        chances = np.cos(np.radians(angle_deg) / 2.0) ** 2
+        bounded = [
+            (chance * np.log1p(1.0 + reach[frame].variance_rad2 / variance_rad2), frame, angle, chance)
+            for frame, angle, chance in zip(frames, angle_deg, chances, strict=True)
+            if frame in reach
+        ]
+        found = []
+        for _, frame, angle, chance in sorted(bounded, reverse=True)[:_ASKED]:
+            overlap = self._overlap(frame)
+            count = 1 + reach[frame].edges
+            known = self.solution.relative_covariance(frame, self.previous) + one_edge + count**2 * self.systematic
+            ratio = overlap * np.linalg.solve(one_edge + self.systematic, known)
+            gain_nats = chance * 0.5 * float(np.linalg.slogdet(np.eye(6) + ratio)[1])
+            found.append(Prospect(frame, float(angle), overlap, gain_nats))
+        return sorted(found, key=lambda prospect: -prospect.gain_nats)
+
+    def _overlap(self, frame: int) -> float:
+        """Return the share of a view's surface that should face the new view's camera."""
+        view = self.views[frame]
+        chosen = np.linspace(0, len(view.points_m) - 1, min(_WITNESSES, len(view.points_m))).astype(int)
+        camera_from_frame = se3.inverse(self.expected) @ self.solution.trajectory[frame]
+        points_m = se3.transform(camera_from_frame, view.points_m[chosen])
+        normals = view.normals[chosen] @ camera_from_frame[:3, :3].T
+        return float(np.mean(np.sum(points_m * normals, axis=1) < 0.0))

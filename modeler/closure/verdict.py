@@ -1,0 +1,95 @@
+"""What is said of a registration before it joins the graph, in numbers and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from modeler import se3
+from modeler.types import Array, PoseGaussian, Posterior
+
+RADIUS = 4.7390  # √χ²₆(0.999): Mahalanobis distance that 1 of 1000 true closures exceeds
+_LEAST_WEIGHT = 0.05  # modes that agree with the prediction must hold so much of the posterior's mass
+
+
+def flaw(posterior: Posterior, min_overlap: float | None = None) -> str | None:
+    """Return what keeps a posterior out of the graph whatever the others say; None: nothing."""
+    if not posterior.usable:
+        return f"{posterior.outcome.label}: {posterior.outcome.advice}"
+    pose = posterior.pose
+    if not (np.isfinite(pose.mean).all() and np.isfinite(pose.covariance).all()):
+        return "the posterior is not finite: the registration broke down"
+    variances = np.linalg.eigvalsh(pose.covariance)
+    if variances[0] <= 1e-15 * variances[-1]:
+        return "the covariance is not positive definite: the registration is degenerate"
+    if min_overlap is not None and not posterior.overlap >= min_overlap:
+        return f"the overlap {posterior.overlap:.2f} is below {min_overlap:.2f}"
+    return None
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far a registration is from what the graph predicts."""
+
+    distance: float
+    """Mahalanobis distance, of the nearest modes where there are several."""
+    off_deg: float
+    """Angle between the two."""
+    off_m: float
+    """Distance between the two at the object."""
+    weight: float
+    """Share (0..1) of the posterior's mass in modes that agree."""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the registration may be true if the prediction is."""
+        return self.distance <= RADIUS and self.weight >= _LEAST_WEIGHT
+
+    @property
+    def words(self) -> str:
+        """The agreement as a report has it."""
+        sizes = f"{self.off_deg:.1f}° and {1000.0 * self.off_m:.1f} mm from its prediction"
+        words = f"{sizes}, distance {self.distance:.1f} of {RADIUS:.1f} allowed"
+        return words if self.weight == 1.0 else f"{words}, {100.0 * self.weight:.0f} % of the modes' mass agrees"
+
+
+def modes(posterior: Posterior) -> list[tuple[float, PoseGaussian]]:
+    """Return the separate modes of a posterior with their weights, heaviest first; itself where it has but one."""
+    return [(mode.weight, mode.pose) for mode in posterior.modes] or [(1.0, posterior.pose)]
+
+
+def agreement(
+    posterior: Posterior,
+    predictions: Sequence[tuple[float, PoseGaussian]],
+    *,
+    systematic: Array,
+    scale: float,
+    centroid_m: Array,
+) -> Agreement:
+    """Compare a posterior, mode by mode, with predictions of the same target_from_source.
+
+    Args:
+        posterior: of the new registration.
+        predictions: what other edges say, with weights that sum to 1.
+        systematic: covariance (6, 6) of what neither covariance knows of.
+        scale: how many times the standard deviations may understate the random errors.
+        centroid_m: (3,) of the object in the source camera.
+    """
+    agreeing, nearest, difference = 0.0, np.inf, np.eye(4)
+    for (weight, predicted), (own_weight, own) in product(predictions, modes(posterior)):
+        apart = se3.inverse(predicted.mean) @ own.mean
+        xi = se3.log(apart)
+        spread = scale**2 * (predicted.covariance + own.covariance) + systematic
+        distance = float(np.sqrt(xi @ np.linalg.solve(spread, xi)))
+        agreeing += weight * own_weight if distance <= RADIUS else 0.0
+        if distance < nearest:
+            nearest, difference = distance, apart
+    return Agreement(
+        distance=nearest,
+        off_deg=float(np.degrees(se3.rotation_angle(difference))),
+        off_m=float(np.linalg.norm(se3.transform(difference, centroid_m[None])[0] - centroid_m)),
+        weight=1.0 if len(predictions) * len(modes(posterior)) == 1 else agreeing,
+    )

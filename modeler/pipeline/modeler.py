@@ -1,0 +1,229 @@
+"""The loop: frames in, steps out. Estimation does not know that it is watched."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from modeler.closure import Closer
+from modeler.fusion import Fuser
+from modeler.pipeline.state import Seen, State
+from modeler.rays import Sensor
+from modeler.segmentation import Scene, Segmenter
+from modeler.types import (
+    AbstractPrior,
+    AbstractRegistrar,
+    Edge,
+    Frame,
+    InputError,
+    ObjectModel,
+    Outcome,
+    Posterior,
+    RayImage,
+    Segmentation,
+    Step,
+)
+
+ACCEPTED = "accepted"
+_BEYOND = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # what a motion beyond the prior may look like
+_PREVIEWED = 40  # views that the model is made of while frames still come
+
+
+@dataclass(frozen=True)
+class Modeler:
+    """Builds the model of an object while it is being turned before the camera.
+
+    Each frame is registered against the previous accepted view and against earlier views to which the object seems to
+    have come back (paper, section VI-D); the posteriors become edges of a pose graph, the solved poses fuse the views.
+    """
+
+    segmenter: Segmenter
+    """Finds the object."""
+    sensor: Sensor
+    """Noise of the camera."""
+    prior: AbstractPrior
+    """What is known of motions before the images are compared."""
+    registrar: AbstractRegistrar
+    """Registers two views."""
+    closer: Closer
+    """Chooses the pairs and judges the results."""
+    fuser: Fuser
+    """Makes the model."""
+    seed: int = 0
+    """Each pair draws from a generator of its own, made from this and the two frame numbers."""
+    executor: Executor | None = None
+    """Where the pairs of one frame are registered side by side; None: one after the other. Results are the same."""
+
+    def run(self, frames: Iterable[Frame], scene: Scene) -> Iterator[Step]:
+        """Yield what each frame brings. A frame that cannot be used is reported and left out.
+
+        Before the last step, frames left out are tried once more, against views that followed them: one that then joins
+        has a second step.
+
+        Args:
+            frames: in order of time; read one ahead, so that the last step is known as such.
+            scene: what the segmenter learnt from the sequence.
+        """
+        state = State()
+        for frame, last in _with_last(frames):
+            seen = Seen(frame, *self.view(frame, scene))
+            state, step = self._joined(state.read(frame.index), seen, state.latest, last=last)
+            if last:
+                for later, found in self._caught_up(state):
+                    state = later
+                    yield replace(found, model=self._fused(state, last=False))
+                step = replace(step, solution=state.solution, edges_so_far=state.graph.edges, views=state.views)
+            if state.views and (last or step.outcome == ACCEPTED):
+                state = replace(state, model=self._fused(state, last=last))
+            yield replace(step, model=state.model, last=last)
+
+    def view(self, frame: Frame, scene: Scene) -> tuple[Segmentation, RayImage | None]:
+        """Return the object in a frame, and the frame made ready; None where the object was not found."""
+        segmentation = self.segmenter.segment(frame, scene)
+        if segmentation.outcome not in (Outcome.CONVERGED, Outcome.UNSURE_MASK):
+            return segmentation, None
+        view = self.sensor.ray_image(replace(frame, mask=segmentation.mask), segmentation.plane)
+        return segmentation, view if len(view.points_m) else None
+
+    def register(self, source: RayImage, target: RayImage, prior: AbstractPrior | None = None) -> Posterior:
+        """Return the posterior of target_from_source. The result depends on views, prior and seed alone.
+
+        Args:
+            source: one view.
+            target: another.
+            prior: what is known of the motion; None: what is known of any.
+
+        Raises:
+            InputError: where the views lack what the prior needs.
+        """
+        motion = (self.prior if prior is None else prior).between(source, target)
+        rng = np.random.default_rng([self.seed, source.index, target.index])
+        return self.registrar.register(source, target, motion, rng=rng)
+
+    def _joined(
+        self, state: State, seen: Seen, previous: int | None, *, last: bool = False, again: bool = False
+    ) -> tuple[State, Step]:
+        """Return the state with one more frame, if it can be placed, and its step.
+
+        Args:
+            state: what is known so far.
+            seen: the frame.
+            previous: the view that it should hang on; None where there is none.
+            last: whether it is the last.
+            again: whether it was tried before.
+        """
+        posteriors, flaw = self._registered(state, seen.view, previous, last=last, again=again)
+        lasting = [replace(p, samples=np.zeros((0, 4, 4)), weights=np.zeros(0)) for p in posteriors]
+        steps = state.steps(seen.frame.index, previous)
+        edges = self.closer.edges(lasting, state.views, state.solution, state.graph.edges, steps=steps)
+        outcome = flaw or _outcome(seen, edges, first=not state.views)
+        state = state.joined(seen, edges, accepted=outcome == ACCEPTED)
+        step = Step(
+            frame=seen.frame,
+            segmentation=seen.segmentation,
+            view=seen.view,
+            posteriors=posteriors,
+            edges=edges,
+            outcome=outcome,
+            solution=state.solution,
+            model=None,
+            edges_so_far=state.graph.edges,
+            views=state.views,
+        )
+        return state, step
+
+    def _caught_up(self, state: State) -> Iterator[tuple[State, Step]]:
+        """Yield states and steps of lost frames that a view which followed them places after all, newest first."""
+        tried: set[tuple[int, int]] = set()
+        waiting = list(state.overdue())
+        while waiting:
+            seen, neighbour = waiting[0]
+            tried.add((seen.frame.index, neighbour))
+            if seen.view is not None:
+                seen = replace(seen, view=self._ready(state, seen.view))
+            state, step = self._joined(state, seen, neighbour, again=True)
+            if step.outcome == ACCEPTED:
+                yield state, step
+            waiting = [(seen, view) for seen, view in state.overdue() if (seen.frame.index, view) not in tried]
+
+    def _registered(
+        self, state: State, view: RayImage | None, previous: int | None, *, last: bool, again: bool
+    ) -> tuple[tuple[Posterior, ...], str | None]:
+        """Return the posteriors of a new view, and why there are none where the prior does not apply."""
+        if view is None or previous is None:
+            return (), None
+        steps = state.steps(view.index, previous)
+        prior, known = self.prior.learned(state.solution, state.graph.edges), state.graph.edges
+        try:
+            odometry = self._pair(state, view, previous, prior.grown(steps) if steps > 1 else prior)
+            posteriors = (odometry,)
+            base, _ = self.closer.base(posteriors, state.views, state.solution, known, steps=steps)
+            if base is None:
+                posteriors = self._relocalised(state, view, odometry, prior, again=again)
+                base, _ = self.closer.base(posteriors, state.views, state.solution, known, steps=steps)
+            if base is None:
+                return posteriors, None
+            tried = {previous, *(posterior.target for posterior in posteriors)}
+            tried |= {edge.target for edge in known if edge.source == view.index}
+            targets = self.closer.closures(base, state.views, state.solution, known, last=last)
+            targets = [target for target in targets if target not in tried]
+            apply = map if self.executor is None else self.executor.map
+            return (*posteriors, *apply(lambda target: self._pair(state, view, target, prior), targets)), None
+        except InputError as error:
+            return (), str(error)
+
+    def _relocalised(
+        self, state: State, view: RayImage, odometry: Posterior, prior: AbstractPrior, *, again: bool
+    ) -> tuple[Posterior, ...]:
+        """Return posteriors of a view that the previous one does not place: in a grown prior, and of other views."""
+        steps = state.steps(view.index, odometry.target)
+        grown = prior.grown(max(steps, 2))
+        if steps == 1 and odometry.outcome in _BEYOND:  # the motion may be larger than the prior allows for one step
+            wider = self._pair(state, view, odometry.target, grown)
+            odometry = replace(wider, seconds=odometry.seconds + wider.seconds)
+        posteriors, known = (odometry,), state.graph.edges
+        while not again and self.closer.base(posteriors, state.views, state.solution, known, steps=steps)[0] is None:
+            target = self.closer.relocation(posteriors, state.views, state.solution)
+            if target is None:
+                break
+            posteriors = (*posteriors, self._pair(state, view, target, grown))
+        return posteriors
+
+    def _pair(self, state: State, source: RayImage, target: int, prior: AbstractPrior) -> Posterior:
+        """Register a view against an accepted one."""
+        return self.register(source, self._ready(state, state.views[target]), prior)
+
+    def _ready(self, state: State, view: RayImage) -> RayImage:
+        """Return a view with the images that a likelihood looks up."""
+        return state.ready.get(view.index) or self.sensor.ray_image(view.frame, view.plane)
+
+    def _fused(self, state: State, *, last: bool) -> ObjectModel:
+        if last:
+            return self.fuser.fuse(state.views, state.solution.trajectory)
+        frames = list(state.views)
+        spread = np.unique(np.linspace(0, len(frames) - 1, _PREVIEWED).round().astype(int))
+        return self.fuser.preview({frames[k]: state.views[frames[k]] for k in spread}, state.solution.trajectory)
+
+
+def _with_last(frames: Iterable[Frame]) -> Iterator[tuple[Frame, bool]]:
+    """Yield frames with whether they are the last, by reading one ahead."""
+    ahead = iter(frames)
+    for frame in ahead:
+        for following in ahead:
+            yield frame, False
+            frame = following
+        yield frame, True
+
+
+def _outcome(seen: Seen, edges: Sequence[Edge], *, first: bool) -> str:
+    """Return "accepted", or in words why a frame is left out."""
+    if seen.view is None:
+        label = seen.segmentation.outcome
+        flaw = Outcome.TOO_FEW_POINTS if label is Outcome.CONVERGED else label
+        return f"{flaw.label}: {flaw.advice}"
+    if first or any(edge.accepted for edge in edges):
+        return ACCEPTED
+    return edges[0].reason
