@@ -44,6 +44,7 @@ class Page:
         self.requested: list[str] = []
         """Addresses that the page asked for."""
         self._number = 0
+        self._loaded = False
         self._unread = b""
         ours_in, theirs_out = os.pipe()
         theirs_in, self._out = os.pipe()
@@ -85,8 +86,11 @@ class Page:
         os.close(self._out)
 
     def open(self, address: str) -> None:
-        """Go to an address."""
+        """Go to an address and return when the page is there."""
+        self._loaded = False
         self._ask("Page.navigate", url=address)
+        while not self._loaded:
+            self._note(self._read())
 
     def value(self, expression: str) -> Any:
         """Return what an expression in JavaScript comes to."""
@@ -136,6 +140,8 @@ class Page:
     def _note(self, event: dict[str, Any]) -> None:
         parameters = event.get("params", {})
         match event.get("method"):
+            case "Page.loadEventFired":
+                self._loaded = True
             case "Runtime.exceptionThrown":
                 self.complaints.append(json.dumps(parameters["exceptionDetails"]))
             case "Runtime.consoleAPICalled" if parameters["type"] in ("error", "assert"):
