@@ -120,11 +120,11 @@ class RelativeCovariance:
     @cached_property
     def _cliques(self) -> list[_Clique]:
         """The cliques of U, children before parents."""
-        factors = gtsam.GaussianFactorGraph()
-        for rows in (*map(self._rows, self.links), *self.others):
-            factors.add(_factor({key: block for key, block in rows.items() if key != self.root}))
         if not self.links:
             return []
+        factors = gtsam.GaussianFactorGraph()
+        for rows in (*self._rows(), *self.others):
+            factors.add(_factor({key: block for key, block in rows.items() if key != self.root}))
         tree = factors.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR)
         cliques: list[_Clique] = []
         waiting = [(clique, None) for clique in tree.roots()]
@@ -140,9 +140,14 @@ class RelativeCovariance:
             for c in reversed(cliques)
         ]
 
-    def _rows(self, link: Link) -> Rows:
-        block = link.root_information @ se3.adjoint(se3.inverse(self.trajectory[link.source]))
-        return {link.target: -block, link.source: block}
+    def _rows(self) -> Iterator[Rows]:
+        """Yield the rows of each link."""
+        frames = {frame: number for number, frame in enumerate(self.trajectory)}
+        camera_from_object = se3.adjoint(se3.inverse(np.stack(list(self.trajectory.values()))))
+        roots = np.stack([link.root_information for link in self.links])
+        blocks = roots @ camera_from_object[[frames[link.source] for link in self.links]]
+        for link, block in zip(self.links, blocks, strict=True):
+            yield {link.target: -block, link.source: block}
 
 
 def _factor(rows: Rows) -> gtsam.JacobianFactor:

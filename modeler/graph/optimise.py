@@ -12,6 +12,7 @@ from modeler.graph.links import Link
 from modeler.types import Array
 
 _GAUGE_SIGMA = 1e-6  # rad and m: far below any registration, so that it pins a pose without being seen
+_ROUGH = 1e-4  # of the error, while annealing: what it chooses is then solved with care
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,31 +58,40 @@ def optimise(
     initial = gtsam.Values() if values is None else gtsam.Values(values)
     for frame, object_from_camera in start.items():
         initial.insert(frame, gtsam.Pose3(object_from_camera))
-    taking_part = [*inlier, *[True] * (len(loops) - len(inlier))]
+    taking_part = (*inlier, *[True] * (len(loops) - len(inlier)))
     chosen = [loop for loop, good in zip(loops, taking_part, strict=True) if good]
     found = _least_squares(_factors([*tree, *chosen], root, others), initial)
-    if not _stands(loops, taking_part, found, threshold):
+    if agree(loops, found, threshold) != taking_part:
         factors = _factors([*tree, *loops], root, others, loops_last=len(loops))
         trusted = factors.size() - len(loops)
-        parameters = gtsam.GncLMParams(_parameters())
+        parameters = gtsam.GncLMParams(_parameters(_ROUGH))
         parameters.setLossType(gtsam.GncLossType.TLS)
         parameters.setKnownInliers(list(range(trusted)))
         annealing = gtsam.GncLMOptimizer(factors, initial, parameters)
         annealing.setInlierCostThresholds(threshold)
         found = annealing.optimize()
-        taking_part = [bool(weight > 0.5) for weight in annealing.getWeights()[trusted:]]
+        taking_part = tuple(bool(weight > 0.5) for weight in annealing.getWeights()[trusted:])
         chosen = [loop for loop, good in zip(loops, taking_part, strict=True) if good]
         # At full weight, where annealing ended between.
         found = _least_squares(_factors([*tree, *chosen], root, others), found)
     error = _factors([*tree, *chosen], root, others).error(found) + threshold * taking_part.count(False)
-    poses = {frame: np.asarray(found.atPose3(frame).matrix(), dtype=np.float64) for frame in start}
-    # The gauge stands in the graph as a tight prior, in the result as what it means.
-    return Optimum(poses | {root: np.eye(4)}, tuple(taking_part), error)
+    return Optimum(poses_of(found, start, root), taking_part, error)
 
 
-def _stands(loops: Sequence[Link], taking_part: Sequence[bool], values: gtsam.Values, threshold: float) -> bool:
-    """Return whether the loops that take part, and only those, stay below the threshold."""
-    return all((loop.factor.error(values) <= threshold) == good for loop, good in zip(loops, taking_part, strict=True))
+def anchor(root: int) -> gtsam.PriorFactorPose3:
+    """Return the factor that pins the root's pose at the identity."""
+    return gtsam.PriorFactorPose3(root, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, _GAUGE_SIGMA))
+
+
+def poses_of(values: gtsam.Values, frames: Iterable[int], root: int) -> dict[int, Array]:
+    """Return object_from_camera (4, 4) by frame number; the root's, pinned by `anchor`, is the identity."""
+    poses = {frame: np.asarray(values.atPose3(frame).matrix(), dtype=np.float64) for frame in frames}
+    return poses | {root: np.eye(4)}
+
+
+def agree(loops: Iterable[Link], values: gtsam.Values, threshold: float) -> tuple[bool, ...]:
+    """Return which loops stay below the threshold: where that is which take part, the choice stands."""
+    return tuple(loop.factor.error(values) <= threshold for loop in loops)
 
 
 def _factors(
@@ -89,7 +99,7 @@ def _factors(
 ) -> gtsam.NonlinearFactorGraph:
     """Return a prior that pins the root at the identity, and links; the last few after all else."""
     factors = gtsam.NonlinearFactorGraph()
-    factors.add(gtsam.PriorFactorPose3(root, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, _GAUGE_SIGMA)))
+    factors.add(anchor(root))
     for link in links[: len(links) - loops_last]:
         factors.push_back(link.factor)
     for factor in others:
@@ -103,9 +113,9 @@ def _least_squares(factors: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> 
     return gtsam.LevenbergMarquardtOptimizer(factors, start, _parameters()).optimize()
 
 
-def _parameters() -> gtsam.LevenbergMarquardtParams:
+def _parameters(tolerance: float = 1e-12) -> gtsam.LevenbergMarquardtParams:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky gives up where one direction is 4096 times vaguer
-    parameters.setRelativeErrorTol(1e-12)
-    parameters.setAbsoluteErrorTol(1e-12)
+    parameters.setRelativeErrorTol(tolerance)
+    parameters.setAbsoluteErrorTol(tolerance)
     return parameters

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from modeler.graph.incremental import Incremental
 from modeler.graph.links import Link, anchored, chain, split
 from modeler.graph.marginals import PoseCovariances, RelativeCovariance
 from modeler.graph.modes import belief, decide
-from modeler.graph.optimise import optimise
+from modeler.graph.optimise import agree, optimise, poses_of
 from modeler.graph.pose_graph import PoseGraph
 from modeler.types import Array, Edge, Solution
+
+_QUORUM = 3  # loops that agree with each other before new ones are judged by them alone
+_JUDGED = 3  # new loops that may be judged so at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +36,16 @@ class _State:
     """What the loops leave to their modes."""
     inlier: tuple[bool, ...] = ()
     """Which loops take part."""
+    engine: Incremental | None = None
+    """The solution as iSAM2 has it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Smoother:
     """Solves a graph that grows, with as much work as the new edges ask for. A value: `plus` makes a new one.
 
-    A frame that hangs on one edge is placed by it and moves no other. An edge that closes a loop moves all: the poses
-    so far are where the optimisation starts, and one or two iterations end it. Which loops to leave out, and which
+    A frame that hangs on one edge is placed by it and moves no other. An edge that closes a loop moves those around it,
+    see `incremental`. Which loops to leave out, and which
     modes to choose, is asked again only where the choice no longer stands. So each solution is that of the whole graph,
     within the tolerance of the optimisation, however it grew.
     """
@@ -78,19 +85,13 @@ class Smoother:
         if not grew or len(loops) > len(self.state.loops):
             weights, decided = self._decided(tree, loops, root, grew=grew)
         taken, closing = ([decided.get(link.edge, link) for link in some] for some in (tree, loops))
-        start = chain(taken, root, {} if _jumped(decided, self.state) else anchored(self.solution.trajectory, root))
-        inlier: tuple[bool, ...] = ()
+        jumped = _jumped(decided, self.state)
+        start = chain(taken, root, {} if jumped else anchored(self.solution.trajectory, root))
+        inlier, engine = self.state.inlier, self.state.engine
         trajectory: Mapping[int, Array] = start if grew or loops else chain(taken, root, {})
-        if grew and len(loops) == len(self.state.loops):  # the new frames hang on one edge each
-            inlier = self.state.inlier
-        elif loops:
-            threshold = 0.5 * self.outlier_distance**2
-            stood = self.state.inlier if grew else ()
-            optimum = optimise(taken, closing, start, root=root, threshold=threshold, inlier=stood)
-            inlier = optimum.inlier
-            # Without a loop dead reckoning meets every edge exactly.
-            trajectory = optimum.poses if any(inlier) else chain(taken, root, {})
-        chosen = [loop for loop, good in zip(closing, inlier, strict=True) if good]
+        if not grew or len(loops) > len(self.state.loops):  # otherwise the new frames hang on one edge each
+            trajectory, inlier, engine = self._closed(taken, closing, start, root=root, afresh=jumped or not grew)
+        chosen = _taking_part(closing, inlier)
         relative_covariance = RelativeCovariance(trajectory, root, (*taken, *chosen))
         several = [link for link in (*taken, *closing) if len(link.edge.posterior.modes) > 1]
         own = {link.edge: [mode.weight for mode in link.edge.posterior.modes] for link in several}
@@ -103,8 +104,57 @@ class Smoother:
             edge_poses={(link.source, link.target): link.pose for link in several},
             mode_weights={(e.source, e.target): weights.get(e, np.array(prior)) for e, prior in own.items()},
         )
-        state = _State(root, links, tuple(tree), tuple(loops), decided, weights, inlier)
+        state = _State(root, links, tuple(tree), tuple(loops), decided, weights, inlier, engine)
         return replace(self, graph=graph, solution=solution, state=state)
+
+    def _closed(
+        self, tree: Sequence[Link], loops: Sequence[Link], start: Mapping[int, Array], *, root: int, afresh: bool
+    ) -> tuple[Mapping[int, Array], tuple[bool, ...], Incremental | None]:
+        """Return the poses under all loops, which loops take part, and the engine that can go on from there."""
+        threshold = 0.5 * self.outlier_distance**2
+        inlier = () if afresh else self.state.inlier
+        engine = None if afresh else self.state.engine
+        if engine is not None:
+            found = self._went_on(engine, tree, loops, start, threshold)
+            if found is not None:
+                return poses_of(found[1].values, start, root), *found
+        if not loops:
+            return chain(tree, root, {}), (), None
+        optimum = optimise(tree, loops, start, root=root, threshold=threshold, inlier=inlier)
+        chosen = _taking_part(loops, optimum.inlier)
+        if not chosen:  # dead reckoning meets every edge exactly
+            return chain(tree, root, {}), optimum.inlier, None
+        return optimum.poses, optimum.inlier, Incremental.of([*tree, *chosen], optimum.poses, root)
+
+    def _went_on(
+        self,
+        engine: Incremental,
+        tree: Sequence[Link],
+        loops: Sequence[Link],
+        start: Mapping[int, Array],
+        threshold: float,
+    ) -> tuple[tuple[bool, ...], Incremental] | None:
+        """Return which loops take part and their solution, from where the engine is; None: all is to be asked again.
+
+        Some of the new loops may be left out, if enough of the others agree to judge them by: the choice is the one
+        that costs least of those that stand.
+        """
+        before = self.state.inlier
+        new = len(loops) - len(before)
+        choices = [(True,) * new]
+        if sum(before) >= max(_QUORUM, 2 * before.count(False)) and new <= _JUDGED:
+            choices = sorted(itertools.product((True, False), repeat=new), key=lambda choice: choice.count(False))
+        best: tuple[float, tuple[bool, ...], Incremental] | None = None
+        for choice in choices:
+            inlier = (*before, *choice)
+            found = engine.plus([*tree, *_taking_part(loops, inlier)], start)
+            if found is not None and agree(loops, found.values, threshold) == inlier:
+                cost = found.error + threshold * inlier.count(False)
+                if best is None or cost < best[0]:
+                    best = cost, inlier, found
+                if all(choice):
+                    break
+        return None if best is None else best[1:]
 
     def _decided(
         self, tree: list[Link], loops: list[Link], root: int, *, grew: bool
@@ -119,6 +169,10 @@ class Smoother:
             for edge, left in weights.items()
         }
         return weights, decided
+
+
+def _taking_part(loops: Sequence[Link], inlier: Sequence[bool]) -> list[Link]:
+    return [loop for loop, good in zip(loops, inlier, strict=True) if good]
 
 
 def _begins(links: Sequence[Link], beginning: Sequence[Link]) -> bool:

@@ -1,0 +1,128 @@
+"""A graph that grows: each solution is the batch solution, however it came about, and takes no more than it must."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from rings import OBJECT_M, edge, measured, turntable
+
+from modeler import se3
+from modeler.graph import PoseGraph, Smoother, smoother, solve
+from modeler.types import Edge, Mode, PoseGaussian, Solution
+
+COUNT, PER_TURN = 40, 12
+
+
+def _arrivals(rng: np.random.Generator, *, false: float = 0.0, modes: bool = False) -> list[list[Edge]]:
+    """The edges that each frame of a turntable brings: to the last view, the one before it, and a turn ago."""
+    truth = turntable(COUNT, PER_TURN)
+    spin = se3.translation(OBJECT_M) @ se3.exp(np.array([0, np.pi / 2, 0, 0, 0, 0])) @ se3.translation(-OBJECT_M)
+    arrivals = []
+    for k in range(1, COUNT):
+        pose = measured(truth, k - 1, k, rng)
+        spun = PoseGaussian(pose.mean @ spin, pose.covariance)
+        both = (Mode(0.6, spun), Mode(0.4, pose)) if modes and k % 5 == 3 else ()
+        edges = [edge(k - 1, k, both[0].pose if both else pose, modes=both)]
+        edges += [edge(t, k, measured(truth, t, k, rng), "closure") for t in (k - 2, k - PER_TURN) if t >= 0]
+        wrong = [e for e in edges[1:] if rng.random() < false]
+        arrivals.append([_spoilt(e, rng) if e in wrong else e for e in edges])
+    return arrivals
+
+
+def _spoilt(of: Edge, rng: np.random.Generator) -> Edge:
+    axis = rng.normal(size=3)
+    turn = np.concatenate([axis / np.linalg.norm(axis) * rng.uniform(0.8, 2.5), np.zeros(3)])
+    about = se3.translation(OBJECT_M) @ se3.exp(turn) @ se3.translation(-OBJECT_M)
+    pose = of.posterior.pose
+    return edge(of.target, of.source, PoseGaussian(pose.mean @ about, pose.covariance), of.kind)
+
+
+def _assert_same(one: Solution, other: Solution) -> None:
+    assert set(one.trajectory) == set(other.trajectory)
+    for frame, pose in one.trajectory.items():
+        np.testing.assert_allclose(pose, other.trajectory[frame], atol=3e-6)  # sigmas are 1e-2 rad and 2e-3 m
+        np.testing.assert_allclose(one.odometry[frame], other.odometry[frame], atol=1e-12)
+    last = max(one.trajectory)
+    whiten = np.linalg.inv(np.linalg.cholesky(other.covariances[last]))
+    np.testing.assert_allclose(whiten @ one.covariances[last] @ whiten.T, np.eye(6), atol=1e-3)
+    assert set(one.outliers) == set(other.outliers)
+    assert set(one.mode_weights) == set(other.mode_weights)
+    for pair, weights in one.mode_weights.items():
+        np.testing.assert_allclose(weights, other.mode_weights[pair], atol=1e-3)
+
+
+@pytest.mark.parametrize(("false", "modes"), [(0.0, False), (0.2, False), (0.0, True), (0.2, True)])
+def test_after_every_frame_the_solution_is_that_of_the_batch(false: float, modes: bool) -> None:
+    growing = Smoother()
+    for number, edges in enumerate(_arrivals(np.random.default_rng(3), false=false, modes=modes)):
+        growing = growing.plus(edges)
+        if number % 6 == 1 or not false:  # a batch takes its time where edges contradict each other
+            _assert_same(growing.solution, solve(growing.graph, {}))
+
+
+def test_how_it_grew_does_not_matter() -> None:
+    arrivals = _arrivals(np.random.default_rng(4), false=0.1)
+    edges = list(itertools.chain.from_iterable(arrivals))
+    singly, wholly = Smoother(), Smoother().plus(edges)
+    for one in edges:
+        singly = singly.plus([one])
+    _assert_same(singly.solution, wholly.solution)
+
+
+def test_smoother_is_a_value() -> None:
+    arrivals = _arrivals(np.random.default_rng(5))
+    trunk = Smoother()
+    for edges in arrivals[:20]:
+        trunk = trunk.plus(edges)
+    before = dict(trunk.solution.trajectory)
+    one = trunk.plus(arrivals[20])
+    trunk.plus([arrivals[20][0], _spoilt(arrivals[20][2], np.random.default_rng(0))])
+    again = trunk.plus(arrivals[20])
+    for frame, pose in before.items():
+        np.testing.assert_array_equal(trunk.solution.trajectory[frame], pose)
+    for frame, pose in one.solution.trajectory.items():
+        np.testing.assert_array_equal(again.solution.trajectory[frame], pose)
+
+
+def test_same_arrivals_same_solution_to_the_bit() -> None:
+    def last() -> Solution:
+        growing = Smoother()
+        for edges in _arrivals(np.random.default_rng(6)):
+            growing = growing.plus(edges)
+        return growing.solution
+
+    one, other = last(), last()
+    for frame in one.trajectory:
+        np.testing.assert_array_equal(one.trajectory[frame], other.trajectory[frame])
+        np.testing.assert_array_equal(one.covariances[frame], other.covariances[frame])
+
+
+def test_the_whole_graph_is_solved_but_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+
+    def counted(tree: Sequence[object], *args: object, **options: object) -> object:
+        calls.append(len(tree))
+        return optimise(tree, *args, **options)  # pyright: ignore[reportArgumentType]
+
+    optimise = smoother.optimise
+    monkeypatch.setattr(smoother, "optimise", counted)
+    growing = Smoother()
+    arrivals = _arrivals(np.random.default_rng(7))
+    for edges in arrivals[:-1]:
+        growing = growing.plus(edges)
+    assert len(calls) == 1  # the first loop
+    growing = growing.plus([*arrivals[-1], _spoilt(arrivals[-1][2], np.random.default_rng(0))])
+    assert len(calls) == 1  # those that agree judge it
+    assert len(growing.solution.outliers) == 1
+
+
+def test_other_root_or_other_edges_are_solved_afresh() -> None:
+    arrivals = _arrivals(np.random.default_rng(8))
+    edges = list(itertools.chain.from_iterable(arrivals))
+    growing = Smoother().plus(edges)
+    for graph in (PoseGraph(tuple(edges), first=5), PoseGraph(tuple(edges[:40])), PoseGraph(tuple(edges[::-1]), 0)):
+        _assert_same(growing.to(graph).solution, solve(graph, {}))
+    assert dict(growing.to(PoseGraph()).solution.trajectory) == {}
