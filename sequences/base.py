@@ -119,15 +119,12 @@ class AbstractSequence(ABC):
         return self if kept == self.indices else SelectedSequence(self, kept)
 
 
-@final
 @dataclass(frozen=True)
-class SelectedSequence(AbstractSequence):
-    """Some frames of another sequence."""
+class AbstractDerived(AbstractSequence):
+    """Another sequence but for what is overridden."""
 
     whole: AbstractSequence
-    """The sequence the frames are taken from."""
-    kept: tuple[int, ...]
-    """Numbers of the frames to keep, ascending."""
+    """The other sequence."""
 
     @property
     def name(self) -> str:
@@ -137,20 +134,15 @@ class SelectedSequence(AbstractSequence):
     @property
     def indices(self) -> tuple[int, ...]:
         """Frame numbers, ascending."""
-        return self.kept
+        return self.whole.indices
 
     def frame(self, index: int) -> Frame:
         """Return the frame with number `index`."""
-        if index not in self.kept:
-            raise InputError(
-                f"frame {index} is not among the selected frames ({span(self.kept)}); ask for one of those."
-            )
         return self.whole.frame(index)
 
     def truth(self) -> dict[int, Array] | None:
         """Return the true camera_from_model (4, 4) by frame number; None where it is not known."""
-        truth = self.whole.truth()
-        return None if truth is None else {index: truth[index] for index in self.kept if index in truth} or None
+        return self.whole.truth()
 
     def sensor(self) -> tuple[float, float] | None:
         """Return the sensor's noise `(sigma_wh, sigma_r_m)`; None where the sequence does not say."""
@@ -158,7 +150,7 @@ class SelectedSequence(AbstractSequence):
 
     @property
     def motion(self) -> Mapping[str, object] | None:
-        """What is known of the motion between consecutive frames of the whole sequence."""
+        """What is known of the motion between consecutive frames of the other sequence."""
         return self.whole.motion
 
     @property
@@ -185,6 +177,33 @@ class SelectedSequence(AbstractSequence):
     def notes(self) -> tuple[str, ...]:
         """What the reader assumed, or left out."""
         return self.whole.notes
+
+
+@final
+@dataclass(frozen=True)
+class SelectedSequence(AbstractDerived):
+    """Some frames of another sequence."""
+
+    kept: tuple[int, ...]
+    """Numbers of the frames to keep, ascending."""
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Frame numbers, ascending."""
+        return self.kept
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`."""
+        if index not in self.kept:
+            raise InputError(
+                f"frame {index} is not among the selected frames ({span(self.kept)}); ask for one of those."
+            )
+        return self.whole.frame(index)
+
+    def truth(self) -> dict[int, Array] | None:
+        """Return the true camera_from_model (4, 4) by frame number; None where it is not known."""
+        truth = self.whole.truth()
+        return None if truth is None else {index: truth[index] for index in self.kept if index in truth} or None
 
 
 def frame_range(text: str) -> slice:

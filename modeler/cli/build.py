@@ -30,6 +30,10 @@ class Build:
     """Another program is still writing into SEQUENCE: take the frames as they come."""
     idle_s: Annotated[float, tyro.conf.arg(metavar="S")] = 10.0
     """With --watch: the sequence is over when nothing has come for so long (or a file `done` has, or after Ctrl-C)."""
+    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: as SEQUENCE says)")] = (
+        None
+    )
+    """Noise of the depth camera, as `modeler calibrate-sensor` measured it."""
     view: bool = False
     """Watch in the Rerun viewer."""
     web: bool = False
@@ -50,4 +54,5 @@ class Build:
     def settings(self) -> dict[str, object]:
         """Return what the results depend on besides sequence, seed and the prior's name, as report.json records it."""
         parts = asdict(self.prior) | asdict(self.method) | asdict(self.selection) | asdict(self.where)
+        parts["sensor"] = None if self.sensor is None else str(self.sensor)
         return {name: value for name, value in parts.items() if name not in ("prior", "seed") and value is not None}

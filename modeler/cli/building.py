@@ -16,7 +16,7 @@ from modeler.cli.remembered import Remembered
 from modeler.cli.watching import watched
 from modeler.export import RunFolder, RunMeta
 from modeler.types import InputError
-from sequences import AbstractSequence, frame_range, survey
+from sequences import AbstractSequence, SensedSequence, frame_range, read_noise, survey
 from viz.stream import open_stream
 
 
@@ -31,6 +31,7 @@ def build(options: Build) -> int:
     began = time.perf_counter()
     path = options.sequence
     whole = watched(path, options.idle_s) if options.watch else compose.open_sequence(path)
+    whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     if not frames.live:
         survey(frames, truth=False)  # what cannot be read is found before anything is made

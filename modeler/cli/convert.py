@@ -24,6 +24,8 @@ class Convert:
     """A sequence in any format that is read, or a run folder."""
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """BOP scene folder to make; scene_gt.json or poses.txt for a run."""
+    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: as INPUT says)")] = None
+    """Noise of the depth camera, as `modeler calibrate-sensor` measured it, to write into sequence.json."""
     selection: FrameOptions = field(default_factory=FrameOptions)
     said: InputOptions = field(default_factory=InputOptions)
 

@@ -14,7 +14,7 @@ from modeler.export import RunFolder
 from modeler.export.files import write_atomically
 from modeler.export.tum import tum_text
 from modeler.types import InputError
-from sequences import AbstractSequence, frame_range, open_sequence, survey, write_bop
+from sequences import AbstractSequence, SensedSequence, frame_range, open_sequence, read_noise, survey, write_bop
 from sequences.bop_entries import pose_entry
 
 UNITS_MM = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 10.0)
@@ -30,6 +30,7 @@ def convert(options: Convert) -> int:
     if (options.input / "report.json").is_file():
         return _poses(options.input, options.out)
     whole = open_sequence(options.input, options.said.given())
+    whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
     sequence = whole.select(options.selection.every, frame_range(options.selection.frames))
     found = survey(sequence)
     unit_mm = next((unit for unit in UNITS_MM if found.farthest_m * 1000.0 < 65535.0 * unit), UNITS_MM[-1])

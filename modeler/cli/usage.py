@@ -11,6 +11,7 @@ from typing import Annotated
 import tyro
 
 from modeler.cli.build import Build
+from modeler.cli.calibrate_sensor import CalibrateSensor
 from modeler.cli.convert import Convert
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
@@ -24,6 +25,7 @@ Command = (
     Annotated[Build, tyro.conf.subcommand("build")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
+    | Annotated[CalibrateSensor, tyro.conf.subcommand("calibrate-sensor")]
     | Annotated[Register, tyro.conf.subcommand("register")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Render, tyro.conf.subcommand("render")]
@@ -42,7 +44,9 @@ _HELP_INDENT = " " * 8  # deeper than what went wrong stands the help of an opti
 _DESCRIPTION = "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr."
 
 
-def parsed(arguments: Sequence[str]) -> Build | Info | Convert | Register | Evaluate | Render | View | Report | Export:
+def parsed(
+    arguments: Sequence[str],
+) -> Build | Info | Convert | CalibrateSensor | Register | Evaluate | Render | View | Report | Export:
     """Return the command that the arguments (after the program's name) ask for.
 
     Raises:

@@ -1,0 +1,106 @@
+"""What a depth camera's noise is, as a function of distance and angle: measured, stored in a file, looked up."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+
+from modeler.types import Array, Frame
+from sequences.json_input import Node, read_tree
+
+MAX_ANGLE_RAD = np.radians(85.0)
+
+
+@final
+@dataclass(frozen=True)
+class NoiseModel:
+    """Noise across and along the ray.
+
+    Across, pixels err by a share of themselves, so that noise in (w, h) depends neither on distance nor on angle. Along
+    the ray, triangulating cameras err by z², more on slopes: the variance is
+    floor² + z⁴ (c0 + c1 q + c2 q²) with q = (θ / (π/2 - θ))², a form that Nguyen, Izadi & Lovell (2012) found.
+    """
+
+    lateral_px: float
+    """Standard deviation across the ray, along either axis, in px."""
+    focal_px: float
+    """Focal length of the camera that was measured."""
+    floor_m: float
+    """Standard deviation along the ray that does not depend on distance."""
+    growth: tuple[float, float, float]
+    """c0, c1, c2 in m⁻²."""
+
+    def sigma_wh(self) -> float:
+        """Return the standard deviation in (w, h)."""
+        return self.lateral_px / self.focal_px
+
+    def sigma_r_m(self, distance_m: Array | float, angle_rad: Array | float = 0.0) -> Array:
+        """Return the standard deviation along the ray in m, of any shape.
+
+        Args:
+            distance_m: along the optical axis.
+            angle_rad: between the ray and the normal of the surface.
+        """
+        columns = slope_terms(np.asarray(distance_m, np.float64), np.asarray(angle_rad, np.float64))
+        return np.sqrt(columns @ np.array([self.floor_m**2, *self.growth]))
+
+    def at(self, distance_m: float) -> tuple[float, float]:
+        """Return `(sigma_wh, sigma_r_m)` for a surface that faces the camera."""
+        return self.sigma_wh(), float(self.sigma_r_m(distance_m))
+
+    def record(self) -> dict[str, object]:
+        """Return the model as JSON has it."""
+        return {
+            "lateral_px": self.lateral_px,
+            "focal_px": self.focal_px,
+            "floor_m": self.floor_m,
+            "growth": list(self.growth),
+        }
+
+
+def slope_terms(distance_m: Array, angle_rad: Array) -> Array:
+    """Return what the variance along the ray is linear in (..., 4): 1, z⁴, z⁴ q, z⁴ q²."""
+    angle = np.minimum(np.abs(angle_rad), MAX_ANGLE_RAD)
+    slope = (angle / (0.5 * np.pi - angle)) ** 2
+    fourth, slope = np.broadcast_arrays(np.asarray(distance_m) ** 4, slope)
+    return np.stack([np.ones_like(fourth), fourth, fourth * slope, fourth * slope**2], axis=-1)
+
+
+def read_noise(path: Path) -> NoiseModel:
+    """Read a model that `modeler calibrate-sensor` has stored.
+
+    Raises:
+        InputError: where it is missing or says something else.
+    """
+    node = read_tree(path).need("noise")
+    growth = node.need("growth").elements()
+    if len(growth) != 3:
+        raise node.need("growth").fault("a list of 3 numbers")
+    return NoiseModel(
+        node.need("lateral_px").number(1e-6, 1e3),
+        node.need("focal_px").number(1.0, 1e6),
+        node.need("floor_m").number(0.0, 1.0),
+        (_share(growth[0]), _share(growth[1]), _share(growth[2])),
+    )
+
+
+def _share(node: Node) -> float:
+    return node.number(0.0, 1.0)
+
+
+def noise_text(model: NoiseModel, facts: Mapping[str, object]) -> str:
+    """Return the file of a model: with the noise at the distance where it was measured, and what it was measured on."""
+    return json.dumps({**facts, "noise": model.record()}, indent=1, allow_nan=False) + "\n"
+
+
+def object_distance_m(frame: Frame) -> float:
+    """Return about how far away the object is: half way into its mask, or where the nearest quarter of a scene ends."""
+    measured = np.isfinite(frame.depth_m) & (frame.depth_m > 0.0)
+    inside = measured if frame.mask is None else measured & frame.mask
+    share = 25.0 if frame.mask is None else 50.0
+    return float(np.percentile(frame.depth_m[inside], share)) if inside.any() else 1.0
