@@ -116,7 +116,7 @@ def edges(camera: Array, count: int = 5, noise: float = 1.0, seed: int = 0) -> t
 def hand(camera: Array) -> tuple[Array, Array]:
     """Times (n,) and poses (n, 4, 4) of a hand that turns with the object."""
     grip = se3.translation(np.array([0.03, 0.0, 0.75])) @ se3.exp(np.array([0.4, -0.2, 0.9, 0, 0, 0]))
-    return 0.5 * np.arange(5), np.array([camera @ turned((k - 2) * STEP) @ grip for k in range(5)])
+    return np.arange(5.0) * 0.5, np.array([camera @ turned((k - 2) * STEP) @ grip for k in range(5)])
 
 
 def told(direction: Array) -> tuple[float, float, float]:

@@ -11,7 +11,7 @@ from modeler.priors.about_axis import Axis
 from modeler.priors.axis_turn import across_axis
 from modeler.types import Array, PoseGaussian, Posterior
 
-_LEAST_PAIRS = 3
+_LEAST_PAIRS, _MOST_PAIRS = 3, 60  # the latest of many say enough
 _LEAST_TURN_RAD = np.radians(5.0)
 _STUDENT = 5.0  # degrees of freedom of the weights: few, so that motions that do not fit count little
 _ITERATIONS = 30
@@ -33,6 +33,7 @@ def common_axis(posteriors: Sequence[Posterior], wobble_rad: float, wobble_m: fl
         wobble_m: standard deviation of its shift that no turn makes, at the axis' point.
     """
     turning = [p.pose for p in posteriors if np.linalg.norm(se3.log(p.pose.mean)[:3]) >= _LEAST_TURN_RAD]
+    turning = turning[-_MOST_PAIRS:]
     if len(turning) < _LEAST_PAIRS:
         return None
     direction, point_m = _begin(turning)

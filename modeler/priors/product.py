@@ -6,15 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from modeler.priors.gaussian import Gaussian, fitted
 from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, InputError, RayImage, Solution
 
-_DRAWS = 6000
+_DRAWS = 5000
+_FITTED = 1000
 _ROUNDS = 5
 _GAUSSIAN_SHARE = 0.8
 _WIDER = 1.3  # of the Gaussian than of what it covers, so that weights stay bounded
 _OVERSAMPLING = 4
+_ASTONISHING = 25.0  # nats: seven standard deviations off
 
 
 @dataclass(frozen=True)
@@ -68,11 +71,7 @@ class Product(AbstractMotion):
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Draw motions (count, 4, 4), by resampling a few times as many."""
         drawn, log_weights = _weighted(self.first, self.second, self.gaussian, _OVERSAMPLING * count + 200, rng)
-        weights = np.exp(log_weights - log_weights.max())
-        cumulative = np.cumsum(weights)
-        positions = (np.arange(count) + rng.random()) / count * cumulative[-1]
-        chosen = np.minimum(np.searchsorted(cumulative, positions), len(drawn) - 1)
-        return drawn[rng.permutation(chosen)]
+        return drawn[rng.permutation(resampled(np.exp(log_weights - log_weights.max()), count, rng))]
 
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of motions (n, 4, 4); -inf outside."""
@@ -105,9 +104,23 @@ def multiplied(first: AbstractMotion, second: AbstractMotion, centre_m: Array) -
             return None
         weights = np.exp(log_weights - top)
         log_volume = float(top + np.log(weights.mean()))
-        gaussian = fitted(drawn, weights / weights.sum(), centre_m, _WIDER)
+        chosen = drawn[resampled(weights, _FITTED, rng)]
+        gaussian = fitted(chosen, np.full(_FITTED, 1.0 / _FITTED), centre_m, _WIDER)
     assert gaussian is not None
-    return Product(first, second, gaussian, log_volume)
+    product = Product(first, second, gaussian, log_volume)
+    drawn = product.sample(_FITTED, rng)
+    for part in (first, second):
+        usual, here = (np.median(part.log_density(poses)) for poses in (part.sample(_FITTED, rng), drawn))
+        if here < usual - _ASTONISHING:
+            return None
+    return product
+
+
+def resampled(weights: Array, count: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
+    """Return `count` indices, each as often as its weight (n,) asks, by systematic resampling."""
+    cumulative = np.cumsum(weights)
+    positions = (np.arange(count) + rng.random()) / count * cumulative[-1]
+    return np.minimum(np.searchsorted(cumulative, positions), len(weights) - 1)
 
 
 def _weighted(
