@@ -1,0 +1,168 @@
+"""From options and what sequence.json says of the motion to a prior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from modeler.cli.nonvisual import prior, prior_name
+from modeler.cli.options import PriorOptions
+from modeler.priors import (
+    AxesPrior,
+    FeaturesPrior,
+    GeneralPrior,
+    HeldPrior,
+    Poke,
+    PokePrior,
+    ProductPrior,
+    TablePrior,
+    TurntablePrior,
+    VelocityPrior,
+)
+from modeler.types import Array, Frame, InputError
+from sequences import AbstractSequence
+
+POKE = {"point_m": [0.0, 0.1, 0.8], "direction": [1, 0, 0], "length_m": 0.03}
+
+
+@dataclass(frozen=True)
+class Telling(AbstractSequence):
+    """A sequence that says something of its motion, and has no frame."""
+
+    motion: Mapping[str, object] | None = None  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
+    robot_path: Path | None = None  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
+    name: str = "telling"  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
+    indices: tuple[int, ...] = ()  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
+    model_path: Path | None = field(default=None)  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
+
+    def frame(self, index: int) -> Frame:
+        raise AssertionError
+
+    def truth(self) -> dict[int, Array] | None:
+        return None
+
+    def sensor(self) -> tuple[float, float] | None:
+        return None
+
+
+TURNTABLE = Telling({"kind": "turntable", "step_deg": 25, "sigma_deg": 3})
+
+
+@pytest.mark.parametrize(
+    ("motion", "given", "name"),
+    [
+        (None, {}, "general"),
+        ({"kind": "general", "step_deg": 20}, {}, "general"),
+        ({"kind": "somersault"}, {}, "general"),
+        ({"kind": "table"}, {}, "table"),
+        ({"kind": "table"}, {"max_shift_m": 0.1}, "table"),
+        ({"kind": "table"}, {"max_offset_m": 0.1}, "general"),
+        ({"kind": "table"}, {"prior": "general"}, "general"),
+        ({"kind": "turntable", "step_deg": 25}, {}, "turntable"),
+        ({"kind": "turntable", "step_deg": "25"}, {}, "general"),
+        ({"kind": "turntable"}, {}, "general"),
+        ({"kind": "turntable"}, {"step_deg": 24.0}, "turntable"),
+        ({"kind": "held"}, {}, "general"),
+        ({"kind": "poke", "pokes": {"1": POKE}}, {}, "poke"),
+    ],
+)
+def test_the_sequence_says_what_is_known_unless_it_is_asked_otherwise(
+    motion: Mapping[str, object] | None, given: dict[str, Any], name: str
+) -> None:
+    assert prior_name(PriorOptions(**given), Telling(motion)) == name
+    prior(PriorOptions(**given), Telling(motion))
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("general", GeneralPrior()),
+        ("table", TablePrior()),
+        ("axes", AxesPrior()),
+        ("features+table", FeaturesPrior(TablePrior())),
+        ("table+velocity+axes", AxesPrior(VelocityPrior(TablePrior()))),
+        ("turntable", TurntablePrior(25.0, 3.0)),
+        ("table+turntable", TurntablePrior(25.0, 3.0, needs_table=True)),
+        ("table+general", ProductPrior(TablePrior(), GeneralPrior())),
+    ],
+)
+def test_names_joined_by_plus_hold_together(name: str, expected: object) -> None:
+    assert prior(PriorOptions(prior=name), TURNTABLE) == expected
+
+
+@pytest.mark.parametrize(
+    ("given", "sequence", "sign"),
+    [
+        ({"step_deg": 24.0}, None, "unknown"),
+        ({"step_deg": -24.0}, None, "known"),
+        ({"step_deg": 24.0, "axis_direction": (0.0, -1.0, 0.0)}, None, "known"),
+        ({"step_deg": 24.0, "step_sign": "known"}, None, "known"),
+        ({"step_deg": 24.0}, TURNTABLE, "known"),
+        ({"step_deg": 24.0}, Telling({"step_deg": -25}), "unknown"),
+        ({}, TURNTABLE, "known"),
+        ({"step_sign": "unknown"}, TURNTABLE, "unknown"),
+    ],
+)
+def test_a_bare_step_may_turn_either_way(given: dict[str, Any], sequence: Telling | None, sign: str) -> None:
+    found = prior(PriorOptions(prior="turntable", **given), sequence)
+    assert isinstance(found, TurntablePrior)
+    assert found.step_sign == sign
+
+
+def test_a_robots_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "robot.txt"
+    path.write_text("# time tx ty tz qx qy qz qw\n0 1 2 3 0 0 0 1\n0.5 1 2 4 0 0 1 0\n")
+    sequence = Telling({"kind": "held"}, path)
+    found = prior(PriorOptions(held_sigma_deg=2.0), sequence)
+    assert isinstance(found, HeldPrior)
+    assert (found.held_sigma_deg, found.name) == (2.0, str(path))
+    np.testing.assert_array_equal(found.times_s, [0.0, 0.5])
+    np.testing.assert_allclose(
+        found.camera_from_hand[1], [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 4], [0, 0, 0, 1]], atol=1e-12
+    )
+
+
+def test_pokes_are_read() -> None:
+    expected = Poke((0.0, 0.1, 0.8), (1.0, 0.0, 0.0), 0.03)
+    found = prior(PriorOptions(), Telling({"kind": "poke", "pokes": {"3": POKE}}))
+    assert found == PokePrior(pokes={3: expected})
+    given = PriorOptions(
+        prior="poke", poke_point_m=expected.point_m, poke_direction=(1.0, 0.0, 0.0), poke_length_m=0.03
+    )
+    assert prior(given, None) == PokePrior(expected)
+
+
+@pytest.mark.parametrize(
+    ("options", "sequence", "says"),
+    [
+        (PriorOptions(prior="magic"), None, "no prior 'magic'; there are 'general', 'table'"),
+        (PriorOptions(prior="table+"), None, "no prior ''"),
+        (PriorOptions(prior="velocity+velocity"), None, "names velocity twice"),
+        (PriorOptions(prior="turntable"), None, "give --step-deg"),
+        (PriorOptions(prior="held"), None, "one sequence at a time"),
+        (PriorOptions(prior="held"), TURNTABLE, "telling: has no robot.txt"),
+        (PriorOptions(prior="poke"), TURNTABLE, "give them"),
+        (PriorOptions(prior="poke", poke_length_m=0.1), None, "--poke-point-m as well"),
+        (PriorOptions(prior="table", step_deg=3.0), None, "--step-deg is no parameter of --prior table"),
+        (PriorOptions(prior="table+turntable", max_rotation_deg=3.0), TURNTABLE, "--max-rotation-deg"),
+        (PriorOptions(prior="turntable", step_deg=float("nan")), None, "--step-deg nan is out of range"),
+        (
+            PriorOptions(prior="turntable", step_deg=5.0, axis_point_m=(0, 0, float("inf"))),
+            None,
+            "--axis-point-m 0 0 inf",
+        ),
+        (PriorOptions(prior="held", held_sigma_m=-0.1), TURNTABLE, "--held-sigma-m -0.1 is out of range"),
+        (PriorOptions(), Telling({"kind": "poke", "pokes": {"one": POKE}}), "poke 'one' is not told by a frame number"),
+        (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": {"point_m": [0, 0]}}}), "poke '1' must be"),
+    ],
+)
+def test_what_cannot_be_used_is_told_in_a_line(options: PriorOptions, sequence: Telling | None, says: str) -> None:
+    with pytest.raises(InputError) as caught:
+        prior(options, sequence)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
