@@ -10,7 +10,7 @@ observed, metres wide beside micrometres, is as welcome as any other. First orde
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -75,9 +75,13 @@ class RelativeCovariance:
                 right[frame] = right.get(frame, np.zeros((6, 6))) - passed[6 * place : 6 * place + 6]
         return 0.5 * (covariance + covariance.T)
 
+    def marginals(self) -> Mapping[int, Array]:
+        """Return covariances (6, 6) of ξ in `object_from_camera @ exp(ξ)` by frame number."""
+        return self._marginals
+
     @cached_property
-    def marginals(self) -> dict[int, Array]:
-        """Covariances (6, 6) of ξ in `object_from_camera @ exp(ξ)` by frame number, all in one go from the root."""
+    def _marginals(self) -> dict[int, Array]:
+        """All in one go from the root."""
         spreads: dict[int, Array] = {self.root: np.zeros((6, 1))}  # L with LLᵀ the covariance, where still needed
         roots: dict[int, dict[int, Array]] = {}
         for number in range(len(self._cliques) - 1, -1, -1):  # parents before children
@@ -165,17 +169,19 @@ def _factor(rows: Rows) -> gtsam.JacobianFactor:
 class PoseCovariances(Mapping[int, Array]):
     """Covariances (6, 6) of object_from_camera by frame number, worked out when asked."""
 
-    relative_covariance: RelativeCovariance
+    trajectory: Mapping[int, Array]
+    """object_from_camera (4, 4) by frame number."""
+    marginals: Callable[[], Mapping[int, Array]]
     """Answers for all."""
 
     def __getitem__(self, frame: int) -> Array:
         """Return the covariance of one pose."""
-        return self.relative_covariance.marginals[frame]
+        return self.marginals()[frame]
 
     def __iter__(self) -> Iterator[int]:
         """Yield the solved frames."""
-        return iter(self.relative_covariance.trajectory)
+        return iter(self.trajectory)
 
     def __len__(self) -> int:
         """Return the number of solved frames."""
-        return len(self.relative_covariance.trajectory)
+        return len(self.trajectory)

@@ -15,6 +15,7 @@ from modeler.graph.marginals import PoseCovariances, RelativeCovariance
 from modeler.graph.modes import belief, decide
 from modeler.graph.optimise import agree, optimise, poses_of
 from modeler.graph.pose_graph import PoseGraph
+from modeler.graph.shared import SharedCovariance
 from modeler.types import Array, Edge, Solution
 
 _QUORUM = 3  # loops that agree with each other before new ones are judged by them alone
@@ -53,6 +54,9 @@ class Smoother:
     outlier_distance: float = 14.2
     """Mahalanobis distance of a loop edge from the solution beyond which it is an outlier. The default is three times
     the 99.9 % radius of six dimensions: pairwise covariances may be optimistic."""
+    shared: float = 0.0
+    """Share (0..1) of edges' covariances that is their images' own noise, the same in all edges of an image; see
+    `shared_noise`, which tells it."""
     graph: PoseGraph = field(default_factory=PoseGraph)
     """What is solved."""
     solution: Solution = field(default_factory=Solution)
@@ -93,11 +97,13 @@ class Smoother:
             trajectory, inlier, engine = self._closed(taken, closing, start, root=root, afresh=jumped or not grew)
         chosen = _taking_part(closing, inlier)
         relative_covariance = RelativeCovariance(trajectory, root, (*taken, *chosen))
+        if self.shared:
+            relative_covariance = SharedCovariance(relative_covariance, (*taken, *chosen), self.shared)
         several = [link for link in (*taken, *closing) if len(link.edge.posterior.modes) > 1]
         own = {link.edge: [mode.weight for mode in link.edge.posterior.modes] for link in several}
         solution = Solution(
             trajectory=trajectory,
-            covariances=PoseCovariances(relative_covariance),
+            covariances=PoseCovariances(trajectory, relative_covariance.marginals),
             odometry=odometry,
             outliers=tuple(loop.edge for loop, good in zip(closing, inlier, strict=True) if not good),
             relative_covariance=relative_covariance,
@@ -185,7 +191,9 @@ def _jumped(decided: Mapping[Edge, Link], state: _State) -> bool:
     return any(old is not None and not np.array_equal(link.pose.mean, old.pose.mean) for link, old in before)
 
 
-def solve(graph: PoseGraph, guess: Mapping[int, Array], *, outlier_distance: float = 14.2) -> Solution:
+def solve(
+    graph: PoseGraph, guess: Mapping[int, Array], *, outlier_distance: float = 14.2, shared: float = 0.0
+) -> Solution:
     """Optimise the poses of all frames that accepted edges connect with the first.
 
     Edges that reach a frame nothing else has reached, odometry before closures, cannot be contradicted and are trusted.
@@ -196,8 +204,9 @@ def solve(graph: PoseGraph, guess: Mapping[int, Array], *, outlier_distance: flo
         graph: the edges.
         guess: object_from_camera (4, 4) by frame number, to start from; frames without one start on the chain.
         outlier_distance: see `Smoother`.
+        shared: see `Smoother`.
 
     Raises:
         ValueError: where an accepted edge's covariance is not positive definite.
     """
-    return Smoother(outlier_distance, solution=Solution(guess)).to(graph).solution
+    return Smoother(outlier_distance, shared, solution=Solution(guess)).to(graph).solution

@@ -1,0 +1,108 @@
+"""Edges that share a frame share its noise: what that makes of the uncertainty of a solution.
+
+Of an edge's covariance Σ a share ρ is its two images' own: noise of their pixels, which moves an image as a whole and
+does so in every edge that the image has. Then frame k does not look as if it stood at T_k but at T_k exp(η_k), with one
+η_k ~ N(0, Q_k) for all edges, and edges are independent measurements, of covariance (1 − ρ) Σ, between where frames
+seem to stand. These places are solved for as ever, as one factor for all covariances moves nothing; and
+
+    cov(T_target⁻¹ T_source) = (1 − ρ) cov_independent + Q_source + Ad(source_from_target) Q_target Ad(…)ᵀ.
+
+An edge alone keeps the covariance that it came with. Several edges between two frames and their neighbours make it no
+smaller than the images allow; along a chain the images' own noise cancels from edge to edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import stats
+
+from modeler import se3
+from modeler.graph.links import Link
+from modeler.graph.marginals import RelativeCovariance
+from modeler.graph.pose_graph import PoseGraph
+from modeler.types import Array, Solution
+
+_CAUTION = 0.16  # one standard error to the side on which covariances are larger
+_MOST = 0.9  # of a covariance: registration has noise of its own, from where it looks and how it searches
+
+
+@dataclass(frozen=True, eq=False)
+class SharedCovariance:
+    """Covariances of target_from_source between solved frames whose edges share the frames' noise."""
+
+    independent: RelativeCovariance
+    """Those for edges with nothing in common."""
+    links: Sequence[Link]
+    """All that take part."""
+    share: float
+    """That is the frames' own, 0 to 1."""
+
+    def __call__(self, target: int, source: int) -> Array:
+        """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
+
+        Raises:
+            KeyError: where a frame was not solved.
+        """
+        return self._widened(self.independent(target, source), target, source)
+
+    def marginals(self) -> Mapping[int, Array]:
+        """Return covariances (6, 6) of ξ in `object_from_camera @ exp(ξ)` by frame number."""
+        return self._marginals
+
+    @cached_property
+    def _marginals(self) -> dict[int, Array]:
+        root = self.independent.root
+        return {frame: self._widened(alone, root, frame) for frame, alone in self.independent.marginals().items()}
+
+    def _widened(self, alone: Array, target: int, source: int) -> Array:
+        if target == source:
+            return alone
+        source_from_target = se3.inverse(self.independent.trajectory[source]) @ self.independent.trajectory[target]
+        of_target = se3.inverse_covariance(source_from_target, self._own.get(target, np.zeros((6, 6))))
+        covariance = (1.0 - self.share) * alone + self._own.get(source, np.zeros((6, 6))) + of_target
+        return 0.5 * (covariance + covariance.T)
+
+    @cached_property
+    def _own(self) -> dict[int, Array]:
+        """Covariances Q (6, 6) of the frames' own noise: as the edges of each say, those that are sure first."""
+        informations: dict[int, list[Array]] = {}
+        for link in self.links:
+            information = link.root_information.T @ link.root_information
+            to_target = se3.adjoint(se3.inverse(link.pose.mean))  # ξ of the source frame from one of the target's
+            informations.setdefault(link.source, []).append(information)
+            informations.setdefault(link.target, []).append(to_target.T @ information @ to_target)
+        return {
+            frame: np.asarray(0.5 * self.share * np.linalg.inv(np.mean(some, axis=0)), dtype=np.float64)
+            for frame, some in informations.items()
+        }
+
+
+def shared_noise(graph: PoseGraph, solution: Solution) -> float:
+    """Return the share ρ of edges' covariances that is their images' own, as loops tell: they close better for it.
+
+    The images' noise cancels around a loop, so that 6 l conditions of l loops are met with (1 − ρ) of the squared
+    distance that independent edges would have. The estimate errs towards independence by one standard error; without
+    loops, and where they close no better than edges of independent noise, it is 0.
+
+    Args:
+        graph: the edges; those of neighbouring frames over one, two … steps tell most.
+        solution: of that graph.
+    """
+    count, distance = 0, 0.0
+    for edge in graph.accepted:
+        if edge.target not in solution.trajectory or edge.source not in solution.trajectory:
+            continue
+        if any(edge is outlier for outlier in solution.outliers):
+            continue
+        pose = solution.edge_poses.get((edge.source, edge.target), edge.posterior.pose)
+        xi = se3.log(se3.inverse(pose.mean) @ solution.relative(edge.target, edge.source))
+        distance += float(xi @ np.linalg.solve(pose.covariance, xi))
+        count += 1
+    conditions = 6 * (count - len(solution.trajectory) + 1)
+    if not count or conditions <= 0:
+        return 0.0
+    return float(np.clip(1.0 - distance / stats.chi2(conditions).ppf(_CAUTION), 0.0, _MOST))
