@@ -53,7 +53,7 @@ class Bag:
     @property
     def types(self) -> dict[str, str]:
         """Message types by topic, as in `sensor_msgs/msg/Image`."""
-        return {connection.topic: connection.msgtype for connection in self._reader.connections}
+        return {str(connection.topic): str(connection.msgtype) for connection in self._reader.connections}
 
     def messages(self, topic: str, most: int | None = None) -> Iterator[tuple[Stamp, Any]]:
         """Read the messages of a topic in the order in which they were received.
@@ -89,7 +89,7 @@ class Bag:
             raise InputError(f"{self.path}: lacks a message of {topic} that it had; record it anew.")
 
     def _of(self, topic: str) -> list[Connection]:
-        return [connection for connection in self._reader.connections if connection.topic == topic]
+        return [connection for connection in self._reader.connections if str(connection.topic) == topic]
 
     def _message(self, connection: Connection, data: bytes) -> Any:
         store = _typestore(ros1=self.is_ros1)

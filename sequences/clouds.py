@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -163,7 +164,7 @@ def fitted(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
     Raises:
         InputError: where no pinhole camera that looks along z saw them.
     """
-    rows, columns = np.nonzero(np.isfinite(points).all(axis=2) & (points[..., 2] > 0.0))
+    rows, columns = np.nonzero(np.isfinite(points).all(axis=2) & (points[..., 2] > 1e-9))
     if rows.size < 100:
         raise InputError(f"{path}: has only {rows.size} points before the camera; z must point forward, in m.")
     found, off_px = [], []
@@ -184,14 +185,36 @@ def fitted(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
 
 def _points(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8] | None]:
     """Return the points (h, w, 3) of a cloud, NaN where there is none, and their colours (h, w, 3)."""
+    width, height = organised(path)
+    try:
+        points, colours = _read_pcd(path) if path.suffix.lower() == ".pcd" else _read_ply(path)
+    except Exception as error:  # a broken cloud can make the libraries raise anything
+        why = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"{path}: is not a readable cloud ({why}); save it anew.") from None
+    if points.shape != (width * height, 3):
+        raise InputError(f"{path}: is cut off or broken, {len(points)} points could be read; save it anew.")
+    points = np.where(np.isfinite(points) & (np.abs(points) < 1e9), points, np.nan).reshape(height, width, 3)
+    if colours.shape[:1] != (width * height,) or colours.ndim != 2 or colours.shape[1] < 3:
+        return points, None
+    return points, colours[:, :3].astype(np.uint8).reshape(height, width, 3)
+
+
+def _read_pcd(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return points (n, 3) and colours (n, 3) from 0 to 255, or (0, 3), of a PCD file."""
     import open3d as o3d  # takes a second
 
-    width, height = organised(path)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
-    points, colours = np.asarray(cloud.points), np.asarray(cloud.colors)
-    if len(points) != width * height:
-        raise InputError(f"{path}: is cut off or broken, {len(points)} points could be read; save it anew.")
-    if not len(colours):
-        return points.reshape(height, width, 3), None
-    return points.reshape(height, width, 3), np.rint(colours * 255.0).astype(np.uint8).reshape(height, width, 3)
+    shares = np.nan_to_num(np.asarray(cloud.colors, dtype=np.float64)).clip(0.0, 1.0)
+    return np.asarray(cloud.points, dtype=np.float64), np.rint(255.0 * shares)
+
+
+def _read_ply(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return points (n, 3) and colours (n, 3 or 4) from 0 to 255, or (0, 3), of a PLY file."""
+    from trimesh.exchange.ply import load_ply
+
+    with path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        read = load_ply(file)
+    colours = np.asarray(read.get("vertex_colors", np.zeros((0, 3))), dtype=np.float64)
+    return np.asarray(read["vertices"], dtype=np.float64), np.nan_to_num(colours).clip(0.0, 255.0)

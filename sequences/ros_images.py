@@ -45,6 +45,8 @@ def depth_m(message: Any, unit_mm: float, where: str) -> npt.NDArray[np.float32]
     Raises:
         InputError: where the message contradicts itself.
     """
+    if not is_depth(message):
+        raise InputError(f"{where}: is {_kind(message)} where images before it are depth; record it anew.")
     if _is_raw(message) and message.encoding in METRES:
         depth = _rows(message, 4, where).view(">f4" if message.is_bigendian else "<f4").astype(np.float32)
         return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(np.nan))
@@ -63,6 +65,8 @@ def colour(message: Any, where: str) -> npt.NDArray[np.uint8]:
     Raises:
         InputError: where the message contradicts itself.
     """
+    if not is_colour(message):
+        raise InputError(f"{where}: is {_kind(message)} where images before it are colour; record it anew.")
     if not _is_raw(message):
         return read_colour(Packed(bytes(message.data), where))
     channels = COLOURS[message.encoding]
@@ -89,6 +93,10 @@ def lens(message: Any, where: str, *, ros1: bool) -> Lens:
     if known.bends and model not in ("plumb_bob", "rational_polynomial", "", "None"):
         raise InputError(f"{where}: its distortion model {model!r} is not known; record the rectified topic.")
     return known
+
+
+def _kind(message: Any) -> str:
+    return repr(message.encoding if _is_raw(message) else message.format)[:40]
 
 
 def _is_raw(message: Any) -> bool:

@@ -23,7 +23,7 @@ class CalibrateSensor:
     """At least 3 frames in any format that is read."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """JSON file to write; one that is there is replaced."""
-    said: InputOptions = field(default_factory=InputOptions)
+    given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
         """Measure the noise, store it, and print what was measured at which distance and angle."""

@@ -18,7 +18,7 @@ def calibrate_sensor(options: CalibrateSensor) -> int:
     Raises:
         InputError: where the input cannot be used or the file cannot be written.
     """
-    sequence = open_sequence(options.input, options.said.given())
+    sequence = open_sequence(options.input, options.given.stated())
     found = calibrate(sequence)
     distance_m = object_distance_m(sequence.frame(sequence.indices[0]))
     write_atomically(options.out, noise_text(found.model, _facts(sequence.name, found, distance_m)))

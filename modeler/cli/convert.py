@@ -27,7 +27,7 @@ class Convert:
     sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: as INPUT says)")] = None
     """Noise of the depth camera, as `modeler calibrate-sensor` measured it, to write into sequence.json."""
     selection: FrameOptions = field(default_factory=FrameOptions)
-    said: InputOptions = field(default_factory=InputOptions)
+    given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
         """Convert the input."""

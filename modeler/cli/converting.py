@@ -29,7 +29,7 @@ def convert(options: Convert) -> int:
     """
     if (options.input / "report.json").is_file():
         return _poses(options.input, options.out)
-    whole = open_sequence(options.input, options.said.given())
+    whole = open_sequence(options.input, options.given.stated())
     whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
     sequence = whole.select(options.selection.every, frame_range(options.selection.frames))
     found = survey(sequence)

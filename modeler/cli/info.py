@@ -22,7 +22,7 @@ class Info:
     """A sequence in any format that is read; the format is told from the path."""
     json: bool = False
     """Print a JSON object instead of lines."""
-    said: InputOptions = field(default_factory=InputOptions)
+    given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
         """Print what was found; status 2 where the input cannot be used."""

@@ -16,7 +16,7 @@ def inform(options: Info) -> int:
     Raises:
         InputError: where it cannot be used.
     """
-    sequence = open_sequence(options.input, options.said.given())
+    sequence = open_sequence(options.input, options.given.stated())
     found = survey(sequence)
     if options.json:
         print(json.dumps(record(sequence, found), allow_nan=False))

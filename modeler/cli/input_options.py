@@ -30,7 +30,7 @@ class InputOptions:
     colour_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), _default("the one aligned to depth")] = None
     """Topic of the colour images in a ROS bag."""
 
-    def given(self) -> Given:
+    def stated(self) -> Given:
         """Return them as readers take them.
 
         Raises:

@@ -1,0 +1,1 @@
+"""Damaged inputs by the hundred thousand; `python -m fuzz` runs them."""

@@ -1,0 +1,135 @@
+"""What is fuzzed: a small intact input of each format, and the files of it that are damaged."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import bags
+import numpy as np
+import recordings
+import test_inputs_clouds as clouds
+
+from modeler import se3
+from modeler.types import Camera, Frame
+from sequences import open_sequence, read_noise, survey, write_bop
+
+
+@dataclass(frozen=True)
+class Target:
+    """One format."""
+
+    make: Callable[[Path], Path]
+    """Writes an intact input into a folder and returns its path."""
+    damage: tuple[str, ...]
+    """Patterns, relative to the folder, of the files to damage, one at a time."""
+    read: Callable[[Path], object]
+    """Reads all of it."""
+    share: float = 1.0
+    """How many inputs to try, relative to the others."""
+
+
+def tiny(count: int = 2) -> list[Frame]:
+    """Return frames of 24 x 16 pixels."""
+    rng = np.random.default_rng(0)
+    camera = Camera(24, 16, 30.0, 30.5, 11.5, 7.5)
+    frames = []
+    for index in range(count):
+        depth_m = np.rint(rng.uniform(500.0, 1500.0, (16, 24))).astype(np.float32) * np.float32(0.001)
+        depth_m[rng.random(depth_m.shape) < 0.1] = np.nan
+        colour = rng.integers(0, 256, (16, 24, 3), dtype=np.uint8)
+        frames.append(Frame(index, 0.1 * index, depth_m, camera, depth_m < 1.0, colour))
+    return frames
+
+
+def truth(count: int = 2) -> dict[int, np.ndarray]:
+    rng = np.random.default_rng(1)
+    return {index: se3.exp(0.3 * rng.normal(size=6)) for index in range(count)}
+
+
+def read_all(path: Path) -> object:
+    """Read every frame and the truth, as `modeler info` does."""
+    return survey(open_sequence(path))
+
+
+def _bop(folder: Path) -> Path:
+    meta = {
+        "name": "s",
+        "sensor": {"sigma_wh": 1e-3, "sigma_r_m": 2e-3},
+        "motion": {"kind": "table", "step_deg": 25, "sigma_deg": 3},
+    }
+    write_bop(folder / "s", tiny(), truth(), meta, colour_suffix=".jpg")
+    return folder / "s"
+
+
+def _tiff(folder: Path) -> Path:
+    path = _bop(folder)
+    for frame in tiny():
+        (path / "depth" / f"{frame.index:06d}.png").unlink()
+        recordings.save(path / "depth" / f"{frame.index:06d}.tif", recordings.raw_depth(frame, 0.1))
+    return path
+
+
+def _written(write: Callable[[Path, list[Frame], dict[int, np.ndarray]], None]) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        write(folder / "s", tiny(), truth())
+        return folder / "s"
+
+    return make
+
+
+def _bag(name: str, recorder: bags.Recorder) -> Callable[[Path], Path]:
+    return lambda folder: recorder.write(folder / name, tiny())
+
+
+def _cloud(kind: str) -> Callable[[Path], Path]:
+    suffix, write = clouds.WRITERS[kind]
+
+    def make(folder: Path) -> Path:
+        smooth = replace(tiny()[0], depth_m=np.full((16, 24), 0.8, np.float32))
+        write(folder / f"s{suffix}", smooth)
+        return folder / f"s{suffix}"
+
+    return make
+
+
+def _noise(folder: Path) -> Path:
+    noise = {"lateral_px": 0.5, "focal_px": 500.0, "floor_m": 1e-4, "growth": [1e-6, 1e-7, 0.0]}
+    (folder / "s.json").write_text(json.dumps({"noise": noise}))
+    return folder / "s.json"
+
+
+TARGETS: dict[str, Target] = {
+    "bop": Target(_bop, ("s/*.json",), read_all, 2.0),
+    "png": Target(_bop, ("s/depth/*", "s/mask_visib/*"), read_all, 2.0),
+    "jpg": Target(_bop, ("s/rgb/*",), read_all),
+    "tiff": Target(_tiff, ("s/depth/*",), read_all),
+    "tum": Target(_written(recordings.write_tum), ("s/*.txt",), read_all, 2.0),
+    "open3d": Target(_written(recordings.write_open3d), ("s/*.json", "s/*.log"), read_all, 2.0),
+    "bundlesdf": Target(_written(recordings.write_bundlesdf), ("s/*.txt", "s/annotated_poses/*"), read_all, 2.0),
+    "ros1": Target(_bag("s.bag", bags.Recorder()), ("s.bag",), read_all, 2.0),
+    "ros1 packed": Target(
+        _bag("s.bag", bags.Recorder("compressedDepth", "jpeg", compression=bags.rosbag1.Writer.CompressionFormat.LZ4)),
+        ("s.bag",),
+        read_all,
+    ),
+    "mcap": Target(_bag("s.mcap", bags.Recorder("32FC1", "bgr8")), ("s.mcap",), read_all, 2.0),
+    "db3": Target(_bag("s.db3", bags.Recorder()), ("s.db3",), read_all),
+    "ros2 folder": Target(_bag("s", bags.Recorder()), ("s/metadata.yaml",), read_all, 0.3),
+    "pcd": Target(_cloud("pcd binary"), ("s.pcd",), read_all),
+    "pcd ascii": Target(_cloud("pcd ascii"), ("s.pcd",), read_all),
+    "pcd packed": Target(_cloud("pcd compressed"), ("s.pcd",), read_all),
+    "ply": Target(_cloud("ply binary"), ("s.ply",), read_all),
+    "noise": Target(_noise, ("s.json",), read_noise),
+}
+
+
+def fresh(target: Target, folder: Path) -> tuple[Path, list[Path]]:
+    """Write an intact input and return its path and the files to damage."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    path = target.make(folder)
+    return path, sorted(file for pattern in target.damage for file in folder.glob(pattern))

@@ -1,0 +1,87 @@
+"""Damaged inputs of every format: read, or refused in one line. `python -m fuzz` tries many more."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fuzz.mutate import mutated, with_sums
+from fuzz.targets import TARGETS, fresh, truth
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from recordings import small_frames
+
+from modeler.types import InputError
+from sequences import open_sequence, read_noise, survey, write_bop
+
+INPUTS = 40
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=10) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=12,
+)
+KEYS = st.sampled_from(["0", "1", "cam_K", "depth_scale", "cam_R_m2c", "sensor", "timestamps_s", "name", "noise"])
+ENTRIES = st.dictionaries(KEYS, JSON | st.dictionaries(KEYS, JSON, max_size=3), max_size=4)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_damage_is_told_in_one_line_or_does_not_matter(tmp_path: Path, name: str) -> None:
+    target, rng = TARGETS[name], np.random.default_rng([7, list(TARGETS).index(name)])
+    path, files = fresh(target, tmp_path / "in")
+    intact = {file: file.read_bytes() for file in files}
+    target.read(path)
+    told: list[str] = []
+    for _ in range(INPUTS):
+        file = files[int(rng.integers(len(files)))]
+        file.write_bytes(mutated(intact[file], list(intact.values()), rng))
+        try:
+            target.read(path)
+        except InputError as error:
+            told.append(str(error))
+        file.write_bytes(intact[file])
+    assert told
+    assert "\n" not in "".join(told)
+    target.read(path)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("json") / "s"
+    write_bop(folder, small_frames(2), truth())
+    return folder
+
+
+@given(which=st.sampled_from(["scene_camera.json", "scene_gt.json", "sequence.json"]), tree=ENTRIES | JSON)
+@settings(max_examples=150)
+def test_any_json_is_read_or_refused(scene: Path, which: str, tree: object) -> None:
+    path = scene / which
+    intact, told = path.read_bytes(), ""
+    try:
+        path.write_text(json.dumps(tree))
+        survey(open_sequence(scene))
+    except InputError as error:
+        told = str(error)
+    finally:
+        path.write_bytes(intact)
+    assert "\n" not in told
+
+
+@given(tree=ENTRIES | JSON)
+@settings(max_examples=50)
+def test_any_noise_file_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, tree: object) -> None:
+    path = tmp_path_factory.getbasetemp() / "noise.json"
+    path.write_text(json.dumps(tree))
+    with pytest.raises(InputError):  # nothing but the right numbers in the right places is a model
+        read_noise(path)
+
+
+def test_sums_are_put_right(tmp_path: Path) -> None:
+    _, files = fresh(TARGETS["png"], tmp_path / "in")
+    content = files[0].read_bytes()
+    assert with_sums(content) == content
+    broken = bytearray(content)
+    broken[29] ^= 0xFF  # within the sum of the header
+    assert with_sums(bytes(broken)) == content
