@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -14,7 +15,9 @@ from turning_box import CENTRE_M, HALF_M, object_from_camera, steps
 
 from modeler import se3
 from modeler.export import RunFolder, RunMeta
+from modeler.export.ply import mesh_ply
 from modeler.types import Array, InputError
+from viz import entities
 from viz.report import write_page
 from viz.report.mesh import read_mesh, scene
 from viz.report.result import Result
@@ -128,6 +131,24 @@ def test_a_mesh_without_colour_is_drawn_plain(run: Path, tmp_path: Path) -> None
     mesh = read_mesh(tmp_path / "grey" / "model.ply")
     assert mesh is not None
     assert scene(mesh, [])["colours"] is None
+    assert scene(mesh, [])["certainty"] is None
+
+
+def test_the_viewer_shows_how_sure_each_vertex_is_and_what_is_made_up(tmp_path: Path) -> None:
+    model = list(steps(2))[-1].model
+    assert model is not None
+    sigmas_m = np.array([np.inf, 0.0, 1e-3, 2e-3, 5e-3, 0.0, 0.0, 0.0])
+    views = np.where(np.isfinite(sigmas_m), 3, 0)
+    (tmp_path / "model.ply").write_bytes(mesh_ply(replace(model, vertex_views=views, vertex_sigmas_m=sigmas_m)))
+    mesh = read_mesh(tmp_path / "model.ply")
+    assert mesh is not None
+    assert mesh.certainty is not None
+    order = [int(np.argmin(np.linalg.norm(mesh.vertices_m - vertex, axis=1))) for vertex in model.vertices_m]
+    painted = mesh.certainty[order].astype(int)
+    assert tuple(painted[0]) == entities.MADE_UP_RGB
+    lightness = painted[1:4].sum(axis=1)
+    assert (np.diff(lightness) > 100).all()
+    np.testing.assert_array_equal(painted[3], painted[4])
 
 
 def test_without_truth_recording_or_mesh_the_page_says_so(run: Path, tmp_path: Path) -> None:

@@ -117,7 +117,13 @@ def _readings() -> rrb.Container:
     dark = rrb.archetypes.PlotBackground(color=_BACKGROUND)  # in the browser too, whatever its theme, for white lines
     return rrb.Horizontal(
         *(
-            rrb.TimeSeriesView(origin=path, name=title, plot_legend=hidden, background=dark)
+            rrb.TimeSeriesView(
+                origin=path,
+                name=title,
+                plot_legend=hidden,
+                background=dark,
+                axis_y=rrb.ScalarAxis(range=(0.0, 105.0)) if path == entities.OVERLAP else None,
+            )
             for path, title in titles.items()
         )
     )

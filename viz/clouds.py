@@ -19,6 +19,7 @@ Drawing = Iterator[tuple[str, rr.AsComponents]]
 _PAIR_POINTS: Final = 6_000
 _MODEL_POINTS: Final = 15_000
 _TRIANGLES: Final = 60_000
+_PLAIN: Final = 215.0  # grey of surface without colour
 _CLEAR: Final = rr.Clear(recursive=False)
 _POINT_SIZE: Final = rr.Radius.ui_points(1.75)
 
@@ -88,17 +89,19 @@ def _view_points(view: RayImage, target_from_view: Array, rgb: entities.Rgb) -> 
 
 
 def _mesh(model: ObjectModel) -> rr.Mesh3D:
-    """Return the mesh, coarse enough for the recording to stay small."""
-    attributes = [model.vertices_m, model.vertex_normals]
-    if model.vertex_colours is not None:
-        attributes.append(model.vertex_colours.astype(np.float64))
-    vertices, triangles = coarsened(np.concatenate(attributes, axis=1), model.triangles, _TRIANGLES)
+    """Return the mesh, coarse enough for the recording to stay small; surface that nobody saw is tinted."""
+    colours = np.full(model.vertices_m.shape, _PLAIN) if model.vertex_colours is None else model.vertex_colours
+    colours = colours.astype(np.float64)
+    if model.vertex_views is not None:
+        made_up = model.vertex_views == 0
+        colours[made_up] = 0.5 * (colours[made_up] + entities.MADE_UP_RGB)
+    attributes = np.concatenate([model.vertices_m, model.vertex_normals, colours], axis=1)
+    vertices, triangles = coarsened(attributes, model.triangles, _TRIANGLES)
     return rr.Mesh3D(
         vertex_positions=vertices[:, :3],
         vertex_normals=vertices[:, 3:6],
         triangle_indices=triangles,
-        vertex_colors=None if model.vertex_colours is None else vertices[:, 6:].astype(np.uint8),
-        albedo_factor=(215, 215, 215) if model.vertex_colours is None else None,
+        vertex_colors=np.rint(vertices[:, 6:]).astype(np.uint8),
     )
 
 

@@ -91,6 +91,7 @@ AREAS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((0, 0, 0), (128, 128, 128), (45, 85, 1
 AGREES_RGB: Final[Rgb] = SOURCE_RGB
 HIDDEN_RGB: Final[Rgb] = (120, 80, 45)
 NO_SAY_RGB: Final[Rgb] = (70, 70, 70)
+MADE_UP_RGB: Final[Rgb] = (230, 90, 200)
 VIOLATION_RGB: Final[Rgb] = (255, 40, 160)
 UNCERTAINTY_RGB: Final[Rgb] = (255, 225, 90)
 AXIS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((230, 70, 70), (80, 200, 80), (90, 130, 255))
@@ -104,6 +105,8 @@ motion makes them do.
 **Pair column.** New view orange, the view it is aligned to teal, in the latter's camera frame. Lowest, the posterior
 spread by the factor written there: the object at its mean, ghosts of it at samples, the ends of its axes as dots, its
 centre within 1 and 3 sd as yellow ellipsoids; other modes in other colours, with their share of the probability.
+
+**Model.** Pink surface is made up: nobody saw it, and it closes the mesh.
 
 **Graph.** A pyramid is the camera as the object saw it, the newest orange. Edges: odometry white, closure green,
 rejected red, each with an ellipsoid of the shift it allows within 1 sd. Yellow: position of a camera within 1 sd

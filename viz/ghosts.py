@@ -160,11 +160,13 @@ def _centres(view: RayImage, ghosts: Ghosts, colours: npt.NDArray[np.int64]) -> 
                 fill_mode=style,
             ),
         )
-    below = centres + np.array([0.0, 1.1 * spread.axes_length_m(view), 0.0])
+    # The heaviest mode's caption stands below the object, the others' one over another above it.
+    down = 1.1 * spread.axes_length_m(view) * np.array([1.0, *(-1.0 - 0.25 * np.arange(len(centres) - 1))])
+    places = centres[0] + down[:, None] * np.array([0.0, 1.0, 0.0])
     scale = f"spread {uncertainty.scale_words(ghosts.factor)}"
     shares = [f"mode {k + 1}: {100.0 * mode.weight:.0f} %" for k, mode in enumerate(ghosts.modes)]
-    labels = [scale] if len(shares) == 1 else [f"{share}, {scale}" for share in shares]
+    labels = [scale] if len(shares) == 1 else [f"{shares[0]}, {scale}", *shares[1:]]
     yield (
         entities.GHOST_LABELS,
-        rr.Points3D(below, labels=labels, show_labels=True, radii=rr.Radius.ui_points(0.0), colors=colours),
+        rr.Points3D(places, labels=labels, show_labels=True, radii=rr.Radius.ui_points(0.0), colors=colours),
     )

@@ -9,6 +9,7 @@ import numpy as np
 import rerun as rr
 
 from modeler import se3
+from modeler.export.words import undetermined
 from modeler.types import Array, Edge, Posterior, Step
 from viz import entities, poses
 
@@ -94,6 +95,8 @@ def now_words(step: Step) -> str:
     lines = [f"### Frame {step.frame.index}: {'accepted' if accepted else 'left out'}"]
     for edge in step.edges:
         lines.append(f"- **{pair_words(edge, step)}.** {edge.posterior.outcome.advice}")
+        if np.isfinite(edge.posterior.pose.covariance).all():
+            lines += [f"  - {words}" for words in undetermined(edge.posterior, step.view)]
     if not step.edges:
         lines.append("- The first view of the object." if accepted else f"- {step.outcome}")
     kinds = [edge.kind for edge in step.edges_so_far if poses.takes_part(edge, step)]

@@ -45,7 +45,8 @@ class RerunStream:
         # Rerun takes half a second to import: only runs that record pay for it.
         from viz import blueprint, clouds, ghosts, images, poses, readings, spread, uncertainty, visibility
 
-        self.recording.set_time(entities.FRAME, sequence=step.frame.index)
+        # A frame that was lost is tried again when later ones are known: what that brings stands at the latest frame.
+        self.recording.set_time(entities.FRAME, sequence=max(step.frame.index, *step.views, step.frame.index))
         self.recording.set_time(entities.ELAPSED, duration=time.monotonic() - self.started_s)
         if step.view is not None and set(step.views) == {step.frame.index}:
             self.recording.send_blueprint(blueprint.layout(step.view))

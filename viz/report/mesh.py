@@ -6,13 +6,20 @@ import base64
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Array
+from viz import entities
 from viz.clouds import coarsened
+
+if TYPE_CHECKING:
+    import trimesh
+
+MOST_SIGMA_M: Final = 2e-3
+"""Standard deviation of a vertex at the end of the scale of colours."""
 
 _TRIANGLES: Final = 60_000
 _STEPS: Final = 32767  # of a coordinate from the centre to the farthest vertex: 16-bit whole numbers
@@ -30,6 +37,8 @@ class Mesh:
     """(t, 3) vertex numbers."""
     colours: npt.NDArray[np.uint8] | None
     """(v, 3) RGB, where the input had colour."""
+    certainty: npt.NDArray[np.uint8] | None
+    """(v, 3) RGB that stands for the sd of each vertex, pink where it is made up; None where that is not known."""
     total: int
     """Number of triangles before the mesh was made coarser."""
 
@@ -59,6 +68,9 @@ def read_mesh(path: Path) -> Mesh | None:
     coloured = isinstance(visual, ColorVisuals) and visual.kind == "vertex"
     if isinstance(visual, ColorVisuals) and coloured:
         attributes.append(np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3])
+    sigmas_m = _sigmas_m(mesh)
+    if sigmas_m is not None:
+        attributes.append(_certainty(sigmas_m))
     triangles = np.asarray(mesh.faces, dtype=np.int64)
     vertices, kept = coarsened(np.concatenate(attributes, axis=1, dtype=np.float64), triangles, _TRIANGLES)
     used, kept = np.unique(kept, return_inverse=True)
@@ -67,9 +79,26 @@ def read_mesh(path: Path) -> Mesh | None:
         vertices_m=vertices[:, :3],
         normals=vertices[:, 3:6] / np.maximum(np.linalg.norm(vertices[:, 3:6], axis=1, keepdims=True), 1e-12),
         triangles=kept.reshape(-1, 3),
-        colours=np.rint(vertices[:, 6:]).astype(np.uint8) if coloured else None,
+        colours=np.rint(vertices[:, 6:9]).astype(np.uint8) if coloured else None,
+        certainty=None if sigmas_m is None else np.rint(vertices[:, -3:]).astype(np.uint8),
         total=len(triangles),
     )
+
+
+def _sigmas_m(mesh: trimesh.Trimesh) -> Array | None:
+    """Return the sd (v,) that the file states for each vertex, negative where it is made up; None without."""
+    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    names = getattr(raw, "dtype", np.dtype([])).names or ()
+    return np.asarray(raw["sigma_m"], dtype=np.float64) if raw is not None and "sigma_m" in names else None
+
+
+def _certainty(sigmas_m: Array) -> Array:
+    """Return colours (v, 3) from dark (0) to yellow (MOST_SIGMA_M and more); pink for what is made up."""
+    from matplotlib import colormaps
+
+    rgb = 255.0 * colormaps["cividis"](np.clip(sigmas_m / MOST_SIGMA_M, 0.0, 1.0))[:, :3]
+    rgb[sigmas_m < 0.0] = entities.MADE_UP_RGB
+    return rgb
 
 
 def scene(mesh: Mesh, strips_m: list[Array]) -> Mapping[str, Any]:
@@ -86,6 +115,7 @@ def scene(mesh: Mesh, strips_m: list[Array]) -> Mapping[str, Any]:
         "positions": _packed(places),
         "normals": _packed(np.rint(127.0 * mesh.normals).astype("i1")),
         "colours": None if mesh.colours is None else _packed(mesh.colours),
+        "certainty": None if mesh.certainty is None else _packed(mesh.certainty),
         "triangles": _packed(mesh.triangles.astype("<u4")),
         "lines": _packed(((segments - mesh.centre_m) / mesh.radius_m).astype("<f4")),
         "count": int(mesh.triangles.size),

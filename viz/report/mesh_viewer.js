@@ -48,7 +48,6 @@
   gl.bindVertexArray(body);
   attribute(surface, "place", bytes(scene.positions), gl.SHORT, true);
   attribute(surface, "normal", bytes(scene.normals), gl.BYTE, true);
-  if (scene.colours) attribute(surface, "colour", bytes(scene.colours), gl.UNSIGNED_BYTE, true);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, bytes(scene.triangles), gl.STATIC_DRAW);
   const frame = gl.createVertexArray();
@@ -58,13 +57,22 @@
 
   // Column by column. `turn` takes object axes (y down, z forward in the first image) to the eye's (y up, z back).
   const START = [1, 0, 0, 0, -1, 0, 0, 0, -1];
-  let turn, distance, shift;
+  let turn, distance, shift, plain;
   const multiplied = (a, b) => a.map((_, k) => [0, 1, 2].reduce((s, j) => s + a[3 * j + (k % 3)] * b[3 * ((k / 3) | 0) + j], 0));
   const about = (axis, angle) => {
     const c = Math.cos(angle), s = Math.sin(angle);
     return axis === "x" ? [1, 0, 0, 0, c, s, 0, -s, c] : [c, 0, -s, 0, 1, 0, s, 0, c];
   };
   const home = () => { turn = multiplied(about("x", 0.45), multiplied(about("y", 0.6), START)); distance = 3.4; shift = [0, 0]; };
+  // What the surface is painted with: colour as seen, how sure each vertex is, or plain grey.
+  const chooser = document.getElementById("paint");
+  const repaint = () => {
+    const chosen = scene[chooser.value];
+    gl.bindVertexArray(body);
+    if (chosen) attribute(surface, "colour", bytes(chosen), gl.UNSIGNED_BYTE, true);
+    plain = chosen ? 0 : 1;
+    document.getElementById("scale").hidden = chooser.value !== "certainty";
+  };
   const checked = (name) => { const box = document.getElementById(name); return box !== null && box.checked; };
   const draw = () => {
     const scale = window.devicePixelRatio || 1;
@@ -83,7 +91,7 @@
       gl.uniformMatrix4fv(gl.getUniformLocation(made, "view"), false, view);
       gl.uniformMatrix4fv(gl.getUniformLocation(made, "projection"), false, projection);
       if (made === surface) {
-        gl.uniform1f(gl.getUniformLocation(made, "plain"), scene.colours && checked("coloured") ? 0 : 1);
+        gl.uniform1f(gl.getUniformLocation(made, "plain"), plain);
         gl.drawElements(gl.TRIANGLES, scene.count, gl.UNSIGNED_INT, 0);
       } else if (checked("cameras")) gl.drawArrays(gl.LINES, 0, strokes.length / 12);
     }
@@ -109,9 +117,11 @@
   canvas.addEventListener("wheel", (event) => { event.preventDefault(); distance *= Math.exp(0.001 * event.deltaY); draw(); }, { passive: false });
   canvas.addEventListener("dblclick", () => { home(); draw(); });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-  for (const name of ["coloured", "cameras"]) document.getElementById(name)?.addEventListener("change", draw);
+  document.getElementById("cameras").addEventListener("change", draw);
+  chooser.addEventListener("change", () => { repaint(); draw(); });
   window.addEventListener("resize", draw);
   home();
+  repaint();
   draw();
   canvas.dataset.drawn = String(scene.count / 3);
 })();

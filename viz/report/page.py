@@ -20,7 +20,7 @@ from modeler.export import write_atomically
 from modeler.types import Array, Edge
 from viz.pictures import look_at, shade
 from viz.report import plots
-from viz.report.mesh import Mesh, read_mesh, scene
+from viz.report.mesh import MOST_SIGMA_M, Mesh, read_mesh, scene
 from viz.report.pairs import Thumbnails, thumbnails
 from viz.report.result import Result, sd_of
 
@@ -87,12 +87,16 @@ def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
         return ["<h2>Model</h2><p>The run left no mesh.</p>"]
     cameras = [_pyramid(pose.mean) for pose in result.poses.values()]
     data = json.dumps(scene(mesh, cameras))
-    colour = "<label><input type='checkbox' id='coloured' checked> colour</label>" if mesh.colours is not None else ""
+    paints = {"colours": "colour", "certainty": "certainty", "plain": "plain"}
+    known = [name for name in paints if name == "plain" or getattr(mesh, name) is not None]
+    options = "".join(f"<option value='{name}'>{paints[name]}</option>" for name in known)
     made_coarser = "" if len(mesh.triangles) == mesh.total else f", shown with {len(mesh.triangles):,}"
     return [
         "<h2>Model</h2><figure><div class='stage'>"
         f"<canvas id='mesh' style='background-image:url({_poster(mesh)})'></canvas>"
-        f"<div class='switches'>{colour}<label><input type='checkbox' id='cameras'> cameras</label></div></div>"
+        f"<div class='switches'><span id='scale' hidden>sd {_scale()} {1000.0 * MOST_SIGMA_M:g} mm, "
+        f"<span class='pink'>pink: made up</span></span><select id='paint'>{options}</select>"
+        "<label><input type='checkbox' id='cameras'> cameras</label></div></div>"
         f"<figcaption id='mesh-note'>The fused mesh, {mesh.total:,} triangles{made_coarser}. Drag to turn, wheel to "
         "zoom, Shift and drag to move, double click to start over. Insides of open surfaces are reddish.</figcaption>"
         "</figure>",
@@ -157,11 +161,14 @@ def _pairs(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Array) 
         if pictures
         else "There are no pictures, for recording.rrd is missing."
     )
-    cards = [_pair(result, edge, pictures.get(edge.source), centre_m) for edge in result.edges]
+    cards = [
+        _pair(result, edge, record.get("undetermined", []), pictures.get(edge.source), centre_m)
+        for edge, record in zip(result.edges, result.report["edges"], strict=True)
+    ]
     return [f"<h2>Pairs</h2><p class='quiet'>{note}</p><div class='pairs'>{''.join(cards)}</div>"]
 
 
-def _pair(result: Result, edge: Edge, pictures: Thumbnails | None, centre_m: Array) -> str:
+def _pair(result: Result, edge: Edge, left_open: Sequence[str], pictures: Thumbnails | None, centre_m: Array) -> str:
     posterior = edge.posterior
     shown = ""
     if pictures is not None and edge.kind == "odometry":
@@ -186,10 +193,12 @@ def _pair(result: Result, edge: Edge, pictures: Thumbnails | None, centre_m: Arr
             "translation by {:.1f} mm": 1000.0 * evaluation.translation_error_m(posterior.pose.mean, truth, seen_m),
         }
     words = ", ".join(form.format(value) for form, value in facts.items() if np.isfinite(value))
+    open_words = "".join(f"<p>{escape(words)}.</p>" for words in left_open)
     verdict = edge.kind if edge.accepted else f"{edge.kind}, rejected"
     return (
         f"<div class='pair{'' if edge.accepted else ' no'}'><h3>{edge.source} → {edge.target}: {verdict}, "
-        f"{posterior.outcome.label}</h3>{shown}<p>{words}.</p><p class='quiet'>{escape(edge.reason)}</p></div>"
+        f"{posterior.outcome.label}</h3>{shown}<p>{words}.</p>{open_words}"
+        f"<p class='quiet'>{escape(edge.reason)}</p></div>"
     )
 
 
@@ -228,6 +237,16 @@ def _poster(mesh: Mesh) -> str:
     content = io.BytesIO()
     Image.fromarray(picture).save(content, "JPEG", quality=85)
     return _data(content.getvalue(), "jpeg")
+
+
+def _scale() -> str:
+    """Return the colours of certainty, from sure to unsure."""
+    from matplotlib import colormaps
+
+    stops = ",".join(
+        f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b, _ in 255.0 * colormaps["cividis"](np.linspace(0, 1, 9))
+    )
+    return f"0 <i style='background:linear-gradient(90deg,{stops})'></i>"
 
 
 def _figure(picture: bytes, caption: str, *, style: str = "", kind: str = "svg+xml") -> str:
