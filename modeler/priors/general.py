@@ -1,6 +1,6 @@
 """Nothing known but that the views are neighbours (paper, section IV: the general prior)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -39,6 +39,8 @@ class GeneralMotion(AbstractMotion):
     """(3,)."""
     max_rotation_rad: float
     max_offset_m: float
+    middle: Array = field(default_factory=lambda: np.eye(3))
+    """(3, 3) rotation from which the limit counts."""
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
@@ -46,12 +48,13 @@ class GeneralMotion(AbstractMotion):
         angle = sample_angles(self.max_rotation_rad, count, rng)
         offset_m = directions(count, rng) * self.max_offset_m * rng.random((count, 1)) ** (1 / 3)
         motion = se3.exp(np.concatenate([angle[:, None] * directions(count, rng), np.zeros((count, 3))], axis=1))
+        motion[:, :3, :3] = motion[:, :3, :3] @ self.middle
         motion[:, :3, 3] = self.target_centroid_m + offset_m - motion[:, :3, :3] @ self.source_centroid_m
         return motion
 
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of motions (n, 4, 4); -inf outside."""
-        trace = np.trace(target_from_source[:, :3, :3], axis1=1, axis2=2)
+        trace = target_from_source[:, :3, :3].reshape(-1, 9) @ self.middle.ravel()  # of the rotation from the middle
         offset_m = centroid_offset(target_from_source, self.source_centroid_m, self.target_centroid_m)
         inside = (trace >= 1.0 + 2.0 * np.cos(self.max_rotation_rad) - 1e-9) & (
             np.sum(offset_m**2, axis=1) <= self.max_offset_m**2

@@ -13,6 +13,7 @@ from modeler.priors.general import GeneralPrior
 from modeler.priors.proposal import guided
 from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, Frame, InputError, RayImage, Solution
 
+_ROOM_DEG = 5.0  # about what four standard deviations of the hand's errors allow
 _SAME_TIME_S = 1e-3  # poses and frames that are no farther apart in time belong together
 
 
@@ -59,8 +60,9 @@ class HeldPrior(AbstractPrior):
         if self.newest is None or target.index == self.newest:
             return moved
         # What the hand did up to an earlier view counts in the edges between; here it only tells where to look.
-        reach_deg = min(float(np.degrees(se3.rotation_angle(motion) + 4.0 * sigma_rad)) + 10.0, 180.0)
-        return guided(GeneralPrior(reach_deg, self.max_offset_m).between(source, target), [moved])
+        reach_deg = min(float(np.degrees(4.0 * sigma_rad)) + _ROOM_DEG, 180.0)
+        limits = GeneralPrior(reach_deg, self.max_offset_m).between(source, target)
+        return guided(replace(limits, middle=motion[:3, :3]), [moved])
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> HeldPrior:
         """Return the prior that knows which frame came last."""

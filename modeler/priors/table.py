@@ -55,17 +55,20 @@ class TableMotion(AbstractMotion):
     """Where the object stands."""
     max_rotation_rad: float
     max_shift_m: float
+    middle_rad: float = 0.0
+    """The turn from which the limit counts."""
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Draw motions (count, 4, 4)."""
-        turn_rad = rng.uniform(-self.max_rotation_rad, self.max_rotation_rad, count)
+        turn_rad = self.middle_rad + rng.uniform(-self.max_rotation_rad, self.max_rotation_rad, count)
         return self.plane.motions(turn_rad, sample_disc(self.max_shift_m, count, rng), rng)
 
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of motions (n, 4, 4); -inf outside."""
         turn_rad, shift_m, out_of_plane = self.plane.coordinates(target_from_source)
-        inside = (np.abs(turn_rad) <= self.max_rotation_rad) & (np.sum(shift_m**2, axis=1) <= self.max_shift_m**2)
+        turn_rad = np.abs(np.remainder(turn_rad - self.middle_rad + np.pi, 2.0 * np.pi) - np.pi)
+        inside = (turn_rad <= self.max_rotation_rad) & (np.sum(shift_m**2, axis=1) <= self.max_shift_m**2)
         uniform = -np.log(2.0 * self.max_rotation_rad * np.pi * self.max_shift_m**2)
         return np.where(inside, out_of_plane + uniform, -np.inf)
 

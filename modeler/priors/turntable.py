@@ -19,6 +19,7 @@ from modeler.types import AbstractMotion, AbstractPrior, Edge, RayImage, Solutio
 
 _UP = (0.0, -1.0, 0.0)  # against gravity for a camera held upright: y points down
 _BROAD_DEG, _GIVEN_DEG = 30.0, 1.0
+_ROOM_DEG = 5.0  # about what four standard deviations of the steps allow
 
 
 @dataclass(frozen=True)
@@ -128,10 +129,14 @@ class TurntablePrior(AbstractPrior):
         )
 
     def _limits(self, source: RayImage, target: RayImage) -> AbstractMotion:
-        """Return motions as far as the steps may reach, on the table where one is seen."""
+        """Return motions as far as the steps may reach, on the table where one is seen; all turns within are alike."""
         steps = target.index - source.index
-        turn_deg = abs((steps * self.step_deg + 180.0) % 360.0 - 180.0)
-        reach_deg = min(turn_deg + 4.0 * self.step_sigma_deg * np.sqrt(abs(steps)) + 10.0, 180.0)
-        if support(source, target) is not None:
-            return TablePrior(max_rotation_deg=reach_deg, max_shift_m=self.max_shift_m).between(source, target)
-        return GeneralPrior(max_rotation_deg=reach_deg, max_offset_m=self.max_shift_m).between(source, target)
+        turn_deg = (steps * self.step_deg + 180.0) % 360.0 - 180.0
+        reach_deg = 4.0 * self.step_sigma_deg * np.sqrt(abs(steps)) + _ROOM_DEG
+        whole_deg = min(abs(turn_deg) + reach_deg, 180.0)
+        if support(source, target) is None:
+            return GeneralPrior(whole_deg, self.max_shift_m).between(source, target)
+        motion = TablePrior(whole_deg, self.max_shift_m).between(source, target)
+        if self.step_sign == "unknown" or reach_deg >= 180.0:
+            return motion
+        return replace(motion, max_rotation_rad=float(np.radians(reach_deg)), middle_rad=float(np.radians(turn_deg)))
