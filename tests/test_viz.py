@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import logging
 import os
 import signal
@@ -716,3 +717,20 @@ def test_a_run_that_is_terminated_leaves_a_whole_recording_and_no_server(tmp_pat
 def test_rerun_is_not_imported_before_it_is_needed() -> None:
     program = "import sys, viz.stream, viz.viewer, viz.entities; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_the_notebook_runs_and_embeds_the_viewer(monkeypatch: pytest.MonkeyPatch) -> None:
+    display = pytest.importorskip("IPython.display")
+    shown: list[Any] = []
+    monkeypatch.setattr(display, "display", shown.append)
+    notebook = json.loads((Path(__file__).parents[1] / "docs" / "watch.ipynb").read_text())
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    whole = 'open_sequence(bundled("box"))'
+    assert sum(whole in cell for cell in cells) == 1
+    names: dict[str, Any] = {}
+    for cell in cells:
+        exec(cell.replace(whole, f"{whole}.select(frames=slice(0, 3))"), names)
+    (frame,) = shown
+    assert frame.src.startswith("http://127.0.0.1:")
+    assert len(names["step"].views) == 3
+    assert names["stream"].viewers[0].process.poll() is not None
