@@ -53,7 +53,8 @@ class Bag:
     @property
     def types(self) -> dict[str, str]:
         """Message types by topic, as in `sensor_msgs/msg/Image`."""
-        return {str(connection.topic): str(connection.msgtype) for connection in self._reader.connections}
+        named = ((str(connection.topic), str(connection.msgtype)) for connection in self._reader.connections)
+        return {topic: kind for topic, kind in named if topic.isprintable()}
 
     def messages(self, topic: str, most: int | None = None) -> Iterator[tuple[Stamp, Any]]:
         """Read the messages of a topic in the order in which they were received.

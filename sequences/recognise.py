@@ -12,7 +12,7 @@ from sequences.folders import entries
 from sequences.given import Given
 from sequences.tum import open_tum
 
-FORMATS = "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder, organised clouds, or a ROS bag"
+FORMATS = "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder, organised clouds, a ROS bag, or an Azure Kinect .mkv"
 BAGS = (".bag", ".mcap", ".db3")
 CLOUDS = (".pcd", ".ply")
 
@@ -41,6 +41,10 @@ def _open(path: Path, given: Given) -> AbstractSequence:
         from sequences.ros import open_ros
 
         return open_ros(path, given)
+    if path.is_file() and path.suffix.lower() == ".mkv":
+        from sequences.kinect import open_kinect
+
+        return open_kinect(path, given)
     if (path.is_file() and path.suffix.lower() in CLOUDS) or _holds_clouds(path):
         from sequences.clouds import open_clouds
 

@@ -1,0 +1,202 @@
+"""Recordings as the Azure Kinect writes them: raw 16-bit big-endian depth, JPEG colour, the calibration attached."""
+
+from __future__ import annotations
+
+import builtins
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from modeler import se3
+from modeler.cli import main
+from modeler.types import Camera, InputError
+from sequences import Given, open_sequence
+from sequences.alignment import Alignment
+from sequences.json_input import Node
+from sequences.kinect_calibration import colour_from_depth, colour_lens, depth_lens
+from sequences.lens import Lens
+
+WIDTH, HEIGHT = 320, 288  # NFOV_2X2BINNED
+COLOUR_SIZE = (1280, 720)
+# As the device tells them: shares of the sensor, from the corner of the first pixel.
+DEPTH_PARAMETERS = [0.51, 0.515, 0.4925, 0.4929, 0.55, -0.021, -0.0027, 0.89, 0.086, -0.0139, 0, 0, -7e-5, 2e-5]
+COLOUR_PARAMETERS = [0.5, 0.5066, 0.478, 0.6374, 0.33, -2.489, 1.4537, 0.2089, -2.3029, 1.3751, 0, 0, -1.3e-4, -1.6e-4]
+COLOUR_FROM_DEPTH = se3.exp(np.array([0.1, 0.002, -0.001, -0.032, -0.002, 0.004]))
+
+
+def calibration() -> dict:
+    def camera(purpose: str, parameters: list[float], pose: np.ndarray, size: tuple[int, int]) -> dict:
+        return {
+            "Intrinsics": {
+                "ModelParameterCount": 14,
+                "ModelParameters": parameters,
+                "ModelType": "CALIBRATION_LensDistortionModelBrownConrady",
+            },
+            "Purpose": purpose,
+            "Rt": {"Rotation": pose[:3, :3].ravel().tolist(), "Translation": pose[:3, 3].tolist()},
+            "SensorWidth": size[0],
+            "SensorHeight": size[1],
+        }
+
+    return {
+        "CalibrationInformation": {
+            "Cameras": [
+                camera("CALIBRATION_CameraPurposeDepth", DEPTH_PARAMETERS, np.eye(4), (1024, 1024)),
+                camera("CALIBRATION_CameraPurposePhotoVideo", COLOUR_PARAMETERS, COLOUR_FROM_DEPTH, (4096, 3072)),
+            ]
+        }
+    }
+
+
+def write_mkv(path: Path, count: int = 3, *, attached: dict | None = None, colour: bool = True) -> list[np.ndarray]:
+    """Write a recording of a slanted plane and return its raw depth images."""
+    av = pytest.importorskip("av")
+    container = av.open(str(path), "w", format="matroska", options={"allow_raw_vfw": "1"})
+    depth = container.add_stream("rawvideo", rate=30)
+    depth.width, depth.height, depth.pix_fmt = WIDTH, HEIGHT, "gray16be"
+    depth.metadata["title"] = "DEPTH"
+    tracks = [depth]
+    if colour:
+        picture = container.add_stream("mjpeg", rate=30)
+        picture.width, picture.height, picture.pix_fmt = *COLOUR_SIZE, "yuvj420p"
+        picture.metadata["title"] = "COLOR"
+        tracks.append(picture)
+    content = json.dumps(calibration() if attached is None else attached).encode()
+    container.add_attachment("calibration.json", "application/octet-stream", content + b"\0")
+    images = []
+    for place in range(count):
+        slope = np.linspace(600.0, 1200.0, WIDTH)[None, :] + 5.0 * place + np.zeros((HEIGHT, 1))
+        raw = np.rint(slope).astype(np.uint16)
+        raw[:20, :20] = 0
+        images.append(raw)
+        frame = av.VideoFrame.from_ndarray(raw, format="gray16le").reformat(format="gray16be")
+        frame.pts = place
+        container.mux(depth.encode(frame))
+        if colour:
+            half = np.full((COLOUR_SIZE[1], COLOUR_SIZE[0], 3), (200, 40, 40), np.uint8)
+            half[:, COLOUR_SIZE[0] // 2 :] = (40, 40, 200)
+            frame = av.VideoFrame.from_ndarray(half, format="rgb24")
+            frame.pts = place
+            container.mux(tracks[1].encode(frame))
+    for track in tracks:
+        container.mux(track.encode())
+    container.close()
+    # The library leaves out which kind of raw image it is; recorders of the camera say b16g.
+    written = path.read_bytes()
+    header = struct.pack("<IiiHHI", 40, WIDTH, -HEIGHT, 1, 16, 0)
+    assert header in written
+    path.write_bytes(written.replace(header, struct.pack("<IiiHH", 40, WIDTH, HEIGHT, 1, 16) + b"b16g"))
+    return images
+
+
+def test_depth_comes_out_straight_and_colour_aligned(tmp_path: Path) -> None:
+    path = tmp_path / "eine Aufnahme.mkv"
+    images = write_mkv(path)
+    sequence = open_sequence(path)
+    assert sequence.layout == "Azure Kinect recording (MKV)"
+    assert sequence.indices == (0, 1, 2)
+    lens = depth_lens(Node(calibration(), path), (WIDTH, HEIGHT), None)
+    for raw, frame in zip(images, sequence, strict=True):
+        assert frame.time_s == pytest.approx(frame.index / 30.0, abs=2e-3)
+        expected = lens.straight(np.where(raw == 0, np.nan, raw * 0.001).astype(np.float32), float("nan"))
+        np.testing.assert_allclose(frame.depth_m, expected, rtol=1e-6)
+        assert np.isfinite(frame.depth_m).mean() > 0.9
+        assert frame.colour is not None
+    frame = sequence.frame(1)
+    assert frame.colour is not None
+    seen = frame.colour.sum(axis=2) > 0
+    red = seen & (frame.colour[..., 0] > frame.colour[..., 2])
+    # The colour camera's middle column, seen from the depth camera: 32 mm to the side at about 0.9 m.
+    w, _ = frame.camera.rays()
+    middle = frame.depth_m[HEIGHT // 2]
+    there = se3.transform(
+        COLOUR_FROM_DEPTH, np.stack([w[HEIGHT // 2] * middle, 0.0 * middle, middle], axis=1).astype(np.float64)
+    )
+    should_be_red = there[:, 0] / there[:, 2] < 0.0
+    known = seen[HEIGHT // 2]
+    assert known.sum() > 150
+    assert (red[HEIGHT // 2][known] == should_be_red[known]).mean() > 0.97
+
+
+def test_a_mode_bins_and_crops_the_sensor() -> None:
+    node = Node(calibration(), Path("c.json"))
+    small, large = depth_lens(node, (320, 288), None).camera, depth_lens(node, (640, 576), None).camera
+    assert large.fx == pytest.approx(1024 * 0.4925)
+    assert large.cx == pytest.approx(1024 * 0.51 - 192 - 0.5)
+    assert small.fx == pytest.approx(large.fx / 2.0)
+    assert 2.0 * (small.cx + 0.5) == pytest.approx(large.cx + 0.5)  # the same corner of the sensor
+    wide = depth_lens(node, (1024, 1024), None).camera
+    assert wide.cy == pytest.approx(large.cy + 180.0)
+    full, cropped = colour_lens(node, (4096, 3072)).camera, colour_lens(node, (1280, 720)).camera
+    assert cropped.fx == pytest.approx(full.fx / 3.2)
+    assert cropped.cy + 120.5 == pytest.approx((full.cy + 0.5) / 3.2)
+    np.testing.assert_allclose(colour_from_depth(node), COLOUR_FROM_DEPTH, atol=1e-12)
+    with pytest.raises(InputError, match="of no mode of the Azure Kinect"):
+        depth_lens(node, (600, 500), None)
+
+
+def test_a_recording_without_colour_is_read_and_converted(tmp_path: Path) -> None:
+    write_mkv(tmp_path / "s.mkv", colour=False)
+    assert open_sequence(tmp_path / "s.mkv").frame(0).colour is None
+    assert main(["convert", str(tmp_path / "s.mkv"), "--out", str(tmp_path / "bop")]) == 0
+    assert len(open_sequence(tmp_path / "bop")) == 3
+    given = open_sequence(tmp_path / "s.mkv", Given(intrinsics=(250.0, 250.0, 160.0, 144.0), depth_scale_mm=0.5))
+    assert given.frame(0).camera.fx == 250.0
+    assert given.depth_unit == "0.5 mm (--depth-scale-mm)"
+
+
+@pytest.mark.parametrize("fault", ["truncated", "empty", "noise", "no calibration", "wrong calibration", "no lens"])
+def test_broken_recordings_are_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str], fault: str) -> None:
+    path = tmp_path / "s.mkv"
+    tree = calibration()
+    if fault == "no lens":
+        tree["CalibrationInformation"]["Cameras"][0]["Intrinsics"]["ModelParameters"] = [0] * 14
+    write_mkv(path, attached={"no": 1} if fault == "wrong calibration" else tree)
+    content = path.read_bytes()
+    damaged = {
+        "truncated": content[:400],
+        "empty": b"",
+        "noise": b"noise" * 500,
+        "no calibration": content.replace(b"calibration.json", b"calibration.txt_"),
+    }
+    path.write_bytes(damaged.get(fault, content))
+    capfd.readouterr()
+    assert main(["info", str(path)]) == 2
+    said = capfd.readouterr().err
+    assert str(path) in said
+    assert said.count("\n") == 1
+
+
+def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "s.mkv").write_bytes(b"\x1aE\xdf\xa3")
+    load = builtins.__import__
+
+    def refuse(name: str, *arguments: object, **more: object) -> object:
+        if name == "av":
+            raise ImportError
+        return load(name, *arguments, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(InputError, match=r"read by PyAV; pip install 'modeler\[kinect\]'"):
+        open_sequence(tmp_path / "s.mkv")
+
+
+def test_what_is_hidden_from_the_colour_camera_gets_no_colour() -> None:
+    camera = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
+    beside = Alignment(camera, Lens(camera, ()), se3.translation(np.array([-0.1, 0.0, 0.0])))
+    depth_m = np.full((60, 80), 2.0, np.float32)
+    depth_m[20:40, 30:50] = 0.5
+    depth_m[0, 0] = np.nan
+    picture = np.zeros((60, 80, 3), np.uint8)
+    picture[..., 0] = np.arange(80, dtype=np.uint8) + 1
+    colour = beside.aligned(depth_m, picture)
+    assert colour[0, 0].sum() == 0
+    near, far = 70.0 * 0.1 / 0.5, 70.0 * 0.1 / 2.0
+    assert colour[30, 40, 0] == 40 + 1 - near
+    assert colour[5, 60, 0] == pytest.approx(60 + 1 - far, abs=0.5)
+    hidden = colour[30, :30, 0] == 0  # behind the near thing as the other camera sees it
+    assert hidden[int(30 - near + far) + 3 : 29].all()
+    assert not hidden[int(far) + 1 : int(30 - near + far) - 2].any()
