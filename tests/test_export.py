@@ -9,16 +9,33 @@ from typing import Any
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 import open3d as o3d
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
-from modeler.export import RunFolder, RunMeta, export_mesh, g2o_text, posteriors_of, tum_text, write_atomically
+from modeler.export import (
+    RunFolder,
+    RunMeta,
+    export_mesh,
+    g2o_text,
+    posteriors_of,
+    read_model,
+    simplified,
+    textured,
+    tinted,
+    tum_text,
+    write_atomically,
+    write_bop,
+    write_mesh,
+)
 from modeler.export.ply import cloud_ply, mesh_ply
+from modeler.export.tints import MADE_UP_RGB
 from modeler.graph import PoseGraph, solve
 from modeler.types import (
+    Array,
     Camera,
     Edge,
     Frame,
@@ -201,6 +218,117 @@ def test_vertices_tell_who_saw_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(columns["sigma_m"].ravel(), np.where(views == 0, -1.0, sigmas_m), rtol=1e-6)
     np.testing.assert_allclose(mesh.vertices, model.vertices_m, atol=1e-6)
     np.testing.assert_allclose(np.asarray(o3d.io.read_triangle_mesh(path).vertices), model.vertices_m, atol=1e-6)
+
+
+def test_a_mesh_that_is_read_back_writes_the_same_bytes(tmp_path: Path) -> None:
+    views = np.arange(len(_model().vertices_m))
+    for model in (
+        _model(),
+        _model(coloured=False),
+        replace(_model(), vertex_views=views, vertex_sigmas_m=np.where(views == 0, np.inf, 1e-3)),
+    ):
+        (tmp_path / "model.ply").write_bytes(mesh_ply(model))
+        assert mesh_ply(read_model(tmp_path / "model.ply")) == (tmp_path / "model.ply").read_bytes()
+
+
+def test_stl_of_a_closed_mesh_is_watertight_and_manifold_also_with_fewer_triangles(tmp_path: Path) -> None:
+    for name, model in (("all", _model()), ("few", simplified(_model(), 100))):
+        path = tmp_path / f"{name}.stl"
+        write_mesh(model, path)
+        mesh = trimesh.load_mesh(path)  # corners at one place become one vertex
+        assert mesh.is_watertight
+        assert mesh.is_winding_consistent
+        assert mesh.is_volume
+        theirs = o3d.io.read_triangle_mesh(path).merge_close_vertices(1e-6)
+        assert theirs.is_edge_manifold(allow_boundary_edges=False)
+        assert theirs.is_vertex_manifold()
+    assert len(mesh.faces) <= 100
+
+
+def test_simplified_keeps_the_shape_and_what_is_known_of_it() -> None:
+    views = np.where(_model().vertices_m[:, 2] > 0.8, 3, 0)
+    model = replace(_model(), vertex_views=views, vertex_sigmas_m=np.where(views == 0, np.inf, 1e-3))
+    fewer = simplified(model, 150)
+    assert 100 < len(fewer.triangles) <= 150
+    radius = np.linalg.norm(fewer.vertices_m - [0.0, 0.0, 0.8], axis=1)
+    assert np.abs(radius - 0.05).max() < 1.5e-3
+    assert fewer.vertex_views is not None
+    clear = np.abs(fewer.vertices_m[:, 2] - 0.8) > 0.015
+    np.testing.assert_array_equal((fewer.vertex_views > 0)[clear], (fewer.vertices_m[:, 2] > 0.8)[clear])
+    outward = (fewer.vertices_m - [0.0, 0.0, 0.8]) / radius[:, None]
+    assert np.sum(outward * fewer.vertex_normals, axis=1).min() > 0.95
+    assert simplified(model, 10**6) is model
+    with pytest.raises(InputError, match="--triangles 3"):
+        simplified(model, 3)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "glb"])
+def test_texture_shows_each_point_its_colour(tmp_path: Path, suffix: str) -> None:
+    def paint(points: Array, normals: Array) -> npt.NDArray[np.uint8]:
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+        return np.rint(255.0 * ((points - [0.0, 0.0, 0.8]) / 0.1 + 0.5)).astype(np.uint8)
+
+    model, texture = textured(_model(), paint, 1e-3)
+    out = tmp_path / f"ball.{suffix}"
+    write_mesh(model, out, texture)
+    assert {path.suffix for path in tmp_path.iterdir()} == ({".obj", ".mtl", ".png"} if suffix == "obj" else {".glb"})
+    mesh = _loaded(out)
+    assert {frozenset(map(tuple, t)) for t in np.round(mesh.triangles, 5)} == {
+        frozenset(map(tuple, t)) for t in np.round(_model().vertices_m[_model().triangles], 5)
+    }
+    material = mesh.visual.material
+    image = np.asarray(material.image if suffix == "obj" else material.baseColorTexture)[:, :, :3]
+    np.testing.assert_array_equal(image, texture.image)
+    u, v = mesh.visual.uv[mesh.faces].mean(axis=1).T  # the middles of the triangles
+    height, width = image.shape[:2]
+    shown = image[((1.0 - v) * height).astype(int), (u * width).astype(int)].astype(float)
+    expected = 255.0 * ((mesh.triangles_center - [0.0, 0.0, 0.8]) / 0.1 + 0.5)
+    assert np.abs(shown - expected).max() < 6.0  # half a texel moves a colour by two or three
+
+
+def test_texture_needs_a_format_that_holds_it(tmp_path: Path) -> None:
+    model, texture = textured(_model(), lambda points, _: np.full((len(points), 3), 7, dtype=np.uint8), 2e-3)
+    with pytest.raises(InputError, match="holds no texture"):
+        write_mesh(model, tmp_path / "ball.stl", texture)
+    assert not list(tmp_path.iterdir())
+
+
+def test_bop_model_is_in_mm_about_its_centre_with_its_entry(tmp_path: Path) -> None:
+    folder = tmp_path / "models"
+    write_bop(_model(), folder / "obj_000007.ply")
+    write_bop(_model(), folder / "obj_000002.ply")
+    entries = _strict((folder / "models_info.json").read_text())
+    assert list(entries) == ["2", "7"]
+    entry = entries["7"]
+    assert entry["diameter"] == pytest.approx(100.0, abs=0.5)
+    for axis in "xyz":
+        assert entry[f"size_{axis}"] == pytest.approx(100.0, abs=0.5)
+        assert entry[f"min_{axis}"] == pytest.approx(-50.0, abs=0.3)
+    np.testing.assert_allclose(entry["origin_m"], [0.0, 0.0, 0.8], atol=1e-6)
+    mesh = _loaded(folder / "obj_000007.ply")
+    back = mesh.vertices / 1000.0 + entry["origin_m"]
+    np.testing.assert_allclose(back, _model().vertices_m, atol=1e-6)
+    header = (folder / "obj_000007.ply").read_bytes().split(b"end_header")[0].decode()
+    kinds = {line.split()[1] for line in header.splitlines() if line.startswith("property") and "list" not in line}
+    assert kinds <= {"float", "double", "int", "uchar"}  # what BOP's own reader takes
+    (folder / "models_info.json").write_text("{")
+    with pytest.raises(InputError, match="cannot be read"):
+        write_bop(_model(), folder / "obj_000007.ply")
+    with pytest.raises(InputError, match="PLY files"):
+        write_bop(_model(), folder / "model.obj")
+
+
+def test_tints_tell_what_is_known_of_vertices() -> None:
+    views = np.arange(len(_model().vertices_m)) % 5
+    model = replace(_model(), vertex_views=views, vertex_sigmas_m=np.where(views == 0, np.inf, 1e-3 / (views + 1e-9)))
+    for tint in ("views", "sigma"):
+        colours = tinted(model, tint).vertex_colours
+        assert colours is not None
+        assert len(np.unique(colours, axis=0)) == 5
+        made_up = np.all(colours == MADE_UP_RGB, axis=1)
+        np.testing.assert_array_equal(made_up, views == 0)
+    with pytest.raises(InputError, match="does not tell"):
+        tinted(_model(), "views")
 
 
 def test_mesh_that_cannot_be_exported_is_said_in_one_line(tmp_path: Path) -> None:

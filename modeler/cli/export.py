@@ -1,24 +1,44 @@
 """`modeler export`: the fused mesh in the format of another program."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write the fused mesh of a run as PLY, OBJ, GLB or STL."""
+    """Write the fused mesh of a run as PLY, OBJ, GLB or STL, in m, object frame.
+
+    The axes are those of the camera at the first frame: x right, y down, z forward. --watertight, --texture and
+    --voxel-m make the mesh anew from the frames, so the sequence must be there.
+    """
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Run folder, as `modeler build` makes it."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.{ply,obj,glb,stl}")]
-    """File to write, in m; its ending selects the format. STL carries no colour."""
+    """File to write; its ending selects the format. STL carries no colour."""
+    watertight: bool = False
+    """Close what nobody saw with made-up surface. In PLY its vertices have 0 `views` and a `sigma_m` of -1."""
+    triangles: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: all)")] = None
+    """Simplify the mesh to so many triangles."""
+    texture: bool = False
+    """Colour by an image wrapped around the mesh, from the sharpest frontal views (OBJ with MTL and PNG, GLB)."""
+    bop: bool = False
+    """Write a BOP model: PLY in mm, origin in the centre of its box, and its entry in models_info.json."""
+    tint: Annotated[Literal["views", "sigma"] | None, tyro.conf.arg(help_behavior_hint="(default: none)")] = None
+    """Colour vertices by the number of views that saw them or by their standard deviation; made-up surface is pink."""
+    voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M", help_behavior_hint="(default: as the data)")] = None
+    """Side of a voxel: detail of the mesh."""
+    sequence: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: as in RUN)")] = None
+    """Where the sequence is now, if it has moved."""
 
     def run(self) -> int:
-        """Convert the mesh."""
-        from modeler.export import export_mesh
+        """Write the mesh."""
+        from modeler.cli.exporting import export
 
-        export_mesh(self.run_folder, self.out)
+        export(self)
         return 0

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from modeler.fusion import closing, cloud, grid, surface, tones
 from modeler.fusion.stack import Stack
@@ -16,6 +17,7 @@ from modeler.types import Array, BoolArray, ObjectModel
 if TYPE_CHECKING:
     from modeler.fusion.fuser import Fuser
 
+SOFT, SHARP = 4.0, 16.0  # how much more say a frontal view has in colours: cosine to this power
 LONELY = 6  # a point of the cloud with fewer neighbours within a few voxels is an outlier
 
 
@@ -72,12 +74,25 @@ class Scan:
         """Return what the views say of oriented points (n, 3) of the object frame."""
         return self._heard(points_m, normals, self._gains)
 
+    def painted(self, points_m: Array, normals: Array) -> npt.NDArray[np.uint8]:
+        """Return the RGB (n, 3) of points of the surface (n, 3): from the most frontal views, sharp ones first."""
+        told = self._heard(points_m, normals, self._gains, focus=SHARP)
+        return surface.spread_colours(told.colours, told.coloured, points_m)
+
+    @property
+    def texel_m(self) -> float:
+        """Length on the surface that half a pixel of the views covers."""
+        turns, shifts = self.seen.poses[:, :, :3], self.seen.poses[:, :, 3]
+        centres_m = -np.einsum("fji,fj->fi", turns, shifts)[self.seen.views]
+        depth_m = float(np.median(np.linalg.norm(self.seen.points_m - centres_m, axis=1)))
+        return 0.5 * depth_m / float(np.median(self.seen.lenses[:, 0]))
+
     @cached_property
     def _gains(self) -> Array:
         """Exposure and say of the views, (f, 4)."""
         return tones.gains(self.seen, self.seen.points_m, self.seen.normals, tau_m=self.tau_m, near_m=self.near_m)
 
-    def _heard(self, points_m: Array, normals: Array, gains: Array) -> Testimony:
+    def _heard(self, points_m: Array, normals: Array, gains: Array, *, focus: float = SOFT) -> Testimony:
         return heard(
             self.seen,
             points_m,
@@ -86,6 +101,7 @@ class Scan:
             near_m=self.near_m,
             sigma_m=self.sigma_m,
             gains=gains,
+            focus=focus,
         )
 
     def _believed(self, told: Testimony) -> BoolArray:

@@ -164,10 +164,9 @@ def spanned(vertices_m: Array, triangles: Triangles, free: BoolArray, passes: in
 
 def spread_colours(colours: npt.NDArray[np.uint8], known: BoolArray, vertices_m: Array) -> npt.NDArray[np.uint8]:
     """Return RGB (v, 3) where vertices of unknown colour take that of the few nearest known ones."""
-    if known.all() or not known.any():
+    if known.all() or np.count_nonzero(known) < NEAREST:
         return colours
-    lenders = [rank for rank in range(1, NEAREST + 1) if rank <= np.count_nonzero(known)]
-    near_m, near = KDTree(vertices_m[known]).query(vertices_m[~known], k=lenders)
+    near_m, near = KDTree(vertices_m[known]).query(vertices_m[~known], k=NEAREST)
     weights = 1.0 / (near_m + 1e-6)
     spread = colours.copy()
     spread[~known] = np.rint(

@@ -36,7 +36,15 @@ class Testimony:
 
 
 def heard(
-    seen: Stack, points_m: Array, normals: Array, *, tau_m: float, near_m: float, sigma_m: float, gains: Array
+    seen: Stack,
+    points_m: Array,
+    normals: Array,
+    *,
+    tau_m: float,
+    near_m: float,
+    sigma_m: float,
+    gains: Array,
+    focus: float,
 ) -> Testimony:
     """Ask the views about points.
 
@@ -48,6 +56,7 @@ def heard(
         near_m: surface further away along the normal is another one.
         sigma_m: standard deviation of what one view of weight 1 says.
         gains: (f, 4) factors on the views' red, green and blue, and their say in colours.
+        focus: power of the weights with which views speak of colour: the higher, the more the most frontal one alone.
     """
     parts = [
         fusion.survey(
@@ -58,6 +67,7 @@ def heard(
             *seen.lookup,
             seen.colour,
             gains,
+            focus,
         )
         for start in range(0, max(len(points_m), 1), BATCH)
     ]

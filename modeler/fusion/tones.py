@@ -54,8 +54,9 @@ def gains(seen: Stack, points_m: Array, normals: Array, *, tau_m: float, near_m:
             seen.weights,
             seen.colour[view : view + 1],
             alone,
+            1.0,
         )
-        levels[row], shown[row] = colours[:, :3], colours[:, 3] ** 0.5
+        levels[row], shown[row] = colours[:, :3], colours[:, 3]
     shown[np.any((levels < DARK) | (levels > BRIGHT), axis=2)] = 0.0
     shown[:, np.count_nonzero(shown, axis=0) < 2] = 0.0
     if not shown.any():

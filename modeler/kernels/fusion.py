@@ -177,6 +177,7 @@ def survey(
     weights,
     colour,
     gains,
+    focus,
 ):
     """Return what the views say of oriented points.
 
@@ -198,6 +199,7 @@ def survey(
         weights: (p,).
         colour: (f, h, w, 3) uint8.
         gains: (f, 4) factors on red, green and blue, and the say a view has in colours, 0 = it has none.
+        focus: power of the weights with which views speak of colour.
 
     Returns:
         (n, 5): sum of the supporting views' weights w, number of views that see the point empty, number of supporting
@@ -234,7 +236,7 @@ def survey(
             left, top = math.floor(u), math.floor(v)
             if gains[f, 3] == 0.0 or left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
                 continue
-            share = gains[f, 3] * weights[n] * weights[n] * weights[n] * weights[n]
+            share = gains[f, 3] * weights[n] ** focus
             right, bottom = u - left, v - top
             colours[q, 3] += share
             for c in range(3):

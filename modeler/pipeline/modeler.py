@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from modeler.closure import Closer
-from modeler.fusion import Fuser
+from modeler.fusion import Fuser, own_covariances
 from modeler.pipeline.state import Seen, State
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter
@@ -202,7 +202,7 @@ class Modeler:
 
     def _fused(self, state: State, *, last: bool) -> ObjectModel:
         if last:
-            return self.fuser.fuse(state.views, state.solution.trajectory)
+            return self.fuser.fuse(state.views, state.solution.trajectory, own_covariances(state.solution))
         frames = list(state.views)
         spread = np.unique(np.linspace(0, len(frames) - 1, _PREVIEWED).round().astype(int))
         return self.fuser.preview({frames[k]: state.views[frames[k]] for k in spread}, state.solution.trajectory)

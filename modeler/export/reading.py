@@ -1,0 +1,47 @@
+"""A fused mesh read back from its PLY file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from modeler.types import InputError, ObjectModel
+
+
+def read_model(path: Path) -> ObjectModel:
+    """Return the mesh in a PLY file as a model without a cloud.
+
+    Args:
+        path: as `modeler build` writes it; colours, `views` and `sigma_m` where it has them.
+
+    Raises:
+        InputError: where there is none, it cannot be read or has no triangles.
+    """
+    import trimesh
+    from trimesh.visual import ColorVisuals
+
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such mesh; give a run folder in which `modeler build` has finished")
+    try:
+        mesh = trimesh.load(path, process=False)  # load_mesh would drop the normals
+    except Exception as error:  # trimesh lets whatever its parser trips over through
+        raise InputError(f"{path}: not a mesh that can be read ({error}); build the model again") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{path}: holds no triangles; more views are needed for a surface")
+    columns = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
+    names = columns.dtype.names or () if isinstance(columns, np.ndarray) else tuple(columns)
+    visual = mesh.visual
+    colours = visual.vertex_colors if isinstance(visual, ColorVisuals) and visual.kind == "vertex" else None
+    sigmas_m = np.asarray(columns["sigma_m"], dtype=np.float64).ravel() if "sigma_m" in names else None
+    return ObjectModel(
+        points_m=np.zeros((0, 3)),
+        normals=np.zeros((0, 3)),
+        colours=np.zeros((0, 3), dtype=np.uint8) if colours is not None else None,
+        vertices_m=np.asarray(mesh.vertices, dtype=np.float64),
+        triangles=np.asarray(mesh.faces, dtype=np.int64),
+        vertex_normals=np.asarray(mesh.vertex_normals, dtype=np.float64),
+        vertex_colours=None if colours is None else np.asarray(colours)[:, :3].astype(np.uint8),
+        vertex_views=np.asarray(columns["views"], dtype=np.int64).ravel() if "views" in names else None,
+        vertex_sigmas_m=None if sigmas_m is None else np.where(sigmas_m < 0.0, np.inf, sigmas_m),
+    )

@@ -1,0 +1,96 @@
+"""An image wrapped around a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.types import Array, ObjectModel
+
+LARGEST_PX = 4096
+PADDING_PX = 4  # charts keep this distance, so that colours do not bleed when the image is shrunk
+TRIANGLES = 8_000  # of a mesh whose detail is in the image; unwrapping takes long with more
+
+Paint = Callable[[Array, Array], npt.NDArray[np.uint8]]
+"""From points (n, 3) and normals (n, 3) in the object frame to RGB (n, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """Where the vertices of a mesh lie in an image."""
+
+    uv: Array
+    """(v, 2) places in the image, 0..1: u to the right, v upwards from the lower edge."""
+    image: npt.NDArray[np.uint8]
+    """(h, w, 3) RGB."""
+
+
+def textured(model: ObjectModel, paint: Paint, texel_m: float) -> tuple[ObjectModel, Texture]:
+    """Return the model with vertices doubled along seams, and its texture.
+
+    Args:
+        model: the mesh.
+        paint: gives points of the surface their colours.
+        texel_m: side of a pixel of the image on the surface, larger where the image would become too large.
+    """
+    import xatlas
+
+    corners = model.vertices_m[model.triangles]
+    area_m2 = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    texel_m = max(texel_m, float(np.sqrt(area_m2 / 0.6)) / LARGEST_PX)
+    atlas = xatlas.Atlas()
+    # In texels and from the origin: the library compares lengths with constants.
+    atlas.add_mesh(
+        ((model.vertices_m - model.vertices_m.mean(axis=0)) / texel_m).astype(np.float32),
+        model.triangles.astype(np.uint32),
+    )
+    charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
+    packing.texels_per_unit, packing.padding, packing.bilinear = 1.0, PADDING_PX, True
+    atlas.generate(charts, packing)
+    origin, triangles, places = atlas[0]
+    wrapped = replace(
+        model,
+        vertices_m=model.vertices_m[origin],
+        triangles=triangles.astype(np.int64),
+        vertex_normals=model.vertex_normals[origin],
+        vertex_colours=None if model.vertex_colours is None else model.vertex_colours[origin],
+        vertex_views=None if model.vertex_views is None else model.vertex_views[origin],
+        vertex_sigmas_m=None if model.vertex_sigmas_m is None else model.vertex_sigmas_m[origin],
+    )
+    size = np.array([atlas.width, atlas.height])
+    image = _baked(wrapped, places.astype(np.float64) * size, size, paint)
+    return wrapped, Texture(np.stack([places[:, 0], 1.0 - places[:, 1]], axis=1).astype(np.float64), image)
+
+
+def _baked(model: ObjectModel, places_px: Array, size: npt.NDArray[np.int64], paint: Paint) -> npt.NDArray[np.uint8]:
+    """Return the image (h, w, 3): every pixel in or beside a chart shows the point of the surface nearest to it.
+
+    Args:
+        model: the mesh.
+        places_px: (v, 2) column and row of its vertices, pixel centres at halves.
+        size: (2,) width and height.
+        paint: gives points their colours.
+    """
+    import open3d as o3d
+
+    flat = np.concatenate([places_px, np.zeros((len(places_px), 1))], axis=1).astype(np.float32)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor.from_numpy(flat), o3d.core.Tensor.from_numpy(model.triangles.astype(np.uint32)))
+    columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    pixels = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3).astype(np.float32)
+    found = scene.compute_closest_points(o3d.core.Tensor.from_numpy(pixels))
+    off = np.linalg.norm(found["points"].numpy() - pixels, axis=1)
+    near = off <= PADDING_PX
+    triangle = model.triangles[found["primitive_ids"].numpy()[near].astype(np.int64)]
+    second, third = found["primitive_uvs"].numpy()[near].astype(np.float64).T
+    shares = np.stack([1.0 - second - third, second, third], axis=1)
+    points = np.einsum("nk,nkc->nc", shares, model.vertices_m[triangle])
+    normals = np.einsum("nk,nkc->nc", shares, model.vertex_normals[triangle])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    colours = paint(points, normals)
+    image = np.full((len(pixels), 3), np.rint(colours.mean(axis=0)) if len(colours) else 128, dtype=np.uint8)
+    image[near] = colours
+    return image.reshape(int(size[1]), int(size[0]), 3)
