@@ -69,8 +69,7 @@ def _scan(options: Export) -> Scan | None:
 
 
 def _tell(model: ObjectModel, options: Export) -> None:
-    """Say on stderr what was written."""
-    made_up = ""
+    """Say on stderr what nobody saw."""
     if options.watertight and model.vertex_views is not None:
-        made_up = f", {100.0 * float(np.mean(model.vertex_views == 0)):.0f} % of the vertices made up"
-    print(f"modeler: {len(model.triangles)} triangles{made_up}: {options.out}", file=sys.stderr)
+        share = 100.0 * float(np.mean(model.vertex_views == 0))
+        print(f"modeler: {share:.0f} % of the vertices of {options.out} are made up", file=sys.stderr)
