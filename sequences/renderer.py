@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -154,8 +154,15 @@ class RenderedSequence(AbstractSequence):
         return np.rint(np.clip(np.nan_to_num(lit), 0.0, 255.0)).astype(np.uint8)
 
 
-def render(recipe: Recipe, folder: Path) -> None:
+def render(
+    recipe: Recipe, folder: Path, through: Callable[[AbstractSequence], AbstractSequence] = lambda sequence: sequence
+) -> None:
     """Write the sequence of a recipe as a BOP scene folder, with the true surface as `model.ply`.
+
+    Args:
+        recipe: what to render.
+        folder: where to write; it may exist if it is empty.
+        through: what the frames pass on their way, say something that counts them.
 
     Raises:
         InputError: where the folder is not empty or cannot be written.
@@ -168,7 +175,7 @@ def render(recipe: Recipe, folder: Path) -> None:
         files["robot.txt"] = _tum_bytes(readings, recipe.period_s)
     write_bop(
         folder,
-        sequence,
+        through(sequence),
         sequence.truth(),
         {
             "name": recipe.name,

@@ -6,6 +6,7 @@ import math
 import sys
 
 from modeler.cli.calibrate_sensor import CalibrateSensor
+from modeler.cli.reading import reading
 from modeler.export.files import write_atomically
 from sequences import open_sequence
 from sequences.calibrate import Calibration, calibrate
@@ -19,7 +20,8 @@ def calibrate_sensor(options: CalibrateSensor) -> int:
         InputError: where the input cannot be used or the file cannot be written.
     """
     sequence = open_sequence(options.input, options.given.stated())
-    found = calibrate(sequence)
+    with reading() as watched:
+        found = calibrate(watched(sequence, "reading"))
     distance_m = object_distance_m(sequence.frame(sequence.indices[0]))
     write_atomically(options.out, noise_text(found.model, _facts(sequence.name, found, distance_m)))
     print("\n".join(_table(found)))

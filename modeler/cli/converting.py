@@ -10,6 +10,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.cli.convert import Convert
+from modeler.cli.reading import reading
 from modeler.export import RunFolder
 from modeler.export.files import write_atomically
 from modeler.export.tum import tum_text
@@ -32,16 +33,19 @@ def convert(options: Convert) -> int:
     whole = open_sequence(options.input, options.given.stated())
     whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
     sequence = whole.select(options.selection.every, frame_range(options.selection.frames))
-    found = survey(sequence)
-    unit_mm = next((unit for unit in UNITS_MM if found.farthest_m * 1000.0 < 65535.0 * unit), UNITS_MM[-1])
-    write_bop(
-        options.out,
-        sequence,
-        sequence.truth(),
-        _meta(sequence),
-        depth_scale_mm=unit_mm,
-        files={path.name: path.read_bytes() for path in (sequence.robot_path, sequence.model_path) if path is not None},
-    )
+    with reading() as watched:
+        found = survey(watched(sequence, "reading"))
+        unit_mm = next((unit for unit in UNITS_MM if found.farthest_m * 1000.0 < 65535.0 * unit), UNITS_MM[-1])
+        write_bop(
+            options.out,
+            watched(sequence, "writing"),
+            sequence.truth(),
+            _meta(sequence),
+            depth_scale_mm=unit_mm,
+            files={
+                path.name: path.read_bytes() for path in (sequence.robot_path, sequence.model_path) if path is not None
+            },
+        )
     print(f"modeler: {len(sequence)} frames of a {sequence.layout}: {options.out}", file=sys.stderr)
     for note in sequence.notes:
         print(f"modeler: {note}", file=sys.stderr)

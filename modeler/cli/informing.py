@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 from modeler.cli.info import Info
+from modeler.cli.reading import reading
 from modeler.types import Camera
 from sequences import AbstractSequence, Survey, open_sequence, survey
 from sequences.base import span
@@ -17,7 +18,8 @@ def inform(options: Info) -> int:
         InputError: where it cannot be used.
     """
     sequence = open_sequence(options.input, options.given.stated())
-    found = survey(sequence)
+    with reading() as watched:
+        found = survey(watched(sequence, "reading"))
     if options.json:
         print(json.dumps(record(sequence, found), allow_nan=False))
     else:

@@ -25,9 +25,11 @@ class Render:
     def run(self) -> int:
         """Render the sequence."""
         from modeler.cli.compose import seed
+        from modeler.cli.reading import reading
         from sequences.recipe import load_recipe
         from sequences.renderer import render
 
         recipe = load_recipe(self.recipe)
-        render(recipe if self.seed is None else replace(recipe, seed=seed(self.seed)), self.out)
+        with reading() as watched:
+            render(recipe if self.seed is None else replace(recipe, seed=seed(self.seed)), self.out, watched)
         return 0

@@ -1,0 +1,72 @@
+"""Bars where somebody watches, and silence where nobody does."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from modeler.cli.console import Console
+from modeler.cli.reading import reading
+from sequences import bundled, open_sequence
+
+COMMAND = [sys.executable, "-m", "modeler", "info", str(bundled("tube"))]
+
+
+def test_a_watched_sequence_is_the_same_sequence() -> None:
+    whole = open_sequence(bundled("tube")).select(frames=slice(0, 2))
+    with reading() as watched:
+        same = watched(whole, "reading")
+        assert same.indices == whole.indices
+        assert same.name == whole.name
+        assert same.sensor() == whole.sensor()
+        for one, other in zip(same, whole, strict=True):
+            np.testing.assert_array_equal(one.depth_m, other.depth_m)
+
+
+def test_where_stderr_is_no_terminal_there_is_no_bar(capfd: pytest.CaptureFixture[str]) -> None:
+    with reading() as watched:
+        assert len(list(watched(open_sequence(bundled("tube")).select(frames=slice(0, 2)), "reading"))) == 2
+    with Console(3, None):
+        pass
+    said = capfd.readouterr()
+    assert said.out == ""
+    assert said.err == ""
+
+
+def on_a_terminal(command: list[str]) -> str:
+    """Return what a command writes to a terminal that is its stderr."""
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=theirs, env={**os.environ, "TERM": "xterm", "COLUMNS": "100"}
+    ) as process:
+        os.close(theirs)
+        said = b""
+        while True:
+            ready, _, _ = select.select([ours], [], [], 60.0)
+            assert ready, said
+            try:
+                piece = os.read(ours, 4096)
+            except OSError:  # the other end is closed
+                break
+            if not piece:
+                break
+            said += piece
+        os.close(ours)
+        assert process.wait(10.0) == 0
+    return said.decode()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
+def test_a_terminal_sees_how_far_it_is_and_how_long_it_takes() -> None:
+    said = on_a_terminal(COMMAND)
+    assert "reading" in said
+    assert "14/14" in said
+    assert "0:00:0" in said  # gone by, and to go
+    assert Path(COMMAND[-1]).name not in said  # data goes to stdout
