@@ -218,6 +218,16 @@ def test_register_prints_one_edge_the_same_for_the_same_seed(run: Run) -> None:
     assert run("register", BOX, "1", "0", "--prior", "table", "--seed", "6").out != ended.out
 
 
+def test_the_sequence_says_what_is_known_and_the_user_is_told(run: Run, tmp_path: Path) -> None:
+    told = run("register", BOX, "1", "0", "--method", "icp")
+    assert told.status == 0
+    assert "prior table, as sequence.json says" in told.err
+    assert told.out == run("register", BOX, "1", "0", "--method", "icp", "--prior", "table").out
+    ended = run("build", BOX, "--out", tmp_path / "run", "--method", "icp", "--frames", "0:2")
+    assert ended.err.startswith("modeler: prior table, as sequence.json says\n")
+    assert report(tmp_path / "run")["prior"] == "table"
+
+
 def test_register_gives_the_edge_that_build_finds(run: Run, built: Path) -> None:
     edge = json.loads(run("register", BOX, "1", "0", *QUICK[:4]).out)
     found = report(built)["edges"][0]

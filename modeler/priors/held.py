@@ -25,9 +25,9 @@ class HeldPrior(AbstractPrior):
     whose time lies between two poses gets one on the way between them, the less sure the farther they are apart.
     """
 
-    times_s: Array = field(compare=False)
+    times_s: Array = field(compare=False, repr=False)
     """(n,) times of the hand's poses, growing, on the clock of the frames."""
-    camera_from_hand: Array = field(compare=False)
+    camera_from_hand: Array = field(compare=False, repr=False)
     """(n, 4, 4) poses of the hand in camera coordinates."""
     held_sigma_deg: float = 3.0
     """Standard deviation of slip and calibration error in the rotation of one motion, about each axis."""

@@ -26,7 +26,7 @@ class VelocityPrior(AbstractPrior):
     """Standard deviation of the change of rotation from one motion to the next, about each axis."""
     velocity_sigma_m: float = 0.01
     """Standard deviation of the change of the centroid's shift from one motion to the next, along each axis."""
-    trajectory: tuple[tuple[int, Array], ...] = field(default=(), compare=False)
+    trajectory: tuple[tuple[int, Array], ...] = field(default=(), compare=False, repr=False)
     """Frame numbers and object_from_camera (4, 4) of the poses so far, in order of frames."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
