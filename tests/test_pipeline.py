@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import final
@@ -22,12 +22,14 @@ from modeler.types import (
     AbstractPrior,
     AbstractRegistrar,
     Array,
+    Edge,
     Frame,
     InputError,
     Outcome,
     PoseGaussian,
     Posterior,
     RayImage,
+    Solution,
     Step,
 )
 
@@ -40,6 +42,7 @@ SIGMAS = np.repeat([0.002, 0.0005], 3)
 @final
 @dataclass(frozen=True)
 class AnyMotion(AbstractMotion):
+    steps: float = 1.0
     evidence = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
@@ -53,11 +56,20 @@ class AnyMotion(AbstractMotion):
 @dataclass(frozen=True)
 class AnyPrior(AbstractPrior):
     refused: int | None = None
+    steps: float = 1.0
+    lessons: list[tuple[list[int], int]] = field(default_factory=list)
 
     def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
         if source.index == self.refused:
             raise InputError(f"frame {source.index}: no plane")
-        return AnyMotion()
+        return AnyMotion(self.steps)
+
+    def grown(self, steps: float) -> AbstractPrior:
+        return replace(self, steps=steps)
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
+        self.lessons.append((list(solution.trajectory), len(edges)))
+        return self
 
 
 @final
@@ -65,18 +77,25 @@ class AnyPrior(AbstractPrior):
 class Oracle(AbstractRegistrar):
     noise: float = 0.0
     blind: frozenset[int] = frozenset()
+    apart: frozenset[tuple[int, int]] = frozenset()
+    reach: float = 1.0
     asked: list[tuple[int, int]] = field(default_factory=list)
+    priors: list[tuple[int, int, float]] = field(default_factory=list)
 
     def register(
         self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
     ) -> Posterior:
+        assert isinstance(motion, AnyMotion)
         self.asked.append((source.index, target.index))
+        self.priors.append((source.index, target.index, motion.steps))
         target_from_source = POSES[target.index] @ se3.inverse(POSES[source.index])
         error = se3.exp(self.noise * SIGMAS * rng.standard_normal(6))
-        lost = source.index in self.blind
+        lost = source.index in self.blind or ((source.index, target.index) in self.apart and motion.steps <= self.reach)
         pose = PoseGaussian(target_from_source @ error, np.diag(SIGMAS**2))
         outcome = Outcome.NO_OVERLAP if lost else Outcome.CONVERGED
-        return Posterior(source.index, target.index, pose, outcome, overlap=0.0 if lost else 0.8)
+        samples = np.broadcast_to(pose.mean, (50, 4, 4))
+        overlap = 0.0 if lost else 0.8
+        return Posterior(source.index, target.index, pose, outcome, overlap, samples, np.full(50, 0.02))
 
 
 def modeler(**changes: object) -> Modeler:
@@ -207,6 +226,130 @@ def test_same_seed_same_bits_side_by_side_or_one_after_the_other() -> None:
     assert one.model is not None
     assert other.model is not None
     assert np.array_equal(one.model.vertices_m, other.model.vertices_m)
+
+
+def test_the_prior_learns_from_all_that_came_before_a_frame() -> None:
+    prior = AnyPrior()
+    steps = run(FRAMES[:4], prior=prior)
+    assert prior.lessons == [([], 0), ([0], 0), ([0, 1], 1), ([0, 1, 2], 2)][1:]
+    assert len(steps[-1].edges_so_far) == 3
+
+
+def test_after_lost_frames_the_prior_grows_with_their_number() -> None:
+    registrar = Oracle()
+    run([FRAMES[0], FRAMES[1], blank(2), blank(3), FRAMES[4], FRAMES[5]], registrar=registrar)
+    assert registrar.priors == [(1, 0, 1.0), (4, 1, 3.0), (5, 4, 1.0)]
+
+
+def test_numbers_of_frames_do_not_grow_the_prior() -> None:
+    registrar = Oracle()
+    run(FRAMES[::2], registrar=registrar)
+    assert {steps for _, _, steps in registrar.priors} == {1.0}
+
+
+def test_a_motion_beyond_the_prior_is_tried_once_more_with_a_grown_one() -> None:
+    registrar = Oracle(apart=frozenset({(2, 1)}), reach=1.5)
+    steps = run(FRAMES[:4], registrar=registrar)
+    assert [step.outcome for step in steps] == [ACCEPTED] * 4
+    assert registrar.priors == [(1, 0, 1.0), (2, 1, 1.0), (2, 1, 2.0), (3, 2, 1.0)]
+    assert trajectory_error(steps[-1]) < 1e-6
+
+
+def test_a_frame_that_the_previous_view_does_not_place_is_found_from_another() -> None:
+    registrar = Oracle(apart=frozenset({(3, 2)}), reach=9.0)
+    steps = run(FRAMES[:5], registrar=registrar)
+    assert [step.outcome for step in steps] == [ACCEPTED] * 5
+    assert steps[3].posteriors[0].target == 2
+    assert [edge.accepted for edge in steps[3].edges] == [False, True]
+    assert trajectory_error(steps[-1]) < 1e-6
+
+
+def test_lost_frames_join_after_all_where_later_views_place_them() -> None:
+    early = frozenset((source, target) for source in (3, 4, 5, 6) for target in range(source) if target < 3)
+    registrar = Oracle(apart=early, reach=9.0)
+    steps = run(FRAMES, registrar=registrar)
+    outcomes = [(step.frame.index, step.outcome == ACCEPTED) for step in steps]
+    lost = [frame for frame, joined in outcomes if not joined]
+    assert lost == [3, 4, 5, 6]
+    assert outcomes[:8] == [(k, k not in lost) for k in range(8)]
+    assert outcomes[8:] == [(6, True), (5, True), (4, True), (3, True), (8, True)]
+    assert [step.last for step in steps] == [False] * 12 + [True]
+    assert set(steps[-1].views) == set(steps[-1].solution.trajectory) == set(range(9))
+    assert steps[-1].model is not None
+    assert len({(e.source, e.target) for e in steps[-1].edges_so_far}) == len(steps[-1].edges_so_far)
+    assert trajectory_error(steps[-1]) < 1e-6
+
+
+def test_what_is_kept_of_a_frame_is_light_and_makes_the_same_view_again() -> None:
+    steps = run()
+    assert all(not view.layers for view in steps[-1].views.values())
+    assert all(not len(edge.posterior.samples) for edge in steps[-1].edges_so_far)
+    assert all(len(posterior.samples) for step in steps for posterior in step.posteriors)
+    whole = steps[3].view
+    assert whole is not None
+    again = Sensor().ray_image(steps[-1].views[3].frame, steps[-1].views[3].plane)
+    assert set(again.layers) == set(whole.layers)
+    assert np.array_equal(again.points_m, whole.points_m)
+    for name, layer in whole.layers.items():
+        np.testing.assert_array_equal(again.layers[name], layer)
+
+
+def _resized(frame: Frame, rows: slice, columns: slice) -> Frame:
+    camera = replace(
+        frame.camera,
+        width=columns.stop - columns.start,
+        height=rows.stop - rows.start,
+        cx=frame.camera.cx - columns.start,
+        cy=frame.camera.cy - rows.start,
+    )
+    assert frame.mask is not None
+    assert frame.colour is not None
+    window = (rows, columns)
+    return replace(
+        frame, depth_m=frame.depth_m[window], mask=frame.mask[window], colour=frame.colour[window], camera=camera
+    )
+
+
+def test_frames_of_different_size_make_one_model() -> None:
+    height, width = FRAMES[0].depth_m.shape
+    cut = [_resized(frame, slice(k, height), slice(0, width - 2 * k)) for k, frame in enumerate(FRAMES[:4])]
+    last = run(cut)[-1]
+    assert list(last.solution.trajectory) == [0, 1, 2, 3]
+    assert last.model is not None
+    assert len(last.model.triangles) > 0
+
+
+@pytest.mark.parametrize("kind", ["nothing measured", "all object", "one pixel", "zero depth", "far apart", "no mask"])
+def test_an_odd_frame_never_stops_the_run(kind: str) -> None:
+    frame = FRAMES[2]
+    depth_m, mask = frame.depth_m.copy(), np.ones_like(frame.depth_m, dtype=bool)
+    match kind:
+        case "nothing measured":
+            depth_m[:] = np.nan
+        case "one pixel":
+            mask[:] = False
+            mask[10, 10] = True
+        case "zero depth":
+            depth_m[:] = 0.0
+        case "far apart":
+            depth_m[:] = np.nan
+            depth_m[::7, ::7] = 0.8
+            mask = np.isfinite(depth_m)
+    odd = replace(frame, depth_m=depth_m, mask=None if kind == "no mask" else mask)
+    steps = run([FRAMES[0], FRAMES[1], odd, FRAMES[3], FRAMES[4]])
+    last = steps[-1]
+    assert last.last
+    assert {0, 1, 3, 4} <= set(last.solution.trajectory)
+    assert last.model is not None
+    assert trajectory_error(last) < 1e-6
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_frame_or_two_are_a_sequence(count: int) -> None:
+    last = run(FRAMES[:count])[-1]
+    assert last.last
+    assert list(last.solution.trajectory) == list(range(count))
+    assert last.model is not None
 
 
 @pytest.mark.parametrize(("frames", "told"), [(1, 1), (3, 3), (15, 15), (16, 15), (1000, 15)])

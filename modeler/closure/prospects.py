@@ -50,9 +50,10 @@ class Outlook:
         """Return the most promising of `frames`, whose predicted rotations to the new view are `angle_deg` (n,).
 
         An edge of covariance R between two frames whose motion is known with covariance P adds ½ log |1 + P R⁻¹| nats,
-        if it is found. R is taken to be that of the newest edge, more where less surface is shared, and the chance to
-        find it to be what a sphere shows again after such a turn, (1 + cos θ) / 2. The surest way through the graph
-        bounds P, so that P itself is worked out for a few frames only, however long the sequence.
+        if it is found. R is taken to be that of the newest edge, over the share of surface seen again and over cos² θ,
+        as errors grow with the turn θ; the chance to find it to be what a sphere shows again, (1 + cos θ) / 2. The
+        surest way through the graph bounds P, so that P itself is worked out for a few frames only, however long the
+        sequence.
         """
         newest = next((edge for edge in reversed(self.edges) if edge.accepted and edge.source == self.previous), None)
         if newest is None:
@@ -62,7 +63,12 @@ class Outlook:
         variance_rad2 = float(np.trace(one_edge[:3, :3]))
         chances = np.cos(np.radians(angle_deg) / 2.0) ** 2
         bounded = [
-            (chance * np.log1p(1.0 + reach[frame].variance_rad2 / variance_rad2), frame, angle, chance)
+            (
+                chance * np.log1p(_tells(angle) * (1.0 + reach[frame].variance_rad2 / variance_rad2)),
+                frame,
+                angle,
+                chance,
+            )
             for frame, angle, chance in zip(frames, angle_deg, chances, strict=True)
             if frame in reach
         ]
@@ -71,7 +77,7 @@ class Outlook:
             overlap = self._overlap(frame)
             count = 1 + reach[frame].edges
             known = self.solution.relative_covariance(frame, self.previous) + one_edge + count**2 * self.systematic
-            ratio = overlap * np.linalg.solve(one_edge + self.systematic, known)
+            ratio = overlap * _tells(angle) * np.linalg.solve(one_edge + self.systematic, known)
             gain_nats = chance * 0.5 * float(np.linalg.slogdet(np.eye(6) + ratio)[1])
             found.append(Prospect(frame, float(angle), overlap, gain_nats))
         return sorted(found, key=lambda prospect: -prospect.gain_nats)
@@ -84,3 +90,8 @@ class Outlook:
         points_m = se3.transform(camera_from_frame, view.points_m[chosen])
         normals = view.normals[chosen] @ camera_from_frame[:3, :3].T
         return float(np.mean(np.sum(points_m * normals, axis=1) < 0.0))
+
+
+def _tells(angle_deg: float) -> float:
+    """Return how much an edge over an angle tells, against one over none."""
+    return float(np.cos(np.radians(angle_deg)) ** 2)

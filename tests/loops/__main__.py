@@ -1,0 +1,100 @@
+"""Build whole sequences and report the error before and after loop closure: `PYTHONPATH=tests python -m loops`.
+
+The table goes to stdout, progress to stderr, and loops.json into a folder. The status is 1 where, on a rendered case,
+the error after is more than 0.6 of that before, or above 1°.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from loops.cases import Case, bundled, real, rendered, turned
+from loops.study import Result, run
+from modeler.closure import Closer
+from modeler.export import write_atomically
+from modeler.types import Step
+
+_WIDTHS = (16, 8, 6, 6, 6, 6, 9, 9, 9, 9, 9, 9, 9, 8)
+_HEADS = (
+    *("case", "joined", "regs", "close", "span", "reject", "before°", "after°", "before mm", "after mm"),
+    *("turned°", "residual°", "after°", "s"),
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(prog="loops", description=__doc__)
+    parser.add_argument("--cases", nargs="+", metavar="NAME", help="only these")
+    parser.add_argument("--shape", default="figurine", help="recipe of the rendered object")
+    parser.add_argument("--seed", type=int, default=0, help="of noise and registration")
+    parser.add_argument("--long", type=int, metavar="N", help="instead: N small frames at 3°, and what each costs")
+    parser.add_argument("--out", type=Path, default=Path("runs/loops"), help="folder of the results")
+    for field, kind in (("max_closures", int), ("min_gain_nats", float)):
+        parser.add_argument(f"--{field.replace('_', '-')}", type=kind, default=getattr(Closer, field), help="of Closer")
+    options = parser.parse_args(arguments)
+    closer = Closer(max_closures=options.max_closures, min_gain_nats=options.min_gain_nats)
+    if options.long:
+        angles_deg = 3.0 * np.arange(options.long)
+        cases = [Case(f"{options.long}-at-3deg", turned(angles_deg, shape=options.shape, width=320, seed=options.seed))]
+    else:
+        cases = [*rendered(options.shape, options.seed), *bundled(), *real()]
+        cases = [case for case in cases if not options.cases or case.name in options.cases]
+    if not cases:
+        parser.error("no case is left; check --cases")
+    options.out.mkdir(parents=True, exist_ok=True)
+    print(_row(_HEADS), flush=True)
+    results = []
+    for case in cases:
+        results.append(run(case, closer, seed=options.seed, told=_Progress(case.name, every=20 if options.long else 0)))
+        print(_row(_cells(results[-1])), flush=True)
+    write_atomically(options.out / "loops.json", json.dumps([result.values() for result in results], indent=1) + "\n")
+    exact = {case.name for case in rendered(options.shape, options.seed)}
+    return 1 if any(_fails(result) for result in results if result.name in exact) else 0
+
+
+def _fails(result: Result) -> bool:
+    if result.before_deg is None or result.after_deg is None:
+        return True
+    return result.after_deg > 1.0 or result.after_deg > 0.6 * result.before_deg
+
+
+def _cells(result: Result) -> list[str]:
+    counts = (result.registrations, result.closures, result.spanning, result.rejected)
+    figures = (result.before_deg, result.after_deg, result.before_mm, result.after_mm)
+    residuals = (result.turned_deg, result.residual_before_deg, result.residual_after_deg)
+    numbers = ["-" if number is None else f"{number:.2f}" for number in (*figures, *residuals)]
+    return [result.name, f"{result.joined}/{result.frames}", *map(str, counts), *numbers, f"{result.seconds:.0f}"]
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "".join(
+        cell.ljust(width) if number == 0 else cell.rjust(width)
+        for number, (cell, width) in enumerate(zip(cells, _WIDTHS, strict=True))
+    )
+
+
+class _Progress:
+    """Tells on stderr what frames cost, `every` so many; 0: only of frames left out."""
+
+    def __init__(self, name: str, *, every: int) -> None:
+        self._name, self._every, self._spent, self._steps = name, every, [], 0
+
+    def __call__(self, step: Step, seconds: float, memory_mib: float) -> None:
+        self._spent.append(seconds)
+        self._steps += 1
+        if step.outcome != "accepted":
+            print(f"{self._name}: frame {step.frame.index}: {step.outcome}", file=sys.stderr, flush=True)
+        if self._every and self._steps % self._every == 0:
+            figures = f"{np.median(self._spent):.2f} s a frame (mean {np.mean(self._spent):.2f}), {memory_mib:.0f} MiB"
+            print(f"{self._name}: to frame {step.frame.index}: {figures}", file=sys.stderr, flush=True)
+            self._spent = []
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,143 @@
+"""One case from its frames to figures."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from loops.cases import Case
+from modeler import se3
+from modeler.closure import Closer
+from modeler.evaluation import trajectory_errors
+from modeler.fusion import Fuser
+from modeler.pipeline import Modeler
+from modeler.priors import GeneralPrior, TablePrior
+from modeler.rays import Sensor
+from modeler.registration import VisibilityRegistrar
+from modeler.segmentation import Segmenter, telling
+from modeler.types import Array, Solution, Step
+
+_PAGE_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a case came to. Before = along the chain alone, after = with every accepted edge."""
+
+    name: str
+    frames: int
+    joined: int
+    registrations: int
+    closures: int
+    """Accepted edges that close a loop."""
+    spanning: int
+    """Accepted edges beyond the chain that do not."""
+    rejected: int
+    before_deg: float | None
+    """Largest rotation error over the trajectory, where the truth is known."""
+    after_deg: float | None
+    before_mm: float | None
+    """Largest translation error at the object."""
+    after_mm: float | None
+    turned_deg: float
+    """Rotation summed over the chain."""
+    residual_before_deg: float | None
+    """Median angle between accepted closures and what the poses say."""
+    residual_after_deg: float | None
+    seconds: float
+    """Processor time."""
+    peak_mib: float
+
+    def values(self) -> dict[str, object]:
+        """Return the figures as JSON holds them."""
+        return asdict(self)
+
+
+def modeler(case: Case, closer: Closer, seed: int) -> Modeler:
+    """Return the loop for a case; its model is coarse, for nobody looks at it."""
+    noise = case.sequence.sensor()
+    return Modeler(
+        segmenter=Segmenter(),
+        sensor=Sensor() if noise is None else Sensor(*noise),
+        prior=TablePrior() if case.prior == "table" else GeneralPrior(),
+        registrar=VisibilityRegistrar(),
+        closer=closer,
+        fuser=Fuser(voxel_m=0.01),
+        seed=seed,
+    )
+
+
+def run(case: Case, closer: Closer, *, seed: int, told: Callable[[Step, float, float], None]) -> Result:
+    """Build a case and return its figures; `told` hears of each step, its processor time and memory."""
+    maker = modeler(case, closer, seed)
+    indices = case.sequence.indices
+    scene = maker.segmenter.scene([case.sequence.frame(index) for index in telling(indices)])
+    began = time.process_time()
+    before, peak_mib, registrations, step = began, 0.0, 0, None
+    for step in maker.run(case.frames(), scene):
+        now = time.process_time()
+        peak_mib = max(peak_mib, memory_mib())
+        registrations += len(step.posteriors)
+        told(step, now - before, memory_mib())
+        before = now
+    assert step is not None
+    return _figures(case, replace(step, model=None), registrations, time.process_time() - began, peak_mib)
+
+
+def _figures(case: Case, step: Step, registrations: int, seconds: float, peak_mib: float) -> Result:
+    solution, truth = step.solution, case.truth()
+    taking_part = [edge for edge in step.edges_so_far if edge.accepted and edge not in step.solution.outliers]
+    loops = [edge for edge in taking_part if edge.kind == "closure"]
+    errors: list[float | None] = [None] * 4
+    if truth is not None and solution.trajectory and all(frame in truth for frame in solution.trajectory):
+        centroid_m = step.views[min(solution.trajectory)].centroid_m
+        chain, whole = (trajectory_errors(t, truth, centroid_m) for t in (solution.odometry, solution.trajectory))
+        errors = [
+            chain.max_rotation_deg,
+            whole.max_rotation_deg,
+            1e3 * chain.max_translation_m,
+            1e3 * whole.max_translation_m,
+        ]
+    measured = {(edge.target, edge.source): edge.posterior.pose.mean for edge in loops}
+    return Result(
+        name=case.name,
+        frames=len(case.sequence.indices),
+        joined=len(solution.trajectory),
+        registrations=registrations,
+        closures=len(loops),
+        spanning=len(taking_part) - len(loops) - (len(solution.trajectory) - 1),
+        rejected=len(step.edges_so_far) - len(taking_part),
+        before_deg=errors[0],
+        after_deg=errors[1],
+        before_mm=errors[2],
+        after_mm=errors[3],
+        turned_deg=_turned_deg(solution),
+        residual_before_deg=_residual_deg(measured, solution.odometry),
+        residual_after_deg=_residual_deg(measured, solution.trajectory),
+        seconds=seconds,
+        peak_mib=peak_mib,
+    )
+
+
+def _turned_deg(solution: Solution) -> float:
+    """Return the rotation summed over the chain, frame after frame."""
+    poses = [solution.odometry[frame] for frame in sorted(solution.odometry)]
+    steps = [se3.inverse(one) @ other for one, other in itertools.pairwise(poses)]
+    return float(np.degrees(sum(float(se3.rotation_angle(step)) for step in steps)))
+
+
+def _residual_deg(measured: Mapping[tuple[int, int], Array], poses: Mapping[int, Array]) -> float | None:
+    if not measured:
+        return None
+    apart = [se3.inverse(se3.inverse(poses[t]) @ poses[s]) @ motion for (t, s), motion in measured.items()]
+    return float(np.median(np.degrees(se3.rotation_angle(np.stack(apart)))))
+
+
+def memory_mib() -> float:
+    """Return the memory that this process holds."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE_BYTES / 2**20
