@@ -26,7 +26,7 @@ from PIL import Image
 from turning_box import CENTRE_M, COVARIANCE, HALF_M, object_from_camera, steps
 
 from modeler import se3
-from modeler.types import Array, Mode, Outcome, PoseGaussian, Segmentation, Solution, Step
+from modeler.types import Array, Edge, Mode, Outcome, PoseGaussian, Segmentation, Solution, Step
 from viz import (
     blueprint,
     chain,
@@ -734,3 +734,20 @@ def test_the_notebook_runs_and_embeds_the_viewer(monkeypatch: pytest.MonkeyPatch
     assert frame.src.startswith("http://127.0.0.1:")
     assert len(names["step"].views) == 3
     assert names["stream"].viewers[0].process.poll() is not None
+
+
+def test_the_chain_goes_by_odometry_and_over_closures_only_where_that_ends(run: list[Step]) -> None:
+    odometry = run[1].edges[0]
+
+    def edge(source: int, target: int, kind: str) -> Edge:
+        return replace(odometry, posterior=replace(odometry.posterior, source=source, target=target), kind=kind)
+
+    edges = [edge(2, 0, "closure"), edge(1, 0, "odometry"), edge(2, 1, "odometry"), edge(4, 2, "closure")]
+    edges += [edge(5, 4, "odometry"), edge(9, 8, "odometry"), replace(edge(6, 5, "odometry"), accepted=False)]
+    poses = chain.poses(edges, 0)
+    assert set(poses) == {0, 1, 2, 4, 5}
+    step = odometry.posterior.pose.mean
+    for frame, count in ((1, 1), (2, 2), (4, 3), (5, 4)):
+        np.testing.assert_allclose(poses[frame].mean, np.linalg.matrix_power(step, count), atol=1e-9)
+    back = chain.poses([edge(0, 1, "odometry")], 0)[1]
+    np.testing.assert_allclose(back.mean, se3.inverse(step), atol=1e-12)
