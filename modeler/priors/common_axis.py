@@ -16,7 +16,7 @@ _LEAST_TURN_RAD = np.radians(5.0)
 _STUDENT = 5.0  # degrees of freedom of the weights: few, so that motions that do not fit count little
 _ITERATIONS = 30
 _DECISIVE = np.log(1000.0)  # odds at which the sense of turning is taken for known
-_DOUBT = 0.02  # least chance that a pair is all wrong
+_DOUBT = 0.1  # least chance that a pair is all wrong: one mode may have been missed
 
 
 def common_axis(posteriors: Sequence[Posterior], wobble_rad: float, wobble_m: float) -> Axis | None:
