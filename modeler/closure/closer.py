@@ -10,7 +10,7 @@ import numpy as np
 from modeler import se3
 from modeler.closure.prospects import Outlook
 from modeler.closure.verdict import Agreement, agreement, flaw, modes
-from modeler.closure.ways import along, ways
+from modeler.closure.ways import Way, along, ways
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, RayImage, Solution
 
 
@@ -30,8 +30,8 @@ class Closer:
     """How far in degrees the object must have turned away from an earlier view before it counts as coming back."""
     max_closures: int = 2
     """At most so many views besides the previous one are tried for a frame; 0 = never close."""
-    min_gain_nats: float = 5.0
-    """Least information that an edge must promise: the default makes six directions 2.3 times as sure, e^(5/6)."""
+    min_gain_nats: float = 4.16
+    """Least information that an edge must promise: the default makes six directions twice as sure, 6 log 2."""
     max_relocations: int = 4
     """At most so many earlier views are tried for a frame that the previous view does not place."""
     min_overlap: float = 0.4
@@ -72,17 +72,15 @@ class Closer:
             solution, views, known, base.target, expected, self._systematic(1, views[base.target].centroid_m)
         )
         chosen, spanned = [], False
-        for prospect in outlook.prospects([frames[number] for number in near], angle_deg[near]):
-            if prospect.gain_nats < self.min_gain_nats or prospect.overlap < self.min_overlap:
-                continue
-            back = self._came_back(prospect.frame, base.source, base, solution, known)
-            if back or not spanned:  # one large step over many small ones is enough
-                chosen.append(prospect.frame)
-            spanned = spanned or not back
-        if frames[0] in chosen or (
-            last and 0 in near and self._came_back(frames[0], base.source, base, solution, known)
-        ):
-            chosen = [frames[0], *(frame for frame in chosen if frame != frames[0])]  # to close on the first is best
+        for prospect in outlook.prospects([frames[number] for number in near], angle_deg[near], self.min_gain_nats):
+            if prospect.overlap >= self.min_overlap:
+                back = self._came_back(prospect.frame, base.source, outlook.reach, solution)
+                if back or not spanned:  # one large step over many small ones is enough
+                    chosen.append(prospect.frame)
+                spanned = spanned or not back
+        first = frames[0]
+        if first in chosen or (last and 0 in near and self._came_back(first, base.source, outlook.reach, solution)):
+            chosen = [first, *(frame for frame in chosen if frame != first)]  # to close on the first is best
         return tuple(chosen[: self.max_closures])
 
     def relocation(
@@ -153,8 +151,9 @@ class Closer:
             off_deg = float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ measured)))
             if off_deg <= self.max_angle_deg:
                 return posterior, f"{reason}, {off_deg:.0f}° from the motion going on"
+            reach = ways(known, posterior.target)
             for witness in standing if off_deg <= steps * self.max_angle_deg else ():
-                if witness is not posterior and self._agreement(witness, posterior, views, solution, known).agrees:
+                if witness is not posterior and self._agreement(witness, posterior, views, solution, reach).agrees:
                     return posterior, f"{reason}, frame {witness.target} agrees"
         return None, ""
 
@@ -179,9 +178,10 @@ class Closer:
             steps: how many frames lie between the previous view and this frame, this one counted.
         """
         base, base_reason = self.base(posteriors, views, solution, known, steps=steps)
+        reach = ways(known, base.target) if base is not None and len(posteriors) > 1 else {}
         edges = []
         for number, posterior in enumerate(posteriors):
-            back = number > 0 and self._came_back(posterior.target, posterior.source, base, solution, known)
+            back = number > 0 and self._came_back(posterior.target, posterior.source, reach, solution)
             if posterior is base:
                 accepted, reason = True, base_reason
             elif (found := flaw(posterior, self.min_overlap if number else None)) is not None:
@@ -189,30 +189,27 @@ class Closer:
             elif base is None:
                 accepted, reason = False, "neither the previous view nor another one places the frame with certainty"
             else:
-                agreed = self._agreement(posterior, base, views, solution, known)
+                agreed = self._agreement(posterior, base, views, solution, reach)
                 agreeing = "closes the loop" if back else "spans several steps"
                 verdict = agreeing if agreed.agrees else "contradicts the chain"
                 accepted, reason = agreed.agrees, f"{verdict}: {agreed.words}"
             edges.append(Edge(posterior, "closure" if back else "odometry", accepted, reason))
         return tuple(edges)
 
-    def _came_back(
-        self, target: int, source: int, base: Posterior | None, solution: Solution, known: Sequence[Edge]
-    ) -> bool:
+    def _came_back(self, target: int, source: int, reach: Mapping[int, Way], solution: Solution) -> bool:
         """Return whether the object turned well away from a view before another frame, or on the way between the two.
 
         Args:
             target: number of the view.
             source: number of the other frame.
-            base: the registration that places it.
+            reach: ways from the view that it hangs on.
             solution: the poses so far.
-            known: every edge judged so far.
         """
         frames = {frame for frame in solution.trajectory if min(target, source) < frame < max(target, source)}
-        if base is not None:
-            frames |= set(along(ways(known, base.target), target))
-        poses = np.stack([solution.trajectory[frame] for frame in (target, *frames)])
-        return bool(se3.rotation_angle(se3.inverse(poses[0]) @ poses).max() >= np.radians(self.away_deg))
+        frames |= set(along(reach, target))
+        rotations = np.stack([solution.trajectory[frame][:3, :3] for frame in (target, *frames)])
+        cosine = 0.5 * (np.einsum("ij,nij->n", rotations[0], rotations) - 1.0)
+        return bool(cosine.min() <= np.cos(np.radians(self.away_deg)))
 
     def _stands(self, posterior: Posterior) -> bool:
         """Return whether a registration could place a frame without the previous view."""
@@ -224,7 +221,7 @@ class Closer:
         base: Posterior,
         views: Mapping[int, RayImage],
         solution: Solution,
-        known: Sequence[Edge],
+        reach: Mapping[int, Way],
     ) -> Agreement:
         """Return how well a registration agrees with the way through the graph and along `base`."""
         way = solution.relative_gaussian(posterior.target, base.target)
@@ -236,7 +233,7 @@ class Closer:
             for weight, pose in modes(base)
         ]
         centroid_m = se3.transform(se3.inverse(modes(base)[0][1].mean), views[base.target].centroid_m[None])[0]
-        surest = ways(known, base.target).get(posterior.target)
+        surest = reach.get(posterior.target)
         length = abs(list(views).index(base.target) - list(views).index(posterior.target))
         length = length if surest is None else surest.edges
         return agreement(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from modeler import se3
-from modeler.closure.ways import ways
+from modeler.closure.ways import Way, ways
 from modeler.types import Array, Edge, RayImage, Solution
 
 _ASKED = 6  # views whose motion's covariance is worked out: the most promising by a bound that costs little
@@ -46,7 +47,12 @@ class Outlook:
     systematic: Array
     """Covariance (6, 6) of an edge's systematic error, in the camera of the view that the new one hangs on."""
 
-    def prospects(self, frames: Sequence[int], angle_deg: Array) -> list[Prospect]:
+    @cached_property
+    def reach(self) -> Mapping[int, Way]:
+        """The surest ways from the view that the new one hangs on."""
+        return ways(self.edges, self.previous)
+
+    def prospects(self, frames: Sequence[int], angle_deg: Array, least_nats: float) -> list[Prospect]:
         """Return the most promising of `frames`, whose predicted rotations to the new view are `angle_deg` (n,).
 
         An edge of covariance R between two frames whose motion is known with covariance P adds ½ log |1 + P R⁻¹| nats,
@@ -54,32 +60,34 @@ class Outlook:
         as errors grow with the turn θ; the chance to find it to be what a sphere shows again, (1 + cos θ) / 2. The
         surest way through the graph bounds P, so that P itself is worked out for a few frames only, however long the
         sequence.
+
+        Args:
+            frames: numbers of earlier views.
+            angle_deg: predicted rotation to each.
+            least_nats: what tells less is left out.
         """
         newest = next((edge for edge in reversed(self.edges) if edge.accepted and edge.source == self.previous), None)
         if newest is None:
             return []
-        one_edge = newest.posterior.pose.covariance
-        reach = ways(self.edges, self.previous)
-        variance_rad2 = float(np.trace(one_edge[:3, :3]))
-        chances = np.cos(np.radians(angle_deg) / 2.0) ** 2
-        bounded = [
-            (
-                chance * np.log1p(_tells(angle) * (1.0 + reach[frame].variance_rad2 / variance_rad2)),
-                frame,
-                angle,
-                chance,
-            )
-            for frame, angle, chance in zip(frames, angle_deg, chances, strict=True)
-            if frame in reach
-        ]
+        one_edge = newest.posterior.pose.covariance + self.systematic
+        variance_rad2 = _rotation_variance(one_edge)
+        own_rad2 = _rotation_variance(self.systematic)
+        bounded = []
+        for frame, angle in zip(frames, angle_deg, strict=True):
+            if frame in self.reach:
+                way = self.reach[frame]
+                ratio = 1.0 + (way.variance_rad2 + way.edges * own_rad2) / variance_rad2
+                bound_nats = 3.0 * _chance(angle) * np.log1p(_tells(angle) * ratio)
+                bounded.append((float(bound_nats), frame, float(angle)))
         found = []
-        for _, frame, angle, chance in sorted(bounded, reverse=True)[:_ASKED]:
+        for _, frame, angle in sorted((b for b in bounded if b[0] >= least_nats), reverse=True)[:_ASKED]:
             overlap = self._overlap(frame)
-            count = 1 + reach[frame].edges
-            known = self.solution.relative_covariance(frame, self.previous) + one_edge + count**2 * self.systematic
-            ratio = overlap * _tells(angle) * np.linalg.solve(one_edge + self.systematic, known)
-            gain_nats = chance * 0.5 * float(np.linalg.slogdet(np.eye(6) + ratio)[1])
-            found.append(Prospect(frame, float(angle), overlap, gain_nats))
+            known = self.solution.relative_covariance(frame, self.previous)
+            known = known + one_edge + self.reach[frame].edges * self.systematic
+            ratio = overlap * _tells(angle) * np.linalg.solve(one_edge, known)
+            gain_nats = _chance(angle) * 0.5 * float(np.linalg.slogdet(np.eye(6) + ratio)[1])
+            if gain_nats >= least_nats:
+                found.append(Prospect(frame, angle, overlap, gain_nats))
         return sorted(found, key=lambda prospect: -prospect.gain_nats)
 
     def _overlap(self, frame: int) -> float:
@@ -90,6 +98,15 @@ class Outlook:
         points_m = se3.transform(camera_from_frame, view.points_m[chosen])
         normals = view.normals[chosen] @ camera_from_frame[:3, :3].T
         return float(np.mean(np.sum(points_m * normals, axis=1) < 0.0))
+
+
+def _rotation_variance(covariance: Array) -> float:
+    return float(np.trace(covariance[:3, :3]))
+
+
+def _chance(angle_deg: float) -> float:
+    """Return how much of a sphere is shown again after a turn."""
+    return float(np.cos(np.radians(angle_deg) / 2.0) ** 2)
 
 
 def _tells(angle_deg: float) -> float:

@@ -6,8 +6,6 @@ import heapq
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from modeler.types import Edge
 
 
@@ -28,7 +26,8 @@ def ways(edges: Iterable[Edge], start: int) -> Mapping[int, Way]:
     neighbours: dict[int, list[tuple[int, float]]] = {}
     for edge in edges:
         if edge.accepted:
-            variance_rad2 = float(np.trace(edge.posterior.pose.covariance[:3, :3]))
+            covariance = edge.posterior.pose.covariance
+            variance_rad2 = float(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
             neighbours.setdefault(edge.source, []).append((edge.target, variance_rad2))
             neighbours.setdefault(edge.target, []).append((edge.source, variance_rad2))
     found: dict[int, Way] = {}
