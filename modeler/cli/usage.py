@@ -16,6 +16,7 @@ from modeler.cli.convert import Convert
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
 from modeler.cli.info import Info
+from modeler.cli.join import Join
 from modeler.cli.register import Register
 from modeler.cli.render import Render
 from modeler.cli.report import Report
@@ -32,6 +33,7 @@ Command = (
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Join, tyro.conf.subcommand("join")]
 )
 
 _STYLE = (
@@ -46,7 +48,7 @@ _DESCRIPTION = "Object models from depth-camera sequences. Data goes to stdout, 
 
 def parsed(
     arguments: Sequence[str],
-) -> Build | Info | Convert | CalibrateSensor | Register | Evaluate | Render | View | Report | Export:
+) -> Build | Info | Convert | CalibrateSensor | Register | Evaluate | Render | View | Report | Export | Join:
     """Return the command that the arguments (after the program's name) ask for.
 
     Raises:

@@ -36,6 +36,8 @@ class RunMeta:
     """Every other option that the results depend on, as JSON values."""
     closure_expected: bool = False
     """Whether the object is known to come back to its start, so that a run without closure is not to be trusted."""
+    doubts: Sequence[str] = ()
+    """Further reasons in words not to trust the model."""
     interrupted: bool = False
     """Whether the user ended the run before its last frame."""
     seconds: Mapping[str, float] = field(default_factory=dict)
@@ -110,7 +112,7 @@ def posteriors_of(report: Mapping[str, Any]) -> dict[tuple[int, int], Posterior]
 
 def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> list[str]:
     """Return in words why the model is not to be trusted; empty where it is."""
-    reasons = []
+    reasons = list(meta.doubts)
     if meta.interrupted:
         reasons.append(f"the run was interrupted after frame {step.frame.index}")
     elif not step.last:

@@ -1,0 +1,202 @@
+"""What `modeler join` does once it is understood."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from modeler import se3
+from modeler.cli.join import Join
+from modeler.cli.reopened import Reopened, renumbered, reopened
+from modeler.export import RunFolder, RunMeta
+from modeler.export.report import FrameRecord
+from modeler.fusion import Fuser, Match, Matcher, own_covariances
+from modeler.graph import PoseGraph, solve
+from modeler.priors.bumps import Bumps
+from modeler.registration import VisibilityRegistrar
+from modeler.types import Array, Edge, InputError, Outcome, Posterior, Segmentation, Solution, Step
+
+_SIGMA_RAD, _SIGMA_M = 0.12, 0.01  # how far off the laid models may be
+_RIVAL = 0.97  # of the best match's score: one that is as good and lies elsewhere leaves the choice open
+_FARTHEST_RAD = 0.5  # a posterior farther from the match than this is another place
+
+
+def join(options: Join) -> int:
+    """Join two runs into a run folder and return the exit status.
+
+    Raises:
+        InputError: where a run cannot be read, or no pair of their views can be registered.
+    """
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed} is negative; give a whole number from 0 on")
+    if options.pairs < 1:
+        raise InputError(f"--pairs {options.pairs} leaves nothing to join by; give at least 1")
+    began = time.perf_counter()
+    first, second = reopened(options.run_a), reopened(options.run_b)
+    offset = max(record["id"] for record in first.report["frames"]) + 1
+    second = _shifted(second, offset)
+    folder = RunFolder.open(options.out, overwrite=options.overwrite)
+    matches = _matches(first, second)
+    _say(f"laid on each other, {100.0 * matches[0].score:.0f} % of the surface agree")
+    edges = _edges(first, second, matches[0], options)
+    count = sum(edge.accepted for edge in edges)
+    if not count:
+        raise InputError(
+            f"{options.run_a} and {options.run_b}: none of {len(edges)} pairs of views could be registered; are they "
+            "of the same object, and do they share enough surface? Try more --pairs"
+        )
+    graph = PoseGraph(edges=(*first.edges, *second.edges, *edges), first=min(first.solution.trajectory))
+    guess = dict(first.solution.trajectory) | {
+        frame: matches[0].target_from_source @ pose for frame, pose in second.solution.trajectory.items()
+    }
+    meta = RunMeta(
+        sequence=f"{first.report['sequence']} + {second.report['sequence']}",
+        seed=options.seed,
+        prior="none",
+        settings={"joined": [str(options.run_a), str(options.run_b)], "offset": offset, "pairs": options.pairs},
+        doubts=_doubts(matches),
+        seconds={"total": time.perf_counter() - began},
+    )
+    report = _written(folder, (first, second), graph, solve(graph, guess), meta)
+    _say(f"{count} of {len(edges)} pairs registered, {len(report['poses'])} frames joined: {options.out}")
+    if report["reasons"]:
+        _say(f"not to be trusted: {report['reasons'][0]}")
+    return 0 if report["trustworthy"] else 3
+
+
+def _matches(first: Reopened, second: Reopened) -> list[Match]:
+    """Return the ways to lay the second model on the first, best first.
+
+    Raises:
+        InputError: where there is none.
+    """
+    scans = first.scan(Fuser()), second.scan(Fuser())
+    models = scans[0].model(), scans[1].model()
+    found = Matcher().matches(*scans, models) if all(len(model.points_m) for model in models) else []
+    if not found:
+        raise InputError("the models cannot be laid on each other; build both runs from more views")
+    return found
+
+
+def _doubts(matches: list[Match]) -> list[str]:
+    """Return in words why the way the models lie on each other is open; empty where it is not."""
+    rivals = [match for match in matches[1:] if match.score > _RIVAL * matches[0].score]
+    if not rivals:
+        return []
+    angle = float(se3.rotation_angle(se3.inverse(matches[0].target_from_source) @ rivals[0].target_from_source))
+    return [
+        f"the models can be laid on each other as well another way, turned by {np.degrees(angle):.0f}°: the object "
+        "looks the same from several sides"
+    ]
+
+
+def _edges(first: Reopened, second: Reopened, match: Match, options: Join) -> tuple[Edge, ...]:
+    """Register views of the second run against views of the first that look from nearly the same side."""
+    edges = []
+    for target, source in _facing(first, second, match.target_from_source, options.pairs):
+        views = second.views[source], first.views[target]
+        poses = second.solution.trajectory[source], first.solution.trajectory[target]
+        guess = se3.inverse(poses[1]) @ match.target_from_source @ poses[0]
+        motion = Bumps(
+            guess[None],
+            np.ones(1),
+            centre_m=views[0].centroid_m,
+            sigma_rad=_SIGMA_RAD,
+            sigma_m=_SIGMA_M,
+            evidence=False,
+        )
+        rng = np.random.default_rng([options.seed, source, target])
+        posterior = VisibilityRegistrar().register(*views, motion, rng=rng)
+        edges.append(_judged(posterior, guess))
+    return tuple(edges)
+
+
+def _judged(posterior: Posterior, guess: Array) -> Edge:
+    """Return the posterior as an edge that takes part where it is usable and in the place that was looked at."""
+    off = se3.inverse(guess) @ posterior.pose.mean
+    away = float(se3.rotation_angle(off)) > _FARTHEST_RAD
+    lasting = replace(posterior, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
+    if not posterior.usable:
+        return Edge(lasting, "closure", False, f"{posterior.outcome.label}: {posterior.outcome.advice}")
+    if away:
+        return Edge(lasting, "closure", False, "lies elsewhere than the models laid on each other")
+    return Edge(lasting, "closure", True, "joins the runs")
+
+
+def _facing(first: Reopened, second: Reopened, target_from_source: Array, count: int) -> list[tuple[int, int]]:
+    """Return pairs of views, target and source, that look at the object from the nearest sides, no view twice."""
+    centre = np.mean([first.solution.trajectory[k] @ np.append(v.centroid_m, 1.0) for k, v in first.views.items()], 0)
+    sides = []
+    for run, motion in ((first, np.eye(4)), (second, target_from_source)):
+        frames = [frame for frame in run.solution.trajectory if frame in run.views]
+        rays = np.stack([(motion @ run.solution.trajectory[frame])[:3, 3] - centre[:3] for frame in frames])
+        sides.append((frames, rays / np.linalg.norm(rays, axis=1, keepdims=True)))
+    cosines = sides[0][1] @ sides[1][1].T
+    pairs = []
+    for flat in np.argsort(-cosines, axis=None, kind="stable"):
+        row, column = np.unravel_index(flat, cosines.shape)
+        target, source = sides[0][0][int(row)], sides[1][0][int(column)]
+        if len(pairs) < count and all(target != pair[0] and source != pair[1] for pair in pairs):
+            pairs.append((target, source))
+    return pairs
+
+
+def _shifted(run: Reopened, offset: int) -> Reopened:
+    """Return a run with frame numbers from `offset` on."""
+    edges = tuple(
+        replace(
+            edge,
+            posterior=replace(edge.posterior, source=edge.source + offset, target=edge.target + offset),
+        )
+        for edge in run.edges
+    )
+    trajectory, covariances, odometry = (
+        {frame + offset: value for frame, value in mapping.items()}
+        for mapping in (run.solution.trajectory, run.solution.covariances, run.solution.odometry)
+    )
+    before = run.solution.relative_covariance
+    solution = replace(
+        run.solution,
+        trajectory=trajectory,
+        covariances=covariances,
+        odometry=odometry,
+        relative_covariance=lambda target, source: before(target - offset, source - offset),
+    )
+    views = {frame + offset: renumbered(view, offset) for frame, view in run.views.items()}
+    report = dict(run.report) | {"frames": [r | {"id": r["id"] + offset} for r in run.report["frames"]]}
+    return replace(run, report=report, views=views, edges=edges, solution=solution)
+
+
+def _written(
+    folder: RunFolder, parts: tuple[Reopened, Reopened], graph: PoseGraph, solution: Solution, meta: RunMeta
+) -> Mapping[str, Any]:
+    """Fuse the frames of both parts, write the run folder and return its report."""
+    views = dict(parts[0].views) | dict(parts[1].views)
+    model = Fuser().fuse(views, solution.trajectory, own_covariances(solution))
+    for part in parts:
+        folder.frames.update({record["id"]: FrameRecord(**record) for record in part.report["frames"]})
+    last = views[max(views)]
+    mask = last.frame.mask if last.frame.mask is not None else np.isfinite(last.frame.depth_m)
+    step = Step(
+        frame=last.frame,
+        segmentation=Segmentation(mask, last.plane, Outcome.CONVERGED),
+        view=last,
+        posteriors=(),
+        edges=(),
+        outcome="accepted",
+        solution=solution,
+        model=model,
+        edges_so_far=graph.edges,
+        views=views,
+        last=True,
+    )
+    return folder.write(step, meta)
+
+
+def _say(words: str) -> None:
+    print(f"modeler: {words}", file=sys.stderr)
