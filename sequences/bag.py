@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import struct
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -93,9 +94,10 @@ class Bag:
         return [connection for connection in self._reader.connections if str(connection.topic) == topic]
 
     def _message(self, connection: Connection, data: bytes) -> Any:
-        store = _typestore(ros1=self.is_ros1)
-        read = store.deserialize_ros1 if self.is_ros1 else store.deserialize_cdr
-        return read(data, connection.msgtype)
+        store, kind = _typestore(ros1=self.is_ros1), str(connection.msgtype)
+        if not self.is_ros1:
+            return store.deserialize_cdr(data, kind)
+        return store.deserialize_ros1(_image_alone(data) if kind == "sensor_msgs/msg/Image" else data, kind)
 
     @cached_property
     def _reader(self) -> rosbag1.Reader | rosbag2.Reader:
@@ -126,6 +128,15 @@ class Bag:
         except Exception as error:  # a broken file can make the library raise anything
             advice = "reindex it (rosbag reindex)" if "index" in str(error) else "record or copy it anew"
             raise InputError(f"{self.path}: is not a readable bag ({_line(error)}); {advice}.") from None
+
+
+def _image_alone(data: bytes) -> bytes:
+    """Return a ROS 1 image message without the bytes that RealSense's recorder leaves behind it."""
+    at = 12  # behind number and time
+    for fixed in (8, 5, 0):  # texts and pixels tell their lengths; between them: size, order and step
+        (length,) = struct.unpack_from("<I", data, at)
+        at += 4 + length + fixed
+    return data[:at]
 
 
 def _line(error: Exception) -> str:

@@ -85,6 +85,10 @@ class AbstractSequence(ABC):
         """Whether more frames come than `indices` tells, so that iterating takes as long as they take to come."""
         return False
 
+    def recorded(self) -> AbstractSequence:
+        """Return what is there already, which ends by itself, of a live sequence."""
+        return self
+
     def until(self, stop: Callable[[], bool]) -> AbstractSequence:
         """Return the sequence that, where it is live, ends as soon as `stop` says so."""
         return self

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import weakref
 from collections.abc import Iterator, Mapping
@@ -9,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -25,11 +26,6 @@ from sequences.lens import Lens
 from sequences.pictures import metres
 from sequences.recording import AbstractRecording
 from sequences.tum import MAX_APART_S, nearest
-
-if TYPE_CHECKING:
-    from av.container import InputContainer
-    from av.packet import Packet
-    from av.video.stream import VideoStream
 
 ADVICE = "pip install 'modeler[kinect]'"
 
@@ -178,9 +174,8 @@ class Matroska:
                 return np.asarray(image.to_ndarray(format="rgb24"), dtype=np.uint8)
         raise InputError(f"{where}: cannot be decoded; record it anew.")
 
-    def _find(self, title: str, stamp: int) -> Packet:
+    def _find(self, title: str, stamp: int) -> Any:
         track = self._track(title)
-        assert track is not None
         for start in (stamp, 0):  # recordings that were cut off have no index: then from the beginning
             self._container.seek(start, stream=track)
             for packet in self._container.demux(track):
@@ -188,7 +183,7 @@ class Matroska:
                     return packet
         raise InputError(f"{self.path}: lacks an image of {title} that it had; record it anew.")
 
-    def _track(self, title: str) -> VideoStream | None:
+    def _track(self, title: str) -> Any:
         named = (track for track in self._container.streams.video if track.metadata.get("title") == title)
         track = next(named, None)
         if track is not None and not 0 < track.width * track.height <= MAX_PIXELS:
@@ -196,10 +191,10 @@ class Matroska:
         return track
 
     @cached_property
-    def _container(self) -> InputContainer:
+    def _container(self) -> Any:
         """Return the open file; it is closed when this recording is forgotten."""
         try:
-            import av
+            av = importlib.import_module("av")
         except ImportError:
             raise InputError(f"{self.path}: recordings of the Azure Kinect are read by PyAV; {ADVICE}") from None
         container = av.open(str(self.path), mode="r")

@@ -10,9 +10,13 @@ from sequences.bop import BopSequence
 from sequences.colour_depth import COLOUR_FOLDERS, open_colour_depth
 from sequences.folders import entries
 from sequences.given import Given
+from sequences.realsense import SCHEME, open_camera
 from sequences.tum import open_tum
 
-FORMATS = "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder, organised clouds, a ROS bag, or an Azure Kinect .mkv"
+FORMATS = (
+    "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder, organised clouds, a ROS bag, an Azure Kinect .mkv, "
+    "or realsense:"
+)
 BAGS = (".bag", ".mcap", ".db3")
 CLOUDS = (".pcd", ".ply")
 
@@ -21,13 +25,15 @@ def open_sequence(path: str | Path, given: Given | None = None) -> AbstractSeque
     """Open the sequence at a path; what it is stored as is told from the path.
 
     Args:
-        path: a folder or a file.
+        path: a folder or a file, or `realsense:` for a live camera.
         given: what a person says of it.
 
     Raises:
         InputError: where it does not hold a readable sequence.
     """
     path, given = Path(path), given or Given()
+    if str(path).startswith(SCHEME):
+        return open_camera(str(path).removeprefix(SCHEME), given)
     try:
         return _open(path, given)
     except OSError as error:

@@ -30,10 +30,10 @@ class RosSequence(AbstractRecording):
     """The open bag."""
     depth_topic: str
     """Topic of the depth images."""
-    colour_topic: str | None
-    """Topic of the colour images."""
+    colour: topics.Colour | None
+    """Where colour comes from."""
     lens: Lens
-    """The depth camera, which is the colour camera too."""
+    """The depth camera."""
     unit_mm: float
     """Millimetres per unit of 16-bit depth."""
     unit: str
@@ -55,10 +55,10 @@ class RosSequence(AbstractRecording):
         time_s, depth_stamp, colour_stamp = self.shots[index]
         where = f"{self.path}: {self.depth_topic}, image {index}"
         depth_m = ros_images.depth_m(self.bag.message(self.depth_topic, depth_stamp), self.unit_mm, where)
-        self._check_size(where, depth_m.shape)
+        self._check_size(where, depth_m.shape, self.lens)
         camera = self.lens.camera
         depth_m = self.lens.straight(depth_m, float("nan"))
-        return Frame(index, time_s, depth_m, camera, None, self._colour(index, colour_stamp))
+        return Frame(index, time_s, depth_m, camera, None, self._colour(index, depth_m, colour_stamp))
 
     def truth(self) -> dict[int, Array] | None:
         """Return None: bags do not tell the object's pose."""
@@ -81,16 +81,19 @@ class RosSequence(AbstractRecording):
         """What was assumed or left out."""
         return self.remarks
 
-    def _colour(self, index: int, stamp: Stamp | None) -> npt.NDArray[np.uint8] | None:
-        if stamp is None or self.colour_topic is None:
+    def _colour(
+        self, index: int, depth_m: npt.NDArray[np.float32], stamp: Stamp | None
+    ) -> npt.NDArray[np.uint8] | None:
+        if stamp is None or self.colour is None:
             return None
-        where = f"{self.path}: {self.colour_topic}, for image {index}"
-        colour = ros_images.colour(self.bag.message(self.colour_topic, stamp), where)
-        self._check_size(where, colour.shape[:2])
-        return self.lens.straight(colour)
+        where = f"{self.path}: {self.colour.topic}, for image {index}"
+        picture = ros_images.colour(self.bag.message(self.colour.topic, stamp), where)
+        alignment = self.colour.alignment
+        self._check_size(where, picture.shape[:2], self.lens if alignment is None else alignment.colour)
+        return self.lens.straight(picture) if alignment is None else alignment.aligned(depth_m, picture)
 
-    def _check_size(self, where: str, found: tuple[int, ...]) -> None:
-        camera = self.lens.camera
+    def _check_size(self, where: str, found: tuple[int, ...], lens: Lens) -> None:
+        camera = lens.camera
         if found != (camera.height, camera.width):
             raise InputError(
                 f"{where}: is {found[1]} x {found[0]} pixels where camera_info says {camera.width} x {camera.height}; "
@@ -108,12 +111,12 @@ def open_ros(path: Path, given: Given) -> RosSequence:
     first = topics.first_images(bag)
     depth_topic = topics.depth_topic(bag, first, given)
     lens = topics.depth_lens(bag, depth_topic, first[depth_topic], given)
-    colour_topic, left = topics.colour_topic(bag, first, lens, given)
+    colour, left = topics.colour_source(bag, first, (depth_topic, lens), given)
     unit_mm, unit = topics.unit(bag, depth_topic, first[depth_topic], given)
     times = _times(bag, depth_topic)
     if not times:
         raise InputError(f"{path}: holds no message of {depth_topic}; record it anew.")
-    colours = [] if colour_topic is None else _times(bag, colour_topic)
+    colours = [] if colour is None else _times(bag, colour.topic)
     partners = nearest([time_s for time_s, _ in times], [time_s for time_s, _ in colours], MAX_APART_S)
     shots = {
         index: (time_s, stamp, None if partner is None else colours[partner][1])
@@ -122,7 +125,7 @@ def open_ros(path: Path, given: Given) -> RosSequence:
     alone = sum(partner is None for partner in partners)
     if colours and alone:
         left.append(f"{alone} depth images have no colour image within {MAX_APART_S * 1000:g} ms")
-    return RosSequence(path, bag, depth_topic, colour_topic, lens, unit_mm, unit, shots, tuple(left))
+    return RosSequence(path, bag, depth_topic, colour, lens, unit_mm, unit, shots, tuple(left))
 
 
 def _times(bag: Bag, topic: str) -> list[tuple[float, Stamp]]:

@@ -90,7 +90,7 @@ def lens(message: Any, where: str, *, ros1: bool) -> Lens:
     if not sane((fx, fy, cx, cy)) or not np.isfinite(bend).all():
         raise InputError(f"{where}: camera_info has no usable K; calibrate the camera, or convert with --intrinsics.")
     known = Lens(Camera(int(message.width), int(message.height), fx, fy, cx, cy), coefficients(bend.tolist()))
-    if known.bends and model not in ("plumb_bob", "rational_polynomial", "", "None"):
+    if known.bends and model not in ("plumb_bob", "rational_polynomial", "Brown Conrady", "", "None"):
         raise InputError(f"{where}: its distortion model {model!r} is not known; record the rectified topic.")
     return known
 

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, final
 
 import numpy as np
 
 from modeler.types import Camera, InputError
-from sequences import ros_images
+from sequences import realsense_bag, ros_images
+from sequences.alignment import Alignment
 from sequences.bag import Bag
 from sequences.given import Given
 from sequences.lens import Lens
-
-_DEPTH_UNITS = "/option/Depth_Units/value"
-"""Where RealSense's recorder puts the metres in one unit, beside the sensor's other options."""
 
 
 def first_images(bag: Bag) -> dict[str, Any]:
@@ -84,8 +83,27 @@ def _camera(bag: Bag, topic: str) -> Lens | None:
     return None
 
 
-def colour_topic(bag: Bag, first: Mapping[str, Any], lens: Lens, given: Given) -> tuple[str | None, list[str]]:
-    """Return the topic of colour images that the depth camera's own pixels have, and which others there are.
+@final
+@dataclass(frozen=True, eq=False)
+class Colour:
+    """Where colour comes from."""
+
+    topic: str
+    """Topic of the images."""
+    alignment: Alignment | None
+    """Where their camera is; None where they have the depth camera's pixels."""
+
+
+def colour_source(
+    bag: Bag, first: Mapping[str, Any], depth: tuple[str, Lens], given: Given
+) -> tuple[Colour | None, list[str]]:
+    """Return where colour comes from that is or can be aligned to depth, and what is said of other colour.
+
+    Args:
+        bag: the bag.
+        first: the first image of each topic.
+        depth: topic and camera of the depth images.
+        given: what a person says.
 
     Raises:
         InputError: where the topic asked for holds none.
@@ -94,16 +112,26 @@ def colour_topic(bag: Bag, first: Mapping[str, Any], lens: Lens, given: Given) -
     if given.colour_topic is not None:
         if given.colour_topic not in found:
             raise InputError(f"{bag.path}: {given.colour_topic} holds no colour images; there are {_names(found)}.")
-        return given.colour_topic, []
-    aligned = [topic for topic in found if _same(_camera(bag, topic), lens)]
+        return Colour(given.colour_topic, _beside(bag, given.colour_topic, *depth)), []
+    aligned = [topic for topic in found if _same(_camera(bag, topic), depth[1])]
     for better in (
         [topic for topic in aligned if "color" in topic or "rgb" in topic or "colour" in topic],
         [topic for topic in aligned if first[topic].__msgtype__ == ros_images.IMAGE],
     ):
         aligned = better or aligned
     if aligned:
-        return aligned[0], []
+        return Colour(aligned[0], None), []
+    for topic in found:
+        alignment = _beside(bag, topic, *depth) if "Color" in topic else None
+        if alignment is not None:
+            return Colour(topic, alignment), []
     return None, [f"colour of {topic} is not aligned to depth and is left out" for topic in found[:3]]
+
+
+def _beside(bag: Bag, topic: str, depth_topic: str, lens: Lens) -> Alignment | None:
+    """Return where the camera of a colour topic is; None where nothing tells it."""
+    camera, motion = _camera(bag, topic), realsense_bag.colour_from_depth(bag, topic, depth_topic)
+    return None if camera is None or motion is None else Alignment(lens.camera, camera, motion)
 
 
 def _same(one: Lens | None, other: Lens) -> bool:
@@ -121,14 +149,9 @@ def unit(bag: Bag, topic: str, image: Any, given: Given) -> tuple[float, str]:
         return given.depth_scale_mm, f"{given.depth_scale_mm:g} mm (--depth-scale-mm)"
     if image.__msgtype__ == ros_images.IMAGE and image.encoding in ros_images.METRES:
         return 1000.0, "m (32FC1)"
-    sensor = re.match(r"/device_\d+/sensor_\d+", topic)
-    option = "" if sensor is None else sensor[0] + _DEPTH_UNITS
-    for name in bag.types:
-        if name.replace(" ", "_") == option:
-            for _, message in bag.messages(name, most=1):
-                unit_mm = float(message.data) * 1000.0
-                if 1e-6 <= unit_mm <= 1e3:
-                    return unit_mm, f"{unit_mm:g} mm ({name})"
+    found = realsense_bag.unit_mm(bag, topic)
+    if found is not None:
+        return found[0], f"{found[0]:g} mm ({found[1]})"
     return 1.0, "1 mm (16UC1)"
 
 

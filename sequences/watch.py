@@ -73,6 +73,10 @@ class WatchedSequence(AbstractSequence):
         """True: more frames come."""
         return True
 
+    def recorded(self) -> AbstractSequence:
+        """Return what was there when it was opened."""
+        return self.seen
+
     def frame(self, index: int) -> Frame:
         """Return a frame that was there when the sequence was opened."""
         return self.seen.frame(index)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import builtins
 import json
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -172,14 +172,7 @@ def test_broken_recordings_are_one_line(tmp_path: Path, capfd: pytest.CaptureFix
 
 def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "s.mkv").write_bytes(b"\x1aE\xdf\xa3")
-    load = builtins.__import__
-
-    def refuse(name: str, *arguments: object, **more: object) -> object:
-        if name == "av":
-            raise ImportError
-        return load(name, *arguments, **more)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(builtins, "__import__", refuse)
+    monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"read by PyAV; pip install 'modeler\[kinect\]'"):
         open_sequence(tmp_path / "s.mkv")
 

@@ -21,7 +21,7 @@ def calibrate_sensor(options: CalibrateSensor) -> int:
     """
     sequence = open_sequence(options.input, options.given.stated())
     with reading() as watched:
-        found = calibrate(watched(sequence, "reading"))
+        found = calibrate(watched(sequence.recorded(), "reading"))
     distance_m = object_distance_m(sequence.frame(sequence.indices[0]))
     write_atomically(options.out, noise_text(found.model, _facts(sequence.name, found, distance_m)))
     print("\n".join(_table(found)))

@@ -21,6 +21,9 @@ from sequences.bop_entries import pose_entry
 UNITS_MM = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 10.0)
 """Depth is written in the finest of these in which it fits into 16 bits."""
 
+LIVE_REACH_M = 16.0
+"""What lies farther away of what a live camera sees is an error of its."""
+
 
 def convert(options: Convert) -> int:
     """Write an input as a BOP scene folder, or the poses of a run.
@@ -32,10 +35,14 @@ def convert(options: Convert) -> int:
         return _poses(options.input, options.out)
     whole = open_sequence(options.input, options.given.stated())
     whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
-    sequence = whole.select(options.selection.every, frame_range(options.selection.frames))
+    kept = frame_range(options.selection.frames)
+    sequence = whole.select(options.selection.every, kept)
+    if sequence.live and kept.stop is None:
+        raise InputError(f"{options.input}: has no end; say how many frames to record, for instance --frames :30.")
     with reading() as watched:
-        found = survey(watched(sequence, "reading"))
-        unit_mm = next((unit for unit in UNITS_MM if found.farthest_m * 1000.0 < 65535.0 * unit), UNITS_MM[-1])
+        found = survey(watched(sequence.recorded(), "reading"))
+        farthest_m = LIVE_REACH_M if sequence.live else found.farthest_m
+        unit_mm = next((unit for unit in UNITS_MM if farthest_m * 1000.0 < 65535.0 * unit), UNITS_MM[-1])
         write_bop(
             options.out,
             watched(sequence, "writing"),
@@ -46,7 +53,7 @@ def convert(options: Convert) -> int:
                 path.name: path.read_bytes() for path in (sequence.robot_path, sequence.model_path) if path is not None
             },
         )
-    print(f"modeler: {len(sequence)} frames of a {sequence.layout}: {options.out}", file=sys.stderr)
+    print(f"modeler: {len(open_sequence(options.out))} frames of a {sequence.layout}: {options.out}", file=sys.stderr)
     for note in sequence.notes:
         print(f"modeler: {note}", file=sys.stderr)
     return 0

@@ -19,7 +19,7 @@ def inform(options: Info) -> int:
     """
     sequence = open_sequence(options.input, options.given.stated())
     with reading() as watched:
-        found = survey(watched(sequence, "reading"))
+        found = survey(watched(sequence.recorded(), "reading"))
     if options.json:
         print(json.dumps(record(sequence, found), allow_nan=False))
     else:

@@ -1,0 +1,86 @@
+"""What RealSense's own recorder writes into bags besides images: units of depth, and where its cameras are.
+
+It has recorded bags of ROS 1, with messages, and since version 2.57 of ROS 2, with texts `key=value;key=value`.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from modeler import se3
+from modeler.types import Array, InputError
+from sequences.bag import Bag
+
+_STREAM = r"(/device_\d+/sensor_\d+)/\w+"
+
+
+def unit_mm(bag: Bag, topic: str) -> tuple[float, str] | None:
+    """Return the millimetres in one unit of depth and the topic that says so; None where nothing does."""
+    sensor = re.match(_STREAM, topic)
+    if sensor is None:
+        return None
+    for name in bag.types:
+        if name.replace(" ", "_") == f"{sensor[1]}/option/Depth_Units/value":
+            for _, message in bag.messages(name, most=1):
+                found = _number(str(message.data)) * 1000.0
+                if 1e-6 <= found <= 1e3:
+                    return found, name
+    return None
+
+
+def colour_from_depth(bag: Bag, colour_topic: str, depth_topic: str) -> Array | None:
+    """Return the motion (4, 4), in m, from the depth to the colour camera; None where nothing tells it.
+
+    Raises:
+        InputError: where what tells it is no motion.
+    """
+    poses = [_from_reference(bag, topic) for topic in (colour_topic, depth_topic)]
+    colour, depth = poses
+    return None if colour is None or depth is None else colour @ se3.inverse(depth)
+
+
+def _from_reference(bag: Bag, topic: str) -> Array | None:
+    """Return camera_from_reference (4, 4) of the camera of a topic."""
+    stream = re.match(_STREAM, topic)
+    if stream is None:
+        return None
+    for name in bag.types:
+        if re.fullmatch(re.escape(stream[0]) + r"/tf/\w+", name):
+            for _, message in bag.messages(name, most=1):
+                return _pose(message, f"{bag.path}: {name}")
+    return None
+
+
+def _pose(message: Any, where: str) -> Array:
+    if message.__msgtype__ == "geometry_msgs/msg/Transform":
+        turn, shift = message.rotation, message.translation
+        quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64)
+        size = float(np.linalg.norm(quaternion))
+        rotation = Rotation.from_quat(quaternion).as_matrix() if 0.9 < size < 1.1 else np.full((3, 3), np.nan)
+        pose = se3.translation(np.array([shift.x, shift.y, shift.z], dtype=np.float64))
+    else:
+        said = dict(part.split("=", 1) for part in str(getattr(message, "data", "")).split(";") if "=" in part)
+        # Matrices of the camera's library stand column by column.
+        rotation = _numbers(said.get("rotation", ""), 9).reshape(3, 3).T
+        pose = se3.translation(_numbers(said.get("translation", ""), 3))
+    pose[:3, :3] = rotation
+    sound = bool(np.isfinite(pose).all()) and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
+    if not sound or np.abs(pose[:3, 3]).max() > 10.0:
+        raise InputError(f"{where}: is no rigid motion; record it anew.")
+    return pose
+
+
+def _numbers(text: str, count: int) -> Array:
+    found = [_number(word) for word in text.split(",")]
+    return np.array(found) if len(found) == count else np.full(count, np.nan)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
