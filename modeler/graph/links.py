@@ -121,3 +121,11 @@ def anchored(guess: Mapping[int, Array], root: int) -> Mapping[int, Array]:
         return guess
     root_from_guess = se3.inverse(guess[root])
     return {frame: root_from_guess @ pose for frame, pose in guess.items()}
+
+
+def inverse_right_jacobian(xi: Array) -> Array:
+    """Return J (n, 6, 6) with log(exp(ξ) exp(η)) = ξ + J η to first order in η, to third order in small ξ (n, 6)."""
+    adjoint = np.zeros((len(xi), 6, 6))
+    adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = se3.hat(xi[:, :3])
+    adjoint[:, 3:, :3] = se3.hat(xi[:, 3:])
+    return np.eye(6) + 0.5 * adjoint + adjoint @ adjoint / 12.0

@@ -1,11 +1,12 @@
 """Uncertainty of solved frames and of the motion between any two of them, from square roots of information.
 
 Errors are written in object coordinates, δ_k with true object_from_camera(k) = exp(δ_k) object_from_camera(k), so that
-a link says R Ad(source_from_object) (δ_source − δ_target) ~ N(0, I), with RᵀR the inverse of its covariance; the root
-has no error. Householder QR of all rows, clique by clique along a sparse ordering, leaves U with UᵀU the information of
-all poses (Kaess and Dellaert, Covariance recovery from a square root information matrix, RAS 2009).
-Neither information nor covariance is ever formed, subtracted or inverted as a whole, so that a direction nobody
-observed, metres wide beside micrometres, is as welcome as any other. First order in the errors.
+a link says R J Ad(source_from_object) (δ_source − δ_target) ~ N(0, I), with RᵀR the inverse of its covariance and J the
+derivative of its error's logarithm, the identity but for what is left of that error; the root has none. Householder QR
+of all rows, clique by clique along a sparse ordering, leaves U with UᵀU the information of all poses (Kaess and
+Dellaert, Covariance recovery from a square root information matrix, RAS 2009). Neither information nor covariance is
+ever formed, subtracted or inverted as a whole, so that a direction nobody observed, metres wide beside micrometres, is
+as welcome as any other. First order in the errors.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from modeler import se3
-from modeler.graph.links import Link
+from modeler.graph.links import Link, inverse_right_jacobian
 from modeler.types import Array
 
 _GAUGE_SIGMA = 1e-9  # rad and m: a pose relative to itself, as a covariance that is still positive definite
@@ -128,7 +129,7 @@ class RelativeCovariance:
             return []
         factors = gtsam.GaussianFactorGraph()
         for rows in (*self._rows(), *self.others):
-            factors.add(_factor({key: block for key, block in rows.items() if key != self.root}))
+            factors.add(gaussian_factor({key: block for key, block in rows.items() if key != self.root}))
         tree = factors.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR)
         cliques: list[_Clique] = []
         waiting = [(clique, None) for clique in tree.roots()]
@@ -145,24 +146,30 @@ class RelativeCovariance:
         ]
 
     def _rows(self) -> Iterator[Rows]:
-        """Yield the rows of each link."""
+        """Yield the rows of each link, where it stands in the solution."""
         frames = {frame: number for number, frame in enumerate(self.trajectory)}
-        camera_from_object = se3.adjoint(se3.inverse(np.stack(list(self.trajectory.values()))))
+        poses = np.stack(list(self.trajectory.values()))
+        targets, sources = (
+            poses[[frames[frame] for frame in ends]]
+            for ends in ([link.target for link in self.links], [link.source for link in self.links])
+        )
+        means = np.stack([link.pose.mean for link in self.links])
+        xi = se3.log(se3.inverse(means) @ se3.inverse(targets) @ sources)
         roots = np.stack([link.root_information for link in self.links])
-        blocks = roots @ camera_from_object[[frames[link.source] for link in self.links]]
+        blocks = roots @ inverse_right_jacobian(xi) @ se3.adjoint(se3.inverse(sources))
         for link, block in zip(self.links, blocks, strict=True):
             yield {link.target: -block, link.source: block}
 
 
-def _factor(rows: Rows) -> gtsam.JacobianFactor:
-    """Return rows of one to three variables as GTSAM takes them."""
+def gaussian_factor(rows: Rows, right: Array | None = None) -> gtsam.JacobianFactor:
+    """Return rows of one to three variables, and their right sides (m,) or zero, as GTSAM takes them."""
     (key, block), *more = rows.items()
-    zero, unit = np.zeros(len(block)), gtsam.noiseModel.Unit.Create(len(block))
+    right, unit = np.zeros(len(block)) if right is None else right, gtsam.noiseModel.Unit.Create(len(block))
     if not more:
-        return gtsam.JacobianFactor(key, block, zero, unit)
+        return gtsam.JacobianFactor(key, block, right, unit)
     if len(more) == 1:
-        return gtsam.JacobianFactor(key, block, *more[0], zero, unit)
-    return gtsam.JacobianFactor(key, block, *more[0], *more[1], zero, unit)
+        return gtsam.JacobianFactor(key, block, *more[0], right, unit)
+    return gtsam.JacobianFactor(key, block, *more[0], *more[1], right, unit)
 
 
 @dataclass(frozen=True, eq=False)

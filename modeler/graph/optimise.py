@@ -35,8 +35,6 @@ def optimise(
     root: int,
     threshold: float,
     inlier: Sequence[bool] = (),
-    others: Iterable[gtsam.NonlinearFactor] = (),
-    values: gtsam.Values | None = None,
 ) -> Optimum:
     """Return the optimum and which loops take part in it: those whose error stays below the threshold.
 
@@ -51,19 +49,14 @@ def optimise(
         root: the frame whose pose is the identity.
         threshold: half the squared Mahalanobis distance beyond which a loop is left out.
         inlier: which loops took part in an earlier solution; those beyond it are taken to.
-        others: more factors that are trusted.
-        values: initial values of variables that are no frames.
     """
-    others = list(others)
-    initial = gtsam.Values() if values is None else gtsam.Values(values)
-    for frame, object_from_camera in start.items():
-        initial.insert(frame, gtsam.Pose3(object_from_camera))
+    initial = values_of(start)
     taking_part = (*inlier, *[True] * (len(loops) - len(inlier)))
     chosen = [loop for loop, good in zip(loops, taking_part, strict=True) if good]
-    found = _least_squares(_factors([*tree, *chosen], root, others), initial)
+    found = _least_squares(factors_of([*tree, *chosen], root), initial)
     if agree(loops, found, threshold) != taking_part:
-        factors = _factors([*tree, *loops], root, others, loops_last=len(loops))
-        trusted = factors.size() - len(loops)
+        factors = factors_of([*tree, *loops], root)
+        trusted = 1 + len(tree)
         parameters = gtsam.GncLMParams(_parameters(_ROUGH))
         parameters.setLossType(gtsam.GncLossType.TLS)
         parameters.setKnownInliers(list(range(trusted)))
@@ -73,14 +66,22 @@ def optimise(
         taking_part = tuple(bool(weight > 0.5) for weight in annealing.getWeights()[trusted:])
         chosen = [loop for loop, good in zip(loops, taking_part, strict=True) if good]
         # At full weight, where annealing ended between.
-        found = _least_squares(_factors([*tree, *chosen], root, others), found)
-    error = _factors([*tree, *chosen], root, others).error(found) + threshold * taking_part.count(False)
+        found = _least_squares(factors_of([*tree, *chosen], root), found)
+    error = factors_of([*tree, *chosen], root).error(found) + threshold * taking_part.count(False)
     return Optimum(poses_of(found, start, root), taking_part, error)
 
 
 def anchor(root: int) -> gtsam.PriorFactorPose3:
     """Return the factor that pins the root's pose at the identity."""
     return gtsam.PriorFactorPose3(root, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, _GAUGE_SIGMA))
+
+
+def values_of(poses: Mapping[int, Array]) -> gtsam.Values:
+    """Return object_from_camera (4, 4) by frame number as GTSAM takes it."""
+    values = gtsam.Values()
+    for frame, object_from_camera in poses.items():
+        values.insert(frame, gtsam.Pose3(object_from_camera))
+    return values
 
 
 def poses_of(values: gtsam.Values, frames: Iterable[int], root: int) -> dict[int, Array]:
@@ -94,17 +95,11 @@ def agree(loops: Iterable[Link], values: gtsam.Values, threshold: float) -> tupl
     return tuple(loop.factor.error(values) <= threshold for loop in loops)
 
 
-def _factors(
-    links: Sequence[Link], root: int, others: Sequence[gtsam.NonlinearFactor], *, loops_last: int = 0
-) -> gtsam.NonlinearFactorGraph:
-    """Return a prior that pins the root at the identity, and links; the last few after all else."""
+def factors_of(links: Iterable[Link], root: int) -> gtsam.NonlinearFactorGraph:
+    """Return a prior that pins the root at the identity, and links."""
     factors = gtsam.NonlinearFactorGraph()
     factors.add(anchor(root))
-    for link in links[: len(links) - loops_last]:
-        factors.push_back(link.factor)
-    for factor in others:
-        factors.push_back(factor)
-    for link in links[len(links) - loops_last :]:
+    for link in links:
         factors.push_back(link.factor)
     return factors
 

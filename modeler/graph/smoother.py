@@ -9,17 +9,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from modeler.graph.axis import CommonAxis
 from modeler.graph.incremental import Incremental
 from modeler.graph.links import Link, anchored, chain, split
-from modeler.graph.marginals import PoseCovariances, RelativeCovariance
+from modeler.graph.marginals import PoseCovariances, RelativeCovariance, Rows
 from modeler.graph.modes import belief, decide
-from modeler.graph.optimise import agree, optimise, poses_of
+from modeler.graph.optimise import agree, optimise, poses_of, values_of
 from modeler.graph.pose_graph import PoseGraph
 from modeler.graph.shared import SharedCovariance
 from modeler.types import Array, Edge, Solution
 
 _QUORUM = 3  # loops that agree with each other before new ones are judged by them alone
 _JUDGED = 3  # new loops that may be judged so at once
+
+_ROUNDS = 5  # in which an axis may change which loops agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,8 @@ class Smoother:
     shared: float = 0.0
     """Share (0..1) of edges' covariances that is their images' own noise, the same in all edges of an image; see
     `shared_noise`, which tells it."""
+    axis: CommonAxis | None = None
+    """The turntable, where there is one. Each solution is then made afresh; not together with `shared`."""
     graph: PoseGraph = field(default_factory=PoseGraph)
     """What is solved."""
     solution: Solution = field(default_factory=Solution)
@@ -75,8 +80,10 @@ class Smoother:
         """Return the smoother of a graph, which costs the less the more of its edges are in this one's.
 
         Raises:
-            ValueError: where an accepted edge's covariance is not positive definite.
+            ValueError: where an accepted edge's covariance is not positive definite, or with an axis and shared noise.
         """
+        if self.axis is not None and self.shared:
+            raise ValueError("an axis and shared noise were given: the noise of frames is not told apart from slip yet")
         root = graph.root
         if root is None:
             return replace(self, graph=graph, solution=Solution(), state=_State())
@@ -95,8 +102,12 @@ class Smoother:
         trajectory: Mapping[int, Array] = start if grew or loops else chain(taken, root, {})
         if not grew or len(loops) > len(self.state.loops):  # otherwise the new frames hang on one edge each
             trajectory, inlier, engine = self._closed(taken, closing, start, root=root, afresh=jumped or not grew)
+        state = _State(root, links, tuple(tree), tuple(loops), decided, weights, inlier, engine)
+        rows: Sequence[Rows] = ()
+        if self.axis is not None:
+            trajectory, inlier, rows = self._turned(self.axis, taken, closing, trajectory, state)
         chosen = _taking_part(closing, inlier)
-        relative_covariance = RelativeCovariance(trajectory, root, (*taken, *chosen))
+        relative_covariance = RelativeCovariance(trajectory, root, (*taken, *chosen), rows)
         if self.shared:
             relative_covariance = SharedCovariance(relative_covariance, (*taken, *chosen), self.shared)
         several = [link for link in (*taken, *closing) if len(link.edge.posterior.modes) > 1]
@@ -110,7 +121,6 @@ class Smoother:
             edge_poses={(link.source, link.target): link.pose for link in several},
             mode_weights={(e.source, e.target): weights.get(e, np.array(prior)) for e, prior in own.items()},
         )
-        state = _State(root, links, tuple(tree), tuple(loops), decided, weights, inlier, engine)
         return replace(self, graph=graph, solution=solution, state=state)
 
     def _closed(
@@ -131,6 +141,26 @@ class Smoother:
         if not chosen:  # dead reckoning meets every edge exactly
             return chain(tree, root, {}), optimum.inlier, None
         return optimum.poses, optimum.inlier, Incremental.of([*tree, *chosen], optimum.poses, root)
+
+    def _turned(
+        self,
+        axis: CommonAxis,
+        tree: Sequence[Link],
+        loops: Sequence[Link],
+        trajectory: Mapping[int, Array],
+        state: _State,
+    ) -> tuple[Mapping[int, Array], tuple[bool, ...], Sequence[Rows]]:
+        """Return the poses with a common axis, which loops then take part, and what the axis says there."""
+        inlier, solution = state.inlier, (trajectory, state.inlier, ())
+        for _ in range(_ROUNDS):
+            found = axis.solved([*tree, *_taking_part(loops, inlier)], trajectory, state.root or 0)
+            if found is None:
+                return solution
+            solution = found[0], inlier, found[1]
+            inlier = agree(loops, values_of(found[0]), 0.5 * self.outlier_distance**2)
+            if inlier == solution[1]:
+                break
+        return solution
 
     def _went_on(
         self,
@@ -192,7 +222,12 @@ def _jumped(decided: Mapping[Edge, Link], state: _State) -> bool:
 
 
 def solve(
-    graph: PoseGraph, guess: Mapping[int, Array], *, outlier_distance: float = 14.2, shared: float = 0.0
+    graph: PoseGraph,
+    guess: Mapping[int, Array],
+    *,
+    outlier_distance: float = 14.2,
+    shared: float = 0.0,
+    axis: CommonAxis | None = None,
 ) -> Solution:
     """Optimise the poses of all frames that accepted edges connect with the first.
 
@@ -205,8 +240,9 @@ def solve(
         guess: object_from_camera (4, 4) by frame number, to start from; frames without one start on the chain.
         outlier_distance: see `Smoother`.
         shared: see `Smoother`.
+        axis: the turntable, where there is one.
 
     Raises:
         ValueError: where an accepted edge's covariance is not positive definite.
     """
-    return Smoother(outlier_distance, shared, solution=Solution(guess)).to(graph).solution
+    return Smoother(outlier_distance, shared, axis, solution=Solution(guess)).to(graph).solution

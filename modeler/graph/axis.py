@@ -1,0 +1,230 @@
+"""A turntable in the graph: one axis, unknown but the same for all steps, about which the object turns.
+
+Between consecutive frames target_from_source = A Rz(θ) exp(slip) A⁻¹, with A = camera_from_axis, the axis its third
+direction. A is a variable that all steps share, so that what the images of each say of it serves all, and counts once.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.graph.links import Link, inverse_right_jacobian
+from modeler.graph.marginals import Rows, gaussian_factor
+from modeler.types import Array
+
+_AXIS = gtsam.symbol("a", 0)  # frames are numbered far below
+# Standard deviations of A about where it is sought, rad and m. A turn about the axis changes nothing and is held; a
+# shift along it moves the point about which the object tilts, which lies within the object; the rest is all but free.
+_AXIS_SIGMAS = np.array([1.0, 1.0, 1e-4, 1.0, 1.0, 0.03])
+_LEAST_RAD = np.radians(5.0)  # a table that has turned by less in all shows no axis
+_ITERATIONS, _HALVINGS = 50, 10  # of Gauss and Newton, and of one step of theirs that overshoots
+_TOLERANCE = 1e-6  # of half the squared Mahalanobis distance: where a step lowers it by less, the next is nothing
+
+
+@dataclass(frozen=True)
+class CommonAxis:
+    """What is known of a turntable, beyond what the edges know: they must not hold it already."""
+
+    step_rad: float | None = None
+    """Turn between frames whose numbers differ by one, positive; None: not known."""
+    sigma_step_rad: float = float(np.radians(1.0))
+    """Standard deviation of that turn."""
+    sigma_tilt_rad: float = float(np.radians(0.2))
+    """How far the object tilts against the axis in a step: wobble of the table, slip on it."""
+    sigma_shift_m: float = 0.0005
+    """How far it slips in a step, in any direction."""
+
+    def solved(
+        self, links: Sequence[Link], trajectory: Mapping[int, Array], root: int
+    ) -> tuple[dict[int, Array], list[Rows]] | None:
+        """Return the poses that meet links and axis best, and what the axis says there; None where none is to be seen.
+
+        The rows are whitened, of errors in object coordinates, as `marginals` takes them.
+
+        Args:
+            links: all that take part.
+            trajectory: object_from_camera (4, 4) by frame number, not far off.
+            root: the frame whose pose is the identity.
+        """
+        if len(trajectory) < 2:
+            return None
+        start = estimated_axis(trajectory, surest_point(links))
+        if start is None:
+            return None
+        known = _Known(self, links, list(trajectory), root, start)
+        poses = {**trajectory, _AXIS: start}
+        rows = known.rows(poses)
+        for _ in range(_ITERATIONS):
+            linear = gtsam.GaussianFactorGraph()
+            for blocks, error in rows:
+                linear.add(gaussian_factor(blocks, -error))
+            step = linear.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR).optimize()
+            moved, moved_rows = poses, rows
+            for halvings in range(_HALVINGS):
+                moved = {
+                    key: pose if key == root else pose @ se3.exp(0.5**halvings * step.at(key))
+                    for key, pose in poses.items()
+                }
+                moved_rows = known.rows(moved)
+                if _half_square(moved_rows) <= _half_square(rows):
+                    break
+            fallen = _half_square(rows) - _half_square(moved_rows)
+            if fallen < 0.0:
+                break
+            poses, rows = moved, moved_rows
+            if fallen <= _TOLERANCE:
+                break
+        to_object = {key: se3.adjoint(se3.inverse(pose)) for key, pose in poses.items() if key != _AXIS}
+        said: list[Rows] = [
+            {key: block @ to_object[key] if key in to_object else block for key, block in blocks.items()}
+            for blocks, _ in rows[len(links) :]
+        ]
+        return {frame: poses[frame] for frame in trajectory}, said
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """All that is known of poses and axis: links, a loose guess of the axis, and how little steps slip."""
+
+    axis: CommonAxis
+    links: Sequence[Link]
+    frames: Sequence[int]
+    root: int
+    start: Array
+
+    def rows(self, poses: Mapping[int, Array]) -> list[tuple[Rows, Array]]:
+        """Return whitened derivatives by variable, blocks (m, 6), and errors (m,): of links, the guess, and steps.
+
+        Args:
+            poses: object_from_camera (4, 4) by frame number, and camera_from_axis.
+        """
+        targets, sources = (
+            np.stack([poses[frame] for frame in ends])
+            for ends in ([link.target for link in self.links], [link.source for link in self.links])
+        )
+        target_from_source = se3.inverse(targets) @ sources
+        xi = se3.log(se3.inverse(np.stack([link.pose.mean for link in self.links])) @ target_from_source)
+        whiten = np.stack([link.root_information for link in self.links])
+        of_source = whiten @ inverse_right_jacobian(xi)
+        of_target = -of_source @ se3.adjoint(se3.inverse(target_from_source))
+        errors = (whiten @ xi[..., None])[..., 0]
+        rows: list[tuple[Rows, Array]] = [
+            (self._free({link.target: to, link.source: of}), error)
+            for link, to, of, error in zip(self.links, of_target, of_source, errors, strict=True)
+        ]
+        away = se3.log(se3.inverse(self.start) @ poses[_AXIS])
+        away[2] = 0.0
+        rows.append(({_AXIS: np.diag(1.0 / _AXIS_SIGMAS)}, away / _AXIS_SIGMAS))
+        steps = list(itertools.pairwise(sorted(self.frames)))
+        for (target, source), error, *blocks in zip(steps, *self._slips(poses, np.array(steps)), strict=True):
+            rows.append((self._free({target: blocks[0], source: blocks[1], _AXIS: blocks[2]}), error))
+        return rows
+
+    def _free(self, blocks: Rows) -> Rows:
+        return {key: block for key, block in blocks.items() if key != self.root}
+
+    def _slips(self, poses: Mapping[int, Array], steps: npt.NDArray[np.int64]) -> list[Array]:
+        """Return `slip` of steps (n, 2) between a target and a source, whitened."""
+        axis, apart = self.axis, steps[:, 1] - steps[:, 0]
+        targets, sources = (np.stack([poses[int(frame)] for frame in ends]) for ends in steps.T)
+        turns_rad = None if axis.step_rad is None else axis.step_rad * apart
+        turn = () if axis.step_rad is None else (axis.sigma_step_rad,)
+        sigmas = np.array([axis.sigma_tilt_rad, axis.sigma_tilt_rad, *turn, *(axis.sigma_shift_m,) * 3])
+        whiten = 1.0 / (np.sqrt(apart)[:, None] * sigmas)
+        error, *derivatives = slip(targets, sources, poses[_AXIS], turns_rad)
+        return [whiten * error, *(whiten[..., None] * derivative for derivative in derivatives)]
+
+
+def _half_square(rows: Sequence[tuple[Rows, Array]]) -> float:
+    return 0.5 * float(sum(error @ error for _, error in rows))
+
+
+def surest_point(links: Sequence[Link]) -> Array:
+    """Return the point (3,) in camera coordinates whose motion links know best: where the object is."""
+    inertia, moment = np.zeros((3, 3)), np.zeros(3)
+    for link in links:  # least Σ E|υ + ω × p|²
+        spread = link.pose.covariance / np.trace(link.pose.covariance[:3, :3])
+        turns, mixed = spread[:3, :3], spread[:3, 3:]
+        inertia += np.trace(turns) * np.eye(3) - turns
+        moment += np.array([mixed[1, 2] - mixed[2, 1], mixed[2, 0] - mixed[0, 2], mixed[0, 1] - mixed[1, 0]])
+    return np.asarray(np.linalg.solve(inertia, moment), dtype=np.float64)
+
+
+def estimated_axis(trajectory: Mapping[int, Array], near_m: Array) -> Array | None:
+    """Return camera_from_axis (4, 4) that the steps between consecutive frames share best; None where they hardly turn.
+
+    The object turns about its third direction in the positive sense, seen from camera coordinates, as time goes back.
+
+    Args:
+        trajectory: object_from_camera (4, 4) by frame number.
+        near_m: (3,) a point in camera coordinates, to which the origin is the nearest on the axis.
+    """
+    steps = np.stack([se3.inverse(trajectory[t]) @ trajectory[s] for t, s in itertools.pairwise(sorted(trajectory))])
+    turns = se3.log(steps)[:, :3]
+    if np.sum(np.linalg.norm(turns, axis=1)) < _LEAST_RAD:
+        return None
+    axis = np.linalg.svd(turns)[2][0]
+    axis = axis if np.sum(turns @ axis) > 0.0 else -axis
+    fixed = (np.eye(3) - steps[:, :3, :3]).reshape(-1, 3)
+    # Points on the axis stay where they are.
+    point = np.linalg.lstsq(np.vstack([fixed, axis]), np.append(steps[:, :3, 3].ravel(), axis @ near_m), rcond=None)[0]
+    across = np.linalg.svd(axis[None])[2][1]
+    camera_from_axis = np.eye(4)
+    camera_from_axis[:3, :3] = np.stack([across, np.cross(axis, across), axis], axis=1)
+    camera_from_axis[:3, 3] = point
+    return camera_from_axis
+
+
+def slip(
+    object_from_target: Array,
+    object_from_source: Array,
+    camera_from_axis: Array,
+    turns_rad: npt.NDArray[np.floating] | None,
+) -> tuple[Array, Array, Array, Array]:
+    """Return what of steps is no turn about the axis (n, m), and its derivatives (n, m, 6) by ξ of the three poses.
+
+    Tilt about the first two directions in rad, then the turn in rad beyond `turns_rad` (n,) where these are given, then
+    shift along all three in m: m is 6, or 5.
+
+    Args:
+        object_from_target: (n, 4, 4).
+        object_from_source: (n, 4, 4).
+        camera_from_axis: (4, 4).
+        turns_rad: what the turns should be.
+    """
+    target_from_source = se3.inverse(object_from_target) @ object_from_source
+    step = se3.inverse(camera_from_axis) @ target_from_source @ camera_from_axis
+    rotation = step[:, :3, :3]
+    sine, cosine = rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1]
+    turned = rotation[:, None] @ se3.hat(
+        np.eye(3)
+    )  # derivatives of the rotation by a turn from the right, (n, 3, 3, 3)
+    slope = np.zeros((len(step), 6))  # of the angle
+    slope[:, :3] = cosine[:, None] * (turned[:, :, 1, 0] - turned[:, :, 0, 1])
+    slope[:, :3] -= sine[:, None] * (turned[:, :, 0, 0] + turned[:, :, 1, 1])
+    slope /= (cosine**2 + sine**2)[:, None]
+    angle = np.arctan2(sine, cosine)
+    back = np.zeros((len(step), 6))
+    back[:, 2] = -angle
+    rest = se3.exp(back) @ step
+    xi = se3.log(rest)
+    held = np.eye(6) - se3.adjoint(se3.inverse(rest))[:, :, 2, None] * slope[:, None]
+    derivative = inverse_right_jacobian(xi) @ held
+    if turns_rad is None:
+        kept = [0, 1, 3, 4, 5]
+        error, derivative = xi[:, kept], derivative[:, kept]
+    else:  # the place of the turn, which has been taken out
+        error = xi.copy()
+        error[:, 2] = np.remainder(angle - turns_rad + np.pi, 2.0 * np.pi) - np.pi
+        derivative[:, 2] = slope
+    of_source = derivative @ se3.adjoint(se3.inverse(camera_from_axis))
+    of_target = -of_source @ se3.adjoint(se3.inverse(target_from_source))
+    of_axis = derivative @ (np.eye(6) - se3.adjoint(se3.inverse(step)))
+    return error, of_target, of_source, of_axis
