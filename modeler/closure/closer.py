@@ -152,7 +152,8 @@ class Closer:
             if off_deg <= self.max_angle_deg:
                 return posterior, f"{reason}, {off_deg:.0f}° from the motion going on"
             reach = ways(known, posterior.target)
-            for witness in standing if off_deg <= steps * self.max_angle_deg else ():
+            # A pace that changes at random from step to step goes astray with the root of their number.
+            for witness in standing if off_deg <= np.sqrt(steps) * self.max_angle_deg else ():
                 if witness is not posterior and self._agreement(witness, posterior, views, solution, reach).agrees:
                     return posterior, f"{reason}, frame {witness.target} agrees"
         return None, ""
@@ -257,5 +258,5 @@ def _continued(solution: Solution, frames: Sequence[int], source: int) -> Array:
     if len(frames) < 2:
         return solution.trajectory[last]
     before = frames[-2]
-    pace = min(max((source - last) / (last - before), 0.0), 3.0)  # beyond three steps it is anybody's guess
+    pace = max((source - last) / (last - before), 0.0)
     return solution.trajectory[last] @ se3.exp(pace * se3.log(solution.relative(before, last)))

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from loops.cases import Case, bundled, real, rendered, turned
-from loops.study import Result, run
+from loops.study import Result, modeler, run
 from modeler.closure import Closer
 from modeler.export import write_atomically
 from modeler.types import Step
@@ -34,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--shape", default="figurine", help="recipe of the rendered object")
     parser.add_argument("--seed", type=int, default=0, help="of noise and registration")
     parser.add_argument("--long", type=int, metavar="N", help="instead: N small frames at 3°, and what each costs")
+    parser.add_argument("--told-truth", action="store_true", help="register by the truth: what all else costs")
     parser.add_argument("--out", type=Path, default=Path("runs/loops"), help="folder of the results")
     for field, kind in (("max_closures", int), ("min_gain_nats", float)):
         parser.add_argument(f"--{field.replace('_', '-')}", type=kind, default=getattr(Closer, field), help="of Closer")
@@ -51,7 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(_row(_HEADS), flush=True)
     results = []
     for case in cases:
-        results.append(run(case, closer, seed=options.seed, told=_Progress(case.name, every=20 if options.long else 0)))
+        maker = modeler(case, closer, options.seed, told_truth=options.told_truth)
+        results.append(run(maker, case, _Progress(case.name, every=20 if options.long else 0)))
         print(_row(_cells(results[-1])), flush=True)
     write_atomically(options.out / "loops.json", json.dumps([result.values() for result in results], indent=1) + "\n")
     exact = {case.name for case in rendered(options.shape, options.seed)}

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from loops.cases import Case
+from loops.known import Known
 from modeler import se3
 from modeler.closure import Closer
 from modeler.evaluation import trajectory_errors
@@ -58,23 +59,23 @@ class Result:
         return asdict(self)
 
 
-def modeler(case: Case, closer: Closer, seed: int) -> Modeler:
+def modeler(case: Case, closer: Closer, seed: int, *, told_truth: bool = False) -> Modeler:
     """Return the loop for a case; its model is coarse, for nobody looks at it."""
     noise = case.sequence.sensor()
+    truth = case.truth() if told_truth else None
     return Modeler(
         segmenter=Segmenter(),
         sensor=Sensor() if noise is None else Sensor(*noise),
         prior=TablePrior() if case.prior == "table" else GeneralPrior(),
-        registrar=VisibilityRegistrar(),
+        registrar=VisibilityRegistrar() if truth is None else Known(truth),
         closer=closer,
         fuser=Fuser(voxel_m=0.01),
         seed=seed,
     )
 
 
-def run(case: Case, closer: Closer, *, seed: int, told: Callable[[Step, float, float], None]) -> Result:
+def run(maker: Modeler, case: Case, told: Callable[[Step, float, float], None]) -> Result:
     """Build a case and return its figures; `told` hears of each step, its processor time and memory."""
-    maker = modeler(case, closer, seed)
     indices = case.sequence.indices
     scene = maker.segmenter.scene([case.sequence.frame(index) for index in telling(indices)])
     began = time.process_time()

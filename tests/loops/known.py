@@ -1,0 +1,40 @@
+"""A registrar that is told the truth, to see what everything else costs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from modeler import se3
+from modeler.evaluation import true_motion
+from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, PoseGaussian, Posterior, RayImage
+
+
+@final
+@dataclass(frozen=True)
+class Known(AbstractRegistrar):
+    """The true motion, but for an error as large as it says."""
+
+    camera_from_model: Mapping[int, Array]
+    """(4, 4) by frame number."""
+    sigma_deg: float = 0.3
+    """Standard deviation of the rotation about each axis."""
+    sigma_m: float = 0.0005
+    """Standard deviation of the object's place along each axis."""
+
+    def register(
+        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+    ) -> Posterior:
+        """Return the posterior of target_from_source."""
+        sigmas = np.repeat([np.radians(self.sigma_deg), self.sigma_m], 3)
+        about_object = se3.translation(source.centroid_m)
+        error = about_object @ se3.exp(sigmas * rng.normal(size=6)) @ se3.inverse(about_object)
+        carried = se3.adjoint(about_object)
+        pose = PoseGaussian(
+            true_motion(self.camera_from_model, target.index, source.index) @ error,
+            carried @ np.diag(sigmas**2) @ carried.T,
+        )
+        return Posterior(source.index, target.index, pose, Outcome.CONVERGED, overlap=0.8, seconds=0.0)
