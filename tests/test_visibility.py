@@ -9,7 +9,6 @@ from modeler.evaluation import nees, rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
-from modeler.registration.surface import relief_m, spread_points
 from modeler.segmentation import Scene, Segmenter
 from modeler.types import Camera, Frame, Outcome
 from sequences import bundled, open_sequence
@@ -85,18 +84,3 @@ def surface_view(depth_m):
     height, width = depth_m.shape
     camera = Camera(width, height, 200.0, 200.0, (width - 1) / 2, (height - 1) / 2)
     return Sensor(sigma_wh=0.001, sigma_r_m=0.0005).ray_image(Frame(0, 0.0, depth_m.astype(np.float32), camera))
-
-
-def test_only_surface_that_does_not_go_on_smoothly_has_relief(rng):
-    w = (np.arange(120) - 59.5) / 200.0
-    x, y = 0.6 * w[None, :], 0.6 * w[:, None]
-    plane = 0.6 + 0.3 * x + 0.0 * y
-    cylinder = 0.6 - np.sqrt(np.maximum(0.3**2 - x**2, 0)) + 0.3 + 0.0 * y
-    waves = plane + 0.004 * np.sin(x / 0.006) * np.sin(y / 0.006)
-    reliefs = []
-    for depth_m in (plane, cylinder, waves):
-        view = surface_view(depth_m)
-        reliefs.append(np.median(relief_m(view, spread_points(view, 300, rng), (0.1, 0.2))))
-    assert reliefs[0] < 5e-5
-    assert reliefs[1] < 2e-4
-    assert reliefs[2] > 1e-3

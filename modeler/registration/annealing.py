@@ -1,7 +1,7 @@
 """An annealed sampler on SE(3): from a prior, through ever sharper likelihoods, to samples of the posterior."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,6 +10,8 @@ from modeler.registration.posterior import matrices, rows
 from modeler.types import AbstractMotion, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
+_IMPOSSIBLE = -1e300  # log-likelihood where the prior has none; finite, so that differences are
+
 Level = Callable[[Array], LogLikelihood]  # from the samples so far, (n, 4, 4), the next likelihood
 
 
@@ -31,42 +33,38 @@ class Population:
 class AnnealedSampler:
     """Sequential Monte Carlo: weight, resample, move; temperatures bridge the steps where weights would collapse."""
 
-    initial: int = 3000
-    """Samples drawn from the prior."""
+    initial: int = 2000
+    """Samples drawn at first."""
     particles: int = 500
     """Samples kept from the first weighting on."""
     moves: int = 2
     """Rounds of moves after a weighting."""
     final_particles: int = 1000
     """Samples of the result."""
-    final_moves: int = 4
+    final_moves: int = 3
     """Rounds of moves after the last weighting."""
     min_share: float = 0.4
     """Least effective share of the samples that a weighting may leave; with less, the step is cut."""
 
-    def thorough(self) -> "AnnealedSampler":
-        """Return a sampler that looks four times as hard."""
-        return replace(self, initial=4 * self.initial, particles=4 * self.particles)
-
     def run(
         self, motion: AbstractMotion, levels: Sequence[Level], centre_m: Array, rng: np.random.Generator
     ) -> Population:
-        """Return samples of motion × last level.
+        """Return samples of what is known of a motion × last level.
 
         Args:
-            motion: where to start.
+            motion: where to start, and what is known.
             levels: makers of log-likelihoods, from the bluntest to the one wanted; each is shown the samples so far.
             centre_m: (3,) point of the source about which moves turn.
             rng: source of all randomness.
         """
         poses = motion.sample(self.initial, rng)
-        prior = motion.log_density(poses)
-        before = np.zeros(len(poses))
+        # A motion that is more than what is known, because it only proposes, is bridged like another level.
+        previous = _excess(motion)
+        prior, before, _ = _Blend(motion, previous, _nothing, 0.0).evaluate(poses)
         evidence, worst_tail = 0.0, -np.inf
-        previous = None
         for number, make in enumerate(levels):
             level = make(poses)
-            after = level(poses)
+            after = np.where(np.isfinite(prior), level(poses), _IMPOSSIBLE)
             reached = 0.0
             while reached < 1.0:
                 share = min(self.min_share, self.particles * self.min_share / len(poses))
@@ -91,18 +89,18 @@ class _Blend:
     """The density between two levels: prior × previous^(1 - reached) × level^reached."""
 
     motion: AbstractMotion
-    previous: LogLikelihood | None
+    previous: LogLikelihood
     level: LogLikelihood
     reached: float
 
     def evaluate(self, poses: Array) -> tuple[Array, Array, Array]:
         """Return log prior, log-likelihood under the previous and under this level, each (n,)."""
-        prior = self.motion.log_density(poses)
+        prior = self.motion.log_evidence(poses)
         inside = np.isfinite(prior)
-        before, after = np.zeros(len(poses)), np.full(len(poses), -1e300)
+        before, after = np.zeros(len(poses)), np.full(len(poses), _IMPOSSIBLE)
         if inside.any():
             after[inside] = self.level(poses[inside])
-            if self.previous is not None and self.reached < 1.0:
+            if self.reached < 1.0:
                 before[inside] = self.previous(poses[inside])
         return prior, before, after
 
@@ -110,6 +108,18 @@ class _Blend:
         """Return the log density (n,) of evaluated samples."""
         prior, before, after = state
         return prior + (1.0 - self.reached) * before + self.reached * after
+
+
+def _nothing(poses: Array) -> Array:
+    """Return the log-likelihood (n,) that says nothing of poses (n, 4, 4)."""
+    return np.zeros(len(poses))
+
+
+def _excess(motion: AbstractMotion) -> LogLikelihood:
+    """Return what a motion's density holds beyond what is known: nothing, or a proposal."""
+    if motion.evidence:
+        return _nothing
+    return lambda poses: motion.log_density(poses) - motion.log_evidence(poses)
 
 
 def _move(

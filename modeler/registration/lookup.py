@@ -1,6 +1,5 @@
 """The points of one view, and the image of the other in which they are looked up."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +16,7 @@ class Lookup:
     """One direction of the comparison of two views: p(points of one | image of the other, pose)."""
 
     points: Array
-    """(n, 8) position in m, unit normal, variance along the normal in m², gain of a match (nats)."""
+    """(n, 8) position in m, unit normal, variance along the normal in m², gain of a match (nats), 0."""
     image: RayImage
     """The view in which the points are looked up."""
     surface_m: float
@@ -31,39 +30,37 @@ class Lookup:
     measured_share: float
     """Share of pixels around the surface that carry a measurement."""
 
-    def at(self, blur_m: float, stride: int, *, lead: bool) -> Callable[[Array], Array]:
-        """Return the log-likelihood (m,) of poses (m, 12) over every `stride`-th point, the surfaces blurred.
-
-        With `lead`, matches gain what their surface's relief is worth; without, it is the likelihood itself.
-        """
-        columns = np.ascontiguousarray(self.points[::stride].T)
-        columns[kernel.GAIN] *= lead
+    def log_likelihoods(self, poses: Array, blur_m: float, *, stride: int, gain: float) -> Array:
+        """Return the log-likelihood (m,) of poses (m, 12) over every `stride`-th point, the surfaces blurred."""
+        columns = self._columns(stride)
+        columns[kernel.GAIN] = gain
         table = kernel.match_table(self.hidden_share)
-        model = self._model(blur_m)
-        return lambda poses: kernel.log_likelihoods(poses, columns, self._cells, self._intrinsics, model, table)
+        return kernel.log_likelihoods(poses, columns, self._cells, self._intrinsics, self._model(blur_m), table)
 
     def verdicts(self, pose: Array) -> np.ndarray:
         """Return the verdict (n,) of `kernels.visibility` on each point under one pose (12,)."""
-        return kernel.classify(pose, self._columns, self._cells, self._intrinsics, self._model(0.0))
+        return kernel.classify(pose, self._columns(), self._cells, self._intrinsics, self._model(0.0))
 
     def matched_residuals(self, pose: Array, blur_m: float) -> Array:
         """Return squared distances (k,) in m² of matching points beyond their own variance, under one pose (12,)."""
-        return kernel.matched_residuals(pose, self._columns, self._cells, self._intrinsics, self._model(blur_m))
+        return kernel.matched_residuals(pose, self._columns(), self._cells, self._intrinsics, self._model(blur_m))
 
     def matches(self, pose: Array, surface_m: float) -> Array:
         """Return what each point finds under one pose (12,): `kernels.matching.matches`."""
-        return matching.matches(pose, self._columns, self._cells, self._intrinsics, np.array(FACING), surface_m)
+        return matching.matches(pose, self._columns(), self._cells, self._intrinsics, np.array(FACING), surface_m)
 
-    def normal_equations(self, poses: Array, centres_m: Array, surface_m: float) -> Array:
+    def explained(self, poses: Array, surface_m: float, *, stride: int) -> Array:
+        """Return how many points (m,) find matching surface under poses (m, 12)."""
+        columns, facing = self._columns(stride), np.array(FACING)
+        return matching.explained(poses, columns, self._cells, self._intrinsics, facing, surface_m)
+
+    def normal_equations(self, poses: Array, centres_m: Array, surface_m: float, *, stride: int = 1) -> Array:
         """Return the normal equations (m, 27) of matching points under poses (m, 12) about centres (m, 3)."""
-        facing = np.array(FACING)
-        return matching.normal_equations(
-            poses, centres_m, self._columns, self._cells, self._intrinsics, facing, surface_m
-        )
+        columns, facing = self._columns(stride), np.array(FACING)
+        return matching.normal_equations(poses, centres_m, columns, self._cells, self._intrinsics, facing, surface_m)
 
-    @property
-    def _columns(self) -> Array:
-        return np.ascontiguousarray(self.points.T)
+    def _columns(self, stride: int = 1) -> Array:
+        return np.ascontiguousarray(self.points[::stride].T)
 
     @property
     def _cells(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Two views compared in both directions: the likelihood of `visibility` at any blur."""
+"""Two views compared in both directions: the likelihood of `visibility`, and the equations of matching surface."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
+from modeler.kernels import matching
 from modeler.kernels import visibility as kernel
 from modeler.registration.annealing import LogLikelihood
 from modeler.registration.lookup import Lookup
 from modeler.registration.posterior import rows
 from modeler.types import Array
 
+_UPPER = np.triu_indices(6)
+
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """p(surface of source | image target, T) · p(surface of target | image source, T), tempered."""
+    """p(surface of source | image target, T) · p(surface of target | image source, T)."""
 
     forward: Lookup
     """The source's points looked up in the target."""
@@ -24,23 +27,59 @@ class Pair:
     """The target's points looked up in the source."""
     effective_points: float
     """Number of independent measurements that the points of both views together are worth."""
+    size_m: float
+    """Standard deviation in m of the surface points of a view: the size of the object."""
 
-    def level(self, blur_m: float, _: Array, *, lead: bool = True) -> LogLikelihood:
-        """Return the tempered log-likelihood of poses (n, 4, 4), the surfaces blurred by `blur_m`.
+    @property
+    def centre_m(self) -> Array:
+        """The source's centroid (3,), about which motions turn."""
+        return self.backward.image.centroid_m
 
-        With `lead` it leans towards poses where surface with relief matches, so that blurred levels do not settle for
-        the many poses that merely contradict nothing.
+    @property
+    def weight(self) -> float:
+        """Exponent that tempers the product over all points."""
+        return self.effective_points / (len(self.forward.points) + len(self.backward.points))
+
+    def log_likelihoods(self, poses: Array, blur_m: float, *, stride: int = 1, gain: float = 0.0) -> Array:
+        """Return the log-likelihoods (n,) of poses (n, 4, 4), not tempered.
+
+        Args:
+            poses: target_from_source.
+            blur_m: blur of the surfaces in m.
+            stride: every so manieth point stands for the others.
+            gain: what a point counts that the other view explains (nats).
         """
-        stride = 2 if blur_m < 0.003 else 4 if blur_m < 0.006 else 8  # blunt comparisons need fewer points
-        weight = stride * self.effective_points / (len(self.forward.points) + len(self.backward.points))
+        there, back = rows(poses), rows(se3.inverse(poses))
+        return stride * (
+            self.forward.log_likelihoods(there, blur_m, stride=stride, gain=gain)
+            + self.backward.log_likelihoods(back, blur_m, stride=stride, gain=gain)
+        )
 
-        forward, backward = self.forward.at(blur_m, stride, lead=lead), self.backward.at(blur_m, stride, lead=lead)
+    def explained_share(self, poses: Array, surface_m: float, *, stride: int = 1) -> Array:
+        """Return the share (n,) of all points that find matching surface under poses (n, 4, 4)."""
+        found = self.forward.explained(rows(poses), surface_m, stride=stride)
+        found = found + self.backward.explained(rows(se3.inverse(poses)), surface_m, stride=stride)
+        return stride * found / (len(self.forward.points) + len(self.backward.points))
 
-        def log_likelihood(target_from_source: Array) -> Array:
-            there, back = rows(target_from_source), rows(se3.inverse(target_from_source))
-            return weight * (forward(there) + backward(back))
+    def tempered(self, blur_m: float, *, stride: int = 2) -> LogLikelihood:
+        """Return the tempered log-likelihood of poses (n, 4, 4), the surfaces blurred by `blur_m`."""
+        return lambda poses: self.weight * self.log_likelihoods(poses, blur_m, stride=stride)
 
-        return log_likelihood
+    def normal_equations(self, poses: Array, surface_m: float, *, stride: int = 1) -> tuple[Array, Array]:
+        """Return gradients (n, 6) and matrices (n, 6, 6) of matching surface for ξ of poses (n, 4, 4) about the centre.
+
+        Carried forward, a point moves by (R ω, R v) about the carried centre; carried back, by -ξ about the centre.
+        """
+        rotation = poses[:, :3, :3]
+        carried_m = rotation @ self.centre_m + poses[:, :3, 3]
+        still_m = np.tile(self.centre_m, (len(poses), 1))
+        there = self.forward.normal_equations(rows(poses), carried_m, surface_m, stride=stride)
+        back = self.backward.normal_equations(rows(se3.inverse(poses)), still_m, surface_m, stride=stride)
+        both = np.zeros((len(poses), 6, 6))
+        both[:, :3, :3] = both[:, 3:, 3:] = rotation
+        gradient = (there[:, None, matching.GRADIENT] @ both)[:, 0] - back[:, matching.GRADIENT]
+        matrix = both.transpose(0, 2, 1) @ _symmetric(there) @ both + _symmetric(back)
+        return stride * gradient, stride * matrix
 
     def surface_noise_m(self, poses: Array, blur_m: float) -> float:
         """Return the standard deviation in m of matching surfaces' distance, beyond their pixels' noise.
@@ -72,3 +111,10 @@ class Pair:
         wrong = np.isin(verdicts, (kernel.BEHIND, kernel.IN_FRONT, kernel.IN_EMPTY_SPACE)).sum()
         matched = (verdicts == kernel.MATCHED).sum()
         return float(matched / max(matched + wrong, 1))
+
+
+def _symmetric(equations: Array) -> Array:
+    """Return the matrices (n, 6, 6) of normal equations (n, 27)."""
+    full = np.zeros((len(equations), 6, 6))
+    full[:, _UPPER[0], _UPPER[1]] = full[:, _UPPER[1], _UPPER[0]] = equations[:, matching.MATRIX]
+    return full

@@ -19,8 +19,6 @@ from modeler.registration.pair import Pair
 from modeler.registration.posterior import rows
 from modeler.types import Array
 
-_UPPER = np.triu_indices(6)
-
 
 @dataclass(frozen=True)
 class Refiner:
@@ -95,7 +93,7 @@ def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: f
     centre = se3.translation(centre_m)
     pose, noise_m = start, pair.surface_noise_m(start[None], fine_m)
     for _ in range(8):
-        gradient, matrix = _normal_equations(pair, pose[None], noise_m, centre_m)
+        gradient, matrix = pair.normal_equations(pose[None], noise_m)
         away = se3.log(se3.inverse(start @ centre) @ pose @ centre)
         step = np.linalg.solve(matrix[0] + precision, gradient[0] - precision @ away)
         pose = pose @ centre @ se3.exp(step) @ se3.inverse(centre)
@@ -107,32 +105,9 @@ def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: f
 
 def _steps(pair: Pair, poses: Array, noise_m: float, spread: Array, centre_m: Array) -> Array:
     """Return the Gauss-Newton steps (n, 6) of motions, held by the samples' spread where nothing else holds them."""
-    gradient, matrix = _normal_equations(pair, poses, noise_m, centre_m)
+    gradient, matrix = pair.normal_equations(poses, noise_m)
     held = matrix + np.linalg.inv(spread @ spread.T)
     return np.asarray(np.linalg.solve(held, gradient[:, :, None])[:, :, 0], dtype=np.float64)
-
-
-def _normal_equations(pair: Pair, poses: Array, noise_m: float, centre_m: Array) -> tuple[Array, Array]:
-    """Return gradients (n, 6) and matrices (n, 6, 6) for ξ of target_from_source (n, 4, 4) about a centre.
-
-    Carried forward, a point moves by (R ω, R v) about the carried centre; carried back, by -ξ about the centre.
-    """
-    rotation = poses[:, :3, :3]
-    carried_m = rotation @ centre_m + poses[:, :3, 3]
-    there = pair.forward.normal_equations(rows(poses), carried_m, noise_m)
-    back = pair.backward.normal_equations(rows(se3.inverse(poses)), np.tile(centre_m, (len(poses), 1)), noise_m)
-    both = np.zeros((len(poses), 6, 6))
-    both[:, :3, :3] = both[:, 3:, 3:] = rotation
-    gradient = (there[:, None, matching.GRADIENT] @ both)[:, 0] - back[:, matching.GRADIENT]
-    matrix = both.transpose(0, 2, 1) @ _symmetric(there) @ both + _symmetric(back)
-    return gradient, matrix
-
-
-def _symmetric(equations: Array) -> Array:
-    """Return the matrices (n, 6, 6) of normal equations (n, 27)."""
-    full = np.zeros((len(equations), 6, 6))
-    full[:, _UPPER[0], _UPPER[1]] = full[:, _UPPER[1], _UPPER[0]] = equations[:, matching.MATRIX]
-    return full
 
 
 def _equations(pair: Pair, pose: Array, noise_m: float, centre_m: Array) -> tuple[Array, Array, Array, Array, Array]:

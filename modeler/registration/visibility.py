@@ -2,17 +2,19 @@
 
 import time
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
-from modeler.registration.annealing import AnnealedSampler, Level, Population
+from modeler.registration.annealing import AnnealedSampler, Population
 from modeler.registration.lookup import Lookup
+from modeler.registration.mixture import MixtureMotion
+from modeler.registration.modes import Place, separate, shares, told
 from modeler.registration.pair import Pair
 from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
 from modeler.registration.refinement import Refiner
-from modeler.registration.surface import measured_share, relief_m, spread_points
-from modeler.types import AbstractMotion, AbstractRegistrar, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.registration.search import Candidates, Search
+from modeler.registration.surface import measured_share, spread_points
+from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, PoseGaussian, Posterior, RayImage
 
 
 @dataclass(frozen=True)
@@ -20,33 +22,34 @@ class VisibilityRegistrar(AbstractRegistrar):
     """The paper's likelihood with normals: surface that faces a camera is seen by it, other surface is hidden.
 
     p(surface of B | image A, T) · p(surface of A | image B, T), each a product over points, tempered because
-    neighbouring points err alike, and sampled by annealing from a blurred likelihood to the sharp one.
+    neighbouring points err alike. A search finds the places where it may be high, each is sampled and weighed, and what
+    matching surface determines well is sharpened by its own equations.
     """
 
     points: int = 600
     """Surface points taken from each view."""
     effective_points: float = 40.0
     """Number of independent measurements that the points of both views together are worth."""
-    blurs_m: tuple[float, ...] = (0.016, 0.008, 0.004, 0.002, 0.001)
-    """Blur of the surfaces at each level of the annealing; at one more, their own noise as the samples show it."""
     surface_noise: float = 0.1
     """Least error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
     surface_detail: float = 0.003
     """Least error of local planes on a curved surface, as a share of the object's size."""
     hidden_share: float = 0.3
     """Share of points that face the other camera and are hidden by another part of the object."""
-    max_gain: float = 1.5
-    """Most that the match of one point may gain for the relief of the surface around it (nats)."""
-    relief_reaches: tuple[float, ...] = (0.1, 0.2)
-    """Radii of the surroundings that a point's height is predicted from, as shares of the object's size."""
-    relief_noise: float = 1.0
-    """Noise of the surfaces that relief stands out from, as a share of the sensor's range noise."""
     worst: float = 10.0
     """Most that one point may cost (nats)."""
     bend: float = 2.0
     """Cost (nats) of normals at right angles."""
+    search: Search = field(default_factory=Search)
+    """How the places are found where the posterior has its mass."""
+    max_places: int = 4
+    """The best of so many are explored."""
+    widening: float = 1.3
+    """How much wider than the search's Gaussians the first samples lie."""
+    blunt_share: float = 0.4
+    """Share of them that looks farther, as far as surface leaves open when it is blurred."""
     sampler: AnnealedSampler = field(default_factory=AnnealedSampler)
-    """How the posterior is explored."""
+    """How each place is explored."""
     refiner: Refiner = field(default_factory=Refiner)
     """How samples are sharpened by the surface that matches."""
     min_points: int = 60
@@ -55,6 +58,8 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Least share of the surface that both should see and do."""
     max_at_limit: float = 0.2
     """With a larger share of the samples at the end of the prior, the motion may lie beyond it."""
+    max_beyond: float = 5.0
+    """Where matching surface leads out of the prior to a place so much better (nats), the motion may lie beyond it."""
     min_effective: float = 100.0
     """With fewer effective samples the result is called degenerate."""
     max_sigma_deg: float = 10.0
@@ -68,74 +73,99 @@ class VisibilityRegistrar(AbstractRegistrar):
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS)
         pair = self.pair(source, target, rng)
-        posterior = self._explored(pair, self.sampler, motion, rng=rng)
-        if not posterior.usable:  # a mode may have been missed: look once more, and harder
-            posterior = self._explored(pair, self.sampler.thorough(), motion, rng=rng)
+        posterior = self._explored(pair, self.search, motion, rng=rng)
+        if not posterior.usable:  # a place may have been missed: look once more, and harder
+            posterior = self._explored(pair, self.search.thorough(), motion, rng=rng)
         return replace(posterior, seconds=time.perf_counter() - started)
 
-    def _explored(
-        self, pair: Pair, sampler: AnnealedSampler, motion: AbstractMotion, *, rng: np.random.Generator
-    ) -> Posterior:
-        """Return the posterior that one run of a sampler finds."""
+    def _explored(self, pair: Pair, search: Search, motion: AbstractMotion, *, rng: np.random.Generator) -> Posterior:
+        """Return the posterior that one search finds."""
         source, target = pair.backward.image, pair.forward.image
-        levels: list[Level] = [partial(pair.level, blur_m) for blur_m in self.blurs_m]
-        levels.append(lambda poses: pair.level(pair.surface_noise_m(poses, self.blurs_m[-1]), poses, lead=False))
-        population = sampler.run(motion, levels, source.centroid_m, rng)
-        at_limit = share_at_limit(motion, population.poses, source.centroid_m, rng)
-        refined = self.refiner.refine(pair, population.poses, rng, fine_m=self.blurs_m[-1])
-        inside = np.isfinite(motion.log_density(refined))
-        samples = np.where(inside[:, None, None], refined, population.poses)
-        weights = np.full(len(samples), 1.0 / len(samples))
-        pose = weighted_gaussian(samples, weights, source.centroid_m)
-        overlap = pair.overlap(pose.mean)
+        candidates = search.candidates(pair, motion, rng)
+        found = separate(candidates, pair.centre_m)[: self.max_places]
+        populations = [self._population(pair, motion, place, rng) for place in found]
+        places = [
+            Place(self._refined(pair, population.poses, motion, rng), population.log_evidence + bonus)
+            for population, bonus in populations
+        ]
+        mass = shares(places)
+        samples = np.concatenate([place.poses for place in places])
+        weights = np.repeat(mass / [len(place.poses) for place in places], [len(place.poses) for place in places])
+        pose = weighted_gaussian(samples, weights, pair.centre_m)
+        heaviest = int(np.argmax(mass))
+        main = populations[heaviest][0]
+        overlap = pair.overlap(weighted_gaussian(places[heaviest].poses, np.ones(len(main.poses)), pair.centre_m).mean)
+        at_limit = share_at_limit(motion, main.poses, pair.centre_m, rng)
+        at_limit = 1.0 if candidates.beyond > self.max_beyond else at_limit
+        effective = float(
+            1.0 / np.sum([m**2 / p.effective_samples for m, (p, _) in zip(mass, populations, strict=True)])
+        )
         return Posterior(
             source=source.index,
             target=target.index,
             pose=pose,
-            outcome=self._outcome(population, pose, overlap, at_limit=at_limit),
+            outcome=self._outcome(effective, pose, overlap, at_limit=at_limit),
             overlap=overlap,
             samples=samples,
             weights=weights,
-            effective_samples=population.effective_samples,
-            pareto_k=population.pareto_k,
-            log_evidence=population.log_evidence,
+            modes=told(places, pair.centre_m),
+            effective_samples=effective,
+            pareto_k=main.pareto_k,
+            log_evidence=float(np.logaddexp.reduce([place.log_mass for place in places])),
         )
+
+    def _population(
+        self, pair: Pair, motion: AbstractMotion, candidates: Candidates, rng: np.random.Generator
+    ) -> tuple[Population, float]:
+        """Return samples of one place, and what to add to their evidence to compare it with other places'."""
+        noise_m = pair.surface_noise_m(candidates.poses[:1], self.search.blurs[-1] * pair.size_m)
+        likelihood = pair.tempered(noise_m)
+        plain = likelihood(candidates.poses)
+        volumes = np.log(np.diagonal(candidates.spreads, axis1=1, axis2=2)).sum(axis=1)
+        log_weights = np.where(candidates.blunt, candidates.scores, plain + volumes)
+        for kind, share in ((candidates.blunt, self.blunt_share), (~candidates.blunt, 1.0 - self.blunt_share)):
+            if kind.any():
+                log_weights[kind] += np.log(share) - np.logaddexp.reduce(log_weights[kind])
+        proposal = MixtureMotion(
+            motion, candidates.poses, self.widening * candidates.spreads, log_weights, pair.centre_m
+        )
+        population = self.sampler.run(proposal, [lambda _: likelihood], pair.centre_m, rng)
+        return population, float(candidates.scores[0] - plain[0])
+
+    def _refined(self, pair: Pair, poses: Array, motion: AbstractMotion, rng: np.random.Generator) -> Array:
+        """Return samples sharpened by matching surface, but for those that would leave what is possible."""
+        refined = self.refiner.refine(pair, poses, rng, fine_m=self.search.blurs[-1] * pair.size_m)
+        inside = np.isfinite(motion.log_evidence(refined))
+        return np.where(inside[:, None, None], refined, poses)
 
     def pair(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> Pair:
         """Return the comparison of two views, at points drawn with `rng`."""
         size_m = float(np.mean([np.sqrt(np.sum(np.var(view.points_m, axis=0))) for view in (source, target)]))
         return Pair(
-            self._lookup(source, target, size_m, rng), self._lookup(target, source, size_m, rng), self.effective_points
+            self._lookup(source, target, size_m, rng),
+            self._lookup(target, source, size_m, rng),
+            effective_points=self.effective_points,
+            size_m=size_m,
         )
 
     def _lookup(self, view: RayImage, image: RayImage, size_m: float, rng: np.random.Generator) -> Lookup:
-        """Return points of a view to be looked up in another's image.
-
-        A match is worth what it says beyond what the surroundings said already: the log of the ratio of the two
-        Gaussians' widths, ½ log(1 + relief² / noise²). It leads the blurred levels; the last goes without, for on round
-        objects it would count as knowledge of the spin what is only less surface in common.
-        """
-        points = spread_points(view, self.points, rng)
-        detail_m = self.surface_detail * size_m
-        noise = 2.0 * points[:, 6] + detail_m**2 + (self.relief_noise * view.sigma_r_m) ** 2
-        excess = np.maximum(relief_m(view, points, self.relief_reaches) ** 2 - noise, 0.0)
-        points[:, 7] = np.minimum(0.5 * np.log1p(excess / noise), self.max_gain)
+        """Return points of a view to be looked up in another's image."""
         return Lookup(
-            points,
+            spread_points(view, self.points, rng),
             image,
-            surface_m=float(np.hypot(detail_m, self.surface_noise * image.sigma_r_m)),
+            surface_m=float(np.hypot(self.surface_detail * size_m, self.surface_noise * image.sigma_r_m)),
             hidden_share=self.hidden_share,
             worst=self.worst,
             bend=self.bend,
             measured_share=measured_share(image),
         )
 
-    def _outcome(self, population: Population, pose: PoseGaussian, overlap: float, *, at_limit: float) -> Outcome:
+    def _outcome(self, effective_samples: float, pose: PoseGaussian, overlap: float, *, at_limit: float) -> Outcome:
         if at_limit > self.max_at_limit:
             return Outcome.AT_LIMIT
         if overlap < self.min_overlap:
             return Outcome.NO_OVERLAP
-        if population.effective_samples < self.min_effective:
+        if effective_samples < self.min_effective:
             return Outcome.DEGENERATE
         sigma_rad = np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])
         return Outcome.AMBIGUOUS if sigma_rad > np.deg2rad(self.max_sigma_deg) else Outcome.CONVERGED

@@ -1,0 +1,173 @@
+"""Where the posterior may have its mass: many starts from the prior, each led downhill to surface that matches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.registration.pair import Pair
+from modeler.types import AbstractMotion, Array, BoolArray, PoseGaussian
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Motions to which matching surface leads, each with a Gaussian for its surroundings."""
+
+    poses: Array
+    """(k, 4, 4) target_from_source, best first, blunt ones last."""
+    scores: Array
+    """(k,) how good they are beside each other (nats)."""
+    spreads: Array
+    """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid."""
+
+    blunt: BoolArray
+    """(k,) whether a candidate stands for the surroundings that surface, blurred, leaves open."""
+    beyond: float = -np.inf
+    """How much better (nats) than the best is what surface leads to beyond the prior's support."""
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.poses)
+
+    def some(self, chosen: npt.NDArray[np.int64] | BoolArray) -> Candidates:
+        """Return those chosen by number or by mask."""
+        return Candidates(
+            self.poses[chosen], self.scores[chosen], self.spreads[chosen], self.blunt[chosen], self.beyond
+        )
+
+
+@dataclass(frozen=True)
+class Search:
+    """Looks for separate modes: the best of many samples of the prior go downhill as point-to-plane ICP does.
+
+    A likelihood alone does not find the motion between views that turned far: poses that hide every point contradict
+    nothing, and are many. Two views that are to be registered have surface in common, so that poses under which next
+    to nothing matches are all but excluded beforehand; among the others the likelihood decides.
+    """
+
+    samples: int = 6000
+    """Motions drawn from the prior."""
+    starts: int = 400
+    """The best of them are led to matching surface."""
+    survivors: int = 100
+    """The best of those are followed to the end."""
+    blurs: tuple[float, ...] = (0.25, 0.12, 0.06, 0.03, 0.015)
+    """Blur of the surfaces as shares of the object's size: of the first look, and of each stage of the way down."""
+    iterations: int = 4
+    """Gauss-Newton steps of each stage."""
+    max_step_rad: float = 0.2
+    """A step turns the object no further."""
+    effective_points: float = 80.0
+    """Number of independent measurements that all points are worth when separate places are compared."""
+    no_overlap: float = 50.0
+    """What it costs that no surface matches (nats)."""
+    little_overlap: float = 0.1
+    """Share of the points at which that cost has fallen to its e-th part."""
+    negligible: float = 20.0
+    """A candidate so many nats below the best is dropped."""
+    reach: float = 0.5
+    """Of candidates nearer to each other than so many standard deviations one is kept."""
+
+    def thorough(self) -> Search:
+        """Return a search that looks four times as hard."""
+        return replace(self, samples=4 * self.samples, starts=4 * self.starts, survivors=2 * self.survivors)
+
+    def candidates(self, pair: Pair, motion: AbstractMotion, rng: np.random.Generator) -> Candidates:
+        """Return what was found, best first; always one at least.
+
+        Args:
+            pair: the two views.
+            motion: where to look.
+            rng: source of all randomness.
+        """
+        poses = motion.sample(self.samples, rng)
+        centred = poses @ se3.translation(pair.centre_m)
+        mean = se3.mean(centred[:500], np.full(len(centred[:500]), 1.0 / len(centred[:500])))
+        prior = PoseGaussian(mean[0], mean[1] + np.diag(np.repeat([1e-4, 1e-5], 3) ** 2))
+        # Blunt surfaces match easily; that they do counts as much as how much better they tell the depth than a guess.
+        look = pair.log_likelihoods(poses, self.blurs[0] * pair.size_m, stride=8, gain=-np.log(self.blurs[0]))
+        poses = poses[_best(look, self.starts)]
+        for _ in range(self.iterations):
+            poses = self._stepped(pair, poses, prior, self.blurs[1] * pair.size_m)
+        poses = poses[_best(self.scores(pair, poses, self.blurs[1] * pair.size_m), self.survivors)]
+        blunt = self._ranked(pair, motion, poses, prior, self.blurs[1] * pair.size_m)
+        for blur in self.blurs[2:]:
+            for _ in range(self.iterations):
+                poses = self._stepped(pair, poses, prior, blur * pair.size_m)
+        fine_m = self.blurs[-1] * pair.size_m
+        sharp = self._ranked(pair, motion, poses, prior, fine_m)
+        if not len(sharp):
+            sharp = self._ranked(pair, motion, motion.sample(self.survivors, rng), prior, fine_m)
+        return Candidates(
+            np.concatenate([sharp.poses, blunt.poses]),
+            np.concatenate([sharp.scores, blunt.scores]),
+            np.concatenate([sharp.spreads, blunt.spreads]),
+            np.repeat([False, True], [len(sharp), len(blunt)]),
+            beyond=float(self.scores(pair, poses, fine_m).max() - sharp.scores[0]),
+        )
+
+    def _ranked(
+        self, pair: Pair, motion: AbstractMotion, poses: Array, prior: PoseGaussian, blur_m: float
+    ) -> Candidates:
+        """Return those of some poses (n, 4, 4) that are possible, good and distinct, best first."""
+        poses = poses[np.isfinite(motion.log_evidence(poses))]
+        scores = self.scores(pair, poses, blur_m)
+        order = np.argsort(-scores, kind="stable")
+        order = order[scores[order] > scores[order[:1]] - self.negligible]
+        poses, scores = poses[order], scores[order]
+        _, matrices = pair.normal_equations(poses, blur_m, stride=2)
+        spreads = np.linalg.cholesky(np.linalg.inv(pair.weight * matrices + np.linalg.inv(prior.covariance)))
+        found = Candidates(poses, scores, np.asarray(spreads, dtype=np.float64), np.zeros(len(poses), dtype=np.bool_))
+        return self._distinct(found, pair.centre_m)
+
+    def scores(self, pair: Pair, poses: Array, blur_m: float) -> Array:
+        """Return how good (n,) places are beside each other: log-likelihood and surface in common (nats)."""
+        weight = self.effective_points / (len(pair.forward.points) + len(pair.backward.points))
+        share = pair.explained_share(poses, blur_m, stride=2)
+        excluded = self.no_overlap * np.exp(-share / self.little_overlap)
+        return weight * pair.log_likelihoods(poses, blur_m, stride=2) - excluded
+
+    def _stepped(self, pair: Pair, poses: Array, prior: PoseGaussian, blur_m: float) -> Array:
+        """Return motions one damped Gauss-Newton step further down, held by what the prior says of them."""
+        gradient, matrix = pair.normal_equations(poses, blur_m, stride=4)
+        centre = se3.translation(pair.centre_m)
+        away = se3.log(se3.inverse(prior.mean) @ poses @ centre)
+        hold = np.linalg.inv(pair.weight * prior.covariance)
+        count = 0.25 * (len(pair.forward.points) + len(pair.backward.points))
+        damping = np.diag(np.repeat([1.0 / self.max_step_rad, 1.0 / (self.max_step_rad * pair.size_m)], 3) ** 2)
+        held = matrix + hold + 0.01 * count * damping
+        step = np.linalg.solve(held, (gradient - away @ hold)[:, :, None])[:, :, 0]
+        angle = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
+        step *= np.minimum(1.0, self.max_step_rad / np.maximum(angle, 1e-12))
+        return poses @ centre @ se3.exp(step) @ se3.inverse(centre)
+
+    def _distinct(self, found: Candidates, centre_m: Array) -> Candidates:
+        """Return one of each group of candidates that lie within each other's reach."""
+        kept: list[int] = []
+        left = np.ones(len(found), dtype=bool)
+        centre = se3.translation(centre_m)
+        for number in range(len(found)):
+            if left[number]:
+                kept.append(number)
+                left &= distances(found, number, centre) > self.reach
+        return found.some(np.array(kept, dtype=np.int64))
+
+
+def distances(found: Candidates, number: int, centre: Array) -> Array:
+    """Return how far (k,) candidates are from one of them, in standard deviations of its surroundings.
+
+    Args:
+        found: the candidates.
+        number: the one.
+        centre: (4, 4) shift to the source's centroid.
+    """
+    xi = se3.log(se3.inverse(found.poses[number] @ centre) @ found.poses @ centre)
+    return np.linalg.norm(np.linalg.solve(found.spreads[number], xi.T), axis=0)
+
+
+def _best(scores: Array, count: int) -> np.ndarray:
+    """Return the numbers of the highest scores, at most `count`, in their order of arrival."""
+    return np.sort(np.argsort(-scores, kind="stable")[:count])

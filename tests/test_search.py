@@ -1,0 +1,123 @@
+"""Where the posterior may have its mass: the search, its separate places, and the mixture that samples start from."""
+
+import numpy as np
+import pytest
+
+from modeler import se3
+from modeler.evaluation import rotation_error_deg, true_motion
+from modeler.priors import GeneralPrior
+from modeler.priors.general import GeneralMotion
+from modeler.rays import Sensor
+from modeler.registration.mixture import MixtureMotion
+from modeler.registration.modes import Place, separate, told
+from modeler.registration.search import Candidates, Search
+from modeler.registration.visibility import VisibilityRegistrar
+from modeler.types import Outcome
+from sequences import bundled, open_sequence
+
+
+def views(name, source, target):
+    """Two frames of a bundled sequence made ready, and the true motion."""
+    sequence = open_sequence(bundled(name))
+    sensor = Sensor(*sequence.sensor())
+    made = [sensor.ray_image(sequence.frame(index)) for index in (source, target)]
+    return *made, true_motion(sequence.truth(), target=target, source=source)
+
+
+def candidates(poses, sigmas, scores, blunt=None):
+    """Candidates with round Gaussians: standard deviations of ξ, the same in rad and m."""
+    spreads = np.array(sigmas)[:, None, None] * np.eye(6)
+    blunt = np.zeros(len(poses), dtype=bool) if blunt is None else np.array(blunt)
+    return Candidates(np.stack(poses), np.array(scores, dtype=float), spreads, blunt)
+
+
+def turned(angle_rad):
+    return se3.exp(np.array([angle_rad, 0, 0, 0, 0, 0]))
+
+
+@pytest.mark.parametrize("name", ["box", "flashlight"])
+def test_the_search_finds_the_motion_in_a_wide_prior(name, rng):
+    source, target, truth = views(name, source=2, target=0)
+    motion = GeneralPrior(max_rotation_deg=110.0, max_offset_m=0.08).between(source, target)
+    pair = VisibilityRegistrar().pair(source, target, rng)
+    found = Search().candidates(pair, motion, rng)
+    assert np.isfinite(motion.log_density(found.poses)).all()
+    assert (np.diff(found.scores[~found.blunt]) <= 0).all()
+    rolled_deg = min(rotation_error_deg(pose, truth) for pose in found.poses)
+    assert rolled_deg < 8.0  # a flashlight's roll is all but free
+
+
+def test_a_turn_beyond_the_prior_shows(rng):
+    source, target, truth = views("box", source=1, target=0)
+    pair = VisibilityRegistrar().pair(source, target, rng)
+    narrow = GeneralPrior(max_rotation_deg=12.0).between(source, target)
+    assert not np.isfinite(narrow.log_density(truth[None]))[0]
+    assert Search().candidates(pair, narrow, rng).beyond > VisibilityRegistrar().max_beyond
+    wide = GeneralPrior(max_rotation_deg=60.0, max_offset_m=0.08).between(source, target)
+    assert Search().candidates(pair, wide, rng).beyond < VisibilityRegistrar().max_beyond
+    assert VisibilityRegistrar().register(source, target, narrow, rng=rng).outcome is Outcome.AT_LIMIT
+
+
+def test_candidates_that_reach_each_other_share_a_place():
+    near, far = turned(0.02), turned(1.5)
+    places = separate(candidates([np.eye(4), near, far], [0.01, 0.01, 0.01], [3, 2, 1]), np.zeros(3))
+    assert [len(place) for place in places] == [2, 1]
+    np.testing.assert_array_equal(places[0].poses[0], np.eye(4))
+
+
+def test_a_blunt_candidate_joins_what_it_covers_and_is_no_place_itself():
+    ends = [turned(-0.2), turned(0.2)]
+    alone = separate(candidates(ends, [0.01, 0.01], [2, 1]), np.zeros(3))
+    joined = separate(
+        candidates([*ends, np.eye(4), turned(2.0)], [0.01, 0.01, 0.1, 0.1], [2, 1, 0, 0], [False, False, True, True]),
+        np.zeros(3),
+    )
+    assert [len(place) for place in alone] == [1, 1]
+    assert [len(place) for place in joined] == [3]
+
+
+def test_modes_are_told_only_where_there_are_several(rng):
+    here = turned(0.0) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
+    there = turned(1.5) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
+    one = told([Place(here, 0.0), Place(there, -20.0)], np.zeros(3))
+    two = told([Place(here, 0.0), Place(there, np.log(3.0))], np.zeros(3))
+    assert one == ()
+    np.testing.assert_allclose([mode.weight for mode in two], [0.75, 0.25])
+    assert rotation_error_deg(two[0].pose.mean, turned(1.5)) < 1.0
+
+
+def mixture(rng):
+    """Three Gaussians a few centimetres off the axes of motion, over a general prior."""
+    centre_m = np.array([0.02, -0.05, 0.8])
+    known = GeneralMotion(centre_m, centre_m + 0.01, max_rotation_rad=0.9, max_offset_m=0.04)
+    means = se3.exp(rng.normal(size=(3, 6)) * np.repeat([0.3, 0.02], 3))
+    spreads = np.linalg.cholesky(np.stack([np.cov(rng.normal(size=(6, 20))) for _ in range(3)]))
+    spreads *= np.repeat([0.1, 0.005], 3)[:, None]
+    return MixtureMotion(known, means, spreads, np.log([0.5, 0.3, 0.2]), centre_m)
+
+
+def test_a_mixture_has_the_density_of_its_samples(rng):
+    """∫ q over a broad known density, by importance: 1; and the mean of log q agrees with the entropy of samples."""
+    motion = mixture(rng)
+    broad = MixtureMotion(motion.known, motion.means, 2.0 * motion.spreads, motion.log_weights, motion.centre_m)
+    samples = broad.sample(40_000, rng)
+    ratio = np.exp(motion.log_density(samples) - broad.log_density(samples))
+    assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std() / np.sqrt(len(ratio))
+
+
+def test_a_narrow_component_has_the_gaussian_density(rng):
+    motion = mixture(rng)
+    narrow = MixtureMotion(motion.known, motion.means[:1], 0.01 * motion.spreads[:1], np.zeros(1), motion.centre_m)
+    centre = se3.translation(motion.centre_m)
+    xi = (narrow.spreads[0] @ rng.normal(size=(6, 50))).T
+    poses = narrow.means[0] @ centre @ se3.exp(xi) @ se3.inverse(centre)
+    covariance = narrow.spreads[0] @ narrow.spreads[0].T
+    expected = -0.5 * np.einsum("ni,ij,nj->n", xi, np.linalg.inv(covariance), xi)
+    expected -= 0.5 * np.linalg.slogdet(2.0 * np.pi * covariance)[1]
+    np.testing.assert_allclose(narrow.log_density(poses), expected, atol=1e-4)
+
+
+def test_a_mixture_only_proposes(rng):
+    motion = mixture(rng)
+    samples = motion.sample(200, rng)
+    np.testing.assert_array_equal(motion.log_evidence(samples), motion.known.log_density(samples))
