@@ -189,3 +189,9 @@ def test_models_are_laid_on_each_other_from_any_side() -> None:
     assert np.quantile(np.abs(brick.distance(laid)), 0.95) < 2e-3
     assert best.score > 0.85
     assert all(match.score <= best.score for match in rest)
+
+
+def test_the_size_of_voxels_is_checked_before_a_build(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["build", str(tmp_path), "--out", str(tmp_path / "run"), "--voxel-m", "0"]) == 2
+    assert "--voxel-m 0 is out of range" in capfd.readouterr().err
+    assert not (tmp_path / "run").exists()

@@ -40,6 +40,8 @@ class Build:
     """Watch in the browser, served on 127.0.0.1 only."""
     connect: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="(default: none)")] = None
     """Watch in a Rerun viewer that is already open: rerun+http://HOST:PORT/proxy."""
+    voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M", help_behavior_hint="(default: as the data)")] = None
+    """Side of a voxel of the model: its detail."""
     prior: PriorOptions = field(default_factory=PriorOptions)
     method: MethodOptions = field(default_factory=MethodOptions)
     selection: FrameOptions = field(default_factory=FrameOptions)
@@ -54,5 +56,6 @@ class Build:
     def settings(self) -> dict[str, object]:
         """Return what the results depend on besides sequence, seed and the prior's name, as report.json records it."""
         parts = asdict(self.prior) | asdict(self.method) | asdict(self.selection) | asdict(self.where)
+        parts["voxel_m"] = self.voxel_m
         parts["sensor"] = None if self.sensor is None else str(self.sensor)
         return {name: value for name, value in parts.items() if name not in ("prior", "seed") and value is not None}

@@ -28,6 +28,8 @@ def build(options: Build) -> int:
     """
     if options.resume and options.overwrite:
         raise InputError("--resume keeps what --overwrite deletes; give one of them")
+    if options.voxel_m is not None and not 0.0 < options.voxel_m < 1.0:
+        raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m between 0 and 1")
     began = time.perf_counter()
     path = options.sequence
     whole = watched(path, options.idle_s) if options.watch else compose.open_sequence(path)
@@ -36,6 +38,7 @@ def build(options: Build) -> int:
     if not frames.live:
         survey(frames, truth=False)  # what cannot be read is found before anything is made
     modeler = compose.modeler(whole, options.prior, options.method, options.where)
+    modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=options.voxel_m))
     prior, remark = compose.told_prior(options.prior, whole)
     meta = RunMeta(
         sequence=str(options.sequence),

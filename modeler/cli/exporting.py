@@ -65,7 +65,8 @@ def _scan(options: Export) -> Scan | None:
     """Return the views of the run, where the mesh has to be made anew."""
     if not (options.watertight or options.texture or options.voxel_m is not None):
         return None
-    return reopened(options.run_folder, options.sequence).scan(Fuser(voxel_m=options.voxel_m))
+    run = reopened(options.run_folder, options.sequence)
+    return run.scan(Fuser(voxel_m=options.voxel_m or run.report["settings"].get("voxel_m")))
 
 
 def _tell(model: ObjectModel, options: Export) -> None:
