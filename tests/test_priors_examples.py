@@ -92,6 +92,22 @@ def test_a_turntable_does_not_lift_the_object(rng: np.random.Generator) -> None:
         assert np.mean(np.linalg.norm(moved, axis=1)) > 0.005
 
 
+def test_a_turntable_without_any_error_is_still_a_density(rng: np.random.Generator) -> None:
+    prior = TurntablePrior(24.0, 0.0, axis_direction=told(NORMAL), axis_sigma_deg=0.0, wobble_deg=0.0, wobble_m=0.0)
+    motion = prior.between(SOURCE, TARGET)
+    samples = motion.sample(100, rng)
+    assert np.isfinite(motion.log_density(samples)).all()
+    np.testing.assert_allclose(turns_deg(samples), -24.0, atol=0.01)
+
+
+def test_larger_turns_leave_more_room_for_what_is_seen(rng: np.random.Generator) -> None:
+    for step_deg, most_m in ((20.0, 0.05), (60.0, 0.0966)):
+        samples = TurntablePrior(step_deg).between(SOURCE, TARGET).sample(2000, rng)
+        offset_m = samples[:, :3, :3] @ SOURCE.centroid_m + samples[:, :3, 3] - TARGET.centroid_m
+        across_m = offset_m - np.outer(offset_m @ NORMAL, NORMAL)
+        assert np.linalg.norm(across_m, axis=1).max() == pytest.approx(most_m, rel=0.02)
+
+
 def test_a_known_axis_stays_where_it_is(rng: np.random.Generator) -> None:
     prior = turntable(HERE, axis_point_m=told(AXIS_POINT_M), axis_sigma_m=1e-4, axis_sigma_deg=0.05, wobble_m=1e-4)
     samples = prior.between(SOURCE, TARGET).sample(500, rng)

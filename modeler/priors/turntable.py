@@ -19,6 +19,8 @@ from modeler.types import AbstractMotion, AbstractPrior, Edge, RayImage, Solutio
 
 _UP = (0.0, -1.0, 0.0)  # against gravity for a camera held upright: y points down
 _BROAD_DEG, _GIVEN_DEG = 30.0, 1.0
+_SHIFT_DEG = 30.0  # up to this turn the shift's limit is what it says
+_LEAST = 1e-5  # rad or m: densities stay finite where somebody is wholly sure
 _ROOM_DEG = 5.0  # about what four standard deviations of the steps allow
 
 
@@ -48,7 +50,8 @@ class TurntablePrior(AbstractPrior):
     axis_sigma_m: float = 0.005
     """Standard deviation of the axis' point, across the axis, where one is given."""
     max_shift_m: float = 0.05
-    """Largest distance, across the axis, between the target's centroid and the source's, carried over."""
+    """Largest distance, across the axis, between the target's centroid and the source's, carried over; for turns
+    beyond 30 degrees it grows with them."""
     wobble_deg: float = 0.2
     """Standard deviation of the rotation that is no turn about the axis."""
     wobble_m: float = 0.0007
@@ -104,7 +107,7 @@ class TurntablePrior(AbstractPrior):
         if self.axis_sigma_deg is not None:
             sigma_rad = np.radians(self.axis_sigma_deg) if self.axis_sigma_deg < 180.0 else np.inf
         point_m = None if self.axis_point_m is None else np.array(self.axis_point_m)
-        return Axis(direction / np.linalg.norm(direction), float(sigma_rad), point_m, self.axis_sigma_m)
+        return Axis(direction / np.linalg.norm(direction), max(float(sigma_rad), _LEAST), point_m, self.axis_sigma_m)
 
     def _motion(self, source: RayImage, target: RayImage, axis: Axis) -> AboutAxis:
         """Return turns by the commanded steps about an axis."""
@@ -114,9 +117,9 @@ class TurntablePrior(AbstractPrior):
         turn = AxisTurn(
             axis=side * axis.direction,
             turn_rad=float(np.radians(steps * self.step_deg)),
-            sigma_turn_rad=float(np.radians(self.step_sigma_deg) * np.sqrt(max(abs(steps), 1))),
+            sigma_turn_rad=max(float(np.radians(self.step_sigma_deg) * np.sqrt(max(abs(steps), 1))), _LEAST),
             sigma_axis_rad=axis.sigma_direction_rad,
-            sigma_wobble_rad=float(np.radians(self.wobble_deg)),
+            sigma_wobble_rad=max(float(np.radians(self.wobble_deg)), _LEAST),
             either_way=self.step_sign == "unknown",
         )
         return AboutAxis(
@@ -124,19 +127,29 @@ class TurntablePrior(AbstractPrior):
             axis=axis,
             source_centroid_m=source.centroid_m,
             target_centroid_m=target.centroid_m,
-            max_shift_m=self.max_shift_m,
-            wobble_m=self.wobble_m,
+            max_shift_m=self._shift_m(steps),
+            wobble_m=max(self.wobble_m, _LEAST),
         )
+
+    def _shift_m(self, steps: int) -> float:
+        """Return the largest shift for so many steps: the centroid of what is seen lies before the axis, and turns."""
+        turn_deg = abs(_on_circle(steps * self.step_deg))
+        return grown_limits(_SHIFT_DEG, self.max_shift_m, max(turn_deg / _SHIFT_DEG, 1.0))[1]
 
     def _limits(self, source: RayImage, target: RayImage) -> AbstractMotion:
         """Return motions as far as the steps may reach, on the table where one is seen; all turns within are alike."""
         steps = target.index - source.index
-        turn_deg = (steps * self.step_deg + 180.0) % 360.0 - 180.0
+        turn_deg = _on_circle(steps * self.step_deg)
         reach_deg = 4.0 * self.step_sigma_deg * np.sqrt(abs(steps)) + _ROOM_DEG
         whole_deg = min(abs(turn_deg) + reach_deg, 180.0)
         if support(source, target) is None:
-            return GeneralPrior(whole_deg, self.max_shift_m).between(source, target)
-        motion = TablePrior(whole_deg, self.max_shift_m).between(source, target)
+            return GeneralPrior(whole_deg, self._shift_m(steps)).between(source, target)
+        motion = TablePrior(whole_deg, self._shift_m(steps)).between(source, target)
         if self.step_sign == "unknown" or reach_deg >= 180.0:
             return motion
         return replace(motion, max_rotation_rad=float(np.radians(reach_deg)), middle_rad=float(np.radians(turn_deg)))
+
+
+def _on_circle(turn_deg: float) -> float:
+    """Return a turn as one of -180 to 180 degrees."""
+    return (turn_deg + 180.0) % 360.0 - 180.0
