@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, final
 import lz4.frame
 from rosbags import rosbag1, rosbag2
 from rosbags.rosbag1.reader import Chunk
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from modeler.types import InputError
 
@@ -147,7 +147,10 @@ def _line(error: Exception) -> str:
 @lru_cache(maxsize=2)
 def _typestore(*, ros1: bool) -> Typestore:
     """Return the standard messages, which are the same in all versions for images and cameras."""
-    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    if ros1:  # whose standard messages lack it
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    return store
 
 
 def _bounded(chunk: Chunk) -> Chunk:

@@ -1,8 +1,11 @@
 """Depth, colour and mask pictures on disk."""
 
+import contextlib
 import io
+import os
 import re
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -44,7 +47,8 @@ def _open(path: Path | Packed, formats: tuple[str, ...]) -> Image.Image:
             with Image.open(source, formats=formats) as picture:
                 if picture.width * picture.height > MAX_PIXELS:
                     raise Image.DecompressionBombError
-                picture.load()
+                with _quiet() if picture.format == "TIFF" else contextlib.nullcontext():
+                    picture.load()
                 return picture
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the folder is complete.") from None
@@ -54,6 +58,19 @@ def _open(path: Path | Packed, formats: tuple[str, ...]) -> Image.Image:
         said = re.sub(r"<_io\.BytesIO[^>]*>", "it", " ".join(str(error).split()))
         why = said.replace(str(path), "the file") or type(error).__name__
         raise InputError(f"{path}: is not a readable {wanted} picture ({why}); replace it.") from None
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the library for TIFF from writing to stderr itself; what is wrong is told in one line."""
+    stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(nowhere)
 
 
 def picture_size(path: Path) -> tuple[int, int]:

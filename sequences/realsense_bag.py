@@ -9,10 +9,10 @@ import re
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.types import Array, InputError
+from sequences import ros_frames
 from sequences.bag import Bag
 
 _STREAM = r"(/device_\d+/sensor_\d+)/\w+"
@@ -57,18 +57,15 @@ def _from_reference(bag: Bag, topic: str) -> Array | None:
 
 def _pose(message: Any, where: str) -> Array:
     if message.__msgtype__ == "geometry_msgs/msg/Transform":
-        turn, shift = message.rotation, message.translation
-        quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64)
-        size = float(np.linalg.norm(quaternion))
-        rotation = Rotation.from_quat(quaternion).as_matrix() if 0.9 < size < 1.1 else np.full((3, 3), np.nan)
-        pose = se3.translation(np.array([shift.x, shift.y, shift.z], dtype=np.float64))
+        found = ros_frames.pose(message)
+        pose = np.full((4, 4), np.nan) if found is None else found
     else:
         said = dict(part.split("=", 1) for part in str(getattr(message, "data", "")).split(";") if "=" in part)
         # Matrices of the camera's library stand column by column.
-        rotation = _numbers(said.get("rotation", ""), 9).reshape(3, 3).T
         pose = se3.translation(_numbers(said.get("translation", ""), 3))
-    pose[:3, :3] = rotation
-    sound = bool(np.isfinite(pose).all()) and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
+        pose[:3, :3] = _numbers(said.get("rotation", ""), 9).reshape(3, 3).T
+    turn = pose[:3, :3]
+    sound = bool(np.isfinite(pose).all()) and np.abs(turn @ turn.T - np.eye(3)).max() < 1e-3
     if not sound or np.abs(pose[:3, 3]).max() > 10.0:
         raise InputError(f"{where}: is no rigid motion; record it anew.")
     return pose

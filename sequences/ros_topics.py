@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from modeler.types import Camera, InputError
-from sequences import realsense_bag, ros_images
+from sequences import realsense_bag, ros_frames, ros_images
 from sequences.alignment import Alignment
 from sequences.bag import Bag
 from sequences.given import Given
@@ -112,7 +112,7 @@ def colour_source(
     if given.colour_topic is not None:
         if given.colour_topic not in found:
             raise InputError(f"{bag.path}: {given.colour_topic} holds no colour images; there are {_names(found)}.")
-        return Colour(given.colour_topic, _beside(bag, given.colour_topic, *depth)), []
+        return Colour(given.colour_topic, _beside(bag, first, given.colour_topic, depth)), []
     aligned = [topic for topic in found if _same(_camera(bag, topic), depth[1])]
     for better in (
         [topic for topic in aligned if "color" in topic or "rgb" in topic or "colour" in topic],
@@ -121,17 +121,19 @@ def colour_source(
         aligned = better or aligned
     if aligned:
         return Colour(aligned[0], None), []
-    for topic in found:
-        alignment = _beside(bag, topic, *depth) if "Color" in topic else None
+    for topic in (name for name in found if "color" in name.lower() or "rgb" in name):
+        alignment = _beside(bag, first, topic, depth)
         if alignment is not None:
             return Colour(topic, alignment), []
     return None, [f"colour of {topic} is not aligned to depth and is left out" for topic in found[:3]]
 
 
-def _beside(bag: Bag, topic: str, depth_topic: str, lens: Lens) -> Alignment | None:
+def _beside(bag: Bag, first: Mapping[str, Any], topic: str, depth: tuple[str, Lens]) -> Alignment | None:
     """Return where the camera of a colour topic is; None where nothing tells it."""
-    camera, motion = _camera(bag, topic), realsense_bag.colour_from_depth(bag, topic, depth_topic)
-    return None if camera is None or motion is None else Alignment(lens.camera, camera, motion)
+    camera, motion = _camera(bag, topic), realsense_bag.colour_from_depth(bag, topic, depth[0])
+    if motion is None:
+        motion = ros_frames.fixed(bag, first[topic].header.frame_id, first[depth[0]].header.frame_id)
+    return None if camera is None or motion is None else Alignment(depth[1].camera, camera, motion)
 
 
 def _same(one: Lens | None, other: Lens) -> bool:

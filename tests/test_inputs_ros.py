@@ -5,17 +5,22 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from bags import START_NS, Recorder
 from recordings import small_frames
 from rosbags import rosbag1
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
 
+from modeler import se3
 from modeler.cli import main
 from modeler.types import Camera, Frame, InputError
 from sequences import Given, open_sequence
 from sequences.lens import Lens
+from sequences.ros import RosSequence
 
 SUFFIXES = (".bag", ".mcap", ".db3", "")
 
@@ -85,6 +90,53 @@ def test_colour_is_optional_and_must_be_aligned(tmp_path: Path, frames: list[Fra
     assert other.notes == ("colour of /camera/rgb/image_raw is not aligned to depth and is left out",)
     forced = open_sequence(tmp_path / "other.bag", Given(colour_topic="/camera/rgb/image_raw"))
     assert forced.frame(0).colour is not None
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+def test_colour_of_a_camera_that_is_fixed_beside_is_aligned(tmp_path: Path, frames: list[Frame], suffix: str) -> None:
+    """As realsense-ros records: both optical frames hang on one link."""
+    sequence = open_sequence(Rig(colour_scale=1.1).write(tmp_path / f"s{suffix}", frames))
+    assert sequence.notes == ()
+    assert isinstance(sequence, RosSequence)
+    assert sequence.colour is not None
+    assert sequence.colour.alignment is not None
+    np.testing.assert_allclose(sequence.colour.alignment.colour_from_depth, COLOUR_FROM_DEPTH, atol=1e-12)
+    for read in sequence:
+        assert read.colour is not None
+        assert (read.colour.sum(axis=2) > 0).mean() > 0.3
+
+
+COLOUR_FROM_DEPTH = se3.exp(np.array([0.01, -0.02, 0.03, 0.015, 0.001, -0.002]))
+
+
+class Rig(Recorder):
+    """Records fixed transforms too."""
+
+    def _fill(self, writer: Any, frames: list[Frame]) -> None:
+        ros1 = isinstance(writer, rosbag1.Writer)
+        store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+        if ros1:
+            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+        types, link_from_depth = store.types, se3.exp(np.array([0.5, 0.1, -0.3, 0.0, 0.02, 0.01]))
+        link_from_colour = link_from_depth @ se3.inverse(COLOUR_FROM_DEPTH)
+        extra = {"seq": 0} if ros1 else {}
+        stamped = []
+        for child, pose in (("depth", link_from_depth), ("colour", link_from_colour)):
+            quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+            transform = types["geometry_msgs/msg/Transform"](
+                translation=types["geometry_msgs/msg/Vector3"](*map(float, pose[:3, 3])),
+                rotation=types["geometry_msgs/msg/Quaternion"](*map(float, quaternion)),
+            )
+            stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+            header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="link", **extra)
+            stamped.append(
+                types["geometry_msgs/msg/TransformStamped"](header=header, child_frame_id=child, transform=transform)
+            )
+        message = types["tf2_msgs/msg/TFMessage"](transforms=stamped)
+        connection = writer.add_connection("/tf_static", message.__msgtype__, typestore=store)
+        serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+        writer.write(connection, START_NS, bytes(serialize(message, message.__msgtype__)))
+        super()._fill(writer, frames)
 
 
 def test_images_come_in_order_of_capture_each_once(tmp_path: Path, frames: list[Frame]) -> None:
