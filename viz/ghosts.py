@@ -17,8 +17,8 @@ from viz import clouds, entities, spread, uncertainty
 
 Drawing = Iterator[tuple[str, rr.AsComponents]]
 
-_GHOSTS: Final = 24
-_GHOST_POINTS: Final = 250
+_GHOSTS: Final = 20
+_GHOST_POINTS: Final = 200
 _MEAN_POINTS: Final = 1_500
 _SHOWN_SD: Final = 0.12  # of the farthest point under the widest mode, as a share of its distance from the centre
 _MOST_RAD: Final = 0.25  # sd of the rotation as drawn: beyond it a magnified spread no longer looks like one

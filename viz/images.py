@@ -20,6 +20,7 @@ Drawing = Iterator[tuple[str, rr.AsComponents]]
 _PIXELS: Final = 500_000  # larger images are shown at a whole fraction of their size
 _JPEG_QUALITY: Final = 80
 _DEPTH_UNITS_PER_M: Final = 1000.0  # finer units make the picture no better and the file several times larger
+_RUN_LENGTHS: Final = 3  # zlib's strategy; for filtered depth the quickest, and small
 _DIMMED: Final = 0.65  # how dark what is not the object becomes
 
 
@@ -59,7 +60,7 @@ def _depth_png(depth_m: npt.NDArray[np.float32], mask: BoolArray) -> rr.EncodedD
     units = np.nan_to_num(depth_m * _DEPTH_UNITS_PER_M, nan=0.0, posinf=0.0, neginf=0.0)
     buffer = io.BytesIO()
     pixels = np.clip(np.rint(units), 0, np.iinfo(np.uint16).max).astype(np.uint16)
-    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
+    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1, compress_type=_RUN_LENGTHS)
     return rr.EncodedDepthImage(
         blob=buffer.getvalue(),
         media_type="image/png",
@@ -71,7 +72,7 @@ def _depth_png(depth_m: npt.NDArray[np.float32], mask: BoolArray) -> rr.EncodedD
 
 def _depth_range(pixels: npt.NDArray[np.uint16], mask: BoolArray) -> tuple[float, float]:
     """Return the depths, in units of the image, that the ends of the colour scale stand for."""
-    chosen = pixels[mask & (pixels > 0)]
+    chosen = pixels[mask & (pixels > 0)][::4]
     if chosen.size == 0:
         chosen = pixels[pixels > 0]
     if chosen.size == 0:

@@ -116,7 +116,7 @@ def _of_edges(step: Step) -> Drawing:
     rotations = np.array([trajectory[edge.source][:3, :3] for edge in edges])
     blocks = np.array([edge.posterior.pose.covariance[3:, 3:] for edge in edges])
     half_axes, quaternions = ellipsoids(rotations @ blocks @ np.swapaxes(rotations, 1, 2))
-    rgb = {"odometry": entities.ODOMETRY_RGB, "closure": entities.CLOSURE_RGB}
+    rgb = {"odometry": entities.UNCERTAINTY_RGB, "closure": entities.CLOSURE_RGB}
     factor = rounded_down(_LARGEST_EDGE_SIGMA * poses.distance_m(step) / max(float(half_axes.max()), 1e-9))
     factor = min(max(factor, 0.1), 1000.0)
     yield (
@@ -130,7 +130,7 @@ def _of_edges(step: Step) -> Drawing:
         ),
     )
     words = f"edges: 1 sd, {scale_words(factor)}"
-    yield entities.EDGES_MAGNIFICATION, clouds.caption(poses.below_ring_m(step), words, entities.ODOMETRY_RGB)
+    yield entities.EDGES_MAGNIFICATION, clouds.caption(poses.below_ring_m(step), words, entities.UNCERTAINTY_RGB)
 
 
 def magnification(edges: Sequence[Edge], distance_m: float) -> float:

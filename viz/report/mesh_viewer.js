@@ -117,7 +117,11 @@
   canvas.addEventListener("wheel", (event) => { event.preventDefault(); distance *= Math.exp(0.001 * event.deltaY); draw(); }, { passive: false });
   canvas.addEventListener("dblclick", () => { home(); draw(); });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-  document.getElementById("cameras").addEventListener("change", draw);
+  const reach = new Float32Array(strokes.buffer).reduce((most, number) => Math.max(most, Math.abs(number)), 1);
+  document.getElementById("cameras").addEventListener("change", () => {
+    distance = checked("cameras") ? Math.max(distance, 2.9 * reach) : 3.4;
+    draw();
+  });
   chooser.addEventListener("change", () => { repaint(); draw(); });
   window.addEventListener("resize", draw);
   home();
