@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from bags import Recorder
 from PIL import Image
 from recordings import raw_depth, save, small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
 
@@ -313,6 +316,35 @@ def test_poses_of_a_run_go_to_bop_and_tum(tmp_path: Path, rng: np.random.Generat
     assert not (tmp_path / "other.txt").exists()
 
 
+# Commands
+
+
+def test_a_model_is_built_from_any_of_them(tmp_path: Path, frames: list[Frame]) -> None:
+    path = Recorder("32FC1").write(tmp_path / "turned by hand.mcap", frames)
+    run = tmp_path / "run"
+    assert main(["build", str(path), "--out", str(run), "--method", "icp", "--prior", "table"]) == 0
+    report = json.loads((run / "report.json").read_text())
+    assert [frame["outcome"] for frame in report["frames"]] == ["accepted"] * 4
+    assert main(["convert", str(run), "--out", str(tmp_path / "scene_gt.json")]) == 0
+    assert set(json.loads((tmp_path / "scene_gt.json").read_text())) == {"0", "1", "2", "3"}
+
+
+@pytest.mark.parametrize("command", ["info", "convert", "calibrate-sensor"])
+def test_help_imports_nothing_heavy(command: str) -> None:
+    heavy = ["av", "gtsam", "numba", "numpy", "open3d", "pyrealsense2", "rerun", "rosbags", "scipy", "trimesh"]
+    script = f"""
+import sys
+from modeler.cli import main
+try:
+    main(["{command}", "--help"])
+except SystemExit:
+    sys.exit(", ".join(sorted(set({heavy}) & set(sys.modules))) or None)
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.startswith(f"usage: modeler {command}")
+
+
 # Real captures
 
 
@@ -320,9 +352,9 @@ def test_real_sequences_survive_the_way_there_and_back(tmp_path: Path) -> None:
     data = Path(__file__).parents[2] / "shared" / "data"
     if not data.is_dir():
         pytest.skip("the real sequences are not here")
-    for name in ("cap", "dragon", "dog_upright"):
+    for name in ("cap", "dragon"):
         whole = open_sequence(data / name)
-        assert main(["convert", str(data / name), "--every", "6", "--out", str(tmp_path / name)]) == 0
+        assert main(["convert", str(data / name), "--every", "12", "--out", str(tmp_path / name)]) == 0
         again = open_sequence(tmp_path / name)
         for frame in again:
             np.testing.assert_allclose(frame.depth_m, whole.frame(frame.index).depth_m, rtol=0, atol=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import bags
 import numpy as np
 import recordings
 import test_inputs_clouds as clouds
+import test_inputs_kinect as kinect
 
 from modeler import se3
 from modeler.types import Camera, Frame
@@ -96,6 +98,11 @@ def _cloud(kind: str) -> Callable[[Path], Path]:
     return make
 
 
+def _kinect(folder: Path) -> Path:
+    kinect.write_mkv(folder / "s.mkv", 2)
+    return folder / "s.mkv"
+
+
 def _noise(folder: Path) -> Path:
     noise = {"lateral_px": 0.5, "focal_px": 500.0, "floor_m": 1e-4, "growth": [1e-6, 1e-7, 0.0]}
     (folder / "s.json").write_text(json.dumps({"noise": noise}))
@@ -125,6 +132,10 @@ TARGETS: dict[str, Target] = {
     "ply": Target(_cloud("ply binary"), ("s.ply",), read_all),
     "noise": Target(_noise, ("s.json",), read_noise),
 }
+
+
+if importlib.util.find_spec("av") is not None:
+    TARGETS["mkv"] = Target(_kinect, ("s.mkv",), read_all, 0.5)
 
 
 def fresh(target: Target, folder: Path) -> tuple[Path, list[Path]]:
