@@ -9,6 +9,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors.on_plane import OnPlane, on_plane
+from modeler.priors.table import TablePrior
 from modeler.types import AbstractMotion, AbstractPrior, Array, InputError, RayImage
 
 _STEPS = 20  # into which a push is cut
@@ -54,13 +55,18 @@ class PokePrior(AbstractPrior):
     sigma_height_m: float = 0.0007
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
 
-    def between(self, source: RayImage, target: RayImage) -> PokeMotion:
-        """Return the density of target_from_source.
+    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+        """Return the density of target_from_source; after several pushes only that the object is on its table still.
 
         Raises:
-            InputError: where neither view shows a plane, or not exactly one push lies between them.
+            InputError: where neither view shows a plane, or no push is told between them.
         """
         earlier, later = sorted((source, target), key=lambda view: view.index)
+        pokes = self._between(earlier.index, later.index)
+        if len(pokes) > 1:
+            return TablePrior(sigma_tilt_deg=self.sigma_tilt_deg, sigma_height_m=self.sigma_height_m).between(
+                source, target
+            )
         plane = on_plane(
             earlier,
             later,
@@ -69,22 +75,26 @@ class PokePrior(AbstractPrior):
             sigma_tilt_rad=np.radians(self.sigma_tilt_deg),
             sigma_lift_m=self.sigma_height_m,
         )
-        outcomes = self._outcomes(self._between(earlier.index, later.index), earlier, plane)
+        outcomes = self._outcomes(pokes[0], earlier, plane)
         mean = outcomes.mean(axis=0)
         covariance = np.cov(outcomes.T) + np.diag([1e-4, 1e-5, 1e-5]) ** 2
         return PokeMotion(plane, mean, covariance, backwards=source is later)
 
-    def _between(self, earlier: int, later: int) -> Poke:
-        """Return the one push between two frames."""
+    def _between(self, earlier: int, later: int) -> list[Poke]:
+        """Return the pushes between two frames.
+
+        Raises:
+            InputError: where there is none.
+        """
         if not self.pokes and self.poke is not None:
-            return self.poke
+            return [self.poke]
         found = [poke for frame, poke in self.pokes.items() if earlier < frame <= later]
-        if len(found) != 1:
+        if not found:
             raise InputError(
-                f"{len(found) or 'no'} pokes are told between frames {earlier} and {later} where the prior needs one; "
-                "tell each poke, by the first frame after it, or use --prior table"
+                f"no poke is told between frames {earlier} and {later}; tell each poke by the first frame after it, "
+                "or use --prior table"
             )
-        return found[0]
+        return found
 
     def _outcomes(self, poke: Poke, before: RayImage, plane: OnPlane) -> Array:
         """Draw outcomes (n, 3) of a push: turn in rad, and where the centroid goes from the later one, in the plane."""
