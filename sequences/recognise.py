@@ -47,6 +47,8 @@ def _open(path: Path, given: Given) -> AbstractSequence:
         from sequences.ros import open_ros
 
         return open_ros(path, given)
+    if (path / "report.json").is_file():
+        raise InputError(f"{path}: is the folder of a run; give the sequence it was made from, or convert its poses.")
     if path.is_file() and path.suffix.lower() == ".mkv":
         from sequences.kinect import open_kinect
 

@@ -282,6 +282,13 @@ def test_single_empty_frames_are_named_and_left_out(
     assert "nothing measured inside the mask in frames 2: they will be left out" in said
 
 
+def test_the_folder_of_a_run_is_no_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "report.json").write_text("{}")
+    (tmp_path / "model.ply").write_text("ply")
+    assert main(["info", str(tmp_path)]) == 2
+    assert "is the folder of a run" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["nowhere", "nowhere.bag", "", "file.txt"])
 def test_a_path_without_a_sequence_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
     (tmp_path / "file.txt").write_text("hello")

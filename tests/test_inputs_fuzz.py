@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fuzz.mutate import mutated, with_sums
-from fuzz.targets import TARGETS, fresh, truth
+from fuzz.targets import TARGETS, fresh, tiny, truth
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import small_frames
 
 from modeler.types import InputError
 from sequences import open_sequence, read_noise, survey, write_bop
@@ -50,12 +49,12 @@ def test_damage_is_told_in_one_line_or_does_not_matter(tmp_path: Path, name: str
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("json") / "s"
-    write_bop(folder, small_frames(2), truth())
+    write_bop(folder, tiny(), truth())
     return folder
 
 
 @given(which=st.sampled_from(["scene_camera.json", "scene_gt.json", "sequence.json"]), tree=ENTRIES | JSON)
-@settings(max_examples=150)
+@settings(max_examples=120)
 def test_any_json_is_read_or_refused(scene: Path, which: str, tree: object) -> None:
     path = scene / which
     intact, told = path.read_bytes(), ""
