@@ -19,7 +19,17 @@ from modeler.fusion.stack import posed, spread, stack
 from modeler.kernels import closing, fusion, isosurface, thinning
 from modeler.kernels.surfels import surfels
 from modeler.rays import Sensor
-from modeler.types import Frame, InputError, ObjectModel, RayImage, Solution
+from modeler.types import (
+    Edge,
+    Frame,
+    InputError,
+    ObjectModel,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    Solution,
+)
 from sequences.bop import BopSequence
 
 BALL = tabletop.Sphere(0.06)
@@ -483,16 +493,22 @@ def test_a_pose_that_is_unsure_counts_less():
     assert same(alike, blind)
 
 
-def test_own_covariances_do_not_know_of_drift():
-    covariance = np.diag([1.0, 1.0, 1.0, 4.0, 4.0, 4.0])
-    solution = Solution(
-        trajectory={k: np.eye(4) for k in (2, 5, 6)},
-        covariances={2: 0.0 * covariance, 5: covariance, 6: 50.0 * covariance},
-        relative_covariance=lambda target, source: covariance * (2.0 if {target, source} == {5, 6} else 1.0),
-    )
-    own = own_covariances(solution)
-    assert {k: value[0, 0] for k, value in own.items()} == {2: 1.0, 5: 1.0, 6: 2.0}
-    assert own_covariances(Solution(trajectory={0: np.eye(4)})) == {}
+def test_own_covariances_do_not_know_of_drift(rng):
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-6
+
+    def edge(target, source, *, accepted=True):
+        pose = PoseGaussian(se3.exp(rng.normal(size=6)), covariance)
+        return Edge(Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.9), "odometry", accepted, "")
+
+    edges = [edge(2, 5), edge(5, 6), edge(6, 9, accepted=False), edge(2, 6)]
+    solution = Solution(trajectory={k: np.eye(4) for k in (2, 5, 6)}, outliers=(edges[3],))
+    own = own_covariances(solution, edges)
+    assert set(own) == {2, 5, 6}
+    np.testing.assert_allclose(own[6], covariance)
+    np.testing.assert_allclose(own[2], edges[0].posterior.pose.inverse().covariance)
+    both = np.linalg.inv(covariance) + np.linalg.inv(edges[1].posterior.pose.inverse().covariance)
+    np.testing.assert_allclose(own[5], np.linalg.inv(both))
+    assert own_covariances(Solution(trajectory={0: np.eye(4)}), []) == {}
 
 
 def dimmed(view: RayImage, factor: float) -> RayImage:

@@ -177,7 +177,7 @@ def _written(
 ) -> Mapping[str, Any]:
     """Fuse the frames of both parts, write the run folder and return its report."""
     views = dict(parts[0].views) | dict(parts[1].views)
-    model = Fuser().fuse(views, solution.trajectory, own_covariances(solution))
+    model = Fuser().fuse(views, solution.trajectory, own_covariances(solution, graph.edges))
     for part in parts:
         folder.frames.update({record["id"]: FrameRecord(**record) for record in part.report["frames"]})
     last = views[max(views)]

@@ -38,7 +38,7 @@ class Reopened:
 
     def scan(self, fuser: Fuser) -> Scan:
         """Return the views laid together as `modeler build` lays them."""
-        return fuser.scanned(self.views, self.solution.trajectory, own_covariances(self.solution))
+        return fuser.scanned(self.views, self.solution.trajectory, own_covariances(self.solution, self.edges))
 
 
 def reopened(run: Path, sequence: Path | None = None) -> Reopened:

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from itertools import pairwise
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from modeler.types import Array, Solution
+from modeler.types import Array, Edge, Solution
 
 
-def own_covariances(solution: Solution) -> Mapping[int, Array]:
-    """Return by frame number the covariance (6, 6) of each pose against the pose it is surest of beside it.
+def own_covariances(solution: Solution, edges: Iterable[Edge]) -> Mapping[int, Array]:
+    """Return by frame number the covariance (6, 6) of each pose, were the poses it is joined to exact.
 
     Views that see the same surface are neighbours. What they err by together, drift since the first frame, does not
-    tell which of them is right; what each errs by on its own does. Empty for less than two frames.
+    tell which of them is right; what each errs by on its own does.
+
+    Args:
+        solution: the poses.
+        edges: as they were judged; those that take part tell.
     """
-    frames = sorted(solution.trajectory)
-    found: dict[int, Array] = {}
-    for before, after in pairwise(frames):
-        for one, other in ((before, after), (after, before)):
-            covariance = solution.relative_covariance(other, one)
-            if one not in found or np.trace(covariance) < np.trace(found[one]):
-                found[one] = covariance
-    return found
+    information: dict[int, Array] = {}
+    for edge in edges:
+        if not edge.accepted or edge in solution.outliers:
+            continue
+        pose = solution.edge_poses.get((edge.source, edge.target), edge.posterior.pose)
+        ends = ((edge.source, pose.covariance), (edge.target, pose.inverse().covariance))
+        for frame, covariance in ends:
+            if frame in solution.trajectory:
+                information[frame] = information.get(frame, np.zeros((6, 6))) + np.linalg.inv(covariance)
+    return {frame: np.linalg.inv(told).astype(np.float64) for frame, told in information.items()}

@@ -202,7 +202,8 @@ class Modeler:
 
     def _fused(self, state: State, *, last: bool) -> ObjectModel:
         if last:
-            return self.fuser.fuse(state.views, state.solution.trajectory, own_covariances(state.solution))
+            sure = own_covariances(state.solution, state.graph.edges)
+            return self.fuser.fuse(state.views, state.solution.trajectory, sure)
         frames = list(state.views)
         spread = np.unique(np.linspace(0, len(frames) - 1, _PREVIEWED).round().astype(int))
         return self.fuser.preview({frames[k]: state.views[frames[k]] for k in spread}, state.solution.trajectory)
