@@ -194,7 +194,11 @@ def test_large_images_are_shown_smaller(run: list[Step]) -> None:
     (depth,) = [archetype for path, archetype in images.drawing(step) if path == entities.DEPTH]
     assert isinstance(depth, rr.EncodedDepthImage)
     assert depth.blob is not None
-    assert decoded(depth.blob.as_arrow_array().to_pylist()).shape == (480, 640)
+    assert decoded(depth.blob.as_arrow_array().to_pylist()).shape == (240, 320)
+    (mask,) = [archetype for path, archetype in images.drawing(step) if path == entities.MASK]
+    assert isinstance(mask, rr.SegmentationImage)
+    assert mask.buffer is not None
+    assert len(mask.buffer.as_arrow_array().to_pylist()[0]) == 480 * 640
 
 
 def test_the_depth_view_opens_around_the_object_at_any_size(run: list[Step]) -> None:
@@ -202,7 +206,7 @@ def test_the_depth_view_opens_around_the_object_at_any_size(run: list[Step]) -> 
     assert view is not None
     depth_m = np.kron(view.frame.depth_m, np.ones((10, 10), dtype=np.float32))
     large = replace(view, frame=replace(view.frame, depth_m=depth_m), pixels=10 * view.pixels)
-    for shown, shrunk in ((view, 1), (large, 2)):
+    for shown, shrunk in ((view, 1), (large, 3)):
         bounds = blueprint.around(shown).range
         assert bounds is not None
         (ranges,) = bounds.as_arrow_array().to_pylist()

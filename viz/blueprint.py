@@ -41,7 +41,7 @@ def _images(first: RayImage | None) -> rrb.Container:
     """Return the camera's images, without colour where the first frame has none, and the picture of visibility."""
     near = None if first is None else around(first)
     depth = rrb.Spatial2DView(
-        origin=entities.CAMERA, contents=[entities.DEPTH, entities.MASK], name="Depth of the frame", visual_bounds=near
+        origin=entities.CAMERA, contents=[entities.DEPTH], name="Depth of the frame", visual_bounds=near
     )
     seen = rrb.Spatial2DView(
         origin=entities.VISIBILITY,
@@ -165,8 +165,8 @@ def _radius_m(view: RayImage) -> float:
 
 
 def around(view: RayImage) -> rrb.VisualBounds2D:
-    """Return the part of the image around the object, with room for it to move."""
-    pixels = view.pixels / images.stride_px(view.frame)
+    """Return the part of pictures of depth around the object, with room for it to move."""
+    pixels = view.pixels / images.depth_stride_px(view.frame)
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     margin = 0.4 * float((high - low).max())
     return rrb.VisualBounds2D(

@@ -18,6 +18,7 @@ from viz import entities
 Drawing = Iterator[tuple[str, rr.AsComponents]]
 
 _PIXELS: Final = 500_000  # larger images are shown at a whole fraction of their size
+_DEPTH_PIXELS: Final = 100_000
 _JPEG_QUALITY: Final = 80
 _DEPTH_UNITS_PER_M: Final = 1000.0  # finer units make the picture no better and the file several times larger
 _RUN_LENGTHS: Final = 3  # zlib's strategy; for filtered depth the quickest, and small
@@ -32,20 +33,25 @@ def statics() -> Drawing:
 
 def drawing(step: Step) -> Drawing:
     """Yield the colour image, the depth image and the mask of the step's frame."""
-    stride = stride_px(step.frame)
-    depth_m = step.frame.depth_m[::stride, ::stride]
-    mask = step.segmentation.mask[::stride, ::stride]
+    stride, coarse = stride_px(step.frame), depth_stride_px(step.frame)
+    mask = step.segmentation.mask
     if step.frame.colour is None:
         yield entities.COLOUR, rr.Clear(recursive=False)
     else:
         yield entities.COLOUR, _jpeg(step.frame.colour[::stride, ::stride])
-    yield entities.DEPTH, _depth_png(depth_m, mask)
-    yield entities.MASK, rr.SegmentationImage(mask.astype(np.uint8), opacity=_DIMMED, draw_order=1.0)
+    yield entities.DEPTH, _depth_png(step.frame.depth_m[::coarse, ::coarse], mask[::coarse, ::coarse])
+    shown = mask[::stride, ::stride].astype(np.uint8)
+    yield entities.MASK, rr.SegmentationImage(shown, opacity=_DIMMED, draw_order=1.0)
 
 
 def stride_px(frame: Frame) -> int:
     """Return how many pixels of the frame one pixel of its pictures stands for, along either axis."""
     return math.ceil(math.sqrt(frame.depth_m.size / _PIXELS))
+
+
+def depth_stride_px(frame: Frame) -> int:
+    """Return the same for pictures made of depth, which are costly to pack and show no more when they are finer."""
+    return math.ceil(math.sqrt(frame.depth_m.size / _DEPTH_PIXELS))
 
 
 def _jpeg(colour: npt.NDArray[np.uint8]) -> rr.EncodedImage:

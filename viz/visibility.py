@@ -13,7 +13,7 @@ import rerun as rr
 from scipy import ndimage
 
 from modeler import se3
-from modeler.types import Array, RayImage, Step
+from modeler.types import Array, BoolArray, RayImage, Step
 from viz import clouds, entities, images
 
 Drawing = Iterator[tuple[str, rr.AsComponents]]
@@ -62,7 +62,7 @@ def drawing(step: Step) -> Drawing:
             yield path, _CLEAR
         return
     target = step.views[posterior.target]
-    stride = images.stride_px(target.frame)
+    stride = images.depth_stride_px(target.frame)
     yield entities.VISIBILITY_AREAS, rr.SegmentationImage(areas(target)[::stride, ::stride], draw_order=0.0)
     shown = projection(step.view, target, posterior.pose.mean)
     for order, (verdict, (path, rgb, points)) in enumerate(_PATHS.items()):
@@ -136,7 +136,17 @@ def _verdicts(
     if mask is not None:
         # Object pixels without a local plane, and the rim around the silhouette, are mixed and judge nothing.
         rim_px = 2 * math.ceil(_DEAD * max(target.sigma_wh * target.frame.camera.fx, 1.0)) + 1
-        near = ndimage.maximum_filter(mask, size=rim_px)[at]
+        near = _dilated(mask, rim_px)[at]
         verdicts[(verdicts == VIOLATION) & ~planar & near] = NO_SAY
     verdicts[~measured] = NO_SAY
     return verdicts
+
+
+def _dilated(mask: BoolArray, size_px: int) -> BoolArray:
+    """Return the mask (h, w) grown to squares of `size_px` about its pixels."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    grown = np.zeros_like(mask)
+    if len(rows):
+        box = tuple(slice(max(int(ends[0]) - size_px, 0), int(ends[-1]) + size_px + 1) for ends in (rows, columns))
+        grown[box] = ndimage.maximum_filter(mask[box], size=size_px)
+    return grown
