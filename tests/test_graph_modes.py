@@ -10,7 +10,7 @@ import pytest
 from rings import OBJECT_M, covariance, edge, measured, nees, ring, rotation_error, turntable
 
 from modeler import se3
-from modeler.graph import PoseGraph, solve
+from modeler.graph import PoseGraph, Smoother, solve
 from modeler.types import Array, Edge, Mode, PoseGaussian
 
 COUNT = 12
@@ -168,6 +168,20 @@ def test_false_closure_does_not_choose_a_mode() -> None:
     solution = solve(graph.plus([false]), {})
     assert solution.outliers == (false,)
     assert rotation_error(solution.trajectory, truth) < np.radians(3.0)
+
+
+def test_mode_that_was_settled_by_a_lie_is_put_right_by_the_truth() -> None:
+    rng = np.random.default_rng(12)
+    graph, truth = _graph(rng, {4: [0.4, 0.6]}, [])
+    heavy = graph.edges[3].posterior.modes[0].pose
+    lie = edge(3, 4, PoseGaussian(heavy.mean, covariance(rng)), "closure")
+    growing = Smoother().plus([*graph.edges, lie])
+    np.testing.assert_allclose(growing.solution.mode_weights[4, 3], [1.0, 0.0])
+    for target, source in ((2, 6), (1, 5), (0, 11)):
+        growing = growing.plus([edge(target, source, measured(truth, target, source, rng), "closure")])
+    assert growing.solution.outliers == (lie,)
+    np.testing.assert_allclose(growing.solution.mode_weights[4, 3], [0.0, 1.0])
+    assert rotation_error(growing.solution.trajectory, truth) < np.radians(3.0)
 
 
 def test_mode_of_almost_no_weight_changes_nothing() -> None:

@@ -28,7 +28,8 @@ from modeler.types import Array, Edge, PoseGaussian, Posterior
 _BEAM = 4096  # hypotheses kept while loops are taken one by one: all of twelve edges with two modes
 _SOLVED = 8  # hypotheses solved whole
 _MARGIN = 15.0  # nats below the best at which a hypothesis is no longer worth solving
-_DECIDED = 0.9999  # weight from which a mode is taken for settled, unless a loop then contradicts it
+_DECIDED = 0.9999  # weight from which a mode is taken for the only one, unless a loop then contradicts it
+_REFUTED = 1.5  # false loops more than the best hypothesis has, and one is dropped: two, for one may lie
 _PAIRS = 16  # edges up to which the modes of two of them are changed at once
 
 
@@ -98,11 +99,12 @@ def decide(
         loops: the links beyond those.
         root: a frame of the tree.
         threshold: half the squared Mahalanobis distance at which a loop is taken to be false.
-        before: weights that fewer loops left; modes settled there are not put in question unless a loop contradicts.
+        before: weights that fewer loops left; modes settled there are not put in question unless a loop contradicts
+            them on whose way there are others that are not.
     """
-    if not any(len(link.edge.posterior.modes) > 1 for link in (*tree, *loops)):
-        return {}
     settled = {edge: weights for edge, weights in (before or {}).items() if weights.max() >= _DECIDED}
+    if not any(len(link.edge.posterior.modes) > 1 and link.edge not in settled for link in (*tree, *loops)):
+        return settled
     search = _Search.of(tree, loops, root, settled, threshold)
     best = search.best() if search.edges else None
     if settled and best is not None and search.contradicted(best[0][:1]):
@@ -120,7 +122,9 @@ def decide(
         shares = shares / shares.sum()
         for column, edge in enumerate(search.edges):
             modes = np.arange(len(edge.posterior.modes))
-            decided[edge] = (hypotheses[:, column, None] == modes).T @ shares
+            weights = (hypotheses[:, column, None] == modes).T @ shares
+            top = weights == weights.max()
+            decided[edge] = top.astype(np.float64) if weights.max() >= _DECIDED else weights
     return decided
 
 
@@ -147,17 +151,21 @@ class _Search:
         columns: dict[Edge, int] = {}
         found = []
         for loop in loops:
-            ahead, back = [], []
+            ahead: list[tuple[Link, bool]] = []  # each with whether the way goes from its target to its source
+            back: list[tuple[Link, bool]] = []
             target, source = loop.target, loop.source
             while target != source:
                 if depth[target] >= depth[source]:
                     target, link = above[target]
-                    ahead.append(_piece(link, settled, columns, forwards=link.source == target))
+                    ahead.append((link, link.source == target))
                 else:
                     source, link = above[source]
-                    back.append(_piece(link, settled, columns, forwards=link.target == source))
-            found.append(_Loop(_joined([*ahead, *reversed(back)]), _piece(loop, settled, columns, forwards=True)))
-        open_loops = sorted((loop for loop in found if loop.edges), key=lambda loop: len(loop.edges))
+                    back.append((link, link.target == source))
+            way = [*ahead, *reversed(back), (loop, True)]
+            if any(len(link.edge.posterior.modes) > 1 and link.edge not in settled for link, _ in way):
+                *pieces, own = (_piece(link, settled, columns, forwards=forwards) for link, forwards in way)
+                found.append(_Loop(_joined(pieces), own))
+        open_loops = sorted(found, key=lambda loop: len(loop.edges))
         return cls(tuple(columns), tuple(open_loops), threshold)
 
     def best(self) -> tuple[npt.NDArray[np.int64], Array]:
@@ -168,6 +176,8 @@ class _Search:
                 if hypotheses[0, column] < 0:
                     hypotheses, scores = self._grown(hypotheses, scores, column)
             scores = scores + self._closes(loop, hypotheses)[0]
+            alive = scores >= scores.max() - _REFUTED * self.threshold
+            hypotheses, scores = hypotheses[alive], scores[alive]
         hypotheses = hypotheses[np.argsort(-scores, kind="stable")[:_SOLVED]]
         while True:  # what the beam has dropped may be a change or two away
             around = np.unique(np.concatenate([hypotheses, self._neighbours(hypotheses[0])]), axis=0)

@@ -103,6 +103,10 @@ class Smoother:
         if not grew or len(loops) > len(self.state.loops):  # otherwise the new frames hang on one edge each
             trajectory, inlier, engine = self._closed(taken, closing, start, root=root, afresh=jumped or not grew)
         state = _State(root, links, tuple(tree), tuple(loops), decided, weights, inlier, engine)
+        if grew and decided and inlier.count(False) > self.state.inlier.count(False):
+            again = replace(self, state=_State()).to(graph)  # it may be that other modes make fewer loops lie
+            if len(again.solution.outliers) < inlier.count(False):
+                return again
         rows: Sequence[Rows] = ()
         if self.axis is not None:
             trajectory, inlier, rows = self._turned(self.axis, taken, closing, trajectory, state)
