@@ -99,9 +99,7 @@ def test_visibility_is_within_its_bound_of_its_twin(seed):
     cells = random_cells(rng)
     normals = rng.normal(size=(40, 3)) - [0, 0, 1.5]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points = np.hstack(
-        [random_points(rng, 40), normals, rng.uniform(1e-7, 1e-4, (40, 1)), rng.uniform(0, 1.5, (40, 1))]
-    )
+    points = np.hstack([random_points(rng, 40), normals, rng.uniform(1e-7, 1e-4, (40, 1))])
     poses = np.stack([random_pose(rng, 0.3) for _ in range(20)])
     columns, table = np.ascontiguousarray(points.T), visibility.match_table(HIDDEN)
     flat = cells.reshape(-1, planes.CELL_SIZE)
@@ -135,7 +133,7 @@ def test_verdicts_follow_from_where_a_point_lies():
         ([5.0, 0.0, 0.8], towards, visibility.UNKNOWN),
         ([0.0, 0.0, -0.8], towards, visibility.UNKNOWN),
     ]
-    points = np.array([[*position, *normal, 1e-6, 0.0] for position, normal, _ in cases]).T.copy()
+    points = np.array([[*position, *normal, 1e-6] for position, normal, _ in cases]).T.copy()
     model = np.array([0.001, *MODEL[1:]])
     flat = cells.reshape(-1, planes.CELL_SIZE)
     verdicts = visibility.classify(rows(np.eye(4)[None])[0], points, flat, IMAGE, model)

@@ -40,7 +40,7 @@ def matches(pose, points, cells, intrinsics, facing, surface_m):
 
     Args:
         pose: (12,) rows of the 3×4 matrix that carries the points into the other camera.
-        points: (8, n), see `visibility.log_likelihoods`.
+        points: (7, n), see `visibility.log_likelihoods`.
         cells: (h · w, 8) of the other view, see `planes`.
         intrinsics: (6,) fx, fy, cx, cy, width and height in px of the other view.
         facing: (2,) cosines at which a point begins to face the camera and fully does.
@@ -65,29 +65,6 @@ def matches(pose, points, cells, intrinsics, facing, surface_m):
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def explained(poses, points, cells, intrinsics, facing, surface_m):
-    """Return how many points (m,) find matching surface under each pose, each as far as it faces the other camera.
-
-    Args:
-        poses: (m, 12) rows of the 3×4 matrices that carry the points into the other camera.
-        points: (8, n), see `visibility.log_likelihoods`.
-        cells: (h · w, 8) of the other view, see `planes`.
-        intrinsics: (6,) fx, fy, cx, cy, width and height in px of the other view.
-        facing: (2,) cosines at which a point begins to face the camera and fully does.
-        surface_m: noise of the surfaces in m beyond that of points and planes.
-    """
-    result = np.zeros(poses.shape[0])
-    for i in numba.prange(poses.shape[0]):
-        carried, pixels = np.empty((7, points.shape[1])), np.empty(points.shape[1], dtype=np.int32)
-        carry(poses[i], points, intrinsics, facing, carried, pixels)
-        for j in range(points.shape[1]):
-            _, weight = match(points, carried, pixels, cells, surface_m * surface_m, j)
-            if weight > 0.0:
-                result[i] += carried[FACES, j]
-    return result
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
 def normal_equations(poses, centres, points, cells, intrinsics, facing, surface_m):
     """Return the point-to-plane normal equations of the matching points under each pose.
 
@@ -98,7 +75,7 @@ def normal_equations(poses, centres, points, cells, intrinsics, facing, surface_
     Args:
         poses: (m, 12) rows of the 3×4 matrices that carry the points into the other camera.
         centres: (m, 3) in m, in the other camera's frame.
-        points: (8, n), see `visibility.log_likelihoods`.
+        points: (7, n), see `visibility.log_likelihoods`.
         cells: (h · w, 8) of the other view, see `planes`.
         intrinsics: (6,) fx, fy, cx, cy, width and height in px of the other view.
         facing: (2,) cosines at which a point begins to face the camera and fully does.

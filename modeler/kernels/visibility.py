@@ -23,8 +23,14 @@ from modeler.kernels.planes import (
 UNKNOWN, MATCHED, BEHIND, IN_FRONT, HIDDEN, IN_EMPTY_SPACE = 0, 1, 2, 3, 4, 5
 
 # Rows of the points handed in, and of what `carry` makes of them.
-VARIANCE_M2, GAIN = 6, 7
+VARIANCE_M2 = 6
 X, Y, Z, FACING_X, FACING_Y, FACING_Z, FACES = 0, 1, 2, 3, 4, 5, 6
+
+# Columns of what `log_likelihoods` returns.
+LOG_LIKELIHOOD, EXPLAINED = 0, 1
+
+# A point is explained by surface within three standard deviations whose normal agrees as well as this cosine.
+EXPLAINED_HALF_SQUARE, EXPLAINED_AGREEMENT = 4.5, 0.8
 
 # Nodes of the table of log((1 - hidden) exp(match) + hidden); below the first it is log(hidden) within 3e-6.
 TABLE_LOW, TABLE_HIGH, TABLE_STEPS = -14.0, 4.0, 2304
@@ -91,11 +97,11 @@ def height_over(cell, carried, j):
 
 @numba.njit(cache=True, error_model="numpy")
 def score(points, carried, pixels, cells, model, table):
-    """Return the log-likelihood of carried points; arguments as for `log_likelihoods`."""
+    """Return the log-likelihood of carried points, and how many are explained; arguments as for `log_likelihoods`."""
     blur_m, silhouette_px, dead_px, clearance_m, _, _, worst, bend, unmeasured = model
     blur, log_hidden = blur_m * blur_m, table[0]
     per_step = TABLE_STEPS / (TABLE_HIGH - TABLE_LOW)
-    total = 0.0
+    total, explained = 0.0, 0.0
     for j in range(pixels.shape[0]):
         faces = carried[FACES, j]
         pixel = pixels[j]
@@ -113,7 +119,9 @@ def score(points, carried, pixels, cells, model, table):
                     + carried[FACING_Y, j] * cell[NORMAL_Y]
                     + carried[FACING_Z, j] * cell[NORMAL_Z]
                 )
-                match = 0.5 + points[GAIN, j] - half_square - bend * (1.0 - agreement)
+                match = 0.5 - half_square - bend * (1.0 - agreement)
+                if half_square < EXPLAINED_HALF_SQUARE and agreement > EXPLAINED_AGREEMENT:
+                    explained += faces
                 if in_front > 0.0 and match < log_hidden:
                     total += faces * max(match, -worst)  # in front of what was measured: nothing can hide it
                 elif match <= TABLE_LOW:
@@ -128,24 +136,24 @@ def score(points, carried, pixels, cells, model, table):
             beyond = (cell[SILHOUETTE] - dead_px) / silhouette_px
             if beyond > 0.0 and carried[Z, j] < cell[DEPTH] - clearance_m:
                 total -= min(0.5 * beyond * beyond, worst)
-    return total
+    return total, explained
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def log_likelihoods(poses, points, cells, intrinsics, model, table):
-    """Return the log-likelihood (m,) of each pose, summed over the points of one view looked up in the other.
+    """Return the log-likelihood of each pose, summed over the points of one view looked up in the other.
 
     A point that faces the other camera should lie on the surface measured there, but for a share that something
     hides or the camera missed; one that faces away should lie behind it; none may lie where the camera saw
     nothing. Scores are normalised so that on smooth surface, which goes on as anyone would guess, a point that
     matches within its noise and a hidden one both count 0 on average: turning it out of sight neither pays nor
-    costs. Where a gain is given, a match counts so much more.
+    costs.
 
     The table's interpolation errs by less than 4e-6 a point.
 
     Args:
         poses: (m, 12) rows of the 3×4 matrices that carry the points into the other camera.
-        points: (8, n) position in m, unit normal, variance along the normal in m², gain of a match (nats).
+        points: (7, n) position in m, unit normal, variance along the normal in m².
         cells: (h · w, 8) of the other view, see `planes`.
         intrinsics: (6,) fx, fy, cx, cy, width and height in px of the other view.
         model: (9,) extra noise of the surfaces in m; standard deviation and dead zone of the silhouette in px;
@@ -153,15 +161,18 @@ def log_likelihoods(poses, points, cells, intrinsics, model, table):
             and fully does; most that one point may cost; weight of a disagreement of normals; gain (negative) of a
             point that should be seen where nothing was measured.
         table: of `match_table` for the share of hidden points.
+
+    Returns:
+        (m, 2): log-likelihood; number of points that the other view's surface explains, each as far as it faces it.
     """
     block = 16  # poses that share one pair of buffers
-    result = np.empty(poses.shape[0])
+    result = np.empty((poses.shape[0], 2))
     for group in numba.prange((poses.shape[0] + block - 1) // block):
         carried = np.empty((7, points.shape[1]))
         pixels = np.empty(points.shape[1], dtype=np.int32)
         for i in range(group * block, min((group + 1) * block, poses.shape[0])):
             carry(poses[i], points, intrinsics, model[4:6], carried, pixels)
-            result[i] = score(points, carried, pixels, cells, model, table)
+            result[i, LOG_LIKELIHOOD], result[i, EXPLAINED] = score(points, carried, pixels, cells, model, table)
     return result
 
 

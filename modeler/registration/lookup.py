@@ -16,7 +16,7 @@ class Lookup:
     """One direction of the comparison of two views: p(points of one | image of the other, pose)."""
 
     points: Array
-    """(n, 8) position in m, unit normal, variance along the normal in m², gain of a match (nats), 0."""
+    """(n, 7) position in m, unit normal, variance along the normal in m²."""
     image: RayImage
     """The view in which the points are looked up."""
     surface_m: float
@@ -30,11 +30,9 @@ class Lookup:
     measured_share: float
     """Share of pixels around the surface that carry a measurement."""
 
-    def log_likelihoods(self, poses: Array, blur_m: float, *, stride: int, gain: float) -> Array:
-        """Return the log-likelihood (m,) of poses (m, 12) over every `stride`-th point, the surfaces blurred."""
-        columns = self._columns(stride)
-        columns[kernel.GAIN] = gain
-        table = kernel.match_table(self.hidden_share)
+    def log_likelihoods(self, poses: Array, blur_m: float, *, stride: int) -> Array:
+        """Return log-likelihood and number of explained points (m, 2) of poses (m, 12) over every `stride`-th point."""
+        columns, table = self._columns(stride), kernel.match_table(self.hidden_share)
         return kernel.log_likelihoods(poses, columns, self._cells, self._intrinsics, self._model(blur_m), table)
 
     def verdicts(self, pose: Array) -> np.ndarray:
@@ -48,11 +46,6 @@ class Lookup:
     def matches(self, pose: Array, surface_m: float) -> Array:
         """Return what each point finds under one pose (12,): `kernels.matching.matches`."""
         return matching.matches(pose, self._columns(), self._cells, self._intrinsics, np.array(FACING), surface_m)
-
-    def explained(self, poses: Array, surface_m: float, *, stride: int) -> Array:
-        """Return how many points (m,) find matching surface under poses (m, 12)."""
-        columns, facing = self._columns(stride), np.array(FACING)
-        return matching.explained(poses, columns, self._cells, self._intrinsics, facing, surface_m)
 
     def normal_equations(self, poses: Array, centres_m: Array, surface_m: float, *, stride: int = 1) -> Array:
         """Return the normal equations (m, 27) of matching points under poses (m, 12) about centres (m, 3)."""

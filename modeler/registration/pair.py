@@ -9,7 +9,6 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import matching
 from modeler.kernels import visibility as kernel
-from modeler.registration.annealing import LogLikelihood
 from modeler.registration.lookup import Lookup
 from modeler.registration.posterior import rows
 from modeler.types import Array
@@ -25,10 +24,12 @@ class Pair:
     """The source's points looked up in the target."""
     backward: Lookup
     """The target's points looked up in the source."""
-    effective_points: float
-    """Number of independent measurements that the points of both views together are worth."""
     size_m: float
     """Standard deviation in m of the surface points of a view: the size of the object."""
+    no_overlap: float = 50.0
+    """What it costs that no surface matches (nats)."""
+    little_overlap: float = 0.1
+    """Share of the points at which that cost has fallen to its e-th part."""
 
     @property
     def centre_m(self) -> Array:
@@ -36,34 +37,31 @@ class Pair:
         return self.backward.image.centroid_m
 
     @property
-    def weight(self) -> float:
-        """Exponent that tempers the product over all points."""
-        return self.effective_points / (len(self.forward.points) + len(self.backward.points))
+    def points(self) -> int:
+        """Number of points of both views."""
+        return len(self.forward.points) + len(self.backward.points)
 
-    def log_likelihoods(self, poses: Array, blur_m: float, *, stride: int = 1, gain: float = 0.0) -> Array:
-        """Return the log-likelihoods (n,) of poses (n, 4, 4), not tempered.
+    def log_likelihoods(self, poses: Array, blur_m: float, *, stride: int = 1) -> tuple[Array, Array]:
+        """Return the log-likelihoods (n,), not tempered, and the shares (n,) of points that matching surface explains.
 
         Args:
-            poses: target_from_source.
+            poses: (n, 4, 4) target_from_source.
             blur_m: blur of the surfaces in m.
             stride: every so manieth point stands for the others.
-            gain: what a point counts that the other view explains (nats).
         """
-        there, back = rows(poses), rows(se3.inverse(poses))
-        return stride * (
-            self.forward.log_likelihoods(there, blur_m, stride=stride, gain=gain)
-            + self.backward.log_likelihoods(back, blur_m, stride=stride, gain=gain)
-        )
+        found = self.forward.log_likelihoods(rows(poses), blur_m, stride=stride)
+        found = stride * (found + self.backward.log_likelihoods(rows(se3.inverse(poses)), blur_m, stride=stride))
+        return found[:, kernel.LOG_LIKELIHOOD], found[:, kernel.EXPLAINED] / self.points
 
-    def explained_share(self, poses: Array, surface_m: float, *, stride: int = 1) -> Array:
-        """Return the share (n,) of all points that find matching surface under poses (n, 4, 4)."""
-        found = self.forward.explained(rows(poses), surface_m, stride=stride)
-        found = found + self.backward.explained(rows(se3.inverse(poses)), surface_m, stride=stride)
-        return stride * found / (len(self.forward.points) + len(self.backward.points))
+    def tempered(self, poses: Array, blur_m: float, *, effective_points: float, stride: int = 2) -> Array:
+        """Return the log-likelihoods (n,) of poses (n, 4, 4) as if so many points were independent, and overlap.
 
-    def tempered(self, blur_m: float, *, stride: int = 2) -> LogLikelihood:
-        """Return the tempered log-likelihood of poses (n, 4, 4), the surfaces blurred by `blur_m`."""
-        return lambda poses: self.weight * self.log_likelihoods(poses, blur_m, stride=stride)
+        Two views that are to be registered have surface in common. A likelihood does not know: poses that hide every
+        point contradict nothing, and are many. Those under which next to nothing matches are all but excluded; between
+        others, with more or less in common, the likelihood alone decides.
+        """
+        plain, share = self.log_likelihoods(poses, blur_m, stride=stride)
+        return effective_points / self.points * plain - self.no_overlap * np.exp(-share / self.little_overlap)
 
     def normal_equations(self, poses: Array, surface_m: float, *, stride: int = 1) -> tuple[Array, Array]:
         """Return gradients (n, 6) and matrices (n, 6, 6) of matching surface for ξ of poses (n, 4, 4) about the centre.

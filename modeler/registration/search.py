@@ -41,12 +41,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Search:
-    """Looks for separate modes: the best of many samples of the prior go downhill as point-to-plane ICP does.
-
-    A likelihood alone does not find the motion between views that turned far: poses that hide every point contradict
-    nothing, and are many. Two views that are to be registered have surface in common, so that poses under which next
-    to nothing matches are all but excluded beforehand; among the others the likelihood decides.
-    """
+    """Looks for separate modes: the best of many samples of the prior go downhill as point-to-plane ICP does."""
 
     samples: int = 6000
     """Motions drawn from the prior."""
@@ -60,12 +55,10 @@ class Search:
     """Gauss-Newton steps of each stage."""
     max_step_rad: float = 0.2
     """A step turns the object no further."""
+    local_points: float = 40.0
+    """Number of independent measurements that all points are worth around a candidate."""
     effective_points: float = 80.0
     """Number of independent measurements that all points are worth when separate places are compared."""
-    no_overlap: float = 50.0
-    """What it costs that no surface matches (nats)."""
-    little_overlap: float = 0.1
-    """Share of the points at which that cost has fallen to its e-th part."""
     negligible: float = 20.0
     """A candidate so many nats below the best is dropped."""
     reach: float = 0.5
@@ -88,7 +81,8 @@ class Search:
         mean = se3.mean(centred[:500], np.full(len(centred[:500]), 1.0 / len(centred[:500])))
         prior = PoseGaussian(mean[0], mean[1] + np.diag(np.repeat([1e-4, 1e-5], 3) ** 2))
         # Blunt surfaces match easily; that they do counts as much as how much better they tell the depth than a guess.
-        look = pair.log_likelihoods(poses, self.blurs[0] * pair.size_m, stride=8, gain=-np.log(self.blurs[0]))
+        plain, share = pair.log_likelihoods(poses, self.blurs[0] * pair.size_m, stride=8)
+        look = plain - np.log(self.blurs[0]) * share * pair.points
         poses = poses[_best(look, self.starts)]
         for _ in range(self.iterations):
             poses = self._stepped(pair, poses, prior, self.blurs[1] * pair.size_m)
@@ -119,24 +113,22 @@ class Search:
         order = order[scores[order] > scores[order[:1]] - self.negligible]
         poses, scores = poses[order], scores[order]
         _, matrices = pair.normal_equations(poses, blur_m, stride=2)
-        spreads = np.linalg.cholesky(np.linalg.inv(pair.weight * matrices + np.linalg.inv(prior.covariance)))
+        weight = self.local_points / pair.points
+        spreads = np.linalg.cholesky(np.linalg.inv(weight * matrices + np.linalg.inv(prior.covariance)))
         found = Candidates(poses, scores, np.asarray(spreads, dtype=np.float64), np.zeros(len(poses), dtype=np.bool_))
         return self._distinct(found, pair.centre_m)
 
     def scores(self, pair: Pair, poses: Array, blur_m: float) -> Array:
-        """Return how good (n,) places are beside each other: log-likelihood and surface in common (nats)."""
-        weight = self.effective_points / (len(pair.forward.points) + len(pair.backward.points))
-        share = pair.explained_share(poses, blur_m, stride=2)
-        excluded = self.no_overlap * np.exp(-share / self.little_overlap)
-        return weight * pair.log_likelihoods(poses, blur_m, stride=2) - excluded
+        """Return how good (n,) places are beside each other (nats)."""
+        return pair.tempered(poses, blur_m, effective_points=self.effective_points)
 
     def _stepped(self, pair: Pair, poses: Array, prior: PoseGaussian, blur_m: float) -> Array:
         """Return motions one damped Gauss-Newton step further down, held by what the prior says of them."""
         gradient, matrix = pair.normal_equations(poses, blur_m, stride=4)
         centre = se3.translation(pair.centre_m)
         away = se3.log(se3.inverse(prior.mean) @ poses @ centre)
-        hold = np.linalg.inv(pair.weight * prior.covariance)
-        count = 0.25 * (len(pair.forward.points) + len(pair.backward.points))
+        hold = np.linalg.inv(self.local_points / pair.points * prior.covariance)
+        count = 0.25 * pair.points
         damping = np.diag(np.repeat([1.0 / self.max_step_rad, 1.0 / (self.max_step_rad * pair.size_m)], 3) ** 2)
         held = matrix + hold + 0.01 * count * damping
         step = np.linalg.solve(held, (gradient - away @ hold)[:, :, None])[:, :, 0]

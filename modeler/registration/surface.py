@@ -19,13 +19,13 @@ def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> Array
     """Return `count` surface points, or all if fewer, evenly spread over the image.
 
     Returns:
-        (n, 8): position in m, unit normal, variance along the normal in m², a gain of 0.
+        (n, 7): position in m, unit normal, variance along the normal in m².
     """
     total = len(view.points_m)
     stride = max(total / count, 1.0)
     picks = np.arange(min(count, total)) * stride + rng.random() * stride
     chosen = np.minimum(picks.astype(np.int64), total - 1)
     variance = np.asarray(view.layers["variance_m2"], dtype=np.float64)[chosen, None]
-    points = np.hstack([view.points_m[chosen], view.normals[chosen], variance, np.zeros((len(chosen), 1))])
+    points = np.hstack([view.points_m[chosen], view.normals[chosen], variance])
     # In random order, so that every stride through them is again spread over the object.
     return points[rng.permutation(len(points))]

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -119,7 +120,7 @@ class VisibilityRegistrar(AbstractRegistrar):
     ) -> tuple[Population, float]:
         """Return samples of one place, and what to add to their evidence to compare it with other places'."""
         noise_m = pair.surface_noise_m(candidates.poses[:1], self.search.blurs[-1] * pair.size_m)
-        likelihood = pair.tempered(noise_m)
+        likelihood = partial(pair.tempered, blur_m=noise_m, effective_points=self.effective_points)
         plain = likelihood(candidates.poses)
         volumes = np.log(np.diagonal(candidates.spreads, axis1=1, axis2=2)).sum(axis=1)
         log_weights = np.where(candidates.blunt, candidates.scores, plain + volumes)
@@ -144,7 +145,6 @@ class VisibilityRegistrar(AbstractRegistrar):
         return Pair(
             self._lookup(source, target, size_m, rng),
             self._lookup(target, source, size_m, rng),
-            effective_points=self.effective_points,
             size_m=size_m,
         )
 
