@@ -307,3 +307,18 @@ def test_lost_frame_is_bridged_from_the_last_accepted_one() -> None:
     assert run.tried[6][0] == 4
     assert 5 not in run.solution.trajectory
     assert 0 in run.tried[13]
+
+
+def test_after_lost_frames_the_previous_view_is_believed_only_near_where_the_motion_led() -> None:
+    """A box looks the same from behind: after a gap its other side matches the last view."""
+    run = Run([*(23.0 * np.arange(7)), *[0.0] * 4, 253.0])
+
+    def spoil(posterior: Posterior) -> Posterior:
+        if posterior.source != 11:
+            return replace(posterior, outcome=Outcome.TOO_FEW_POINTS) if posterior.source > 6 else posterior
+        behind = ABOUT_OBJECT @ se3.exp(np.array([*np.radians([0.0, 180.0, 0.0]), 0, 0, 0])) @ se3.inverse(ABOUT_OBJECT)
+        return replace(posterior, pose=PoseGaussian(posterior.pose.mean @ behind, COVARIANCE))
+
+    run.run(Closer(), spoil)
+    assert run.tried[11][0] == 6
+    assert not any(edge.accepted for edge in run.judged[11])

@@ -127,8 +127,8 @@ class Closer:
     ) -> tuple[Posterior | None, str]:
         """Return the posterior that places a frame, and why: the previous view's, or else another's.
 
-        Another view's places the frame where the motion going on would, roughly, have taken it; or, with a witness,
-        farther away, the more frames were lost.
+        Another view's places the frame where the motion going on would, roughly, have taken it; with a witness farther
+        away, the more frames were lost. After lost frames the previous view is believed as far as that.
 
         Args:
             posteriors: registrations of the frame, the previous view first.
@@ -140,20 +140,21 @@ class Closer:
         if not posteriors:
             return None, ""
         odometry, *others = posteriors
-        if flaw(odometry) is None:
-            return odometry, f"joins the previous view: {odometry.outcome.label}, overlap {odometry.overlap:.2f}"
         frames = [frame for frame in views if frame in solution.trajectory]
         expected = _continued(solution, frames, odometry.source)
+        # A pace that changes at random from step to step goes astray with the root of their number.
+        reach_deg = float(np.sqrt(steps)) * self.max_angle_deg
+        believed = steps == 1 or len(frames) == 1 or self._off_deg(odometry, expected, solution) <= reach_deg
+        if flaw(odometry) is None and believed:
+            return odometry, f"joins the previous view: {odometry.outcome.label}, overlap {odometry.overlap:.2f}"
         standing = sorted(filter(self._stands, others), key=lambda posterior: -posterior.overlap)
         for posterior in standing:
             reason = f"joins in place of the failed previous view: overlap {posterior.overlap:.2f}"
-            measured = solution.trajectory[posterior.target] @ posterior.pose.mean
-            off_deg = float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ measured)))
+            off_deg = self._off_deg(posterior, expected, solution)
             if off_deg <= self.max_angle_deg:
                 return posterior, f"{reason}, {off_deg:.0f}° from the motion going on"
             reach = ways(known, posterior.target)
-            # A pace that changes at random from step to step goes astray with the root of their number.
-            for witness in standing if off_deg <= np.sqrt(steps) * self.max_angle_deg else ():
+            for witness in standing if off_deg <= reach_deg else ():
                 if witness is not posterior and self._agreement(witness, posterior, views, solution, reach).agrees:
                     return posterior, f"{reason}, frame {witness.target} agrees"
         return None, ""
@@ -211,6 +212,11 @@ class Closer:
         rotations = np.stack([solution.trajectory[frame][:3, :3] for frame in (target, *frames)])
         cosine = 0.5 * (np.einsum("ij,nij->n", rotations[0], rotations) - 1.0)
         return bool(cosine.min() <= np.cos(np.radians(self.away_deg)))
+
+    def _off_deg(self, posterior: Posterior, expected: Array, solution: Solution) -> float:
+        """Return the angle between where a registration puts a frame and an object_from_camera (4, 4)."""
+        placed = solution.trajectory[posterior.target] @ modes(posterior)[0][1].mean
+        return float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ placed)))
 
     def _stands(self, posterior: Posterior) -> bool:
         """Return whether a registration could place a frame without the previous view."""

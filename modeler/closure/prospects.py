@@ -13,6 +13,7 @@ from modeler.closure.ways import Way, ways
 from modeler.types import Array, Edge, RayImage, Solution
 
 _ASKED = 6  # views whose motion's covariance is worked out: the most promising by a bound that costs little
+_RECENT = 20  # edges judged last that tell how sure the next may be
 _WITNESSES = 200  # points of a view asked whether the new view should see them
 
 
@@ -56,20 +57,20 @@ class Outlook:
         """Return the most promising of `frames`, whose predicted rotations to the new view are `angle_deg` (n,).
 
         An edge of covariance R between two frames whose motion is known with covariance P adds ½ log |1 + P R⁻¹| nats,
-        if it is found. R is taken to be that of the newest edge, over the share of surface seen again and over cos² θ,
-        as errors grow with the turn θ; the chance to find it to be what a sphere shows again, (1 + cos θ) / 2. The
-        surest way through the graph bounds P, so that P itself is worked out for a few frames only, however long the
-        sequence.
+        if it is found. R is taken to be the mean of the newest edges', over the share of surface seen again and over
+        cos² θ, as errors grow with the turn θ; the chance to find it to be what a sphere shows again, (1 + cos θ) / 2.
+        The surest way through the graph bounds P, so that P itself is worked out for a few frames only, however long
+        the sequence.
 
         Args:
             frames: numbers of earlier views.
             angle_deg: predicted rotation to each.
             least_nats: what tells less is left out.
         """
-        newest = next((edge for edge in reversed(self.edges) if edge.accepted and edge.source == self.previous), None)
-        if newest is None:
+        recent = [edge.posterior.pose.covariance for edge in self.edges[-_RECENT:] if edge.accepted]
+        if not recent:
             return []
-        one_edge = newest.posterior.pose.covariance + self.systematic
+        one_edge = np.mean(recent, axis=0) + self.systematic
         variance_rad2 = _rotation_variance(one_edge)
         own_rad2 = _rotation_variance(self.systematic)
         bounded = []
