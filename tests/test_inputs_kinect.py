@@ -177,7 +177,7 @@ def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch
         open_sequence(tmp_path / "s.mkv")
 
 
-def test_what_is_hidden_from_the_colour_camera_gets_no_colour() -> None:
+def test_what_is_hidden_from_the_colour_camera_does_not_get_the_colour_before_it() -> None:
     camera = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
     beside = Alignment(camera, Lens(camera, ()), se3.translation(np.array([-0.1, 0.0, 0.0])))
     depth_m = np.full((60, 80), 2.0, np.float32)
@@ -193,3 +193,17 @@ def test_what_is_hidden_from_the_colour_camera_gets_no_colour() -> None:
     hidden = colour[30, :30, 0] == 0  # behind the near thing as the other camera sees it
     assert hidden[int(30 - near + far) + 3 : 29].all()
     assert not hidden[int(far) + 1 : int(30 - near + far) - 2].any()
+
+
+def test_what_is_hidden_takes_the_colour_of_the_same_surface_close_by() -> None:
+    camera = Camera(160, 120, 300.0, 300.0, 79.5, 59.5)
+    beside = Alignment(camera, Lens(camera, ()), se3.translation(np.array([-0.05, 0.0, 0.0])))
+    depth_m = np.full((120, 160), 0.5, np.float32)
+    depth_m[40:80, 100:120] = 0.4  # hides 7.5 px of the plane to its left from a camera to the right
+    far_px, near_px = 300 * 0.05 / 0.5, 300 * 0.05 / 0.4
+    picture = np.full((120, 160, 3), (0, 0, 200), np.uint8)
+    picture[40:80, int(100 - near_px) : int(120 - near_px) + 1] = (200, 0, 0)
+    colour = beside.aligned(depth_m, picture)
+    assert (colour[60, 100:120, 0] == 200).all()
+    assert (colour[60, int(far_px) + 1 : 99, 2] == 200).all()
+    assert (colour[60, 122:, 2] == 200).all()
