@@ -33,7 +33,7 @@ class Population:
 class AnnealedSampler:
     """Sequential Monte Carlo: weight, resample, move; temperatures bridge the steps where weights would collapse."""
 
-    initial: int = 2000
+    initial: int = 1500
     """Samples drawn at first."""
     particles: int = 500
     """Samples kept from the first weighting on."""
@@ -41,7 +41,7 @@ class AnnealedSampler:
     """Rounds of moves after a weighting."""
     final_particles: int = 1000
     """Samples of the result."""
-    final_moves: int = 3
+    final_moves: int = 2
     """Rounds of moves after the last weighting."""
     min_share: float = 0.4
     """Least effective share of the samples that a weighting may leave; with less, the step is cut."""

@@ -105,7 +105,7 @@ def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: f
 
 def _steps(pair: Pair, poses: Array, noise_m: float, spread: Array, centre_m: Array) -> Array:
     """Return the Gauss-Newton steps (n, 6) of motions, held by the samples' spread where nothing else holds them."""
-    gradient, matrix = pair.normal_equations(poses, noise_m)
+    gradient, matrix = pair.normal_equations(poses, noise_m, stride=2)
     held = matrix + np.linalg.inv(spread @ spread.T)
     return np.asarray(np.linalg.solve(held, gradient[:, :, None])[:, :, 0], dtype=np.float64)
 

@@ -43,12 +43,20 @@ class Candidates:
 class Search:
     """Looks for separate modes: the best of many samples of the prior go downhill as point-to-plane ICP does."""
 
-    samples: int = 6000
-    """Motions drawn from the prior."""
-    starts: int = 400
-    """The best of them are led to matching surface."""
-    survivors: int = 100
-    """The best of those are followed to the end."""
+    max_starts: int = 400
+    """At most so many motions are led to matching surface."""
+    starts_per_basin: float = 3.0
+    """With a narrow prior fewer do: so many for each basin from which the way leads to the same place."""
+    basin_deg: float = 10.0
+    """Standard deviation of a basin in each rotation."""
+    basin: float = 0.15
+    """Standard deviation of a basin in each translation, as a share of the object's size."""
+    looks_per_start: int = 15
+    """Motions drawn from the prior for each that is led on: the best of them."""
+    survivors: float = 0.25
+    """Share of them that is followed to the end."""
+    min_starts: int = 60
+    """At least so many motions are led to matching surface."""
     blurs: tuple[float, ...] = (0.25, 0.12, 0.06, 0.03, 0.015)
     """Blur of the surfaces as shares of the object's size: of the first look, and of each stage of the way down."""
     iterations: int = 4
@@ -66,7 +74,7 @@ class Search:
 
     def thorough(self) -> Search:
         """Return a search that looks four times as hard."""
-        return replace(self, samples=4 * self.samples, starts=4 * self.starts, survivors=2 * self.survivors)
+        return replace(self, max_starts=4 * self.max_starts, starts_per_basin=4 * self.starts_per_basin)
 
     def candidates(self, pair: Pair, motion: AbstractMotion, rng: np.random.Generator) -> Candidates:
         """Return what was found, best first; always one at least.
@@ -76,17 +84,16 @@ class Search:
             motion: where to look.
             rng: source of all randomness.
         """
-        poses = motion.sample(self.samples, rng)
-        centred = poses @ se3.translation(pair.centre_m)
-        mean = se3.mean(centred[:500], np.full(len(centred[:500]), 1.0 / len(centred[:500])))
-        prior = PoseGaussian(mean[0], mean[1] + np.diag(np.repeat([1e-4, 1e-5], 3) ** 2))
+        prior = _gaussian(motion.sample(500, rng), pair.centre_m)
+        starts = self._starts(prior, pair.size_m)
+        poses = motion.sample(self.looks_per_start * starts, rng)
         # Blunt surfaces match easily; that they do counts as much as how much better they tell the depth than a guess.
         plain, share = pair.log_likelihoods(poses, self.blurs[0] * pair.size_m, stride=8)
         look = plain - np.log(self.blurs[0]) * share * pair.points
-        poses = poses[_best(look, self.starts)]
+        poses = poses[_best(look, starts)]
         for _ in range(self.iterations):
             poses = self._stepped(pair, poses, prior, self.blurs[1] * pair.size_m)
-        poses = poses[_best(self.scores(pair, poses, self.blurs[1] * pair.size_m), self.survivors)]
+        poses = poses[_best(self.scores(pair, poses, self.blurs[1] * pair.size_m), int(self.survivors * starts))]
         blunt = self._ranked(pair, motion, poses, prior, self.blurs[1] * pair.size_m)
         for blur in self.blurs[2:]:
             for _ in range(self.iterations):
@@ -94,7 +101,7 @@ class Search:
         fine_m = self.blurs[-1] * pair.size_m
         sharp = self._ranked(pair, motion, poses, prior, fine_m)
         if not len(sharp):
-            sharp = self._ranked(pair, motion, motion.sample(self.survivors, rng), prior, fine_m)
+            sharp = self._ranked(pair, motion, motion.sample(starts, rng), prior, fine_m)
         return Candidates(
             np.concatenate([sharp.poses, blunt.poses]),
             np.concatenate([sharp.scores, blunt.scores]),
@@ -102,6 +109,13 @@ class Search:
             np.repeat([False, True], [len(sharp), len(blunt)]),
             beyond=float(self.scores(pair, poses, fine_m).max() - sharp.scores[0]),
         )
+
+    def _starts(self, prior: PoseGaussian, size_m: float) -> int:
+        """Return how many starts a prior is worth."""
+        basin = np.repeat([np.deg2rad(self.basin_deg), self.basin * size_m], 3)
+        variances = np.linalg.eigvalsh(prior.covariance / np.outer(basin, basin))
+        basins = np.sqrt(np.prod(np.maximum(variances, 1.0)))
+        return int(np.clip(self.starts_per_basin * basins, self.min_starts, self.max_starts))
 
     def _ranked(
         self, pair: Pair, motion: AbstractMotion, poses: Array, prior: PoseGaussian, blur_m: float
@@ -158,6 +172,12 @@ def distances(found: Candidates, number: int, centre: Array) -> Array:
     """
     xi = se3.log(se3.inverse(found.poses[number] @ centre) @ found.poses @ centre)
     return np.linalg.norm(np.linalg.solve(found.spreads[number], xi.T), axis=0)
+
+
+def _gaussian(poses: Array, centre_m: Array) -> PoseGaussian:
+    """Return the mean of poses · shift to the centre, and the covariance of ξ about it."""
+    mean, covariance = se3.mean(poses @ se3.translation(centre_m), np.full(len(poses), 1.0 / len(poses)))
+    return PoseGaussian(mean, covariance + np.diag(np.repeat([1e-4, 1e-5], 3) ** 2))
 
 
 def _best(scores: Array, count: int) -> np.ndarray:
