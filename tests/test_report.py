@@ -14,9 +14,11 @@ import pytest
 from turning_box import CENTRE_M, HALF_M, object_from_camera, steps
 
 from modeler import se3
+from modeler.cli import main
 from modeler.export import RunFolder, RunMeta
 from modeler.export.ply import mesh_ply
 from modeler.types import Array, InputError
+from sequences import bundled
 from viz import entities
 from viz.report import write_page
 from viz.report.mesh import read_mesh, scene
@@ -159,6 +161,19 @@ def test_without_truth_recording_or_mesh_the_page_says_so(run: Path, tmp_path: P
     assert "The true motion is not known here" in page
     assert "recording.rrd is missing" in page
     assert "left no mesh" in page
+
+
+def test_the_command_writes_the_page_and_says_where(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = tmp_path / "page.html"
+    assert main(["report", str(run), "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert str(out) in said.err
+    assert "The true motion is not known here" in out.read_text()  # the sequence is not there
+    assert main(["report", str(run), "--out", str(out), "--sequence", str(tmp_path / "moved")]) == 2
+    assert "moved" in capsys.readouterr().err
+    assert main(["report", str(run), "--out", str(out), "--sequence", str(bundled("box"))]) == 0
+    assert "Errors against ground truth" in out.read_text()
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path, run: Path) -> None:

@@ -151,6 +151,16 @@ def test_both_timelines_run_forward(run: list[Step], tmp_path: Path) -> None:
             assert (np.diff(elapsed_s) >= 0.0).all()
 
 
+def test_what_a_frame_tried_again_brings_stands_at_the_latest_frame(run: list[Step], tmp_path: Path) -> None:
+    last = run[-1]
+    again = replace(last, frame=run[LOST].frame, view=run[LOST].view)
+    recording = record(tmp_path / "r.rrd", [*run[:-1], again, last])
+    assert f"Frame {LOST}: left out" in recording[entities.NOW][LOST]["text"][0]
+    assert len(drawn(recording, entities.CLOUD, "positions")[LOST]) < len(
+        drawn(recording, entities.CLOUD, "positions")[4]
+    )
+
+
 def test_a_recording_opens_with_a_layout(tmp_path: Path, run: list[Step]) -> None:
     record(tmp_path / "r.rrd", run)
     reader = rerun.chunk.RrdReader(tmp_path / "r.rrd")

@@ -46,7 +46,7 @@ class RerunStream:
         from viz import blueprint, clouds, ghosts, images, poses, readings, spread, uncertainty, visibility
 
         # A frame that was lost is tried again when later ones are known: what that brings stands at the latest frame.
-        self.recording.set_time(entities.FRAME, sequence=max(step.frame.index, *step.views, step.frame.index))
+        self.recording.set_time(entities.FRAME, sequence=max([step.frame.index, *step.views]))
         self.recording.set_time(entities.ELAPSED, duration=time.monotonic() - self.started_s)
         if step.view is not None and set(step.views) == {step.frame.index}:
             self.recording.send_blueprint(blueprint.layout(step.view))
