@@ -40,6 +40,8 @@ def camera_from_model(node: Node) -> Array:
     """
     entry = node.need("cam_R_m2c")
     written = entry.numbers(9).reshape(3, 3)
+    if np.abs(written).max() > 2.0:
+        raise entry.fault("a rotation matrix, row by row")
     left, stretch, right = np.linalg.svd(written)
     if np.abs(stretch - 1.0).max() > 1e-2 or np.linalg.det(written) < 0.0:
         raise entry.fault("a rotation matrix, row by row")

@@ -133,7 +133,7 @@ def _rigid(rows: list[list[str]], path: Path) -> Array:
         matrix = np.array(rows, dtype=np.float64)
     except ValueError:
         matrix = np.zeros(0)
-    if matrix.shape == (4, 4) and np.isfinite(matrix).all():
+    if matrix.shape == (4, 4) and (np.abs(matrix) < 1e6).all():  # not so of NaN
         rotation = matrix[:3, :3]
         if np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-2 and np.linalg.det(rotation) > 0.0:
             return matrix

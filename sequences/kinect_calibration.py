@@ -76,7 +76,7 @@ def _lens(calibration: Node, purpose: str, size: Size, sensor: Size, corner: Siz
 def _camera_from_device(calibration: Node, purpose: str) -> Array:
     entry = _camera(calibration, purpose).need("Rt")
     rotation = entry.need("Rotation").numbers(9).reshape(3, 3)
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+    if np.abs(rotation).max() > 2.0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
         raise entry.need("Rotation").fault("a rotation matrix, row by row")
     pose = se3.translation(entry.need("Translation").numbers(3))
     pose[:3, :3] = rotation

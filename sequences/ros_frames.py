@@ -12,6 +12,8 @@ from modeler.types import Array
 from sequences.bag import Bag
 
 STATIC = "tf2_msgs/msg/TFMessage"
+FARTHEST_M = 1e4
+"""No robot is larger."""
 MOST = 1000
 """Messages of fixed transforms that are read; drivers send one or a few."""
 
@@ -50,7 +52,8 @@ def pose(transform: Any) -> Array | None:
     turn, shift = transform.rotation, transform.translation
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64)
     offset_m = np.array([shift.x, shift.y, shift.z], dtype=np.float64)
-    if not (0.9 < float(np.linalg.norm(quaternion)) < 1.1 and np.isfinite(offset_m).all()):
+    small = bool((np.abs(quaternion) < 2.0).all() and (np.abs(offset_m) < FARTHEST_M).all())  # not so of NaN
+    if not small or not 0.9 < float(np.linalg.norm(quaternion)) < 1.1:
         return None
     motion = se3.translation(offset_m)
     motion[:3, :3] = Rotation.from_quat(quaternion).as_matrix()

@@ -14,6 +14,8 @@ import numpy as np
 import recordings
 import test_inputs_clouds as clouds
 import test_inputs_kinect as kinect
+import test_inputs_realsense as realsense
+import test_inputs_ros as ros
 
 from modeler import se3
 from modeler.types import Camera, Frame
@@ -120,6 +122,12 @@ TARGETS: dict[str, Target] = {
     "ros1": Target(_bag("s.bag", bags.Recorder()), ("s.bag",), read_all, 2.0),
     "ros1 packed": Target(
         _bag("s.bag", bags.Recorder("compressedDepth", "jpeg", compression=bags.rosbag1.Writer.CompressionFormat.LZ4)),
+        ("s.bag",),
+        read_all,
+    ),
+    "ros1 fixed": Target(_bag("s.bag", ros.Rig(colour_scale=1.1)), ("s.bag",), read_all),
+    "realsense": Target(
+        _bag("s.bag", realsense.OldRecorder("mono16", "rgb8", names=realsense.NAMES, colour_scale=1.1)),
         ("s.bag",),
         read_all,
     ),
