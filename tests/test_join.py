@@ -112,6 +112,9 @@ def test_frames_of_both_runs_find_their_places(runs: tuple[Path, Path, Path, dic
     for k, pose in poses.items():
         off = se3.inverse(base @ runs[3][k]) @ pose
         assert np.degrees(se3.rotation_angle(off)) < 2.0
+    assert {path.name for path in runs[2].iterdir()} == {
+        "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd", "report.json"
+    }  # fmt: skip
     joining = [edge for edge in report["edges"] if edge["source"] >= 9 > edge["target"]]
     assert len(joining) == 4
     assert sum(edge["accepted"] for edge in joining) >= 2

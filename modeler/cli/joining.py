@@ -20,6 +20,7 @@ from modeler.graph import PoseGraph, solve
 from modeler.priors.bumps import Bumps
 from modeler.registration import VisibilityRegistrar
 from modeler.types import Array, Edge, InputError, Outcome, Posterior, Segmentation, Solution, Step
+from viz.stream import open_stream
 
 _SIGMA_RAD, _SIGMA_M = 0.12, 0.01  # how far off the laid models may be
 _RIVAL = 0.97  # of the best match's score: one that is as good and lies elsewhere leaves the choice open
@@ -175,7 +176,7 @@ def _shifted(run: Reopened, offset: int) -> Reopened:
 def _written(
     folder: RunFolder, parts: tuple[Reopened, Reopened], graph: PoseGraph, solution: Solution, meta: RunMeta
 ) -> Mapping[str, Any]:
-    """Fuse the frames of both parts, write the run folder and return its report."""
+    """Fuse the frames of both parts, write the run folder with its recording and return its report."""
     views = dict(parts[0].views) | dict(parts[1].views)
     model = Fuser().fuse(views, solution.trajectory, own_covariances(solution, graph.edges))
     for part in parts:
@@ -195,7 +196,14 @@ def _written(
         views=views,
         last=True,
     )
-    return folder.write(step, meta)
+    facts = {"sequence": meta.sequence, "seed": meta.seed, **meta.settings}
+    stream = open_stream(parts[0].name, save=folder.path / "recording.rrd", facts=facts)
+    try:
+        report = folder.write(step, meta)
+        stream(step)
+    finally:
+        stream.close()
+    return report
 
 
 def _say(words: str) -> None:
