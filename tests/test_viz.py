@@ -596,13 +596,16 @@ def test_the_page_is_served_on_this_machine_alone(run: list[Step], tmp_path: Pat
     assert server.process.poll() is not None
 
 
-def test_a_viewer_that_dies_does_not_stop_the_run(run: list[Step], tmp_path: Path) -> None:
+def test_a_viewer_that_dies_does_not_stop_the_run(
+    run: list[Step], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
     stream(run[0])
     stream.viewers[0].stop()
     for step in run[1:]:
         stream(step)
     stream.close()
+    assert "the viewer was closed" in caplog.text
     assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
 
 

@@ -75,7 +75,9 @@ class RerunStream:
         leave.start()
         leave.join(_PATIENCE_S)
         for own in self.viewers:
-            if leave.is_alive() or not own.lasting:
+            if own.process.poll() is not None:
+                _log.warning("the viewer was closed before the run had ended; the recording holds what it missed")
+            elif leave.is_alive() or not own.lasting:
                 own.stop()
         leave.join(_PATIENCE_S)
 

@@ -5,6 +5,7 @@ imported when a command runs, so that help appears at once.
 """
 
 import logging
+import os
 import sys
 from collections.abc import Sequence
 
@@ -22,6 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: what follows the program's name; those of the process without it.
     """
     logging.basicConfig(level=logging.WARNING, format="modeler: %(message)s")  # to stderr
+    # Rerun complains in its own way of a viewer that was closed, which is nobody's error; we tell what matters.
+    os.environ.setdefault("RUST_LOG", "warn,re_sdk=off,re_grpc_client=off")
     command = parsed(sys.argv[1:] if arguments is None else arguments)
     from modeler.types import InputError
 
