@@ -331,6 +331,8 @@ class Solution:
     """target_from_source by (source, target) of edges that took part otherwise than by the posterior's own pose."""
     mode_weights: Mapping[tuple[int, int], Array] = field(default_factory=dict)
     """Weights (m,) that all edges together leave to the modes of an edge with several, by (source, target)."""
+    camera_from_axis: Array | None = None
+    """(4, 4), the third direction that about which all steps turn; None where that was not asked, or does not fit."""
 
     def relative_gaussian(self, target: int, source: int) -> PoseGaussian:
         """Return target_from_source between two different solved frames, with its uncertainty."""

@@ -17,12 +17,14 @@ TABLE = CommonAxis(STEP_RAD, np.radians(1.0), np.radians(0.2), 0.0005)
 FREE = CommonAxis(None, sigma_tilt_rad=np.radians(0.2), sigma_shift_m=0.0005)
 
 
-def _table(rng: np.random.Generator, count: int = COUNT) -> tuple[dict[int, Array], Array]:
+def _table(
+    rng: np.random.Generator, count: int = COUNT, shift_m: float = TABLE.sigma_shift_m
+) -> tuple[dict[int, Array], Array]:
     """Poses of an object on a turntable that errs as TABLE says, and camera_from_axis."""
     camera_from_axis = se3.translation(OBJECT_M + 0.02 * rng.normal(size=3)) @ se3.exp(
         np.array([np.pi / 2 + 0.4, 0.1 * rng.normal(), 0.1 * rng.normal(), 0.0, 0.0, 0.0])
     )
-    sigmas = np.array([TABLE.sigma_tilt_rad] * 2 + [TABLE.sigma_step_rad] + [TABLE.sigma_shift_m] * 3)
+    sigmas = np.array([TABLE.sigma_tilt_rad] * 2 + [TABLE.sigma_step_rad] + [shift_m] * 2 + [TABLE.sigma_lift_m])
     poses = {0: np.eye(4)}
     for k in range(1, count):
         turn = se3.exp(np.array([0.0, 0.0, STEP_RAD, 0.0, 0.0, 0.0])) @ se3.exp(sigmas * rng.normal(size=6))
@@ -122,6 +124,37 @@ def test_axis_settles_what_each_pair_leaves_open() -> None:
     assert rotation_error(solution.trajectory, truth) < 0.25 * rotation_error(plain.trajectory, truth)
     for frame in range(1, COUNT):
         assert np.linalg.slogdet(solution.covariances[frame])[1] < np.linalg.slogdet(plain.covariances[frame])[1]
+
+
+def test_table_on_which_things_are_pushed_about_still_has_one_normal() -> None:
+    """Steps shift by centimetres, so that they share no axis's place; its direction settles the roll all the same."""
+    pushed, seeds = CommonAxis(sigma_tilt_rad=TABLE.sigma_tilt_rad, sigma_shift_m=0.03), 20
+    values, alone, together = np.zeros(seeds), np.zeros(seeds), np.zeros(seeds)
+    for seed in range(seeds):
+        rng = np.random.default_rng([5, seed])
+        truth, _ = _table(rng, shift_m=0.03)
+        graph = _graph(rng, truth, free_rad=np.radians(30.0))
+        plain, solution = solve(graph, {}), solve(graph, {}, axis=pushed)
+        alone[seed], together[seed] = (rotation_error(s.trajectory, truth) for s in (plain, solution))
+        k = 1 + seed % (COUNT - 1)
+        values[seed] = nees(PoseGaussian(solution.trajectory[k], solution.covariances[k]), truth[k])
+    assert np.median(together) < 0.25 * np.median(alone)
+    assert np.mean(values) == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / seeds))
+
+
+def test_axis_that_does_not_fit_is_left_out() -> None:
+    """An object that is pushed about by centimetres does not turn about one axis, whatever we are told."""
+    rng = np.random.default_rng(3)
+    truth, camera_from_axis = _table(rng)
+    fitting = solve(_graph(rng, truth), {}, axis=FREE)
+    assert fitting.camera_from_axis is not None
+    assert float(fitting.camera_from_axis[:3, 2] @ camera_from_axis[:3, 2]) > np.cos(np.radians(2.0))
+    pushed, _ = _table(rng, shift_m=0.03)
+    graph = _graph(rng, pushed)
+    plain, solution = solve(graph, {}), solve(graph, {}, axis=FREE)
+    assert solution.camera_from_axis is None
+    for frame, pose in plain.trajectory.items():
+        np.testing.assert_array_equal(solution.trajectory[frame], pose)
 
 
 def test_axis_works_beside_closures_and_lies() -> None:

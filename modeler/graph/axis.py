@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
 from modeler import se3
 from modeler.graph.links import Link, inverse_right_jacobian
@@ -28,6 +29,22 @@ _ITERATIONS, _HALVINGS = 50, 10  # of Gauss and Newton, and of one step of their
 _TOLERANCE = 1e-6  # of half the squared Mahalanobis distance: where a step lowers it by less, the next is nothing
 
 
+_UNKNOWN = 4  # of an axis: two of its direction, two of its place
+_FITS = 1.0 - 1e-6  # of tables that are as they are said to be; the others cost a hundred times more
+
+
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """A solution with a common axis."""
+
+    poses: Mapping[int, Array]
+    """object_from_camera (4, 4) by frame number."""
+    rows: Sequence[Rows]
+    """What the axis says there: whitened, of errors in object coordinates, as `marginals` takes them."""
+    camera_from_axis: Array
+    """(4, 4), the axis the third direction."""
+
+
 @dataclass(frozen=True)
 class CommonAxis:
     """What is known of a turntable, beyond what the edges know: they must not hold it already."""
@@ -39,14 +56,13 @@ class CommonAxis:
     sigma_tilt_rad: float = float(np.radians(0.2))
     """How far the object tilts against the axis in a step: wobble of the table, slip on it."""
     sigma_shift_m: float = 0.0005
-    """How far it slips in a step, in any direction."""
+    """How far it slips across the axis in a step. Some centimetres make a table on which it is pushed about: what steps
+    then share is the table's normal."""
+    sigma_lift_m: float = 0.0005
+    """How far it moves along the axis in a step."""
 
-    def solved(
-        self, links: Sequence[Link], trajectory: Mapping[int, Array], root: int
-    ) -> tuple[dict[int, Array], list[Rows]] | None:
-        """Return the poses that meet links and axis best, and what the axis says there; None where none is to be seen.
-
-        The rows are whitened, of errors in object coordinates, as `marginals` takes them.
+    def solved(self, links: Sequence[Link], trajectory: Mapping[int, Array], root: int) -> Turned | None:
+        """Return the poses that meet links and axis best; None where no axis is to be seen, or none that links allow.
 
         Args:
             links: all that take part.
@@ -61,6 +77,7 @@ class CommonAxis:
         known = _Known(self, links, list(trajectory), root, start)
         poses = {**trajectory, _AXIS: start}
         rows = known.rows(poses)
+        alone = _half_square(rows[: len(links)])
         for _ in range(_ITERATIONS):
             linear = gtsam.GaussianFactorGraph()
             for blocks, error in rows:
@@ -86,7 +103,12 @@ class CommonAxis:
             {key: block @ to_object[key] if key in to_object else block for key, block in blocks.items()}
             for blocks, _ in rows[len(links) :]
         ]
-        return {frame: poses[frame] for frame in trajectory}, said
+        # What the axis costs, twice over, is chi² with as many degrees of freedom as it says more than has to be found.
+        conditions = sum(len(error) for _, error in rows[len(links) + 1 :]) - _UNKNOWN
+        cost = 2.0 * (_half_square(rows) - alone)
+        if conditions > 0 and cost > stats.chi2(conditions).ppf(_FITS):
+            return None
+        return Turned({frame: poses[frame] for frame in trajectory}, said, poses[_AXIS])
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +158,8 @@ class _Known:
         targets, sources = (np.stack([poses[int(frame)] for frame in ends]) for ends in steps.T)
         turns_rad = None if axis.step_rad is None else axis.step_rad * apart
         turn = () if axis.step_rad is None else (axis.sigma_step_rad,)
-        sigmas = np.array([axis.sigma_tilt_rad, axis.sigma_tilt_rad, *turn, *(axis.sigma_shift_m,) * 3])
+        across = (axis.sigma_shift_m, axis.sigma_shift_m, axis.sigma_lift_m)
+        sigmas = np.array([axis.sigma_tilt_rad, axis.sigma_tilt_rad, *turn, *across])
         whiten = 1.0 / (np.sqrt(apart)[:, None] * sigmas)
         error, *derivatives = slip(targets, sources, poses[_AXIS], turns_rad)
         return [whiten * error, *(whiten[..., None] * derivative for derivative in derivatives)]

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from modeler.graph.axis import CommonAxis
+from modeler.graph.axis import CommonAxis, Turned
 from modeler.graph.incremental import Incremental
 from modeler.graph.links import Link, anchored, chain, split
-from modeler.graph.marginals import PoseCovariances, RelativeCovariance, Rows
+from modeler.graph.marginals import PoseCovariances, RelativeCovariance
 from modeler.graph.modes import belief, decide
 from modeler.graph.optimise import agree, optimise, poses_of, values_of
 from modeler.graph.pose_graph import PoseGraph
@@ -107,11 +107,14 @@ class Smoother:
             again = replace(self, state=_State()).to(graph)  # it may be that other modes make fewer loops lie
             if len(again.solution.outliers) < inlier.count(False):
                 return again
-        rows: Sequence[Rows] = ()
+        turned: Turned | None = None
         if self.axis is not None:
-            trajectory, inlier, rows = self._turned(self.axis, taken, closing, trajectory, state)
+            inlier, turned = self._turned(self.axis, taken, closing, trajectory, state)
+        trajectory = trajectory if turned is None else turned.poses
         chosen = _taking_part(closing, inlier)
-        relative_covariance = RelativeCovariance(trajectory, root, (*taken, *chosen), rows)
+        relative_covariance = RelativeCovariance(
+            trajectory, root, (*taken, *chosen), () if turned is None else turned.rows
+        )
         if self.shared:
             relative_covariance = SharedCovariance(relative_covariance, (*taken, *chosen), self.shared)
         several = [link for link in (*taken, *closing) if len(link.edge.posterior.modes) > 1]
@@ -124,6 +127,7 @@ class Smoother:
             relative_covariance=relative_covariance,
             edge_poses={(link.source, link.target): link.pose for link in several},
             mode_weights={(e.source, e.target): weights.get(e, np.array(prior)) for e, prior in own.items()},
+            camera_from_axis=None if turned is None else turned.camera_from_axis,
         )
         return replace(self, graph=graph, solution=solution, state=state)
 
@@ -153,18 +157,18 @@ class Smoother:
         loops: Sequence[Link],
         trajectory: Mapping[int, Array],
         state: _State,
-    ) -> tuple[Mapping[int, Array], tuple[bool, ...], Sequence[Rows]]:
-        """Return the poses with a common axis, which loops then take part, and what the axis says there."""
-        inlier, solution = state.inlier, (trajectory, state.inlier, ())
+    ) -> tuple[tuple[bool, ...], Turned | None]:
+        """Return which loops take part where steps share an axis, and the solution then; None: they do not."""
+        inlier, turned = state.inlier, None
         for _ in range(_ROUNDS):
             found = axis.solved([*tree, *_taking_part(loops, inlier)], trajectory, state.root or 0)
             if found is None:
-                return solution
-            solution = found[0], inlier, found[1]
-            inlier = agree(loops, values_of(found[0]), 0.5 * self.outlier_distance**2)
-            if inlier == solution[1]:
+                return state.inlier, None
+            agreeing, turned = agree(loops, values_of(found.poses), 0.5 * self.outlier_distance**2), found
+            if agreeing == inlier:
                 break
-        return solution
+            inlier = agreeing
+        return inlier, turned
 
     def _went_on(
         self,
