@@ -111,7 +111,7 @@ def _figures(case: Case, step: Step, registrations: int, seconds: float, peak_mi
         joined=len(solution.trajectory),
         registrations=registrations,
         closures=len(loops),
-        spanning=len(taking_part) - len(loops) - (len(solution.trajectory) - 1),
+        spanning=max(len(taking_part) - len(loops) - (len(solution.trajectory) - 1), 0),
         rejected=len(step.edges_so_far) - len(taking_part),
         before_deg=errors[0],
         after_deg=errors[1],
