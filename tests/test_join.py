@@ -198,3 +198,20 @@ def test_the_size_of_voxels_is_checked_before_a_build(tmp_path: Path, capfd: pyt
     assert main(["build", str(tmp_path), "--out", str(tmp_path / "run"), "--voxel-m", "0"]) == 2
     assert "--voxel-m 0 is out of range" in capfd.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+def test_joins_that_cannot_be_are_said_in_one_line(
+    runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    for arguments, words in (
+        ([str(runs[0]), str(runs[1]), "--out", str(tmp_path)], "not empty"),
+        ([str(runs[0]), str(tmp_path / "none"), "--out", str(tmp_path / "new")], "there is no report"),
+        ([str(runs[0]), str(runs[1]), "--out", str(tmp_path / "new"), "--pairs", "0"], "--pairs 0"),
+        ([str(runs[0]), str(runs[1]), "--out", str(tmp_path / "new"), "--seed", "-1"], "--seed -1"),
+    ):
+        assert main(["join", *arguments]) == 2
+        told = capfd.readouterr().err
+        assert words in told
+        assert told.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

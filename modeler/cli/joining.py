@@ -23,6 +23,7 @@ from modeler.types import Array, Edge, InputError, Outcome, Posterior, Segmentat
 from viz.stream import open_stream
 
 _SIGMA_RAD, _SIGMA_M = 0.12, 0.01  # how far off the laid models may be
+_LEAST = 0.15  # score of models that fit each other at all
 _RIVAL = 0.97  # of the best match's score: one that is as good and lies elsewhere leaves the choice open
 _FARTHEST_RAD = 0.5  # a posterior farther from the match than this is another place
 
@@ -37,12 +38,18 @@ def join(options: Join) -> int:
         raise InputError(f"--seed {options.seed} is negative; give a whole number from 0 on")
     if options.pairs < 1:
         raise InputError(f"--pairs {options.pairs} leaves nothing to join by; give at least 1")
+    if options.out.is_dir() and any(options.out.iterdir()) and not options.overwrite:
+        raise InputError(f"{options.out}: not empty; choose another --out, or give --overwrite")
     began = time.perf_counter()
     first, second = reopened(options.run_a), reopened(options.run_b)
     offset = max(record["id"] for record in first.report["frames"]) + 1
     second = _shifted(second, offset)
-    folder = RunFolder.open(options.out, overwrite=options.overwrite)
     matches = _matches(first, second)
+    if matches[0].score < _LEAST:
+        raise InputError(
+            f"{options.run_a} and {options.run_b}: the models do not fit each other however they are laid; are they of "
+            "the same object, and do they share enough surface?"
+        )
     _say(f"laid on each other, {100.0 * matches[0].score:.0f} % of the surface agree")
     edges = _edges(first, second, matches[0], options)
     count = sum(edge.accepted for edge in edges)
@@ -63,6 +70,7 @@ def join(options: Join) -> int:
         doubts=_doubts(matches),
         seconds={"total": time.perf_counter() - began},
     )
+    folder = RunFolder.open(options.out, overwrite=options.overwrite)
     report = _written(folder, (first, second), graph, solve(graph, guess), meta)
     _say(f"{count} of {len(edges)} pairs registered, {len(report['poses'])} frames joined: {options.out}")
     if report["reasons"]:
