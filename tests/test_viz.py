@@ -508,6 +508,14 @@ def test_every_pair_is_put_into_words(run: list[Step], recording: Recording) -> 
     assert "nan" not in " ".join(row["text"][0] for row in recording[entities.NOW].values())
 
 
+def test_what_the_graph_leaves_to_the_modes_of_a_pair_is_told(run: list[Step]) -> None:
+    step = run[1]
+    pair = (step.edges[0].source, step.edges[0].target)
+    wary = replace(step, solution=replace(step.solution, mode_weights={pair: np.array([0.9, 0.1])}))
+    assert "leave to its modes 90%, 10%" in readings.now_words(wary)
+    assert "modes" not in readings.now_words(step)
+
+
 def test_readings_that_a_method_does_not_give_are_left_out(run: list[Step]) -> None:
     edge = run[1].edges[0]
     poor = replace(edge, posterior=replace(edge.posterior, effective_samples=float("nan"), seconds=float("nan")))

@@ -97,6 +97,9 @@ def now_words(step: Step) -> str:
         lines.append(f"- **{pair_words(edge, step)}.** {edge.posterior.outcome.advice}")
         if np.isfinite(edge.posterior.pose.covariance).all():
             lines += [f"  - {words}" for words in undetermined(edge.posterior, step.view)]
+        left = step.solution.mode_weights.get((edge.source, edge.target))
+        if left is not None and len(left) > 1:
+            lines.append(f"  - all edges together leave to its modes {', '.join(f'{100 * w:.0f}%' for w in left)}")
     if not step.edges:
         lines.append("- The first view of the object." if accepted else f"- {step.outcome}")
     kinds = [edge.kind for edge in step.edges_so_far if poses.takes_part(edge, step)]

@@ -10,7 +10,7 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from PIL import Image
@@ -162,13 +162,23 @@ def _pairs(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Array) 
         else "There are no pictures, for recording.rrd is missing."
     )
     cards = [
-        _pair(result, edge, record.get("undetermined", []), pictures.get(edge.source), centre_m)
+        _pair(result, edge, record, pictures.get(edge.source), centre_m)
         for edge, record in zip(result.edges, result.report["edges"], strict=True)
     ]
     return [f"<h2>Pairs</h2><p class='quiet'>{note}</p><div class='pairs'>{''.join(cards)}</div>"]
 
 
-def _pair(result: Result, edge: Edge, left_open: Sequence[str], pictures: Thumbnails | None, centre_m: Array) -> str:
+def _mode_words(modes: Sequence[Mapping[str, Any]]) -> str:
+    """Return how the probability is shared among the modes of an edge, where there are several."""
+    if len(modes) < 2:
+        return ""
+    shares = [f"{100.0 * mode['weight']:.0f} %" for mode in modes]
+    left = [f"{100.0 * mode['weight_in_graph']:.0f} %" for mode in modes if mode.get("weight_in_graph") is not None]
+    graph = f"; all edges together leave {', '.join(left)}" if left else ""
+    return f"<p>{len(modes)} modes: {', '.join(shares)}{graph}.</p>"
+
+
+def _pair(result: Result, edge: Edge, record: Mapping[str, Any], pictures: Thumbnails | None, centre_m: Array) -> str:
     posterior = edge.posterior
     shown = ""
     if pictures is not None and edge.kind == "odometry":
@@ -193,7 +203,9 @@ def _pair(result: Result, edge: Edge, left_open: Sequence[str], pictures: Thumbn
             "translation by {:.1f} mm": 1000.0 * evaluation.translation_error_m(posterior.pose.mean, truth, seen_m),
         }
     words = ", ".join(form.format(value) for form, value in facts.items() if np.isfinite(value))
-    open_words = "".join(f"<p>{escape(words)}.</p>" for words in left_open)
+    open_words = _mode_words(record.get("modes", [])) + "".join(
+        f"<p>{escape(words)}.</p>" for words in record.get("undetermined", [])
+    )
     verdict = edge.kind if edge.accepted else f"{edge.kind}, rejected"
     return (
         f"<div class='pair{'' if edge.accepted else ' no'}'><h3>{edge.source} → {edge.target}: {verdict}, "
