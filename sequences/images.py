@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import logging
 import os
 import re
 import warnings
@@ -40,7 +41,7 @@ def _open(path: Path | Packed, formats: tuple[str, ...]) -> Image.Image:
     """Return a picture fully decoded."""
     wanted = " or ".join(formats)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _unlogged():
             warnings.simplefilter("ignore")  # what is wrong with a picture is told below, in one line
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             source = io.BytesIO(path.content) if isinstance(path, Packed) else path
@@ -58,6 +59,18 @@ def _open(path: Path | Packed, formats: tuple[str, ...]) -> Image.Image:
         said = re.sub(r"<_io\.BytesIO[^>]*>", "it", " ".join(str(error).split()))
         why = said.replace(str(path), "the file") or type(error).__name__
         raise InputError(f"{path}: is not a readable {wanted} picture ({why}); replace it.") from None
+
+
+@contextlib.contextmanager
+def _unlogged() -> Iterator[None]:
+    """Keep Pillow from logging."""
+    logger = logging.getLogger("PIL")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 @contextlib.contextmanager
@@ -80,7 +93,7 @@ def picture_size(path: Path) -> tuple[int, int]:
         InputError: where the file is missing or no picture.
     """
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _unlogged():
             warnings.simplefilter("ignore")
             with Image.open(path, formats=("PNG", "TIFF")) as picture:
                 return picture.size

@@ -9,6 +9,7 @@ What fails is kept, with the traceback, in the folder that the message names.
 from __future__ import annotations
 
 import argparse
+import logging
 import resource
 import signal
 import subprocess
@@ -55,6 +56,7 @@ def main() -> int:
 def one(name: str, count: int, seed: int) -> int:
     """Fuzz one format; a crash of the process leaves the input where it is."""
     warnings.simplefilter("error")
+    logging.getLogger().addHandler(Loud())
     resource.setrlimit(resource.RLIMIT_AS, (MAX_BYTES, MAX_BYTES))
     signal.signal(signal.SIGALRM, _late)
     target, rng = TARGETS[name], np.random.default_rng([seed, list(TARGETS).index(name)])
@@ -89,6 +91,15 @@ def one(name: str, count: int, seed: int) -> int:
     )
     subprocess.run(["rm", "-r", str(folder)], check=True)
     return 0
+
+
+class Loud(logging.Handler):
+    """Takes whatever is logged for a failure: it would be a second line on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Fail."""
+        if record.levelno >= logging.WARNING:
+            raise AssertionError(f"logged: {record.getMessage()}")
 
 
 def _late(number: int, frame: FrameType | None) -> None:
