@@ -9,7 +9,7 @@ from modeler.priors import GeneralPrior
 from modeler.priors.general import GeneralMotion
 from modeler.rays import Sensor
 from modeler.registration.mixture import MixtureMotion
-from modeler.registration.modes import Place, separate, told
+from modeler.registration.modes import Place, separate, weighed
 from modeler.registration.search import Candidates, Search
 from modeler.registration.visibility import VisibilityRegistrar
 from modeler.types import Outcome
@@ -76,14 +76,14 @@ def test_a_blunt_candidate_joins_what_it_covers_and_is_no_place_itself():
     assert [len(place) for place in joined] == [3]
 
 
-def test_modes_are_told_only_where_there_are_several(rng):
+def test_places_are_weighed_and_those_of_no_weight_dropped(rng):
     here = turned(0.0) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
     there = turned(1.5) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
-    one = told([Place(here, 0.0), Place(there, -20.0)], np.zeros(3))
-    two = told([Place(here, 0.0), Place(there, np.log(3.0))], np.zeros(3))
-    assert one == ()
-    np.testing.assert_allclose([mode.weight for mode in two], [0.75, 0.25])
-    assert rotation_error_deg(two[0].pose.mean, turned(1.5)) < 1.0
+    one = weighed([Place(here, 0.0, 200.0, 0.1), Place(there, -20.0, 200.0, 0.1)])
+    two = weighed([Place(here, 0.0, 200.0, 0.1), Place(there, np.log(3.0), 200.0, 0.1)])
+    assert [share for share, _ in one] == [1.0]
+    np.testing.assert_allclose([share for share, _ in two], [0.75, 0.25])
+    assert rotation_error_deg(two[0][1].gaussian(np.zeros(3)).mean, turned(1.5)) < 1.0
 
 
 def mixture(rng):

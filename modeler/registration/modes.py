@@ -10,7 +10,7 @@ import numpy as np
 from modeler import se3
 from modeler.registration.posterior import weighted_gaussian
 from modeler.registration.search import Candidates, distances
-from modeler.types import Array, Mode
+from modeler.types import Array, PoseGaussian
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +21,14 @@ class Place:
     """(n, 4, 4) equally weighted."""
     log_mass: float
     """Log of the prior mass times likelihood, up to a constant that all places share."""
+    effective_samples: float
+    """Effective number of the samples."""
+    pareto_k: float
+    """Tail index of the weights with which they came about."""
+
+    def gaussian(self, centre_m: Array) -> PoseGaussian:
+        """Return the mean and covariance of the samples, taken about a point (3,) of the source."""
+        return weighted_gaussian(self.poses, np.ones(len(self.poses)), centre_m)
 
 
 def separate(found: Candidates, centre_m: Array, *, apart: float = 3.5) -> list[Candidates]:
@@ -40,23 +48,10 @@ def separate(found: Candidates, centre_m: Array, *, apart: float = 3.5) -> list[
     return [found.some(place == name) for name in np.unique(place[~found.blunt])]
 
 
-def shares(places: Sequence[Place]) -> Array:
-    """Return the share (m,) of the mass in each place."""
+def weighed(places: Sequence[Place], *, least: float = 0.02) -> list[tuple[float, Place]]:
+    """Return the places with their shares of the mass, heaviest first; without those that hold less than the least."""
     log_mass = np.array([place.log_mass for place in places])
     mass = np.exp(log_mass - log_mass.max())
-    return mass / mass.sum()
-
-
-def told(places: Sequence[Place], centre_m: Array, *, least: float = 0.02) -> tuple[Mode, ...]:
-    """Return the places with at least a share of the mass as modes, heaviest first; none where one holds it all."""
-    mass = shares(places)
+    mass /= mass.sum()
     kept = [number for number in np.argsort(-mass, kind="stable") if mass[number] >= least]
-    if len(kept) < 2:
-        return ()
-    return tuple(
-        Mode(
-            float(mass[number] / mass[kept].sum()),
-            weighted_gaussian(places[number].poses, np.ones(len(places[number].poses)), centre_m),
-        )
-        for number in kept
-    )
+    return [(float(mass[number] / mass[kept].sum()), places[number]) for number in kept]

@@ -6,16 +6,16 @@ from functools import partial
 
 import numpy as np
 
-from modeler.registration.annealing import AnnealedSampler, Population
+from modeler.registration.annealing import AnnealedSampler
 from modeler.registration.lookup import Lookup
 from modeler.registration.mixture import MixtureMotion
-from modeler.registration.modes import Place, separate, shares, told
+from modeler.registration.modes import Place, separate, weighed
 from modeler.registration.pair import Pair
 from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
 from modeler.registration.refinement import Refiner
 from modeler.registration.search import Candidates, Search
 from modeler.registration.surface import measured_share, spread_points
-from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import AbstractMotion, AbstractRegistrar, Mode, Outcome, PoseGaussian, Posterior, RayImage
 
 
 @dataclass(frozen=True)
@@ -83,24 +83,17 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return the posterior that one search finds."""
         source, target = pair.backward.image, pair.forward.image
         candidates = search.candidates(pair, motion, rng)
-        found = separate(candidates, pair.centre_m)[: self.max_places]
-        populations = [self._population(pair, motion, place, rng) for place in found]
-        places = [
-            Place(self._refined(pair, population.poses, motion, rng), population.log_evidence + bonus)
-            for population, bonus in populations
-        ]
-        mass = shares(places)
-        samples = np.concatenate([place.poses for place in places])
-        weights = np.repeat(mass / [len(place.poses) for place in places], [len(place.poses) for place in places])
-        pose = weighted_gaussian(samples, weights, pair.centre_m)
-        heaviest = int(np.argmax(mass))
-        main = populations[heaviest][0]
-        overlap = pair.overlap(weighted_gaussian(places[heaviest].poses, np.ones(len(main.poses)), pair.centre_m).mean)
-        at_limit = share_at_limit(motion, main.poses, pair.centre_m, rng)
-        at_limit = 1.0 if candidates.beyond > self.max_beyond else at_limit
-        effective = float(
-            1.0 / np.sum([m**2 / p.effective_samples for m, (p, _) in zip(mass, populations, strict=True)])
+        places = weighed(
+            [self._place(pair, motion, found, rng) for found in separate(candidates, pair.centre_m)[: self.max_places]]
         )
+        samples = np.concatenate([place.poses for _, place in places])
+        weights = np.concatenate([np.full(len(place.poses), share / len(place.poses)) for share, place in places])
+        pose = weighted_gaussian(samples, weights, pair.centre_m)
+        modes = tuple(Mode(share, place.gaussian(pair.centre_m)) for share, place in places)
+        overlap = pair.overlap(modes[0].pose.mean)
+        effective = 1.0 / sum(share**2 / place.effective_samples for share, place in places)
+        beyond = candidates.beyond > self.max_beyond
+        at_limit = 1.0 if beyond else share_at_limit(motion, places[0][1].poses, pair.centre_m, rng)
         return Posterior(
             source=source.index,
             target=target.index,
@@ -109,17 +102,16 @@ class VisibilityRegistrar(AbstractRegistrar):
             overlap=overlap,
             samples=samples,
             weights=weights,
-            modes=told(places, pair.centre_m),
+            modes=modes if len(modes) > 1 else (),
             effective_samples=effective,
-            pareto_k=main.pareto_k,
-            log_evidence=float(np.logaddexp.reduce([place.log_mass for place in places])),
+            pareto_k=max(place.pareto_k for _, place in places),
+            log_evidence=float(np.logaddexp.reduce([place.log_mass for _, place in places])),
         )
 
-    def _population(
-        self, pair: Pair, motion: AbstractMotion, candidates: Candidates, rng: np.random.Generator
-    ) -> tuple[Population, float]:
-        """Return samples of one place, and what to add to their evidence to compare it with other places'."""
-        noise_m = pair.surface_noise_m(candidates.poses[:1], self.search.blurs[-1] * pair.size_m)
+    def _place(self, pair: Pair, motion: AbstractMotion, candidates: Candidates, rng: np.random.Generator) -> Place:
+        """Return samples of one place, sharpened by matching surface but where that would leave what is possible."""
+        fine_m = self.search.blurs[-1] * pair.size_m
+        noise_m = pair.surface_noise_m(candidates.poses[:1], fine_m)
         likelihood = partial(pair.tempered, blur_m=noise_m, effective_points=self.effective_points)
         plain = likelihood(candidates.poses)
         volumes = np.log(np.diagonal(candidates.spreads, axis1=1, axis2=2)).sum(axis=1)
@@ -131,13 +123,15 @@ class VisibilityRegistrar(AbstractRegistrar):
             motion, candidates.poses, self.widening * candidates.spreads, log_weights, pair.centre_m
         )
         population = self.sampler.run(proposal, [lambda _: likelihood], pair.centre_m, rng)
-        return population, float(candidates.scores[0] - plain[0])
-
-    def _refined(self, pair: Pair, poses: Array, motion: AbstractMotion, rng: np.random.Generator) -> Array:
-        """Return samples sharpened by matching surface, but for those that would leave what is possible."""
-        refined = self.refiner.refine(pair, poses, rng, fine_m=self.search.blurs[-1] * pair.size_m)
+        refined = self.refiner.refine(pair, population.poses, rng, fine_m=fine_m)
         inside = np.isfinite(motion.log_evidence(refined))
-        return np.where(inside[:, None, None], refined, poses)
+        return Place(
+            np.where(inside[:, None, None], refined, population.poses),
+            # Beside other places the points count as independently as the search has them.
+            population.log_evidence + float(candidates.scores[0] - plain[0]),
+            population.effective_samples,
+            population.pareto_k,
+        )
 
     def pair(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> Pair:
         """Return the comparison of two views, at points drawn with `rng`."""
