@@ -322,3 +322,17 @@ def test_after_lost_frames_the_previous_view_is_believed_only_near_where_the_mot
     run.run(Closer(), spoil)
     assert run.tried[11][0] == 6
     assert not any(edge.accepted for edge in run.judged[11])
+
+
+def test_a_view_seen_from_far_round_places_a_frame_only_with_a_witness() -> None:
+    run = Run([*(20.0 * np.arange(9)), *[0.0] * 6, 300.0, 320.0])
+
+    def spoil(posterior: Posterior) -> Posterior:
+        apart_deg = np.degrees(se3.rotation_angle(posterior.pose.mean))
+        failed = posterior.source in range(9, 15) or apart_deg > 65.0
+        return replace(posterior, outcome=Outcome.NO_OVERLAP) if failed else posterior
+
+    run.run(Closer(), spoil)
+    assert not any(edge.accepted for edge in run.judged[15])  # 60° from the first view, and no other in reach
+    assert any(edge.accepted for edge in run.judged[16])
+    np.testing.assert_allclose(run.solution.trajectory[16], run.truth[16], atol=0.02)

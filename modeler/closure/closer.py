@@ -127,8 +127,9 @@ class Closer:
     ) -> tuple[Posterior | None, str]:
         """Return the posterior that places a frame, and why: the previous view's, or else another's.
 
-        Another view's places the frame where the motion going on would, roughly, have taken it; with a witness farther
-        away, the more frames were lost. After lost frames the previous view is believed as far as that.
+        Another view's places the frame where the motion going on would, roughly, have taken it, if the turn between the
+        two is not too large; with a witness also beyond, the farther the more frames were lost. After lost frames the
+        previous view is believed as far as that.
 
         Args:
             posteriors: registrations of the frame, the previous view first.
@@ -151,7 +152,9 @@ class Closer:
         for posterior in standing:
             reason = f"joins in place of the failed previous view: overlap {posterior.overlap:.2f}"
             off_deg = self._off_deg(posterior, expected, solution)
-            if off_deg <= self.max_angle_deg:
+            # Near the end of what views can be registered across, one alone may be cut off there.
+            turned_deg = float(np.degrees(se3.rotation_angle(posterior.pose.mean)))
+            if max(off_deg, turned_deg) <= self.max_angle_deg:
                 return posterior, f"{reason}, {off_deg:.0f}° from the motion going on"
             reach = ways(known, posterior.target)
             for witness in standing if off_deg <= reach_deg else ():
