@@ -17,8 +17,10 @@ from sequences import bundled, open_sequence
 def bundled_pair(name):
     """The first two frames of a bundled sequence compared, and the true motion from 1 to 0."""
     sequence = open_sequence(bundled(name))
-    truth = sequence.truth()
-    target, source = (Sensor(*sequence.sensor()).ray_image(sequence.frame(index)) for index in (0, 1))
+    truth, noise = sequence.truth(), sequence.sensor()
+    assert truth is not None
+    assert noise is not None
+    target, source = (Sensor(*noise).ray_image(sequence.frame(index)) for index in (0, 1))
     pair = VisibilityRegistrar().pair(source, target, np.random.default_rng(0))
     return pair, true_motion(truth, target=0, source=1), source.centroid_m
 

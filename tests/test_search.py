@@ -19,9 +19,12 @@ from sequences import bundled, open_sequence
 def views(name, source, target):
     """Two frames of a bundled sequence made ready, and the true motion."""
     sequence = open_sequence(bundled(name))
-    sensor = Sensor(*sequence.sensor())
+    truth, noise = sequence.truth(), sequence.sensor()
+    assert truth is not None
+    assert noise is not None
+    sensor = Sensor(*noise)
     made = [sensor.ray_image(sequence.frame(index)) for index in (source, target)]
-    return *made, true_motion(sequence.truth(), target=target, source=source)
+    return *made, true_motion(truth, target=target, source=source)
 
 
 def candidates(poses, sigmas, scores, blunt=None):
