@@ -260,7 +260,9 @@ def test_a_frame_that_the_previous_view_does_not_place_is_found_from_another() -
     steps = run(FRAMES[:5], registrar=registrar)
     assert [step.outcome for step in steps] == [ACCEPTED] * 5
     assert steps[3].posteriors[0].target == 2
-    assert [edge.accepted for edge in steps[3].edges] == [False, True]
+    refused, *placing = [edge.accepted for edge in steps[3].edges]
+    assert not refused
+    assert placing == [True, True]  # from far round, one view alone is not taken at its word
     assert trajectory_error(steps[-1]) < 1e-6
 
 
