@@ -154,3 +154,8 @@ def test_graph_file_holds_the_mode_that_was_chosen() -> None:
         line for line in text.splitlines() if line.startswith(f"EDGE_SE3:QUAT {several.target} {several.source}")
     ]
     np.testing.assert_allclose(np.array(line.split()[3:6], dtype=np.float64), true.mean[:3, 3])
+
+
+def test_a_posterior_that_is_not_finite_leaves_nothing_to_name():
+    broken = Posterior(0, 1, PoseGaussian(np.eye(4), np.full((6, 6), np.nan)), Outcome.DEGENERATE, 0.0)
+    assert undetermined(broken) == []

@@ -31,6 +31,7 @@ class Console:
         self._bar = bar()
         self._task = self._bar.add_task("", total=frames)
         self._address = address
+        self._seen: set[int] = set()  # a lost frame that later views place comes a second time
 
     def __enter__(self) -> Console:
         """Show the bar."""
@@ -48,7 +49,9 @@ class Console:
     def __call__(self, step: Step) -> None:
         """Tell of a step."""
         loops = sum(edge.kind == "closure" and edge.accepted for edge in step.edges_so_far)
-        self._bar.update(self._task, advance=1, description=f"{len(step.views)} joined, {loops} loops closed")
+        self._seen.add(step.frame.index)
+        description = f"{len(step.views)} joined, {loops} loops closed"
+        self._bar.update(self._task, completed=len(self._seen), description=description)
         if step.outcome != "accepted":
             self._say(f"frame {step.frame.index} is left out: {step.outcome}")
 

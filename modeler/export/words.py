@@ -16,7 +16,7 @@ _LONG = 1.5  # how many times longer than wide an object is said to have an axis
 
 
 def undetermined(posterior: Posterior, view: RayImage | None = None) -> list[str]:
-    """Name the directions of a motion that the data do not determine, the freest first; empty where they all are.
+    """Name the directions of a motion that the data do not determine, the freest first; none where all are.
 
     Of a posterior with several modes the heaviest is meant, and where the others lie is named after.
 
@@ -26,6 +26,8 @@ def undetermined(posterior: Posterior, view: RayImage | None = None) -> list[str
     """
     modes = posterior.modes if len(posterior.modes) > 1 else ()
     pose = modes[0].pose if modes else posterior.pose
+    if not np.isfinite(pose.covariance).all():
+        return []
     return [*_free(pose, view), *_elsewhere(posterior, view)]
 
 
