@@ -48,7 +48,7 @@ def paper_density(point_b, a_from_b, ranges_m, intrinsics, noise):
 
 def visibility(pose, points, cells, intrinsics, model, hidden):
     """Log-likelihood of one pose and number of explained points: every point in turn, as `kernels.visibility` says."""
-    blur, silhouette_px, dead_px, clearance_m, low, high, worst, bend, unmeasured = model
+    blur, silhouette_px, dead_px, clearance_m, low, high, worst, bend, unmeasured, typical = model
     fx, fy, cx, cy = intrinsics
     total, explained = 0.0, 0.0
     for point in points:
@@ -73,7 +73,7 @@ def visibility(pose, points, cells, intrinsics, model, hidden):
         in_front = plane @ position + cell[planes.DISTANCE]
         agreement = normal @ plane
         square = in_front**2 / (point[6] + cell[planes.VARIANCE] + blur**2)
-        match = 0.5 - 0.5 * square - bend * (1 - agreement)
+        match = typical - 0.5 * square - bend * (1 - agreement)
         explained += faces * (0.5 * square < 4.5 and agreement > 0.8)
         seen = np.log((1 - hidden) * np.exp(max(match, -700)) + hidden)
         if in_front > 0 and match < np.log(hidden):

@@ -89,7 +89,7 @@ def random_cells(rng):
 
 
 IMAGE = np.array([*INTRINSICS, SHAPE[1], SHAPE[0]])
-MODEL = np.array([0.004, 1.5, 1.5, 0.006, 0.1, 0.35, 10.0, 2.0, -1.2])
+MODEL = np.array([0.004, 1.5, 1.5, 0.006, 0.1, 0.35, 10.0, 2.0, -1.2, 0.4])
 HIDDEN = 0.3
 
 

@@ -11,8 +11,8 @@ MIN_AGREEMENT = 0.8
 MAX_SIGMAS = 3.0
 """A point farther from the surface than so many standard deviations does not match it."""
 
-# Columns of `matches`: carried position, its own normal, the normal of the surface, distance from it, weight.
-POSITION, OWN, OTHER, RESIDUAL, WEIGHT = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10
+# Columns of `matches`: carried position, its own normal, the normal of the surface, distance from it, weight, facing.
+POSITION, OWN, OTHER, RESIDUAL, WEIGHT, FACING = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11
 # Columns of `normal_equations`: gradient, upper triangle of the matrix.
 GRADIENT, MATRIX = slice(0, 6), slice(6, 27)
 
@@ -47,12 +47,12 @@ def matches(pose, points, cells, intrinsics, facing, surface_m):
         surface_m: noise of the surfaces in m beyond that of points and planes.
 
     Returns:
-        (n, 11): position in m, own normal and normal of the surface there, all in the other camera's frame; distance
-        in m in front of that surface; weight in 1/m², 0 where nothing matches.
+        (n, 12): position in m, own normal and normal of the surface there, all in the other camera's frame; distance
+        in m in front of that surface; weight in 1/m², 0 where nothing matches; how much it faces the camera (0..1).
     """
     carried, pixels = np.empty((7, points.shape[1])), np.empty(points.shape[1], dtype=np.int32)
     carry(pose, points, intrinsics, facing, carried, pixels)
-    found = np.zeros((points.shape[1], 11))
+    found = np.zeros((points.shape[1], 12))
     for j in range(points.shape[1]):
         residual, weight = match(points, carried, pixels, cells, surface_m * surface_m, j)
         for k in range(3):
@@ -60,7 +60,7 @@ def matches(pose, points, cells, intrinsics, facing, surface_m):
         if weight > 0.0:
             for k in range(3):
                 found[j, 6 + k] = cells[pixels[j], NORMAL_X + k]
-            found[j, RESIDUAL], found[j, WEIGHT] = residual, weight
+            found[j, RESIDUAL], found[j, WEIGHT], found[j, FACING] = residual, weight, carried[FACES, j]
     return found
 
 

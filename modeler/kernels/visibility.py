@@ -98,7 +98,7 @@ def height_over(cell, carried, j):
 @numba.njit(cache=True, error_model="numpy")
 def score(points, carried, pixels, cells, model, table):
     """Return the log-likelihood of carried points, and how many are explained; arguments as for `log_likelihoods`."""
-    blur_m, silhouette_px, dead_px, clearance_m, _, _, worst, bend, unmeasured = model
+    blur_m, silhouette_px, dead_px, clearance_m, _, _, worst, bend, unmeasured, typical = model
     blur, log_hidden = blur_m * blur_m, table[0]
     per_step = TABLE_STEPS / (TABLE_HIGH - TABLE_LOW)
     total, explained = 0.0, 0.0
@@ -119,7 +119,7 @@ def score(points, carried, pixels, cells, model, table):
                     + carried[FACING_Y, j] * cell[NORMAL_Y]
                     + carried[FACING_Z, j] * cell[NORMAL_Z]
                 )
-                match = 0.5 - half_square - bend * (1.0 - agreement)
+                match = typical - half_square - bend * (1.0 - agreement)
                 if half_square < EXPLAINED_HALF_SQUARE and agreement > EXPLAINED_AGREEMENT:
                     explained += faces
                 if in_front > 0.0 and match < log_hidden:
@@ -145,9 +145,8 @@ def log_likelihoods(poses, points, cells, intrinsics, model, table):
 
     A point that faces the other camera should lie on the surface measured there, but for a share that something
     hides or the camera missed; one that faces away should lie behind it; none may lie where the camera saw
-    nothing. Scores are normalised so that on smooth surface, which goes on as anyone would guess, a point that
-    matches within its noise and a hidden one both count 0 on average: turning it out of sight neither pays nor
-    costs.
+    nothing. A point that matches as well as is typical and a hidden one both count 0 on average: turning it out of
+    sight neither pays nor costs.
 
     The table's interpolation errs by less than 4e-6 a point.
 
@@ -156,10 +155,10 @@ def log_likelihoods(poses, points, cells, intrinsics, model, table):
         points: (7, n) position in m, unit normal, variance along the normal in m².
         cells: (h · w, 8) of the other view, see `planes`.
         intrinsics: (6,) fx, fy, cx, cy, width and height in px of the other view.
-        model: (9,) extra noise of the surfaces in m; standard deviation and dead zone of the silhouette in px;
+        model: (10,) extra noise of the surfaces in m; standard deviation and dead zone of the silhouette in px;
             clearance in m from which a background is behind; the cosines at which a point begins to face the camera
             and fully does; most that one point may cost; weight of a disagreement of normals; gain (negative) of a
-            point that should be seen where nothing was measured.
+            point that should be seen where nothing was measured; what a typical match loses to its misfit.
         table: of `match_table` for the share of hidden points.
 
     Returns:

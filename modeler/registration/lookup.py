@@ -30,10 +30,14 @@ class Lookup:
     measured_share: float
     """Share of pixels around the surface that carry a measurement."""
 
-    def log_likelihoods(self, poses: Array, blur_m: float, *, stride: int) -> Array:
-        """Return log-likelihood and number of explained points (m, 2) of poses (m, 12) over every `stride`-th point."""
+    def log_likelihoods(self, poses: Array, blur_m: float, *, stride: int, typical: float) -> Array:
+        """Return log-likelihood and number of explained points (m, 2) of poses (m, 12) over every `stride`-th point.
+
+        Typical is what a good match loses to its misfit (nats), see `misfits`.
+        """
         columns, table = self._columns(stride), kernel.match_table(self.hidden_share)
-        return kernel.log_likelihoods(poses, columns, self._cells, self._intrinsics, self._model(blur_m), table)
+        model = self._model(blur_m, typical)
+        return kernel.log_likelihoods(poses, columns, self._cells, self._intrinsics, model, table)
 
     def verdicts(self, pose: Array) -> np.ndarray:
         """Return the verdict (n,) of `kernels.visibility` on each point under one pose (12,)."""
@@ -42,6 +46,15 @@ class Lookup:
     def matched_residuals(self, pose: Array, blur_m: float) -> Array:
         """Return squared distances (k,) in m² of matching points beyond their own variance, under one pose (12,)."""
         return kernel.matched_residuals(pose, self._columns(), self._cells, self._intrinsics, self._model(blur_m))
+
+    def misfits(self, pose: Array, blur_m: float) -> Array:
+        """Return what each match under one pose (12,) loses to distance and normals (nats), (k,)."""
+        surface_m = float(np.hypot(blur_m, self.surface_m))
+        found = self.matches(pose, surface_m)
+        found = found[found[:, matching.WEIGHT] > 0.0]
+        variance = found[:, matching.FACING] / found[:, matching.WEIGHT]
+        agreement = np.sum(found[:, matching.OWN] * found[:, matching.OTHER], axis=1)
+        return 0.5 * found[:, matching.RESIDUAL] ** 2 / variance + self.bend * (1.0 - agreement)
 
     def matches(self, pose: Array, surface_m: float) -> Array:
         """Return what each point finds under one pose (12,): `kernels.matching.matches`."""
@@ -65,8 +78,8 @@ class Lookup:
         camera = self.image.frame.camera
         return np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
 
-    def _model(self, blur_m: float) -> Array:
-        """Return the parameters (9,) of the kernel."""
+    def _model(self, blur_m: float, typical: float = 0.5) -> Array:
+        """Return the parameters (10,) of the kernel."""
         camera = self.image.frame.camera
         lateral_px = max(self.image.sigma_wh * camera.fx, 1.0)
         blur_px = blur_m * camera.fx / max(float(np.median(self.points[:, 2])), 1e-3)
@@ -80,5 +93,6 @@ class Lookup:
                 self.worst,
                 self.bend,
                 np.log(max(self.hidden_share, 1.0 - self.measured_share)),
+                typical,
             ]
         )

@@ -41,27 +41,55 @@ class Pair:
         """Number of points of both views."""
         return len(self.forward.points) + len(self.backward.points)
 
-    def log_likelihoods(self, poses: Array, blur_m: float, *, stride: int = 1) -> tuple[Array, Array]:
+    def log_likelihoods(
+        self, poses: Array, blur_m: float, *, stride: int = 1, typical: float = 0.5
+    ) -> tuple[Array, Array]:
         """Return the log-likelihoods (n,), not tempered, and the shares (n,) of points that matching surface explains.
 
         Args:
             poses: (n, 4, 4) target_from_source.
             blur_m: blur of the surfaces in m.
             stride: every so manieth point stands for the others.
+            typical: what a good match loses to its misfit (nats), see `typical_misfit`.
         """
-        found = self.forward.log_likelihoods(rows(poses), blur_m, stride=stride)
-        found = stride * (found + self.backward.log_likelihoods(rows(se3.inverse(poses)), blur_m, stride=stride))
+        found = self.forward.log_likelihoods(rows(poses), blur_m, stride=stride, typical=typical)
+        back = rows(se3.inverse(poses))
+        found = stride * (found + self.backward.log_likelihoods(back, blur_m, stride=stride, typical=typical))
         return found[:, kernel.LOG_LIKELIHOOD], found[:, kernel.EXPLAINED] / self.points
 
-    def tempered(self, poses: Array, blur_m: float, *, effective_points: float, stride: int = 2) -> Array:
+    def tempered(
+        self, poses: Array, blur_m: float, *, effective_points: float, stride: int = 2, typical: float = 0.5
+    ) -> Array:
         """Return the log-likelihoods (n,) of poses (n, 4, 4) as if so many points were independent, and overlap.
 
         Two views that are to be registered have surface in common. A likelihood does not know: poses that hide every
         point contradict nothing, and are many. Those under which next to nothing matches are all but excluded; between
         others, with more or less in common, the likelihood alone decides.
         """
-        plain, share = self.log_likelihoods(poses, blur_m, stride=stride)
+        plain, share = self.log_likelihoods(poses, blur_m, stride=stride, typical=typical)
         return effective_points / self.points * plain - self.no_overlap * np.exp(-share / self.little_overlap)
+
+    def typical_misfit(self, pose: Array, blur_m: float) -> float:
+        """Return what matches under a good pose (4, 4) lose to their misfit (nats), so that they count 0 on average.
+
+        The noise that points and planes are said to have is not what it is, and overstated it would pay for every
+        match: the spin of a can would lean to where most of its surface is in common.
+        """
+        misfits = np.concatenate(
+            [
+                self.forward.misfits(rows(pose[None])[0], blur_m),
+                self.backward.misfits(rows(se3.inverse(pose)[None])[0], blur_m),
+            ]
+        )
+        if len(misfits) < 20:
+            return 0.5
+        hidden = self.forward.hidden_share
+        low, high = 0.0, 2.0
+        for _ in range(30):  # the mean grows with what is taken for typical
+            middle = 0.5 * (low + high)
+            mean = np.mean(np.log((1.0 - hidden) * np.exp(middle - misfits) + hidden))
+            low, high = (middle, high) if mean < 0.0 else (low, middle)
+        return 0.5 * (low + high)
 
     def normal_equations(self, poses: Array, surface_m: float, *, stride: int = 1) -> tuple[Array, Array]:
         """Return gradients (n, 6) and matrices (n, 6, 6) of matching surface for ξ of poses (n, 4, 4) about the centre.

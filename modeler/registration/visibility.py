@@ -112,7 +112,12 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return samples of one place, sharpened by matching surface but where that would leave what is possible."""
         fine_m = self.search.blurs[-1] * pair.size_m
         noise_m = pair.surface_noise_m(candidates.poses[:1], fine_m)
-        likelihood = partial(pair.tempered, blur_m=noise_m, effective_points=self.effective_points)
+        likelihood = partial(
+            pair.tempered,
+            blur_m=noise_m,
+            effective_points=self.effective_points,
+            typical=pair.typical_misfit(candidates.poses[0], noise_m),
+        )
         plain = likelihood(candidates.poses)
         volumes = np.log(np.diagonal(candidates.spreads, axis1=1, axis2=2)).sum(axis=1)
         log_weights = np.where(candidates.blunt, candidates.scores, plain + volumes)
