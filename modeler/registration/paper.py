@@ -1,6 +1,7 @@
 """The method of Wüthrich et al. (ICRA 2012) as published: importance sampling from the prior."""
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,8 +9,13 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import paper as kernel
 from modeler.registration.annealing import effective_samples, pareto_tail
-from modeler.registration.posterior import failed, intrinsics, rows, weighted_gaussian
+from modeler.registration.free_space import Draws, FreeSpace, Measured
+from modeler.registration.posterior import failed, intrinsics, matrices, rows, weighted_gaussian
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, Posterior, RayImage
+
+_SAMPLES, _EVEN_SAMPLES = 1_000_000, 10_000_000
+_DRAWN = 1 << 22  # motions of an even spread at a time: one byte each
+_PILOT = 4096  # motions that show which points forbid most
 
 
 @dataclass(frozen=True)
@@ -20,10 +26,10 @@ class PaperRegistrar(AbstractRegistrar):
     few samples, and on round objects the likelihood prefers poses that hide points; `visibility` mends both.
     """
 
-    samples: int = 200_000
-    """Motions drawn from the prior."""
+    samples: int | None = None
+    """Motions drawn from the prior; None = 10⁷ where it is an even spread, 10⁶ of another, which are slower to draw."""
     batch: int = 50_000
-    """Motions drawn and weighted at a time."""
+    """Motions that the prior itself draws at a time; an even spread is drawn without it."""
     points: int = 60
     """Surface points taken from each view."""
     reach_sigmas: float = 4.0
@@ -40,15 +46,13 @@ class PaperRegistrar(AbstractRegistrar):
         started = time.perf_counter()
         if min(len(source.points_m), len(target.points_m)) < 10:
             return failed(source, target, Outcome.TOO_FEW_POINTS)
-        thinned = measured_points(source, self.points, rng), measured_points(target, self.points, rng)
-        ranges = ranges_m(source), ranges_m(target)
+        views = measured(source, self.points, rng), measured(target, self.points, rng)
         kept_poses, kept_weights, drawn = [], [], 0
-        while drawn < self.samples:
-            poses = motion.sample(min(self.batch, self.samples - drawn), rng)
-            drawn += len(poses)
-            log_weights = self.log_weights(poses, (source, target), points=thinned, ranges=ranges)
+        for tried, passing in self._passing(views, motion, rng):
+            drawn += tried
+            log_weights = self.log_weights(passing, views)
             alive = np.isfinite(log_weights)
-            kept_poses.append(poses[alive])
+            kept_poses.append(matrices(passing[alive]))
             kept_weights.append(log_weights[alive])
         poses, log_weights = np.concatenate(kept_poses), np.concatenate(kept_weights)
         if len(poses) == 0:
@@ -69,34 +73,39 @@ class PaperRegistrar(AbstractRegistrar):
             seconds=time.perf_counter() - started,
         )
 
-    def log_weights(
-        self,
-        target_from_source: Array,
-        views: tuple[RayImage, RayImage],
-        *,
-        points: tuple[Array, Array],
-        ranges: tuple[Array, Array],
-    ) -> Array:
-        """Return log w_l (n,), up to a constant, of motions; -inf = rejected.
-
-        Args:
-            target_from_source: (n, 4, 4).
-            views: source and target.
-            points: their surface points (n, 3) in m.
-            ranges: their range images (h, w) in m.
-        """
+    def log_weights(self, poses: Array, views: tuple[Measured, Measured]) -> Array:
+        """Return log w_l (n,), up to a constant, of poses (n, 12) between source and target; -inf = rejected."""
         options = np.array([self.reach_sigmas, self.reject_below])
         source, target = views
-        forward = kernel.log_likelihoods(
-            rows(target_from_source), points[0], ranges[1], intrinsics(target), noise(target), options
+        total = kernel.log_likelihoods(
+            poses, source.points_m, target.ranges_m, target.intrinsics, target.noise, options
         )
-        alive = np.isfinite(forward)
+        alive = np.isfinite(total)
         if alive.any():
-            backward = rows(se3.inverse(target_from_source[alive]))
-            forward[alive] += kernel.log_likelihoods(
-                backward, points[1], ranges[0], intrinsics(source), noise(source), options
+            backward = rows(se3.inverse(matrices(poses[alive])))
+            total[alive] += kernel.log_likelihoods(
+                backward, target.points_m, source.ranges_m, source.intrinsics, source.noise, options
             )
-        return forward
+        return total
+
+    def _passing(
+        self, views: tuple[Measured, Measured], motion: AbstractMotion, rng: np.random.Generator
+    ) -> Iterator[tuple[int, Array]]:
+        """Yield, batch by batch, how many motions were drawn and those (n, 12) that may have a likelihood."""
+        free = FreeSpace.of(*views, self.reach_sigmas, self.reject_below)
+        draws = Draws.of(motion.even_spread(), rng)
+        samples = self.samples or (_SAMPLES if draws is None else _EVEN_SAMPLES)
+        if draws is None:
+            for first in range(0, samples, self.batch):
+                poses = rows(motion.sample(min(self.batch, samples - first), rng))
+                if first == 0:
+                    free = free.ordered(poses[:_PILOT])
+                yield len(poses), poses[free.passes(poses)]
+        else:
+            free = free.ordered(draws.poses(0, min(_PILOT, samples)))
+            for first in range(0, samples, _DRAWN):
+                count = min(_DRAWN, samples - first)
+                yield count, free.passing(draws, first, count)
 
 
 def noise(view: RayImage) -> Array:
@@ -108,6 +117,11 @@ def ranges_m(view: RayImage) -> Array:
     """Return the range r (h, w) of every pixel in m, object and background alike; 0 = no measurement."""
     w, h = view.frame.camera.rays()
     return np.nan_to_num(view.frame.depth_m.astype(np.float64), nan=0.0) * np.sqrt(1.0 + w**2 + h**2)
+
+
+def measured(view: RayImage, count: int, rng: np.random.Generator) -> Measured:
+    """Return what the likelihood takes of a view, with up to `count` of its points."""
+    return Measured(measured_points(view, count, rng), ranges_m(view), intrinsics(view), noise(view))
 
 
 def measured_points(view: RayImage, count: int, rng: np.random.Generator) -> Array:

@@ -72,6 +72,13 @@ class Search:
     reach: float = 0.5
     """Of candidates nearer to each other than so many standard deviations one is kept."""
 
+    walkers: int = 3
+    """From so many of the best the ridges are walked."""
+    stride: float = 2.0
+    """Length of a walker's stride in standard deviations."""
+    max_strides: int = 10
+    """A walker takes at most so many."""
+
     def thorough(self) -> Search:
         """Return a search that looks four times as hard."""
         return replace(self, max_starts=4 * self.max_starts, starts_per_basin=4 * self.starts_per_basin)
@@ -102,6 +109,9 @@ class Search:
         sharp = self._ranked(pair, motion, poses, prior, fine_m)
         if not len(sharp):
             sharp = self._ranked(pair, motion, motion.sample(starts, rng), prior, fine_m)
+        sharp = self._ranked(
+            pair, motion, np.concatenate([sharp.poses, self._walked(pair, sharp, prior)]), prior, fine_m
+        )
         return Candidates(
             np.concatenate([sharp.poses, blunt.poses]),
             np.concatenate([sharp.scores, blunt.scores]),
@@ -110,12 +120,43 @@ class Search:
             beyond=float(self.scores(pair, poses, fine_m).max() - sharp.scores[0]),
         )
 
+    def _walked(self, pair: Pair, found: Candidates, prior: PoseGaussian) -> Array:
+        """Return poses (n, 4, 4) along the ridges through the best candidates.
+
+        Downhill from anywhere on the ridge of a can's spin, the noise of normals leads to the same few points of it.
+        From the best of them the way goes out both ways along the least determined direction, and down only across it.
+        """
+        best = found.some(np.arange(min(self.walkers, len(found))))
+        scaled = best.spreads / self._basin(pair.size_m)[:, None]
+        axes = np.linalg.eigh(scaled.transpose(0, 2, 1) @ scaled)[1][:, :, -1:]  # in units of each one's own spread
+        poses, spreads, axes = (np.concatenate([part, part]) for part in (best.poses, best.spreads, axes))
+        stride = self.stride * np.repeat([1.0, -1.0], len(best))
+        floor, fine_m = found.scores[0] - self.negligible, self.blurs[-1] * pair.size_m
+        centre, visited = se3.translation(pair.centre_m), [poses[:0]]
+        for _ in range(self.max_strides):
+            out = (spreads @ axes)[:, :, 0] * stride[:, None]
+            poses = poses @ centre @ se3.exp(out) @ se3.inverse(centre)
+            for _ in range(2):
+                step = np.linalg.solve(spreads, self._step(pair, poses, prior, fine_m)[:, :, None])
+                across = (spreads @ (step - axes * (axes.transpose(0, 2, 1) @ step)))[:, :, 0]
+                poses = poses @ centre @ se3.exp(across) @ se3.inverse(centre)
+            good = self.scores(pair, poses, fine_m) > floor
+            if not good.any():
+                break
+            poses, spreads, axes, stride = poses[good], spreads[good], axes[good], stride[good]
+            visited.append(poses)
+        return np.concatenate(visited)
+
     def _starts(self, prior: PoseGaussian, size_m: float) -> int:
         """Return how many starts a prior is worth."""
-        basin = np.repeat([np.deg2rad(self.basin_deg), self.basin * size_m], 3)
+        basin = self._basin(size_m)
         variances = np.linalg.eigvalsh(prior.covariance / np.outer(basin, basin))
         basins = np.sqrt(np.prod(np.maximum(variances, 1.0)))
         return int(np.clip(self.starts_per_basin * basins, self.min_starts, self.max_starts))
+
+    def _basin(self, size_m: float) -> Array:
+        """Return the standard deviations (6,) of a basin."""
+        return np.repeat([np.deg2rad(self.basin_deg), self.basin * size_m], 3)
 
     def _ranked(
         self, pair: Pair, motion: AbstractMotion, poses: Array, prior: PoseGaussian, blur_m: float
@@ -137,7 +178,12 @@ class Search:
         return pair.tempered(poses, blur_m, effective_points=self.effective_points)
 
     def _stepped(self, pair: Pair, poses: Array, prior: PoseGaussian, blur_m: float) -> Array:
-        """Return motions one damped Gauss-Newton step further down, held by what the prior says of them."""
+        """Return motions one step further down."""
+        centre = se3.translation(pair.centre_m)
+        return poses @ centre @ se3.exp(self._step(pair, poses, prior, blur_m)) @ se3.inverse(centre)
+
+    def _step(self, pair: Pair, poses: Array, prior: PoseGaussian, blur_m: float) -> Array:
+        """Return the damped Gauss-Newton steps ξ (n, 6) of motions, held by what the prior says of them."""
         gradient, matrix = pair.normal_equations(poses, blur_m, stride=4)
         centre = se3.translation(pair.centre_m)
         away = se3.log(se3.inverse(prior.mean) @ poses @ centre)
@@ -147,8 +193,7 @@ class Search:
         held = matrix + hold + 0.01 * count * damping
         step = np.linalg.solve(held, (gradient - away @ hold)[:, :, None])[:, :, 0]
         angle = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
-        step *= np.minimum(1.0, self.max_step_rad / np.maximum(angle, 1e-12))
-        return poses @ centre @ se3.exp(step) @ se3.inverse(centre)
+        return step * np.minimum(1.0, self.max_step_rad / np.maximum(angle, 1e-12))
 
     def _distinct(self, found: Candidates, centre_m: Array) -> Candidates:
         """Return one of each group of candidates that lie within each other's reach."""
