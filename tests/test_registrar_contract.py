@@ -26,7 +26,7 @@ CLOUD_METHODS: list[AbstractRegistrar] = [
 ]
 IMAGE_METHODS: list[AbstractRegistrar] = [
     registration.VisibilityRegistrar(),
-    registration.PaperRegistrar(samples=50_000, points=25),
+    registration.PaperRegistrar(samples=500_000, points=25),
 ]
 METHODS = CLOUD_METHODS + IMAGE_METHODS
 

@@ -121,8 +121,11 @@ def point_density(point_b, pose, ranges_m, intrinsics, noise, reach_sigmas):
             if exponent > limit:
                 continue
             behind = v_w * dw + v_h * dh + v_r * (r - ranges_m[row, column])
-            # erfc keeps its digits where 1 + erf would cancel.
-            total += math.exp(-exponent) * math.erfc(-behind)
+            if behind > 6.0:
+                total += 2.0 * math.exp(-exponent)  # 2 - erfc(6) is 2 in double precision
+            elif behind > -27.3:
+                # erfc keeps its digits where 1 + erf would cancel; from 27.3 on it is 0 in double precision.
+                total += math.exp(-exponent) * math.erfc(-behind)
     return k2 * total
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.types import AbstractMotion, AbstractPrior, Array, RayImage
+from modeler.types import AbstractMotion, AbstractPrior, Array, EvenSpread, RayImage
 
 _WIDEST_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of what was seen of it
 
@@ -51,6 +51,16 @@ class GeneralMotion(AbstractMotion):
         motion[:, :3, :3] = motion[:, :3, :3] @ self.middle
         motion[:, :3, 3] = self.target_centroid_m + offset_m - motion[:, :3, :3] @ self.source_centroid_m
         return motion
+
+    def even_spread(self) -> EvenSpread:
+        """Return the limits of rotation and offset."""
+        return EvenSpread(
+            self.source_centroid_m,
+            self.target_centroid_m,
+            self.middle,
+            self.max_rotation_rad,
+            self.max_offset_m,
+        )
 
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of motions (n, 4, 4); -inf outside."""

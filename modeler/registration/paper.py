@@ -13,7 +13,7 @@ from modeler.registration.free_space import Draws, FreeSpace, Measured
 from modeler.registration.posterior import failed, intrinsics, matrices, rows, weighted_gaussian
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, Posterior, RayImage
 
-_SAMPLES, _EVEN_SAMPLES = 1_000_000, 10_000_000
+_SAMPLES, _EVEN_SAMPLES = 200_000, 2_000_000
 _DRAWN = 1 << 22  # motions of an even spread at a time: one byte each
 _PILOT = 4096  # motions that show which points forbid most
 
@@ -27,7 +27,7 @@ class PaperRegistrar(AbstractRegistrar):
     """
 
     samples: int | None = None
-    """Motions drawn from the prior; None = 10⁷ where it is an even spread, 10⁶ of another, which are slower to draw."""
+    """Motions drawn from the prior; None = 2·10⁶ of an even spread, 2·10⁵ of another, which takes longer to draw."""
     batch: int = 50_000
     """Motions that the prior itself draws at a time; an even spread is drawn without it."""
     points: int = 60
