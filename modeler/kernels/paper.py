@@ -49,6 +49,31 @@ def inverse_3(matrix):
 
 
 @numba.njit(cache=True)
+def spread(first, second, third, noise):
+    """Return J L Jᵀ + L with J = first · second · third, all (3, 3); loops, as a library's product takes far longer."""
+    half, jacobian = np.zeros((3, 3)), np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                half[i, j] += first[i, k] * second[k, j]
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                jacobian[i, j] += half[i, k] * third[k, j]
+    for i in range(3):
+        for j in range(3):
+            half[i, j] = 0.0
+            for k in range(3):
+                half[i, j] += jacobian[i, k] * noise[k, j]
+    result = noise.copy()
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                result[i, j] += half[i, k] * jacobian[j, k]
+    return result
+
+
+@numba.njit(cache=True)
 def point_coefficients(point_b, point_in_a, rotation, noise):
     """Return D (3 numbers: ww, wh, hh), v (3) and K2 of one point (paper, appendix).
 
@@ -58,12 +83,10 @@ def point_coefficients(point_b, point_in_a, rotation, noise):
         rotation: (3, 3) R⁻¹, which takes directions in B to A.
         noise: (3, 3) L, the sensor's covariance in ray coordinates.
     """
-    q_b_inverse = ray_jacobian_inverse(point_b)
-    q_a = ray_jacobian(point_in_a)
-    to_a = q_a @ rotation @ q_b_inverse
-    precision, _ = inverse_3(to_a @ noise @ to_a.T + noise)  # Λ
-    to_b = ray_jacobian(point_b) @ rotation.T @ ray_jacobian_inverse(point_in_a)
-    _, determinant = inverse_3(to_b @ noise @ to_b.T + noise)
+    in_a = spread(ray_jacobian(point_in_a), rotation, ray_jacobian_inverse(point_b), noise)
+    precision, _ = inverse_3(in_a)  # Λ
+    in_b = spread(ray_jacobian(point_b), rotation.T, ray_jacobian_inverse(point_in_a), noise)
+    _, determinant = inverse_3(in_b)
     last = precision[2, 2]
     return (
         precision[0, 0] - precision[2, 0] ** 2 / last,
