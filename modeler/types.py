@@ -9,6 +9,7 @@ import enum
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -151,7 +152,7 @@ class RayImage:
         """Number of the frame in its sequence."""
         return self.frame.index
 
-    @property
+    @cached_property
     def centroid_m(self) -> Array:
         """Mean (3,) of the surface points; the origin where there are none."""
         return self.points_m.mean(axis=0) if len(self.points_m) else np.zeros(3)
