@@ -129,7 +129,7 @@ def test_motions_drawn_by_number_are_those_of_the_prior():
     # What is independent under the prior is so here: rotation, offset, and one number and the next.
     ranks = np.column_stack([even, np.roll(even, 1, axis=0)]) - 0.5
     correlation = np.corrcoef(ranks.T)
-    np.fill_diagonal(correlation, 0.0)
+    np.fill_diagonal(np.asarray(correlation), 0.0)
     assert np.abs(correlation).max() < 5.0 / np.sqrt(count)
 
 
