@@ -4,12 +4,19 @@ import numba
 import numpy as np
 
 from modeler.kernels.planes import DISTANCE, KIND, NORMAL_X, NORMAL_Y, NORMAL_Z, SURFACE, VARIANCE
-from modeler.kernels.visibility import FACES, FACING_X, FACING_Y, FACING_Z, VARIANCE_M2, X, Y, Z, carry
-
-MIN_AGREEMENT = 0.8
-"""Least cosine between the normals of a point and of the surface that it matches."""
-MAX_SIGMAS = 3.0
-"""A point farther from the surface than so many standard deviations does not match it."""
+from modeler.kernels.visibility import (
+    FACES,
+    FACING_X,
+    FACING_Y,
+    FACING_Z,
+    MAX_SIGMAS,
+    MIN_AGREEMENT,
+    VARIANCE_M2,
+    X,
+    Y,
+    Z,
+    carry,
+)
 
 # Columns of `matches`: carried position, its own normal, the normal of the surface, distance from it, weight, facing.
 POSITION, OWN, OTHER, RESIDUAL, WEIGHT, FACING = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11

@@ -29,8 +29,10 @@ X, Y, Z, FACING_X, FACING_Y, FACING_Z, FACES = 0, 1, 2, 3, 4, 5, 6
 # Columns of what `log_likelihoods` returns.
 LOG_LIKELIHOOD, EXPLAINED = 0, 1
 
-# A point is explained by surface within three standard deviations whose normal agrees as well as this cosine.
-EXPLAINED_HALF_SQUARE, EXPLAINED_AGREEMENT = 4.5, 0.8
+MIN_AGREEMENT = 0.8
+"""Least cosine between the normals of a point and of the surface that it matches."""
+MAX_SIGMAS = 3.0
+"""A point farther from the surface than so many standard deviations does not match it."""
 
 # Nodes of the table of log((1 - hidden) exp(match) + hidden); below the first it is log(hidden) within 3e-6.
 TABLE_LOW, TABLE_HIGH, TABLE_STEPS = -14.0, 4.0, 2304
@@ -120,7 +122,7 @@ def score(points, carried, pixels, cells, model, table):
                     + carried[FACING_Z, j] * cell[NORMAL_Z]
                 )
                 match = typical - half_square - bend * (1.0 - agreement)
-                if half_square < EXPLAINED_HALF_SQUARE and agreement > EXPLAINED_AGREEMENT:
+                if half_square < 0.5 * MAX_SIGMAS * MAX_SIGMAS and agreement > MIN_AGREEMENT:
                     explained += faces
                 if in_front > 0.0 and match < log_hidden:
                     total += faces * max(match, -worst)  # in front of what was measured: nothing can hide it

@@ -71,7 +71,6 @@ class Search:
     """A candidate so many nats below the best is dropped."""
     reach: float = 0.5
     """Of candidates nearer to each other than so many standard deviations one is kept."""
-
     walkers: int = 3
     """From so many of the best the ridges are walked."""
     stride: float = 2.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -99,14 +99,7 @@ def uncertainty(result: Result, centre_m: Array) -> bytes:
             sources = [edge.source for edge in edges]
             of_rotation.scatter(sources, [sd.rotation_deg for sd in own], label=f"sd of the edge, {kind}", **style)
             of_translation.scatter(sources, [sd.translation_mm for sd in own], **style)
-    for axis, words in ((of_rotation, "rotation [deg]"), (of_translation, "translation of the centre [mm]")):
-        axis.set_xlabel("frame")
-        axis.set_ylabel(words)
-        axis.set_ylim(bottom=0.0)
-        axis.xaxis.get_major_locator().set_params(integer=True)
-        _plain(axis)
-    of_rotation.legend(fontsize=8, frameon=False)
-    return _svg(figure)
+    return _by_frame(figure, of_rotation, of_translation)
 
 
 def errors(result: Result, centre_m: Array) -> bytes:
@@ -128,14 +121,7 @@ def errors(result: Result, centre_m: Array) -> bytes:
         ):
             axis.plot(sorted(known), values, ".-", color=colour, linewidth=1.4, label=f"error, {label}")
             axis.fill_between(list(known), sd, color=colour, alpha=0.14, linewidth=0, label=f"stated sd, {label}")
-    for axis, words in ((of_rotation, "rotation [deg]"), (of_translation, "translation of the centre [mm]")):
-        axis.set_xlabel("frame")
-        axis.set_ylabel(words)
-        axis.set_ylim(bottom=0.0)
-        axis.xaxis.get_major_locator().set_params(integer=True)
-        _plain(axis)
-    of_rotation.legend(fontsize=8, frameon=False)
-    return _svg(figure)
+    return _by_frame(figure, of_rotation, of_translation)
 
 
 def coverage(result: Result) -> bytes:
@@ -178,6 +164,18 @@ def _figure(width_in: float, height_in: float) -> Figure:
     from matplotlib.figure import Figure  # slow to load
 
     return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def _by_frame(figure: Figure, of_rotation: Any, of_translation: Any) -> bytes:
+    """Return a figure of rotations in degrees and translations in mm, frame by frame, as SVG."""
+    for axis, words in ((of_rotation, "rotation [deg]"), (of_translation, "translation of the centre [mm]")):
+        axis.set_xlabel("frame")
+        axis.set_ylabel(words)
+        axis.set_ylim(bottom=0.0)
+        axis.xaxis.get_major_locator().set_params(integer=True)
+        _plain(axis)
+    of_rotation.legend(fontsize=8, frameon=False)
+    return _svg(figure)
 
 
 def _plain(axis: Axes) -> None:
