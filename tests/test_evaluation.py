@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import trimesh
 from scipy import stats
 
 from modeler import se3
@@ -10,10 +9,9 @@ from modeler.evaluation import (
     LEVELS,
     about,
     coverage,
+    laid,
     nees,
     rotation_error_deg,
-    sample_surface,
-    surface_errors,
     trajectory_errors,
     translation_error_m,
     true_motion,
@@ -162,41 +160,16 @@ def test_trajectory_is_compared_relative_to_its_first_frame() -> None:
         trajectory_errors({}, truth, CENTROID_M)
 
 
-def test_surface_errors_of_shifted_planes() -> None:
-    grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), axis=-1).reshape(-1, 3) * 0.001
-    errors = surface_errors(grid + np.array([0.0, 0.0, 0.0004]), grid, threshold_m=0.0005)
-    assert (errors.accuracy_m, errors.completeness_m) == pytest.approx((0.0004, 0.0004))
-    assert (errors.precision, errors.recall, errors.f_score) == (1.0, 1.0, 1.0)
-    half = surface_errors(grid[grid[:, 0] < 0.0095], grid, threshold_m=0.0005)  # ten of twenty columns
-    assert (half.accuracy_m, half.precision, half.recall) == (0.0, 1.0, 0.5)
-    assert half.completeness_m == pytest.approx(0.001 * np.arange(1, 11).sum() / 20)
-    assert half.f_score == pytest.approx(2.0 / 3.0)
-    mirrored = surface_errors(grid, grid[grid[:, 0] < 0.0095], threshold_m=0.0005)
-    assert (mirrored.precision, mirrored.recall) == (half.recall, half.precision)
-    assert surface_errors(grid, grid + 1.0, threshold_m=0.0005).f_score == 0.0
-    with pytest.raises(ValueError, match="points"):
-        surface_errors(grid, np.zeros((0, 3)), threshold_m=0.001)
-
-
-def test_samples_lie_on_the_surface_and_spread_by_area() -> None:
-    box = trimesh.creation.box(extents=(0.1, 0.2, 0.4))
-    vertices, triangles = np.asarray(box.vertices), np.asarray(box.faces, dtype=np.int64)
-    count = 20_000
-    points = sample_surface(vertices, triangles, count, np.random.default_rng(9))
-    half = np.array([0.05, 0.1, 0.2])
-    assert np.all(np.abs(points) <= half + 1e-12)
-    on_side = np.isclose(np.abs(points), half)
-    assert np.all(on_side.any(axis=1))
-    areas = 2.0 * np.array([0.2 * 0.4, 0.1 * 0.4, 0.1 * 0.2])
-    share = areas / areas.sum()
-    sides = np.argmax(on_side, axis=1)
-    observed = np.bincount(sides, minlength=3)
-    assert stats.chisquare(observed, share * count).pvalue > 1e-3
-    # Even within a side, too: the two coordinates of the largest are uniform.
-    for axis in (1, 2):
-        coordinate = points[sides == 0, axis] / half[axis]
-        assert stats.kstest(coordinate, stats.uniform(-1.0, 2.0).cdf).pvalue > 1e-3
-    again = sample_surface(vertices, triangles, count, np.random.default_rng(9))
-    np.testing.assert_array_equal(points, again)
-    with pytest.raises(ValueError, match="area"):
-        sample_surface(np.zeros((3, 3)), np.array([[0, 1, 2]]), 5, np.random.default_rng(0))
+def test_an_object_is_laid_on_the_truth_by_all_frames_together() -> None:
+    rng = np.random.default_rng(11)
+    truth = {frame: se3.exp(rng.normal(size=6)) for frame in (2, 3, 5, 9)}
+    model_from_object = se3.exp(rng.normal(size=6))
+    trajectory = {frame: se3.inverse(pose @ model_from_object) for frame, pose in truth.items()}
+    np.testing.assert_allclose(laid(trajectory, truth), model_from_object, atol=1e-9)
+    # One frame of four a little off moves the whole by a quarter of that; which frame comes first does not matter.
+    off = se3.exp(np.array([0.0, 0.0, 0.004, 0.0, 0.0, 0.0]))
+    for frame in (2, 9):
+        moved = laid(trajectory | {frame: trajectory[frame] @ off}, truth)
+        assert np.linalg.norm(se3.log(se3.inverse(model_from_object) @ moved)[:3]) == pytest.approx(0.001, rel=1e-3)
+    with pytest.raises(ValueError, match="no frame"):
+        laid(trajectory, {7: np.eye(4)})

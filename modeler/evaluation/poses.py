@@ -1,4 +1,4 @@
-"""Pure metrics: how far estimates are from the truth, and whether they knew.
+"""How far motions and trajectories are from the truth, and whether they knew.
 
 Truth is `camera_from_model(k)`: the pose (4, 4) of the object's model in the camera at frame k. Motions are compared in
 the source camera, translations at the object's centroid: what a rotation about a distant camera moves there is counted,
@@ -11,9 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
-from scipy.spatial import KDTree
 
 from modeler import se3
 from modeler.types import Array, PoseGaussian
@@ -141,67 +139,20 @@ def trajectory_errors(
     return TrajectoryErrors(rotation_deg, translation_m)
 
 
-@dataclass(frozen=True)
-class SurfaceErrors:
-    """Distances between a reconstructed and a true surface, both as dense points."""
+def laid(trajectory: Mapping[int, Array], camera_from_model: Mapping[int, Array]) -> Array:
+    """Return model_from_object (4, 4) that lays a trajectory's object on the true model, all frames taken together.
 
-    accuracy_m: float
-    """Mean distance from the reconstruction to the truth."""
-    completeness_m: float
-    """Mean distance from the truth to the reconstruction."""
-    precision: float
-    """Share (0..1) of the reconstruction within the threshold of the truth."""
-    recall: float
-    """Share (0..1) of the truth within the threshold of the reconstruction."""
-
-    @property
-    def f_score(self) -> float:
-        """Return the harmonic mean of precision and recall."""
-        total = self.precision + self.recall
-        return 2.0 * self.precision * self.recall / total if total > 0.0 else 0.0
-
-
-def surface_errors(reconstruction_m: Array, truth_m: Array, threshold_m: float) -> SurfaceErrors:
-    """Compare two surfaces in the same frame.
+    It is the mean of what the frames say, so that an error of the first frame is not an error of all others.
 
     Args:
-        reconstruction_m: points (n, 3), of a cloud or from `sample_surface`.
-        truth_m: points (m, 3).
-        threshold_m: distance within which a point counts as right.
+        trajectory: object_from_camera (4, 4) by frame number.
+        camera_from_model: (4, 4) by frame number.
 
     Raises:
-        ValueError: where either has no points.
+        ValueError: where no frame has both.
     """
-    if not len(reconstruction_m) or not len(truth_m):
-        raise ValueError("a surface without points has no distance; sample both surfaces first")
-    to_truth_m, _ = KDTree(truth_m).query(reconstruction_m)
-    to_reconstruction_m, _ = KDTree(reconstruction_m).query(truth_m)
-    return SurfaceErrors(
-        accuracy_m=float(np.mean(to_truth_m)),
-        completeness_m=float(np.mean(to_reconstruction_m)),
-        precision=float(np.mean(to_truth_m <= threshold_m)),
-        recall=float(np.mean(to_reconstruction_m <= threshold_m)),
-    )
-
-
-def sample_surface(vertices_m: Array, triangles: npt.NDArray[np.int64], count: int, rng: np.random.Generator) -> Array:
-    """Return points (count, 3) drawn evenly over the area of a mesh.
-
-    Args:
-        vertices_m: (v, 3).
-        triangles: (t, 3) vertex numbers.
-        count: number of points.
-        rng: source of randomness.
-
-    Raises:
-        ValueError: where the mesh has no area.
-    """
-    a, b, c = np.moveaxis(vertices_m[triangles], 1, 0)
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    if not area.sum() > 0.0:
-        raise ValueError("a mesh without area has no surface to sample")
-    chosen = rng.choice(len(triangles), size=count, p=area / area.sum())
-    along, across = rng.random((2, count, 1))
-    fold = along + across > 1.0  # the far half of the parallelogram folds back onto the triangle
-    along, across = np.where(fold, 1.0 - along, along), np.where(fold, 1.0 - across, across)
-    return a[chosen] + along * (b - a)[chosen] + across * (c - a)[chosen]
+    frames = [frame for frame in sorted(trajectory) if frame in camera_from_model]
+    if not frames:
+        raise ValueError("no frame of the trajectory has a true pose; compare frames of the same sequence")
+    told = [se3.inverse(trajectory[frame] @ camera_from_model[frame]) for frame in frames]
+    return se3.mean(np.stack(told), np.ones(len(told)))[0]

@@ -1,0 +1,16 @@
+"""Pure metrics: how far estimates and models are from the truth, and whether they knew."""
+
+from modeler.evaluation.poses import LEVELS as LEVELS
+from modeler.evaluation.poses import TrajectoryErrors as TrajectoryErrors
+from modeler.evaluation.poses import about as about
+from modeler.evaluation.poses import coverage as coverage
+from modeler.evaluation.poses import laid as laid
+from modeler.evaluation.poses import nees as nees
+from modeler.evaluation.poses import rotation_error_deg as rotation_error_deg
+from modeler.evaluation.poses import trajectory_errors as trajectory_errors
+from modeler.evaluation.poses import translation_error_m as translation_error_m
+from modeler.evaluation.poses import true_motion as true_motion
+from modeler.evaluation.surfaces import SurfaceErrors as SurfaceErrors
+from modeler.evaluation.surfaces import TrueSurface as TrueSurface
+from modeler.evaluation.surfaces import sample_surface as sample_surface
+from modeler.evaluation.surfaces import surface_errors as surface_errors

@@ -1,0 +1,173 @@
+"""How far a reconstructed surface is from the true one: accuracy, completeness, F-score."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.types import Array, BoolArray, Frame
+
+if TYPE_CHECKING:
+    import open3d as o3d
+
+SAMPLES = 50_000
+"""Points drawn on a surface."""
+_REACHED = 1.0 - 1e-5  # share of the way to a point after which nothing hides it but itself
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class SurfaceErrors:
+    """Distances between a reconstructed and a true surface."""
+
+    to_truth_m: Array
+    """(n,) from points spread evenly over the reconstruction to the true surface."""
+    to_reconstruction_m: Array
+    """(m,) from points spread evenly over the true surface to the reconstruction."""
+
+    @property
+    def accuracy_m(self) -> float:
+        """Mean distance from the reconstruction to the truth."""
+        return float(np.mean(self.to_truth_m))
+
+    @property
+    def completeness_m(self) -> float:
+        """Mean distance from the truth to the reconstruction."""
+        return float(np.mean(self.to_reconstruction_m))
+
+    def accurate(self, threshold_m: float) -> float:
+        """Return the share (0..1) of the reconstruction within a distance of the truth (precision)."""
+        return float(np.mean(self.to_truth_m <= threshold_m))
+
+    def complete(self, threshold_m: float) -> float:
+        """Return the share (0..1) of the truth within a distance of the reconstruction (recall)."""
+        return float(np.mean(self.to_reconstruction_m <= threshold_m))
+
+    def f_score(self, threshold_m: float) -> float:
+        """Return the harmonic mean of both shares."""
+        accurate, complete = self.accurate(threshold_m), self.complete(threshold_m)
+        total = accurate + complete
+        return 2.0 * accurate * complete / total if total > 0.0 else 0.0
+
+    def over(self, chosen: BoolArray) -> SurfaceErrors:
+        """Return the errors where nothing but some of the true surface's points (m,) has to be there."""
+        return replace(self, to_reconstruction_m=self.to_reconstruction_m[chosen])
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class TrueSurface:
+    """A true surface."""
+
+    vertices_m: Array
+    """(v, 3) in the model frame."""
+    triangles: npt.NDArray[np.int64]
+    """(t, 3) vertex numbers."""
+    points_m: Array
+    """(m, 3) spread evenly over it."""
+
+    @staticmethod
+    def of(
+        vertices_m: Array, triangles: npt.NDArray[np.int64], rng: np.random.Generator, count: int = SAMPLES
+    ) -> TrueSurface:
+        """Return a mesh with points on it.
+
+        Raises:
+            ValueError: where the mesh has no area.
+        """
+        return TrueSurface(vertices_m, triangles, sample_surface(vertices_m, triangles, count, rng))
+
+    def seen(self, frames: Iterable[tuple[Frame, Array]]) -> BoolArray:
+        """Return which of the points (m,) at least one frame measured: in sight, at an object pixel with depth.
+
+        Args:
+            frames: with their true camera_from_model (4, 4). A frame without a mask shows nothing but the object.
+        """
+        import open3d as o3d
+
+        scene = _scene(self.vertices_m, self.triangles)
+        seen = np.zeros(len(self.points_m), dtype=bool)
+        for frame, camera_from_model in frames:
+            camera, measured = frame.camera, np.isfinite(frame.depth_m)
+            measured = measured if frame.mask is None else measured & frame.mask
+            x, y, z = se3.transform(camera_from_model, self.points_m).T
+            safe = np.where(z > 0.0, z, 1.0)
+            columns = np.rint(camera.fx * x / safe + camera.cx).astype(np.int64)
+            rows = np.rint(camera.fy * y / safe + camera.cy).astype(np.int64)
+            inside = (z > 0.0) & (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
+            asked = np.flatnonzero(inside & ~seen)
+            asked = asked[measured[rows[asked], columns[asked]]]
+            centre_m = se3.inverse(camera_from_model)[:3, 3]
+            ways = self.points_m[asked] - centre_m
+            rays = np.concatenate([np.broadcast_to(centre_m, ways.shape), ways], axis=1)
+            reached = scene.cast_rays(o3d.core.Tensor.from_numpy(rays.astype(np.float32)))["t_hit"].numpy()
+            seen[asked[reached > _REACHED]] = True
+        return seen
+
+
+def surface_errors(
+    vertices_m: Array, triangles: npt.NDArray[np.int64], truth: TrueSurface, rng: np.random.Generator
+) -> SurfaceErrors:
+    """Compare a mesh with the true surface, both in the model frame.
+
+    Distances are from points drawn evenly by area to the nearest place on the other's triangles.
+
+    Args:
+        vertices_m: (v, 3).
+        triangles: (t, 3) vertex numbers.
+        truth: the true surface.
+        rng: draws the points on the mesh.
+
+    Raises:
+        ValueError: where the mesh has no area.
+    """
+    import open3d as o3d
+
+    def far_m(points_m: Array, scene: o3d.t.geometry.RaycastingScene) -> Array:
+        queries = o3d.core.Tensor.from_numpy(points_m.astype(np.float32))
+        return scene.compute_distance(queries).numpy().astype(np.float64)
+
+    points_m = sample_surface(vertices_m, triangles, len(truth.points_m), rng)
+    return SurfaceErrors(
+        to_truth_m=far_m(points_m, _scene(truth.vertices_m, truth.triangles)),
+        to_reconstruction_m=far_m(truth.points_m, _scene(vertices_m, triangles)),
+    )
+
+
+def sample_surface(vertices_m: Array, triangles: npt.NDArray[np.int64], count: int, rng: np.random.Generator) -> Array:
+    """Return points (count, 3) drawn evenly over the area of a mesh.
+
+    Args:
+        vertices_m: (v, 3).
+        triangles: (t, 3) vertex numbers.
+        count: number of points.
+        rng: source of randomness.
+
+    Raises:
+        ValueError: where the mesh has no area.
+    """
+    a, b, c = np.moveaxis(vertices_m[triangles], 1, 0)
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    if not area.sum() > 0.0:
+        raise ValueError("a mesh without area has no surface to sample")
+    chosen = rng.choice(len(triangles), size=count, p=area / area.sum())
+    along, across = rng.random((2, count, 1))
+    fold = along + across > 1.0  # the far half of the parallelogram folds back onto the triangle
+    along, across = np.where(fold, 1.0 - along, along), np.where(fold, 1.0 - across, across)
+    return a[chosen] + along * (b - a)[chosen] + across * (c - a)[chosen]
+
+
+def _scene(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> o3d.t.geometry.RaycastingScene:
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices_m, dtype=np.float32)),
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, dtype=np.uint32)),
+    )
+    return scene
