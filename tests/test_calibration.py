@@ -8,11 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calibration.__main__ import panels, run
-from calibration.study import CONTROL, MEASURES, OURS, OUTSIDE, SPECIMENS, Condition, Study, Trial, judged, staged
+from calibration.study import (
+    CONTROL,
+    MEASURES,
+    OURS,
+    OUTSIDE,
+    SPECIMENS,
+    Condition,
+    Specimen,
+    Study,
+    Trial,
+    judged,
+    staged,
+)
 from calibration.tables import rows, text
+from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.evaluation import rotation_error_deg, true_motion
+from modeler.evaluation import rotation_error_deg, sample_surface, true_motion
 from modeler.priors import TablePrior
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.registration.annealing import AnnealedSampler
@@ -44,15 +57,43 @@ def _drawn(count: int, claim: float) -> list[Trial]:
 
 def test_the_design_is_as_wide_as_promised() -> None:
     study = Study()
-    assert study.pairs >= 300
-    assert len(study.specimens) >= 10
     assert {specimen.recipe for specimen in SPECIMENS} <= set(builtin_recipes())
     assert len({specimen.recipe for specimen in SPECIMENS}) == len(SPECIMENS)
     for half in ("tuning", "held-out"):
-        symmetries = {specimen.symmetry for specimen in SPECIMENS if specimen.half == half}
+        members = tuple(specimen for specimen in SPECIMENS if specimen.half == half)
+        assert replace(study, specimens=members).pairs >= 300
+        assert len(members) >= 10
+        symmetries = {specimen.symmetry for specimen in members}
         assert symmetries == {"asymmetric", "near-symmetric", "n-fold", "revolution"}
     for values in zip(*((c.distance_m, c.noise, c.step_deg) for c in study.conditions), strict=True):
         assert len(set(values)) >= 3
+
+
+@pytest.mark.parametrize("specimen", SPECIMENS, ids=lambda specimen: specimen.recipe)
+def test_shapes_have_the_symmetry_of_their_class(specimen: Specimen) -> None:
+    mesh, rng = load_recipe(specimen.recipe).object.mesh(), np.random.default_rng(0)
+    surface_m = sample_surface(mesh.vertices_m, mesh.triangles, 62_000, rng)
+    # Shapes with an axis have it along z through their origin; what else there is may have one through its middle.
+    surface_m -= surface_m.mean(axis=0) if specimen.symmetry == "asymmetric" else 0.0
+    few_m, nearest = surface_m[:2000], KDTree(surface_m[2000:])
+
+    def moved(axis: int, angle_deg: float) -> float:
+        turn = se3.exp(np.radians(angle_deg) * np.eye(6)[axis])
+        return float(np.mean(nearest.query(se3.transform(turn, few_m))[0] > 0.003))
+
+    shares = {angle_deg: moved(2, angle_deg) for angle_deg in range(30, 181, 30)}
+    onto_itself = {angle_deg for angle_deg, share in shares.items() if share == 0.0}
+    match specimen.symmetry:
+        case "revolution":
+            assert onto_itself == set(shares)
+        case "n-fold":
+            assert onto_itself in ({180}, {90, 180})
+            assert min(share for angle_deg, share in shares.items() if angle_deg not in onto_itself) > 0.15
+        case "near-symmetric":
+            assert min(shares.values()) > 0.01
+            assert max(shares.values()) < 0.25
+        case "asymmetric":
+            assert min(*shares.values(), *(moved(axis, 180.0) for axis in (0, 1))) > 0.25
 
 
 @pytest.mark.parametrize("name", [specimen.recipe for specimen in SPECIMENS])
