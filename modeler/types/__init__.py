@@ -1,0 +1,27 @@
+"""The nouns of the package and its abstract interfaces, a family a file. All are frozen values.
+
+Lengths are metres and angles radians unless a name says otherwise; `se3` holds the conventions of poses and tangents. Data meets them in
+this order: views, motions, posteriors, solution, model; priors learn from solutions.
+"""
+
+from modeler.types.arrays import Array as Array
+from modeler.types.arrays import BoolArray as BoolArray
+from modeler.types.model import ObjectModel as ObjectModel
+from modeler.types.model import Step as Step
+from modeler.types.motions import AbstractMotion as AbstractMotion
+from modeler.types.motions import EvenSpread as EvenSpread
+from modeler.types.outcomes import InputError as InputError
+from modeler.types.outcomes import Outcome as Outcome
+from modeler.types.posteriors import AbstractRegistrar as AbstractRegistrar
+from modeler.types.posteriors import Mode as Mode
+from modeler.types.posteriors import PoseGaussian as PoseGaussian
+from modeler.types.posteriors import Posterior as Posterior
+from modeler.types.priors import AbstractPrior as AbstractPrior
+from modeler.types.priors import SharedAxis as SharedAxis
+from modeler.types.solution import Edge as Edge
+from modeler.types.solution import Solution as Solution
+from modeler.types.views import Camera as Camera
+from modeler.types.views import Frame as Frame
+from modeler.types.views import Plane as Plane
+from modeler.types.views import RayImage as RayImage
+from modeler.types.views import Segmentation as Segmentation

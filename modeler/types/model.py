@@ -1,0 +1,67 @@
+"""The fused object, and the step that brings it: what leaves the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.types.arrays import Array
+from modeler.types.posteriors import Posterior
+from modeler.types.solution import Edge, Solution
+from modeler.types.views import Frame, RayImage, Segmentation
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectModel:
+    """The fused object, in the object frame (camera frame of the first accepted frame)."""
+
+    points_m: Array
+    """(n, 3) merged cloud."""
+    normals: Array
+    """(n, 3) unit normals of the cloud."""
+    colours: npt.NDArray[np.uint8] | None
+    """(n, 3) RGB of the cloud, where the input has colour."""
+    vertices_m: Array
+    """(v, 3) mesh vertices."""
+    triangles: npt.NDArray[np.int64]
+    """(t, 3) vertex numbers, counter-clockwise from outside."""
+    vertex_normals: Array
+    """(v, 3) unit normals of the vertices."""
+    vertex_colours: npt.NDArray[np.uint8] | None
+    """(v, 3) RGB of the vertices."""
+    vertex_views: npt.NDArray[np.int64] | None = None
+    """(v,) how many views saw each vertex; 0 = surface that nobody saw, made up to close a gap. None: not known."""
+    vertex_sigmas_m: Array | None = None
+    """(v,) standard deviation of each vertex along its normal, as far as noise and poses are known to err; inf = made
+    up. None: not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What one frame brought: the only thing that leaves the loop."""
+
+    frame: Frame
+    """The frame as read."""
+    segmentation: Segmentation
+    """What of it is the object."""
+    view: RayImage | None
+    """The frame made ready; None where the object was not found."""
+    posteriors: tuple[Posterior, ...]
+    """Registrations tried with this frame as source."""
+    edges: tuple[Edge, ...]
+    """Their judgement."""
+    outcome: str
+    """"accepted", or why the frame was left out."""
+    solution: Solution
+    """All poses so far."""
+    model: ObjectModel | None
+    """The model so far; None until the first view."""
+    edges_so_far: tuple[Edge, ...] = ()
+    """Every edge judged so far, in order."""
+    views: Mapping[int, RayImage] = field(default_factory=dict)
+    """Every accepted view by frame number."""
+    last: bool = False
+    """True on the final step, whose model is made with care."""

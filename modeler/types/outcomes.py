@@ -1,0 +1,36 @@
+"""What goes wrong, and how attempts end."""
+
+from __future__ import annotations
+
+import enum
+
+
+class InputError(Exception):
+    """Input that cannot be used: one line that names what, where and what to do. Commands end with status 2."""
+
+
+class Outcome(enum.Enum):
+    """How an attempt ended, each with a sentence of advice."""
+
+    CONVERGED = "converged", "The posterior is one compact bump; nothing to do."
+    AMBIGUOUS = "ambiguous", "Several poses explain the images; add a prior (table, turntable) or more views."
+    DEGENERATE = "degenerate", "Too few distinct samples carry the weight; raise the number of samples."
+    NO_OVERLAP = "no overlap", "The views share too little surface; use a smaller step between frames."
+    AT_LIMIT = (
+        "at the prior's limit",
+        "The motion may be larger than the prior allows; raise --max-rotation-deg, --max-offset-m or --max-shift-m.",
+    )
+    TOO_FEW_POINTS = "too few points", "The object covers too few pixels; check the mask, --roi and --max-depth-m."
+    UNSURE_MASK = "unsure mask", "The object is hard to tell from its surroundings; give --roi, --max-depth-m or masks."
+    NO_PLANE = "no plane", "No support plane was found; use --prior general or show more of the table."
+
+    label: str
+    advice: str
+
+    def __new__(cls, label: str, advice: str) -> Outcome:
+        """Make a member whose value is its label."""
+        member = object.__new__(cls)
+        member._value_ = label
+        member.label = label
+        member.advice = advice
+        return member

@@ -1,0 +1,120 @@
+"""What the camera saw: frames, and what is known of them before two are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.types.arrays import Array, BoolArray
+from modeler.types.outcomes import Outcome
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion; x right, y down, z forward."""
+
+    width: int
+    """Image width in px."""
+    height: int
+    """Image height in px."""
+    fx: float
+    """Focal length along x in px."""
+    fy: float
+    """Focal length along y in px."""
+    cx: float
+    """Column of the principal point in px; pixel centres lie at whole numbers."""
+    cy: float
+    """Row of the principal point in px."""
+
+    def rays(self) -> tuple[Array, Array]:
+        """Return w = x/z and h = y/z of every pixel, each (h, w)."""
+        w = (np.arange(self.width, dtype=np.float64) - self.cx) / self.fx
+        h = (np.arange(self.height, dtype=np.float64) - self.cy) / self.fy
+        return np.broadcast_to(w, (self.height, self.width)), np.broadcast_to(h[:, None], (self.height, self.width))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image of the depth camera."""
+
+    index: int
+    """Number of the frame in its sequence."""
+    time_s: float
+    """Time of capture in s; the index where none is known."""
+    depth_m: npt.NDArray[np.float32]
+    """(h, w) distance along the optical axis; NaN = no measurement."""
+    camera: Camera
+    """Intrinsics of the depth image."""
+    mask: BoolArray | None = None
+    """(h, w) True = object; None = not segmented."""
+    colour: npt.NDArray[np.uint8] | None = None
+    """(h, w, 3) RGB aligned to depth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A support plane in camera coordinates: normal · p + offset_m = 0."""
+
+    normal: Array
+    """(3,) unit, pointing to the side on which the camera and the object are."""
+    offset_m: float
+    """Distance of the camera from the plane, positive."""
+    sigma_tilt_rad: float
+    """Standard deviation of the normal's direction, about either axis in the plane."""
+    sigma_offset_m: float
+    """Standard deviation of the plane's distance below the object."""
+
+    def height_m(self, points: Array) -> Array:
+        """Return the height (n,) of points (n, 3) above the plane."""
+        return points @ self.normal + self.offset_m
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """What of a frame is the object, and what it stands on."""
+
+    mask: BoolArray
+    """(h, w) True = object."""
+    plane: Plane | None
+    """The support plane, where one is seen."""
+    outcome: Outcome
+    """CONVERGED, or UNSURE_MASK / TOO_FEW_POINTS where a person should look."""
+
+
+@dataclass(frozen=True, eq=False)
+class RayImage:
+    """A segmented frame made ready for registration: what was seen, and where it was empty.
+
+    Surface points are the object's pixels with a normal; they lie on the measured surface smoothed by local planes.
+    """
+
+    frame: Frame
+    """The frame, with its mask."""
+    plane: Plane | None
+    """The support plane, where one is seen."""
+    sigma_wh: float
+    """Lateral noise of the sensor in ray coordinates (w, h)."""
+    sigma_r_m: float
+    """Noise of the sensor along the ray, for a surface that faces it."""
+    points_m: Array
+    """(n, 3) surface points in camera coordinates."""
+    normals: Array
+    """(n, 3) unit normals, towards the camera."""
+    pixels: npt.NDArray[np.int64]
+    """(n, 2) row and column of each point."""
+    layers: Mapping[str, npt.NDArray[np.float64] | npt.NDArray[np.float32]] = field(default_factory=dict)
+    """Images a likelihood looks up, made by `rays`."""
+
+    @property
+    def index(self) -> int:
+        """Number of the frame in its sequence."""
+        return self.frame.index
+
+    @cached_property
+    def centroid_m(self) -> Array:
+        """Mean (3,) of the surface points; the origin where there are none."""
+        return self.points_m.mean(axis=0) if len(self.points_m) else np.zeros(3)
