@@ -14,6 +14,7 @@ from sequences.recognise import open_sequence as open_sequence
 from sequences.sensed import SensedSequence as SensedSequence
 from sequences.survey import Survey as Survey
 from sequences.survey import survey as survey
+from sequences.true_mesh import true_mesh as true_mesh
 from sequences.watch import Patience as Patience
 from sequences.watch import watch as watch
 

@@ -1,4 +1,4 @@
-"""`modeler evaluate`: methods against ground truth."""
+"""`modeler evaluate`: methods and models against ground truth."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from modeler.cli.options import FrameOptions, Method, ObjectOptions, PriorOption
 class Evaluate:
     """Register pairs of frames whose true motion is known, by several methods, and tell how far off they are.
 
-    Writes results.json, results.csv and rotation_errors.png (box plots), and prints a table.
+    Writes results.json, results.csv and rotation_errors.png (box plots), and prints a table. Of run folders, the model
+    is compared with the true surface instead (model.ply of a rendered sequence, BOP's models folder), and so is one
+    made of the same frames with their true poses: models.json, models.csv and a table.
     """
 
-    sequences: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SEQUENCE...")]
-    """BOP scene folders with scene_gt.json."""
+    sequences: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SEQUENCE|RUN...")]
+    """BOP scene folders with scene_gt.json, or run folders made of such."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder for the results; those of an earlier evaluation are replaced at the end."""
     methods: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ",".join(get_args(Method))

@@ -10,6 +10,7 @@ from modeler import experiment
 from modeler.cli import compose
 from modeler.cli.console import bar
 from modeler.cli.evaluate import Evaluate
+from modeler.cli.evaluating_models import evaluate_models, is_run, models_table
 from modeler.cli.options import Method
 from modeler.experiment import Experiment, Pairing, Summary
 from modeler.types import AbstractRegistrar, InputError
@@ -27,6 +28,12 @@ def evaluate(options: Evaluate) -> int:
         raise InputError("no sequence to evaluate; name at least one folder")
     if options.points is not None and options.points < 1:
         raise InputError(f"--points {options.points} leaves nothing; give a whole number from 1 on")
+    runs = [path for path in options.sequences if is_run(path)]
+    if runs:
+        if len(runs) < len(options.sequences):
+            raise InputError("sequences and run folders are evaluated apart; give one kind at a time")
+        print(columns(models_table(evaluate_models(runs, options.out, compose.seed(options.seed))), left=3))
+        return 0
     kept = frame_range(options.selection.frames)
     recorded = [compose.open_sequence(path).select(options.selection.every, kept) for path in options.sequences]
     # Tables are compared with each other: all sequences have the same prior, `general` if none is asked for.
@@ -70,12 +77,17 @@ def table(rows: Sequence[Summary]) -> str:
         )
         for row in rows
     ]
-    widths = [max(map(len, column)) for column in zip(heading, *cells, strict=True)]
+    return columns([heading, *cells], left=2)
+
+
+def columns(lines: Sequence[tuple[str, ...]], *, left: int) -> str:
+    """Return lines of cells as text in columns, the first `left` of them flush left, the others right."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
         "  ".join(
-            f"{cell:<{width}}" if number < 2 else f"{cell:>{width}}" for number, (cell, width) in enumerate(pairs)
+            f"{cell:<{width}}" if number < left else f"{cell:>{width}}" for number, (cell, width) in enumerate(pairs)
         )
-        for pairs in (list(zip(line, widths, strict=True)) for line in (heading, *cells))
+        for pairs in (list(zip(line, widths, strict=True)) for line in lines)
     )
 
 

@@ -17,6 +17,7 @@ from modeler.graph import PoseGraph, solve
 from modeler.pipeline import ACCEPTED
 from modeler.rays import Sensor
 from modeler.types import Array, Edge, InputError, RayImage, Solution
+from sequences import AbstractSequence, SensedSequence, read_noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,8 @@ class Reopened:
     """Every edge, as it was judged."""
     solution: Solution
     """The poses, solved again from the edges."""
+    recorded: AbstractSequence | None
+    """What it was made of; None where that are two runs."""
 
     def scan(self, fuser: Fuser) -> Scan:
         """Return the views laid together as `modeler build` lays them."""
@@ -60,6 +63,7 @@ def reopened(run: Path, sequence: Path | None = None) -> Reopened:
     if not where.exists():
         raise InputError(f"{where}: the sequence of {run} is not there; say where it is with --sequence")
     whole = compose.open_sequence(where)
+    whole = SensedSequence(whole, read_noise(Path(settings["sensor"]))) if "sensor" in settings else whole
     roi = settings.get("roi")
     limits = ObjectOptions(roi=None if roi is None else tuple(roi), max_depth_m=settings.get("max_depth_m"))
     noise = whole.sensor()
@@ -75,7 +79,7 @@ def reopened(run: Path, sequence: Path | None = None) -> Reopened:
         views[record["id"]] = view
     edges = edges_of(report)
     sensor = Sensor() if noise is None else Sensor(*noise)
-    return Reopened(whole.name, report, sensor, views, edges, solved(edges, poses_of(report)))
+    return Reopened(whole.name, report, sensor, views, edges, solved(edges, poses_of(report)), whole)
 
 
 def edges_of(report: Mapping[str, Any]) -> tuple[Edge, ...]:
@@ -111,4 +115,4 @@ def _joined(run: Path, report: Mapping[str, Any]) -> Reopened:
     edges, poses = edges_of(report), poses_of(report)
     if not poses.keys() <= views.keys():
         raise InputError(f"{run}: its parts have changed since they were joined; join them again")
-    return Reopened(first.name, report, first.sensor, views, edges, solved(edges, poses))
+    return Reopened(first.name, report, first.sensor, views, edges, solved(edges, poses), None)

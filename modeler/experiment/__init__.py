@@ -1,5 +1,10 @@
-"""Methods compared on sequences whose true motions are known: which pairs, which errors, which tables."""
+"""Methods and models compared with what is known to be true: which pairs, which errors, which tables."""
 
+from modeler.experiment.models import Modelled as Modelled
+from modeler.experiment.models import ModelScore as ModelScore
+from modeler.experiment.models import model_scores as model_scores
+from modeler.experiment.models import models_csv as models_csv
+from modeler.experiment.models import models_json as models_json
 from modeler.experiment.pairing import Pairing as Pairing
 from modeler.experiment.runner import evaluate as evaluate
 from modeler.experiment.tables import Summary as Summary

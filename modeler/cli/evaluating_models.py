@@ -1,0 +1,78 @@
+"""What `modeler evaluate` does with finished runs: their models against the true surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from modeler.cli.reopened import reopened
+from modeler.experiment import Modelled, ModelScore, model_scores, models_csv, models_json
+from modeler.export import mesh_of, read_model, write_atomically
+from modeler.fusion import Fuser
+from modeler.types import InputError
+from sequences import true_mesh
+
+
+def is_run(path: Path) -> bool:
+    """Return whether a path is a run folder rather than a sequence."""
+    return (path / "report.json").is_file()
+
+
+def evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> list[ModelScore]:
+    """Judge the models of runs and write `models.json` and `models.csv` into a folder.
+
+    Args:
+        runs: run folders of sequences whose poses and surface are known.
+        out: folder, made where there is none.
+        seed: of the points drawn on the surfaces.
+
+    Raises:
+        InputError: where something cannot be read or written, or is not known.
+    """
+    scores = []
+    for path in runs:
+        run = reopened(path)
+        if run.recorded is None:
+            raise InputError(f"{path}: is joined from two runs; evaluate those, each against its own truth")
+        truth = run.recorded.truth()
+        if truth is None:
+            raise InputError(f"{run.recorded.name}: has no ground truth to compare with; add scene_gt.json.")
+        mesh = true_mesh(run.recorded)
+        modelled = Modelled(
+            name=str(path),
+            model=read_model(mesh_of(path)),
+            views=run.views,
+            trajectory=run.solution.trajectory,
+            camera_from_model=truth,
+            truth=(mesh.vertices_m, mesh.triangles),
+        )
+        scores += model_scores(modelled, Fuser(voxel_m=run.report["settings"].get("voxel_m")), seed)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made ({error.strerror}); choose another folder with --out") from error
+    write_atomically(out / "models.json", models_json(scores, seed))
+    write_atomically(out / "models.csv", models_csv(scores))
+    return scores
+
+
+def models_table(scores: Sequence[ModelScore]) -> list[tuple[str, ...]]:
+    """Return heading and rows of a table of scores."""
+    heading = ("model", "poses", "over", "frames", "max deg", "accuracy mm", "completeness mm", "F 3 mm", "F 5 mm")
+    return [
+        heading,
+        *(
+            (
+                score.run,
+                score.poses,
+                score.over,
+                str(score.frames),
+                f"{score.rotation_error_deg:.2f}",
+                f"{score.accuracy_mm:.2f}",
+                f"{score.completeness_mm:.2f}",
+                f"{score.f_3mm:.3f}",
+                f"{score.f_5mm:.3f}",
+            )
+            for score in scores
+        ),
+    ]

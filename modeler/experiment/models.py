@@ -1,0 +1,140 @@
+"""Models of runs against true surfaces, beside models of the same frames fused with their true poses."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Literal, final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.evaluation import SurfaceErrors, TrueSurface, laid, rotation_error_deg, surface_errors
+from modeler.fusion import Fuser
+from modeler.types import Array, InputError, ObjectModel, RayImage
+
+Poses = Literal["run", "true"]
+Over = Literal["seen", "whole"]
+
+
+@final
+@dataclass(frozen=True)
+class ModelScore:
+    """How far one model is from the true surface."""
+
+    run: str
+    """The run."""
+    poses: Poses
+    """Of whose poses the model is made: the run's own, or the true ones."""
+    over: Over
+    """What of the true surface has to be there: what the frames saw, or all."""
+    frames: int
+    """Number of views with a true pose."""
+    rotation_error_deg: float
+    """Largest rotation error of a pose, the object laid on the true model by all frames together."""
+    accuracy_mm: float
+    """Mean distance from the model to the true surface."""
+    completeness_mm: float
+    """Mean distance from the true surface to the model."""
+    accurate_3mm: float
+    """Share of the model within 3 mm of the true surface."""
+    complete_3mm: float
+    """Share of the true surface within 3 mm of the model."""
+    f_3mm: float
+    """Their harmonic mean."""
+    accurate_5mm: float
+    """As within 3 mm."""
+    complete_5mm: float
+    """As within 3 mm."""
+    f_5mm: float
+    """As within 3 mm."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Modelled:
+    """A run to be judged."""
+
+    name: str
+    """Of the run."""
+    model: ObjectModel
+    """As the run made it."""
+    views: Mapping[int, RayImage]
+    """What it is made of, by frame number."""
+    trajectory: Mapping[int, Array]
+    """Its object_from_camera (4, 4) by frame number."""
+    camera_from_model: Mapping[int, Array]
+    """The true poses (4, 4) by frame number."""
+    truth: tuple[Array, npt.NDArray[np.int64]]
+    """Vertices (v, 3) in m and triangles (t, 3) of the true surface."""
+
+
+def model_scores(modelled: Modelled, fuser: Fuser, seed: int) -> list[ModelScore]:
+    """Compare a run's model, and one that `fuser` makes of the same frames with their true poses, with the truth.
+
+    Args:
+        modelled: the run.
+        fuser: makes the other model.
+        seed: of the points drawn on the surfaces.
+
+    Raises:
+        InputError: where no view has a true pose or the run has no surface.
+    """
+    frames = [frame for frame in modelled.trajectory if frame in modelled.camera_from_model and frame in modelled.views]
+    if not frames:
+        raise InputError(f"{modelled.name}: none of its frames has a true pose; is scene_gt.json of another sequence?")
+    if not len(modelled.model.triangles):
+        raise InputError(f"{modelled.name}: its model has no surface; build it from more frames")
+    true_poses = {frame: se3.inverse(modelled.camera_from_model[frame]) for frame in frames}
+    model_from_object = laid(modelled.trajectory, modelled.camera_from_model)
+    own_poses = {frame: model_from_object @ modelled.trajectory[frame] for frame in frames}
+    vertices_m, triangles = modelled.truth
+    surface = TrueSurface.of(vertices_m, triangles, np.random.default_rng([seed, 0]))
+    seen = surface.seen((modelled.views[frame].frame, modelled.camera_from_model[frame]) for frame in frames)
+    reference = fuser.fuse({frame: modelled.views[frame] for frame in frames}, true_poses)
+    made: list[tuple[Poses, ObjectModel, Array, Mapping[int, Array]]] = [
+        ("run", modelled.model, model_from_object, own_poses),
+        ("true", reference, np.eye(4), true_poses),
+    ]
+    scores: list[ModelScore] = []
+    for poses, model, motion, trajectory in made:
+        rng = np.random.default_rng([seed, 1])
+        errors = surface_errors(se3.transform(motion, model.vertices_m), model.triangles, surface, rng)
+        regions: list[tuple[Over, SurfaceErrors]] = [("seen", errors.over(seen)), ("whole", errors)]
+        scores += [
+            ModelScore(
+                run=modelled.name,
+                poses=poses,
+                over=over,
+                frames=len(frames),
+                rotation_error_deg=max(rotation_error_deg(trajectory[k], true_poses[k]) for k in frames),
+                accuracy_mm=1e3 * part.accuracy_m,
+                completeness_mm=1e3 * part.completeness_m,
+                accurate_3mm=part.accurate(3e-3),
+                complete_3mm=part.complete(3e-3),
+                f_3mm=part.f_score(3e-3),
+                accurate_5mm=part.accurate(5e-3),
+                complete_5mm=part.complete(5e-3),
+                f_5mm=part.f_score(5e-3),
+            )
+            for over, part in regions
+        ]
+    return scores
+
+
+def models_json(scores: Sequence[ModelScore], seed: int) -> str:
+    """Return scores as JSON."""
+    return json.dumps({"schema": 1, "seed": seed, "models": [asdict(score) for score in scores]}, indent=1) + "\n"
+
+
+def models_csv(scores: Sequence[ModelScore]) -> str:
+    """Return scores as CSV, a field a column."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [f.name for f in fields(ModelScore)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(score) for score in scores)
+    return text.getvalue()

@@ -1,0 +1,167 @@
+"""Models of runs against the true surface: what `modeler evaluate RUN` measures, writes and refuses."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from modeler import se3
+from modeler.cli import main
+from modeler.experiment import Modelled, ModelScore, model_scores
+from modeler.fusion import Fuser
+from modeler.rays import Sensor
+from modeler.types import Array, InputError
+from sequences import bundled, open_sequence, true_mesh
+
+BOX = bundled("box")
+FUSER = Fuser(voxel_m=0.003)
+
+
+@pytest.fixture(scope="module")
+def modelled() -> Modelled:
+    """Return a model of three frames whose poses are true, in an object frame of its own."""
+    recorded = open_sequence(BOX)
+    truth, noise, mesh = recorded.truth(), recorded.sensor(), true_mesh(recorded)
+    assert truth is not None
+    assert noise is not None
+    views = {frame: Sensor(*noise).ray_image(recorded.frame(frame), None) for frame in (0, 4, 9)}
+    object_from_model = se3.exp(np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.1]))
+    trajectory = {frame: object_from_model @ se3.inverse(truth[frame]) for frame in views}
+    model = FUSER.fuse(views, trajectory)
+    return Modelled("run", model, views, trajectory, truth, (mesh.vertices_m, mesh.triangles))
+
+
+def _by(scores: list[ModelScore]) -> dict[tuple[str, str], ModelScore]:
+    return {(score.poses, score.over): score for score in scores}
+
+
+def test_true_poses_give_the_model_of_true_poses_in_whatever_frame(modelled: Modelled) -> None:
+    scores = _by(model_scores(modelled, FUSER, 0))
+    assert list(scores) == [("run", "seen"), ("run", "whole"), ("true", "seen"), ("true", "whole")]
+    for over in ("seen", "whole"):
+        run, true = scores["run", over], scores["true", over]
+        assert run.rotation_error_deg == pytest.approx(0.0, abs=1e-5)
+        assert run.frames == 3
+        assert run.accuracy_mm == pytest.approx(true.accuracy_mm, abs=0.05)
+        assert run.f_3mm == pytest.approx(true.f_3mm, abs=0.01)
+    seen, whole = scores["run", "seen"], scores["run", "whole"]
+    assert seen.f_3mm > 0.97
+    assert seen.accurate_3mm == whole.accurate_3mm
+    assert whole.complete_3mm < 0.9 < seen.complete_3mm  # nobody saw the bottom
+
+
+def test_a_model_ten_millimetres_too_far_scores_less_than_one_of_true_poses(modelled: Modelled) -> None:
+    vertices_m = modelled.model.vertices_m
+    grown = vertices_m + 0.01 * modelled.model.vertex_normals
+    scores = _by(model_scores(replace(modelled, model=replace(modelled.model, vertices_m=grown)), FUSER, 0))
+    assert scores["run", "seen"].accuracy_mm == pytest.approx(10.0, abs=0.7)
+    assert scores["run", "seen"].f_3mm < 0.05
+    assert scores["true", "seen"].f_3mm > 0.97
+
+
+def test_one_wrong_pose_is_told(modelled: Modelled) -> None:
+    off = se3.exp(np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0]))
+    wrong = {**modelled.trajectory, 9: modelled.trajectory[9] @ off}
+    scores = model_scores(replace(modelled, trajectory=wrong), FUSER, 0)
+    expected = np.degrees(0.3) * 2.0 / 3.0  # a third of it is shared by all
+    assert scores[0].rotation_error_deg == pytest.approx(expected, rel=0.02)
+
+
+def test_scores_are_the_same_for_the_same_seed(modelled: Modelled) -> None:
+    assert model_scores(modelled, FUSER, 3) == model_scores(modelled, FUSER, 3)
+    assert model_scores(modelled, FUSER, 3) != model_scores(modelled, FUSER, 4)
+
+
+def test_refuses_what_cannot_be_compared(modelled: Modelled) -> None:
+    with pytest.raises(InputError, match="true pose"):
+        model_scores(replace(modelled, camera_from_model={77: np.eye(4)}), FUSER, 0)
+    empty = replace(modelled.model, triangles=np.zeros((0, 3), dtype=np.int64))
+    with pytest.raises(InputError, match="no surface"):
+        model_scores(replace(modelled, model=empty), FUSER, 0)
+
+
+# the command
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("models") / "run"
+    options = ("--prior", "table", "--method", "icp", "--frames", "0:3", "--voxel-m", "0.004")
+    assert main(["build", str(BOX), "--out", str(folder), *options]) == 0
+    return folder
+
+
+def _told(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    capsys.readouterr()
+    status = main([str(argument) for argument in arguments])
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+def test_evaluate_tells_how_good_the_model_of_a_run_is(
+    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = _told(capsys, "evaluate", built, "--out", tmp_path)
+    assert (status, err) == (0, "")
+    lines = out.splitlines()
+    assert len(lines) == 5
+    assert lines[1].split()[:4] == [str(built), "run", "seen", "3"]
+    assert len({len(line) for line in lines}) == 1
+    results = json.loads((tmp_path / "models.json").read_bytes())
+    assert [(row["poses"], row["over"]) for row in results["models"]] == [
+        (poses, over) for poses in ("run", "true") for over in ("seen", "whole")
+    ]
+    for row in results["models"]:
+        assert row["f_3mm"] <= row["f_5mm"] <= 1.0
+    with (tmp_path / "models.csv").open() as file:
+        assert [float(row["f_3mm"]) for row in csv.DictReader(file)] == [row["f_3mm"] for row in results["models"]]
+
+
+def test_sequences_and_runs_are_not_mixed(built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = _told(capsys, "evaluate", BOX, built, "--out", tmp_path / "none")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert not (tmp_path / "none").exists()
+
+
+def _without(built: Path, folder: Path, *names: str) -> tuple[Path, Path]:
+    """Return a copy of the sequence without some files, and of the run as if it was made of that."""
+    sequence, run = folder / "train" / "000001", folder / "run"
+    shutil.copytree(BOX, sequence, ignore=shutil.ignore_patterns("rgb", *names))
+    shutil.copytree(built, run, ignore=shutil.ignore_patterns("*.rrd"))
+    report = json.loads((run / "report.json").read_bytes())
+    (run / "report.json").write_text(json.dumps(report | {"sequence": str(sequence)}))
+    return sequence, run
+
+
+@pytest.mark.parametrize(("missing", "told"), [("model.ply", "no true surface"), ("scene_gt.json", "no ground truth")])
+def test_runs_without_truth_are_refused_in_one_line(
+    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: str, told: str
+) -> None:
+    _, run = _without(built, tmp_path, missing)
+    status, out, err = _told(capsys, "evaluate", run, "--out", tmp_path / "none")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert told in err
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_true_surface_may_lie_in_the_models_folder_of_a_dataset(built: Path, tmp_path: Path) -> None:
+    sequence, _ = _without(built, tmp_path, "model.ply")
+    objects = json.loads((sequence / "scene_gt.json").read_bytes())
+    number = objects["0"][0]["obj_id"]
+    mesh = true_mesh(open_sequence(BOX))
+    (tmp_path / "models").mkdir()
+    in_mm = trimesh.Trimesh(1e3 * mesh.vertices_m, mesh.triangles, process=False)
+    in_mm.export(tmp_path / "models" / f"obj_{number:06d}.ply")
+    found = true_mesh(open_sequence(sequence))
+    np.testing.assert_allclose(_bounds(found.vertices_m), _bounds(mesh.vertices_m), atol=1e-6)
+
+
+def _bounds(vertices_m: Array) -> Array:
+    return np.stack([vertices_m.min(axis=0), vertices_m.max(axis=0)])
