@@ -1,7 +1,7 @@
 """The nouns of the package and its abstract interfaces, a family a file. All are frozen values.
 
-Lengths are metres and angles radians unless a name says otherwise; `se3` holds the conventions of poses and tangents. Data meets them in
-this order: views, motions, posteriors, solution, model; priors learn from solutions.
+Lengths are metres and angles radians unless a name says otherwise; `se3` holds the conventions of poses and tangents.
+Data meets them in this order: views, motions, posteriors, solution, model; priors learn from solutions.
 """
 
 from modeler.types.arrays import Array as Array
