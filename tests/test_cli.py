@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 import signal
 import subprocess
@@ -142,12 +143,20 @@ def test_the_readme_names_every_file_of_a_run_folder() -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ((), "Expected one of"),
-        (("frobnicate",), "frobnicate"),
+        ((), "give a command: build, "),
+        (("frobnicate", "x"), "there is no command 'frobnicate'; there are build, "),
         (("build", BOX), "--out"),
-        (("build", BOX, "--out", "OUT", "--frob"), "--frob"),
+        (("build", BOX, "--out", "OUT", "--frob"), "unknown: --frob; see modeler build --help"),
+        (("build", BOX, "--out", "OUT", "--prio", "table"), "perhaps you meant --prior NAME[+NAME]; see"),
+        (("build", BOX, "--out", "OUT", "--intrinsics", "9", "9", "9", "9"), "(calibrate-sensor, convert, info); see"),
+        (("build", BOX, "--out"), "--out lacks its value"),
+        (("build", BOX, "--out", "OUT", "--step-deg", "0.3rad"), "--step-deg takes a number, not '0.3rad'"),
+        (("build", BOX, "--out", "OUT", "--max-offset-m", "40"), "give a positive number of metres, at most 5\n"),
+        (("build", BOX, "--out", "OUT", "--method", "magic"), "'fpfh-icp', not 'magic'"),
+        (("export", "OUT", "--out", "OUT.glb", "--tint", "red"), ", not 'red'"),
+        (("register", BOX, "one", "0"), "SOURCE takes a whole number, not 'one'"),
         (("build", BOX, "--out", "OUT", "--prior", "magic"), "'general', 'table'"),
-        (("build", BOX, "--out", "OUT", "--roi", "1", "2", "3"), "--roi"),
+        (("build", BOX, "--out", "OUT", "--roi", "1", "2", "3"), "--roi takes 4 numbers, not '1', '2', '3'"),
         (("build", BOX, "--out", "OUT", "--every", "0"), "--every 0"),
         (("build", BOX, "--out", "OUT", "--frames", "1-3"), "--frames '1-3'"),
         (("build", BOX, "--out", "OUT", "--frames", "50:60"), "0 to 13"),
@@ -195,6 +204,16 @@ def test_the_console_script_ends_with_the_status() -> None:
     )
     assert (ended.returncode, ended.stdout) == (2, "")
     assert ended.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [(), ("build",)])
+def test_a_reader_who_has_left_is_no_error(arguments: tuple[str, ...]) -> None:
+    ours, theirs = os.pipe()
+    os.close(ours)
+    command = [sys.executable, "-m", "modeler", *arguments, "--help"]
+    ended = subprocess.run(command, stdout=theirs, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(theirs)
+    assert (ended.returncode, ended.stderr) == (1, "")
 
 
 # register
@@ -276,19 +295,6 @@ def test_same_seed_same_bytes_and_nothing_is_replaced_unasked(run: Run, built: P
     assert run("build", BOX, "--out", folder, *QUICK, "--overwrite").status == 0
     assert contents(folder) == contents(built)
     assert (folder / "notes.txt").read_text() == "the user's own"
-
-
-def test_a_resumed_run_registers_only_what_is_missing(run: Run, built: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    folder.mkdir()
-    cut = report(built)
-    cut["frames"], cut["edges"], cut["complete"] = cut["frames"][:2], cut["edges"][:1], False
-    cut["edges"][0]["seconds"] = 1234.5
-    (folder / "report.json").write_text(json.dumps(cut))
-    assert run("build", BOX, "--out", folder, *QUICK, "--seed", "1", "--resume").status == 2
-    assert run("build", BOX, "--out", folder, *QUICK, "--resume").status == 0
-    assert contents(folder) == contents(built)
-    assert [edge["seconds"] == 1234.5 for edge in report(folder)["edges"]] == [True, False]
 
 
 def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(run: Run, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pty
 import select
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ import pytest
 
 from modeler.cli.console import Console
 from modeler.cli.reading import reading
+from modeler.pipeline import ACCEPTED
+from modeler.types import Outcome, Segmentation, Solution, Step
 from sequences import bundled, open_sequence
 
 COMMAND = [sys.executable, "-m", "modeler", "info", str(bundled("tube"))]
@@ -38,6 +41,26 @@ def test_where_stderr_is_no_terminal_there_is_no_bar(capfd: pytest.CaptureFixtur
     said = capfd.readouterr()
     assert said.out == ""
     assert said.err == ""
+
+
+def test_a_frame_left_out_is_told_once_and_so_is_that_it_was_placed(capfd: pytest.CaptureFixture[str]) -> None:
+    frame = next(iter(open_sequence(bundled("tube"))))
+    lost = Step(
+        frame=frame,
+        segmentation=Segmentation(np.zeros_like(frame.depth_m, dtype=bool), None, Outcome.TOO_FEW_POINTS),
+        view=None,
+        posteriors=(),
+        edges=(),
+        outcome="too few points",
+        solution=Solution(),
+        model=None,
+    )
+    with Console(2, None) as console:
+        for step in (lost, lost, replace(lost, outcome=ACCEPTED)):
+            console(step)
+    assert (
+        capfd.readouterr().err == "modeler: frame 0 is left out: too few points\nmodeler: frame 0 is placed after all\n"
+    )
 
 
 def on_a_terminal(command: list[str]) -> str:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 
 from modeler.cli.interrupt import terminable
-from modeler.cli.usage import parsed
+from modeler.cli.usage import Command, parsed
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it."""
@@ -25,18 +25,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.WARNING, format="modeler: %(message)s")  # to stderr
     # Rerun complains in its own way of a viewer that was closed, which is nobody's error; we tell what matters.
     os.environ.setdefault("RUST_LOG", "warn,re_sdk=off,re_grpc_client=off")
-    command = parsed(sys.argv[1:] if arguments is None else arguments)
+    try:
+        try:
+            return _run(parsed(sys.argv[1:] if arguments is None else arguments))
+        finally:
+            sys.stdout.flush()  # so that a reader who has left is noticed here
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # say nothing more, at exit either
+        return 1
+    except KeyboardInterrupt:
+        print("modeler: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run(command: Command) -> int:
+    """Run a command and return its exit status; what cannot be used is said in one line."""
     from modeler.types import InputError
 
     try:
         with terminable():
             return command.run()
     except InputError as error:
-        print(f"modeler: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"modeler: {' '.join(str(error).split()).removesuffix('.')}", file=sys.stderr)
         return 2
-    except BrokenPipeError:
-        sys.stderr.close()  # whoever read our output has left; say nothing more
-        return 1
-    except KeyboardInterrupt:
-        print("modeler: interrupted", file=sys.stderr)
-        return INTERRUPTED

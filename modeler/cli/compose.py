@@ -73,9 +73,10 @@ def prior(options: PriorOptions, sequence: AbstractSequence | None = None) -> Ab
 
 
 def told_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
-    """Return the name of the prior, and a remark for the user where it was the sequence that chose it."""
+    """Return the name of the prior, and in words what was chosen or assumed without being asked for."""
     name = nonvisual.prior_name(options, sequence)
-    return name, "" if options.prior is not None or name == "general" else f"prior {name}, as sequence.json says"
+    said = () if options.prior is not None or name == "general" else (f"prior {name}, as sequence.json says",)
+    return name, "; ".join((*said, *sequence.notes))
 
 
 def registrar(method: Method) -> AbstractRegistrar:

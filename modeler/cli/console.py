@@ -31,7 +31,7 @@ class Console:
         self._bar = bar()
         self._task = self._bar.add_task("", total=frames)
         self._address = address
-        self._seen: set[int] = set()  # a lost frame that later views place comes a second time
+        self._placed: dict[int, bool] = {}  # a lost frame that later views place comes a second time
 
     def __enter__(self) -> Console:
         """Show the bar."""
@@ -49,11 +49,14 @@ class Console:
     def __call__(self, step: Step) -> None:
         """Tell of a step."""
         loops = sum(edge.kind == "closure" and edge.accepted for edge in step.edges_so_far)
-        self._seen.add(step.frame.index)
+        frame, accepted = step.frame.index, step.outcome == "accepted"
+        again, self._placed[frame] = frame in self._placed, accepted
         description = f"{len(step.views)} joined, {loops} loops closed"
-        self._bar.update(self._task, completed=len(self._seen), description=description)
-        if step.outcome != "accepted":
-            self._say(f"frame {step.frame.index} is left out: {step.outcome}")
+        self._bar.update(self._task, completed=len(self._placed), description=description)
+        if not accepted and not again:
+            self._say(f"frame {frame} is left out: {step.outcome}")
+        elif accepted and again:
+            self._say(f"frame {frame} is placed after all")
 
     def _say(self, text: str) -> None:
         self._bar.console.print(f"modeler: {text}", markup=False)

@@ -36,6 +36,8 @@ class ObjectOptions:
 
 
 _Three = tuple[float, float, float]
+_LIMITS = {"deg": ("degrees", 180.0), "m": ("metres", 5.0), "s": ("seconds", 1e4)}
+"""By the ending of a parameter's name: its unit, and the most that makes sense. Lengths in mm exceed it."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,6 @@ class PriorOptions:
         for parameter in sorted(given.keys() - set(accepted)):
             raise InputError(f"{_flag(parameter)} is no parameter of --prior {name}; leave it out or change the prior.")
         for parameter, value in given.items():
-            most = 180.0 if parameter.endswith("_deg") else 1e4
             if isinstance(value, str):
                 continue
             if isinstance(value, tuple):
@@ -119,10 +120,13 @@ class PriorOptions:
             elif parameter == "step_deg":
                 if not 0.0 < abs(value) <= 360.0:
                     raise InputError(f"--step-deg {value:g} is out of range; give a turn of -360 to 360, but not 0.")
-            elif not 0.0 < value <= most:
-                raise InputError(
-                    f"{_flag(parameter)} {value:g} is out of range; give a positive number, at most {most:g}."
-                )
+            else:
+                unit, most = _LIMITS[parameter.rpartition("_")[2]]
+                if not 0.0 < value <= most:
+                    raise InputError(
+                        f"{_flag(parameter)} {value:g} is out of range; give a positive number of {unit}, "
+                        f"at most {most:g}."
+                    )
         return given
 
     def parameters(self) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Sequence
 from itertools import groupby
-from typing import Annotated
+from typing import Annotated, get_args
 
 import tyro
 
@@ -36,6 +36,7 @@ Command = (
     | Annotated[Join, tyro.conf.subcommand("join")]
 )
 
+_NAMES = tuple(subcommand.name for _, subcommand in map(get_args, get_args(Command)))
 _STYLE = (
     tyro.conf.OmitSubcommandPrefixes,
     tyro.conf.OmitArgPrefixes,
@@ -43,6 +44,25 @@ _STYLE = (
     tyro.conf.DisallowNone,
 )
 _HELP_INDENT = " " * 8  # deeper than what went wrong stands the help of an option
+_REWORDED = (
+    (r" \(applied to modeler [a-z-]+\)", ""),
+    (r" Arguments are applied to the directly preceding subcommand, so ordering can matter", ""),
+    (r"; For full helptext, .*", ""),
+    (r"Unrecognized options: ([^,;]+).*; Available subcommands: ", r"there is no command '\1'; there are "),
+    (r"Unrecognized (?:or misplaced )?options: ([^;]*)", lambda found: f"unknown: {found[1].strip().replace(',', '')}"),
+    (r"Perhaps you meant: ([^;]*)", r"perhaps you meant \1"),
+    (r"Missing from modeler [a-z-]+: ", "missing: "),
+    (r"Missing value for argument '(\S+)'\. .*", r"\1 lacks its value"),
+    (r"Expected one of \{(.*)\}", r"give a command: \1"),
+    (r"Error parsing (\S+): no type matching \{?(.*?)\}? could be .* from \[(.*?)\]\. .*", r"\1 takes \2, not \3"),
+    (r"Error parsing (\S+): invalid literal for int\(\) with base 10: (.*)", r"\1 takes INT, not \2"),
+    (r"'None', |, 'None'", ""),  # an option that may be left out
+    (r"invalid choice '(\S*)' for argument '(\S+)'\. Expected one of \((.*?)\)", r"\2 takes \3, not '\1'"),
+    (r"\b(?:INT|FLOAT)(?: (?:INT|FLOAT))+\b", lambda found: f"{len(found[0].split())} numbers"),
+    (r"\bINT\b", "a whole number"),
+    (r"\bFLOAT\b", "a number"),
+)
+"""From the parser's words to ours."""
 _DESCRIPTION = "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr."
 
 
@@ -60,17 +80,29 @@ def parsed(
             return tyro.cli(Command, prog="modeler", description=_DESCRIPTION, args=arguments, config=_STYLE)  # pyright: ignore[reportReturnType, reportArgumentType]
     except SystemExit as ending:
         if ending.code:
-            print(f"modeler: {_one_line(complaint.getvalue())}", file=sys.stderr)
+            asked = "".join(f"{name} " for name in arguments[:1] if name in _NAMES)
+            print(f"modeler: {_one_line(complaint.getvalue(), asked)}; see modeler {asked}--help", file=sys.stderr)
         raise
 
 
-def _one_line(box: str) -> str:
-    """Return the words of the parser's drawn box, without its title, frame, quoted help and colours."""
+def _one_line(box: str, asked: str) -> str:
+    """Return the words of the parser's drawn box, without its title, frame, quoted help and colours.
+
+    Args:
+        box: what the parser drew.
+        asked: command that was asked for, and a space; empty without one.
+    """
     text = re.sub(r"\x1b\[[0-9;]*m|\[/?bold\]|<class '\w+'>: ", "", box)
     rows = [row.strip("│|╭╮╰╯").rstrip() for row in text.splitlines()][1:]
-    rows = [row for row in rows if not row.startswith(_HELP_INDENT)]
+    rows = [re.sub(r"^ +in modeler (\S+) --help", r"(\1)", row) for row in rows]
+    # Which commands have what was perhaps meant is of interest only where the one asked for has not.
+    beside = (_HELP_INDENT, "(") if f"({asked.strip()})" in rows else _HELP_INDENT
+    rows = [row for row in rows if not row.startswith(beside)]
     parts = [" ".join(" ".join(group).split()) for ruler, group in groupby(rows, _is_ruler) if not ruler]
-    return "; ".join(part.rstrip(".") for part in parts if part and not part.startswith("Argument helptext"))
+    line = "; ".join(part.rstrip(".") for part in parts if part and not part.startswith("Argument helptext"))
+    for words, ours in _REWORDED:
+        line = re.sub(words, ours, line)
+    return line.replace(") (", ", ")
 
 
 def _is_ruler(row: str) -> bool:
