@@ -10,7 +10,7 @@ from modeler import se3
 from modeler.graph import CommonAxis, PoseGraph, solve
 from modeler.graph.axis import estimated_axis, slip, surest_point
 from modeler.graph.links import Link
-from modeler.types import Array, PoseGaussian
+from modeler.types import Array, Edge, PoseGaussian
 
 COUNT, STEP_RAD = 14, np.radians(25.0)
 TABLE = CommonAxis(STEP_RAD, np.radians(1.0), np.radians(0.2), 0.0005)
@@ -113,6 +113,39 @@ def test_trajectory_gains_by_the_axis_and_stays_calibrated(axis: CommonAxis) -> 
     assert np.median(first) < 0.75 * np.median(first_alone)  # the first pair profits from all others
     for values in (poses, near):
         assert np.mean(values) == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / seeds))
+
+
+@pytest.mark.parametrize("tilt_rad", [TABLE.sigma_tilt_rad, np.inf])
+def test_what_edges_hold_already_is_not_counted_again(tilt_rad: float) -> None:
+    """Edges hold the commanded turn and that nothing climbs, and it may be which way the axis points: exactly so."""
+    seeds = 30
+    shared = CommonAxis(None, sigma_tilt_rad=tilt_rad, sigma_shift_m=0.0005, sigma_lift_m=np.inf)
+    alone, together, poses = np.zeros(seeds), np.zeros(seeds), np.zeros(seeds)
+    for seed in range(seeds):
+        rng = np.random.default_rng([9, seed])
+        truth, camera_from_axis = _table(rng)
+        held = [_told(e, camera_from_axis, direction=np.isinf(tilt_rad)) for e in _graph(rng, truth).edges]
+        graph = PoseGraph(tuple(held), first=0)
+        plain, solution = solve(graph, {}), solve(graph, {}, axis=shared)
+        assert solution.camera_from_axis is not None
+        alone[seed], together[seed] = (rotation_error(s.trajectory, truth) for s in (plain, solution))
+        k = 1 + seed % (COUNT - 1)
+        poses[seed] = nees(PoseGaussian(solution.trajectory[k], solution.covariances[k]), truth[k])
+    assert np.median(together) < 0.95 * np.median(alone)
+    assert np.mean(poses) == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / seeds))
+
+
+def _told(of: Edge, camera_from_axis: Array, *, direction: bool) -> Edge:
+    """Return an edge told as well how far its step turned and climbed, and tilted if the axis' direction is known."""
+    sigmas = np.array([TABLE.sigma_tilt_rad if direction else 10.0] * 2 + [TABLE.sigma_step_rad, 10.0, 10.0, 0.0005])
+    to_axis = se3.adjoint(se3.inverse(camera_from_axis))
+    told = to_axis.T @ np.diag(sigmas**-2.0) @ to_axis
+    nominal = camera_from_axis @ se3.exp(np.array([0.0, 0.0, STEP_RAD, 0.0, 0.0, 0.0])) @ se3.inverse(camera_from_axis)
+    pose = of.posterior.pose
+    images = np.linalg.inv(pose.covariance)
+    spread = np.asarray(np.linalg.inv(images + told), dtype=np.float64)
+    pull = told @ se3.log(se3.inverse(pose.mean) @ nominal)
+    return edge(of.target, of.source, PoseGaussian(pose.mean @ se3.exp(spread @ pull), spread))
 
 
 def test_axis_settles_what_each_pair_leaves_open() -> None:

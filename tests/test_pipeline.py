@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import final
@@ -14,6 +14,7 @@ import tabletop
 from modeler import se3
 from modeler.closure import Closer
 from modeler.fusion import Fuser
+from modeler.graph import CommonAxis, PoseGraph, solve
 from modeler.pipeline import ACCEPTED, Modeler
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
@@ -29,6 +30,7 @@ from modeler.types import (
     PoseGaussian,
     Posterior,
     RayImage,
+    SharedAxis,
     Solution,
     Step,
 )
@@ -57,6 +59,7 @@ class AnyMotion(AbstractMotion):
 class AnyPrior(AbstractPrior):
     refused: int | None = None
     steps: float = 1.0
+    axis: SharedAxis | None = None
     lessons: list[tuple[list[int], int]] = field(default_factory=list)
 
     def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
@@ -70,6 +73,9 @@ class AnyPrior(AbstractPrior):
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
         self.lessons.append((list(solution.trajectory), len(edges)))
         return self
+
+    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
+        return self.axis
 
 
 @final
@@ -195,6 +201,28 @@ def test_the_mesh_is_made_though_the_last_frames_are_lost(lost: tuple[int, ...])
     assert last.outcome != ACCEPTED
     assert last.model is not None
     assert len(last.model.triangles) > 0
+
+
+def test_an_axis_that_all_steps_share_sharpens_the_first_pairs_too() -> None:
+    """Only the last solution knows of it: that of all edges and the axis together, in which each counts once."""
+    prior, known = AnyPrior(axis=SharedAxis(1e-4, 1e-5)), CommonAxis(None, 0.0, 1e-4, 1e-5, np.inf)
+    plain, shared = [], []
+    for seed in range(3):
+        *_, before, last = run(registrar=Oracle(noise=1.0), prior=prior, seed=seed)
+        assert before.solution.camera_from_axis is None
+        graph = PoseGraph(last.edges_so_far, first=0)
+        whole = solve(graph, last.solution.trajectory, axis=known)
+        for frame, pose in last.solution.trajectory.items():
+            np.testing.assert_allclose(pose, whole.trajectory[frame], atol=1e-6)
+        plain.append(_rotation_errors(solve(graph, {})))
+        shared.append(_rotation_errors(last.solution))
+    assert np.mean(shared) < 0.8 * np.mean(plain)
+    assert np.mean(shared, axis=0)[0] < np.mean(plain, axis=0)[0]
+
+
+def _rotation_errors(solution: Solution) -> list[float]:
+    truth = {k: POSES[0] @ se3.inverse(POSES[k]) for k in solution.trajectory}
+    return [float(se3.rotation_angle(se3.inverse(truth[k]) @ pose)) for k, pose in solution.trajectory.items() if k]
 
 
 def test_without_any_object_there_is_no_model() -> None:

@@ -41,7 +41,7 @@ from modeler.priors.axis_turn import AxisTurn, angles_and_axes
 from modeler.priors.common_axis import common_axis
 from modeler.priors.poke import pushed
 from modeler.priors.proposal import Guided
-from modeler.types import Array, InputError, Plane, RayImage
+from modeler.types import Array, InputError, Plane, RayImage, SharedAxis
 
 HERE = np.eye(4)
 SOURCE, TARGET = views(HERE)
@@ -144,6 +144,27 @@ def test_the_table_prior_holds_an_object_on_its_table(rng: np.random.Generator) 
 
 
 # The axis that is learnt
+
+
+def test_steps_share_the_axis_as_far_as_no_edge_holds_it() -> None:
+    unknown, bare, shown = TurntablePrior(24.0), [BARE_SOURCE, BARE_TARGET], [SOURCE, TARGET]
+    wobble_rad = np.radians(unknown.wobble_deg)
+    assert unknown.shared_axis(bare) == SharedAxis(wobble_rad, unknown.wobble_m)
+    place_alone = SharedAxis(np.inf, unknown.wobble_m)
+    assert unknown.shared_axis(shown) == place_alone  # each edge goes by the table's normal
+    assert unknown.shared_axis([BARE_SOURCE, TARGET]) == place_alone
+    assert replace(unknown, axis_direction=(0.0, -1.0, 0.0)).shared_axis(bare) == place_alone
+    assert replace(unknown, axis_direction=(0.0, -1.0, 0.0), axis_sigma_deg=180.0).shared_axis(bare) is not None
+    assert replace(unknown, axis_point_m=(0.0, 0.0, 0.8)).shared_axis(bare) is None
+    for guess in (
+        VelocityPrior(unknown),
+        AxesPrior(unknown),
+        FeaturesPrior(unknown),
+        ProductPrior(GeneralPrior(), unknown),
+    ):
+        assert guess.shared_axis(bare) == unknown.shared_axis(bare)
+    for other in (GeneralPrior(), TablePrior(), MixturePrior(unknown, GeneralPrior())):
+        assert other.shared_axis(bare) is None
 
 
 def test_the_common_axis_is_as_sure_as_it_is_right() -> None:

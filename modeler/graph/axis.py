@@ -24,12 +24,10 @@ _AXIS = gtsam.symbol("a", 0)  # frames are numbered far below
 # Standard deviations of A about where it is sought, rad and m. A turn about the axis changes nothing and is held; a
 # shift along it moves the point about which the object tilts, which lies within the object; the rest is all but free.
 _AXIS_SIGMAS = np.array([1.0, 1.0, 1e-4, 1.0, 1.0, 0.03])
+_PLACE_SIGMAS = np.array([0.01, 0.01, *_AXIS_SIGMAS[2:]])  # where steps say nothing of its direction
 _LEAST_RAD = np.radians(5.0)  # a table that has turned by less in all shows no axis
 _ITERATIONS, _HALVINGS = 50, 10  # of Gauss and Newton, and of one step of theirs that overshoots
 _TOLERANCE = 1e-6  # of half the squared Mahalanobis distance: where a step lowers it by less, the next is nothing
-
-
-_UNKNOWN = 4  # of an axis: two of its direction, two of its place
 _FITS = 1.0 - 1e-6  # of tables that are as they are said to be; the others cost a hundred times more
 
 
@@ -54,12 +52,13 @@ class CommonAxis:
     sigma_step_rad: float = float(np.radians(1.0))
     """Standard deviation of that turn."""
     sigma_tilt_rad: float = float(np.radians(0.2))
-    """How far the object tilts against the axis in a step: wobble of the table, slip on it."""
+    """How far the object tilts against the axis in a step: wobble of the table, slip on it. Infinite where edges hold
+    the axis' direction: what steps then share is its place."""
     sigma_shift_m: float = 0.0005
     """How far it slips across the axis in a step. Some centimetres make a table on which it is pushed about: what steps
     then share is the table's normal."""
     sigma_lift_m: float = 0.0005
-    """How far it moves along the axis in a step."""
+    """How far it moves along the axis in a step; infinite where edges hold that."""
 
     def solved(self, links: Sequence[Link], trajectory: Mapping[int, Array], root: int) -> Turned | None:
         """Return the poses that meet links and axis best; None where no axis is to be seen, or none that links allow.
@@ -103,8 +102,12 @@ class CommonAxis:
             {key: block @ to_object[key] if key in to_object else block for key, block in blocks.items()}
             for blocks, _ in rows[len(links) :]
         ]
-        # What the axis costs, twice over, is chi² with as many degrees of freedom as it says more than has to be found.
-        conditions = sum(len(error) for _, error in rows[len(links) + 1 :]) - _UNKNOWN
+        # What the axis costs, twice over, is chi² with as many degrees of freedom as it says more than has to be found:
+        # two numbers of its direction, two of its place.
+        told = np.isfinite([self.sigma_tilt_rad, self.sigma_shift_m])
+        steps = [np.hstack(list(blocks.values())) for blocks, _ in rows[len(links) + 1 :]]
+        conditions = sum(int(np.count_nonzero(step.any(axis=1))) for step in steps)
+        conditions -= 2 * int(np.count_nonzero(told))
         cost = 2.0 * (_half_square(rows) - alone)
         if conditions > 0 and cost > stats.chi2(conditions).ppf(_FITS):
             return None
@@ -143,7 +146,8 @@ class _Known:
         ]
         away = se3.log(se3.inverse(self.start) @ poses[_AXIS])
         away[2] = 0.0
-        rows.append(({_AXIS: np.diag(1.0 / _AXIS_SIGMAS)}, away / _AXIS_SIGMAS))
+        sigmas = _AXIS_SIGMAS if np.isfinite(self.axis.sigma_tilt_rad) else _PLACE_SIGMAS
+        rows.append(({_AXIS: np.diag(1.0 / sigmas)}, away / sigmas))
         steps = list(itertools.pairwise(sorted(self.frames)))
         for (target, source), error, *blocks in zip(steps, *self._slips(poses, np.array(steps)), strict=True):
             rows.append((self._free({target: blocks[0], source: blocks[1], _AXIS: blocks[2]}), error))

@@ -10,6 +10,7 @@ import numpy as np
 
 from modeler.closure import Closer
 from modeler.fusion import Fuser, own_covariances
+from modeler.graph import CommonAxis
 from modeler.pipeline.state import Seen, State
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter
@@ -75,6 +76,7 @@ class Modeler:
                 for later, found in self._caught_up(state):
                     state = later
                     yield replace(found, model=self._fused(state, last=False))
+                state = state.solved(self._shared_axis(state))
                 step = replace(step, solution=state.solution, edges_so_far=state.graph.edges, views=state.views)
             if state.views and (last or step.outcome == ACCEPTED):
                 state = replace(state, model=self._fused(state, last=last))
@@ -148,6 +150,17 @@ class Modeler:
             if step.outcome == ACCEPTED:
                 yield state, step
             waiting = [(seen, view) for seen, view in state.overdue() if (seen.frame.index, view) not in tried]
+
+    def _shared_axis(self, state: State) -> CommonAxis | None:
+        """Return the axis that all steps share, of which no edge knows; None where there is none.
+
+        The images of every pair say where it lies: solved for with all poses, it sharpens the first pairs as the last,
+        and what each pair says of it counts once.
+        """
+        shared = self.prior.shared_axis(list(state.views.values()))
+        if shared is None:
+            return None
+        return CommonAxis(sigma_tilt_rad=shared.sigma_tilt_rad, sigma_shift_m=shared.sigma_shift_m, sigma_lift_m=np.inf)
 
     def _registered(
         self, state: State, view: RayImage | None, previous: int | None, *, last: bool, again: bool

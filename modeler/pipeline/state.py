@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from modeler.graph import PoseGraph, Smoother
+from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.types import Edge, Frame, ObjectModel, RayImage, Segmentation, Solution
 
 _READY = 8  # views kept ready for registration; of others the images that a likelihood looks up are made again
@@ -75,6 +75,10 @@ class State:
             ready=dict(list(ready.items())[-_READY:]),
             lost={frame: other for frame, other in self.lost.items() if frame != number},
         )
+
+    def solved(self, axis: CommonAxis | None) -> State:
+        """Return the state solved with an axis that all steps share, where there is one."""
+        return self if axis is None else replace(self, smoother=replace(self.smoother, axis=axis).to(self.graph))
 
     def overdue(self) -> Iterator[tuple[Seen, int]]:
         """Yield lost frames, newest first, each with the view that followed it soonest, if that was soon."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from modeler import se3
 from modeler.priors.axis_turn import across_axis
 from modeler.priors.general import GeneralPrior, centroid_offset
 from modeler.priors.proposal import guided
-from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, Solution
+from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, SharedAxis, Solution
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,10 @@ class AxesPrior(AbstractPrior):
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AxesPrior:
         """Return the prior over what is known by now."""
         return replace(self, known=self.known.learned(solution, edges))
+
+    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
+        """Return the axis that all steps share, as what is known has it."""
+        return self.known.shared_axis(views)
 
     def grown(self, steps: float) -> AxesPrior:
         """Return the prior within limits that hold for several steps."""

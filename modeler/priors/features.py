@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from modeler.priors.bumps import Bumps
 from modeler.priors.general import GeneralPrior
 from modeler.priors.proposal import guided
-from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, Solution
+from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, SharedAxis, Solution
 
 _DRAWS = 20_000  # triples looked at
 _JUDGED = 1000  # at most so many of their motions are put to the vote
@@ -70,6 +70,10 @@ class FeaturesPrior(AbstractPrior):
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> FeaturesPrior:
         """Return the prior over what is known by now."""
         return replace(self, known=self.known.learned(solution, edges))
+
+    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
+        """Return the axis that all steps share, as what is known has it."""
+        return self.known.shared_axis(views)
 
     def grown(self, steps: float) -> FeaturesPrior:
         """Return the prior within limits that hold for several steps."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from modeler.priors.gaussian import Gaussian, fitted
-from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, InputError, RayImage, Solution
+from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, InputError, RayImage, SharedAxis, Solution
 
 _DRAWS = 5000
 _FITTED = 1000
@@ -46,6 +46,10 @@ class ProductPrior(AbstractPrior):
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> ProductPrior:
         """Return the product of what both learnt."""
         return replace(self, first=self.first.learned(solution, edges), second=self.second.learned(solution, edges))
+
+    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
+        """Return the axis that all steps share, where either part has one."""
+        return self.first.shared_axis(views) or self.second.shared_axis(views)
 
     def grown(self, steps: float) -> ProductPrior:
         """Return the product with limits that hold for several steps."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,12 +15,13 @@ from modeler.priors.general import GeneralPrior, grown_limits
 from modeler.priors.on_plane import no_plane, support
 from modeler.priors.proposal import guided
 from modeler.priors.table import TablePrior
-from modeler.types import AbstractMotion, AbstractPrior, Edge, RayImage, Solution
+from modeler.types import AbstractMotion, AbstractPrior, Edge, RayImage, SharedAxis, Solution
 
 _UP = (0.0, -1.0, 0.0)  # against gravity for a camera held upright: y points down
 _BROAD_DEG, _GIVEN_DEG = 30.0, 1.0
 _SHIFT_DEG = 30.0  # up to this turn the shift's limit is what it says
 _LEAST = 1e-5  # rad or m: densities stay finite where somebody is wholly sure
+_VAGUE_DEG = 20.0  # a direction known no better counts for nothing beside what steps show, in however many edges it is
 _ROOM_DEG = 5.0  # about what four standard deviations of the steps allow
 
 
@@ -92,6 +93,17 @@ class TurntablePrior(AbstractPrior):
         up = np.array(_UP if self.axis_direction is None else self.axis_direction)
         sense = turn_sense([edge.posterior for edge in accepted], up)
         return prior if sense == 0.0 else replace(prior, step_sign="known", step_deg=sense * abs(self.step_deg))
+
+    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
+        """Return the axis that all steps share, as far as the edge of each does not hold it; None where it is given.
+
+        Edges hold the commanded step and that nothing climbs along the axis. They hold the axis' direction too where it
+        is given or a table is seen, each the same one: there steps share its place alone.
+        """
+        if self.axis_point_m is not None:
+            return None
+        vague = all(self._axis(view, view).sigma_direction_rad >= np.radians(_VAGUE_DEG) for view in views)
+        return SharedAxis(float(np.radians(self.wobble_deg)) if vague else np.inf, self.wobble_m)
 
     def _axis(self, source: RayImage, target: RayImage) -> Axis:
         """Return what is known of the axis without comparing the images."""

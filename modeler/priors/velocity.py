@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from modeler import se3
 from modeler.priors.bumps import Bumps
 from modeler.priors.general import GeneralPrior
 from modeler.priors.proposal import guided
-from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, Solution
+from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, SharedAxis, Solution
 
 _MOST_STEPS = 3.0  # beyond, it is anybody's guess
 
@@ -55,6 +55,10 @@ class VelocityPrior(AbstractPrior):
         """Return the prior that goes on from the poses so far."""
         trajectory = tuple(sorted(solution.trajectory.items(), key=lambda item: item[0]))
         return replace(self, known=self.known.learned(solution, edges), trajectory=trajectory)
+
+    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
+        """Return the axis that all steps share, as what is known has it."""
+        return self.known.shared_axis(views)
 
     def grown(self, steps: float) -> VelocityPrior:
         """Return the prior within limits that hold for several steps."""
