@@ -77,7 +77,7 @@ class RealsenseCamera(AbstractCamera):
         try:
             context = rs.context() if context is None else context
             if not len(context.query_devices()):
-                raise InputError(f"{where}: no camera is plugged in; connect one to a USB 3 port.")
+                raise InputError(f"{where.removesuffix(':')}: no camera is plugged in; connect one to a USB 3 port.")
             pipeline, config = rs.pipeline(context), rs.config()
             if serial:
                 config.enable_device(serial)

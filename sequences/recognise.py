@@ -14,8 +14,8 @@ from sequences.realsense import SCHEME, open_camera
 from sequences.tum import open_tum
 
 FORMATS = (
-    "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder, organised clouds, a ROS bag, an Azure Kinect .mkv, "
-    "or realsense:"
+    "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder, organised clouds, a ROS bag, a RealSense recording, "
+    "an Azure Kinect .mkv, or realsense:"
 )
 BAGS = (".bag", ".mcap", ".db3")
 CLOUDS = (".pcd", ".ply")
@@ -58,7 +58,7 @@ def _open(path: Path, given: Given) -> AbstractSequence:
 
         return open_clouds(path, given)
     if not path.is_dir():
-        raise InputError(f"{path}: no such folder; a file of this kind holds no sequence, give {FORMATS}.")
+        raise InputError(f"{path}: a file of this kind holds no sequence; give {FORMATS}.")
     if (path / "scene_camera.json").exists():
         return BopSequence(path, given)
     if (path / "depth.txt").exists():
@@ -84,4 +84,6 @@ def _advice(path: Path) -> str:
         return f"holds {len(scenes)} sequences; give one of them: {', '.join(scenes[:3])}{more}."
     if any(name in COLOUR_FOLDERS for name in inner):
         return "holds colour but no depth images; only depth can be registered, put it into depth/."
-    return f"holds no depth images; give {FORMATS}."
+    if path.absolute().name == "depth":
+        return f"is the folder of the images alone; give the one it lies in, {path.absolute().parent}."
+    return f"holds no depth images where they are looked for; give {FORMATS}."

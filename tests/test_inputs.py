@@ -272,6 +272,23 @@ def test_colour_without_depth_is_refused(tmp_path: Path, frames: list[Frame]) ->
         open_sequence(tmp_path / "hot3d")
 
 
+def test_the_folder_of_the_images_alone_is_told_from_its_sequence(tmp_path: Path, frames: list[Frame]) -> None:
+    write_bop(tmp_path / "scene", frames[:1], depth_scale_mm=1.0)
+    with pytest.raises(InputError, match=rf"give the one it lies in, {tmp_path / 'scene'}"):
+        open_sequence(tmp_path / "scene" / "depth")
+    with pytest.raises(InputError, match="a file of this kind holds no sequence"):
+        open_sequence(tmp_path / "scene" / "depth" / "000000.png")
+
+
+def test_a_sequence_has_no_poses_to_convert(
+    tmp_path: Path, frames: list[Frame], capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_bop(tmp_path / "scene", frames[:1], depth_scale_mm=1.0)
+    assert main(["convert", str(tmp_path / "scene"), "--out", str(tmp_path / "poses.txt")]) == 2
+    assert "is no folder of a run" in capfd.readouterr().err
+    assert not (tmp_path / "poses.txt").exists()
+
+
 def test_tiff_pictures_are_read(tmp_path: Path, frames: list[Frame]) -> None:
     write_bop(tmp_path / "itodd", frames, depth_scale_mm=1.0)
     for frame in frames:

@@ -157,6 +157,7 @@ def test_a_textured_export_shows_the_colours(runs: tuple[Path, Path, Path, dict[
     [
         (["--texture", "--out", "a.stl"], "--texture goes with"),
         (["--bop", "--out", "a.obj"], "BOP models are PLY files"),
+        (["--tint", "views", "--out", "a.stl"], "STL carries no colour"),
         (["--triangles", "2", "--out", "a.stl"], "--triangles 2 is too few"),
         (["--voxel-m", "-1", "--out", "a.stl"], "--voxel-m -1 is out of range"),
         (["--texture", "--tint", "views", "--out", "a.glb"], "give one of them"),

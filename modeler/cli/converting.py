@@ -33,6 +33,8 @@ def convert(options: Convert) -> int:
     """
     if (options.input / "report.json").is_file():
         return _poses(options.input, options.out)
+    if options.out.suffix in (".json", ".txt"):
+        raise InputError(f"{options.input}: is no folder of a run, whose poses {options.out} could hold; give one")
     whole = open_sequence(options.input, options.given.stated())
     whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
     kept = frame_range(options.selection.frames)
@@ -53,7 +55,7 @@ def convert(options: Convert) -> int:
                 path.name: path.read_bytes() for path in (sequence.robot_path, sequence.model_path) if path is not None
             },
         )
-    print(f"modeler: {len(open_sequence(options.out))} frames of a {sequence.layout}: {options.out}", file=sys.stderr)
+    print(f"modeler: {len(open_sequence(options.out))} frames ({sequence.layout}): {options.out}", file=sys.stderr)
     for note in sequence.notes:
         print(f"modeler: {note}", file=sys.stderr)
     return 0

@@ -53,6 +53,8 @@ def _check(options: Export) -> None:
         raise InputError(f"{options.out}: --texture goes with {' and '.join(TEXTURED)} alone; choose another --out")
     if options.texture and options.tint is not None:
         raise InputError("--texture and --tint are two ways to colour; give one of them")
+    if options.tint is not None and suffix == ".stl":
+        raise InputError(f"{options.out}: STL carries no colour for --tint; choose another --out")
     if options.bop and suffix != ".ply":
         raise InputError(f"{options.out}: BOP models are PLY files; give --out a name such as obj_000001.ply")
     if options.triangles is not None and options.triangles < 4:
@@ -70,7 +72,8 @@ def _scan(options: Export) -> Scan | None:
 
 
 def _tell(model: ObjectModel, options: Export) -> None:
-    """Say on stderr what nobody saw."""
+    """Say on stderr what was written, and how much of it nobody saw."""
+    made_up = ""
     if options.watertight and model.vertex_views is not None:
-        share = 100.0 * float(np.mean(model.vertex_views == 0))
-        print(f"modeler: {share:.0f} % of the vertices of {options.out} are made up", file=sys.stderr)
+        made_up = f", {100.0 * float(np.mean(model.vertex_views == 0)):.0f} % of the vertices made up"
+    print(f"modeler: {len(model.triangles)} triangles{made_up}: {options.out}", file=sys.stderr)
