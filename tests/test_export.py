@@ -492,7 +492,7 @@ def test_resumed_run_keeps_what_it_had_until_it_is_there_again(tmp_path: Path) -
         run.write(step, META)
     before = (tmp_path / "report.json").read_bytes()
     resumed = RunFolder.open(tmp_path, resume=True)
-    assert set(resumed.posteriors(META)) == {(5, 3), (7, 5)}
+    assert not resumed.finished(META)
     for step in steps[:2]:
         resumed.write(step, META)
         assert (tmp_path / "report.json").read_bytes() == before
@@ -508,13 +508,41 @@ def test_resumed_run_keeps_what_it_had_until_it_is_there_again(tmp_path: Path) -
 
 
 def test_resuming_with_other_settings_is_refused(tmp_path: Path) -> None:
-    assert RunFolder.open(tmp_path, resume=True).posteriors(META) == {}
+    assert not RunFolder.open(tmp_path, resume=True).finished(META)
     RunFolder.open(tmp_path).write(_steps()[0], META)
     run = RunFolder.open(tmp_path, resume=True)
-    assert run.posteriors(META) == {}
+    assert not run.finished(META)
     for other in (replace(META, seed=4), replace(META, prior="general"), replace(META, settings={"every": 2})):
         with pytest.raises(InputError, match="cannot resume"):
-            run.posteriors(other)
+            run.finished(other)
+
+
+def test_run_has_finished_when_its_registrations_are_forgotten(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path)
+    for step in _steps(2):
+        run.write(step, META)
+        run.pairs.keep(_steps()[-1].edges_so_far[0].posterior, "question")
+        assert not run.finished(META)
+    run.finish()
+    assert run.finished(META)
+    assert {path.name for path in tmp_path.iterdir()} == FILES - {"recording.rrd"}
+    run.write(_steps(2)[-1], replace(META, interrupted=True))
+    run.pairs.keep(_steps(2)[-1].edges_so_far[0].posterior, "question")
+    run.finish()
+    assert not run.finished(META)
+    assert run.pairs.folder.exists()
+
+
+def test_what_no_report_tells_of_is_not_resumed(tmp_path: Path) -> None:
+    """A program that was killed at --overwrite may leave files of the earlier run; their report goes first."""
+    run = RunFolder.open(tmp_path)
+    for step in _steps():
+        run.write(step, META)
+    run.pairs.keep(_steps()[-1].edges_so_far[0].posterior, "question")
+    (tmp_path / "report.json").unlink()
+    (tmp_path / "notes.txt").write_text("mine")
+    RunFolder.open(tmp_path, resume=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 def test_file_is_whole_whatever_happens_while_it_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from modeler.cli.console import Console
 from modeler.cli.interrupt import Interrupt
 from modeler.cli.remembered import Remembered
 from modeler.cli.watching import watched
-from modeler.export import RunFolder, RunMeta
+from modeler.export import RunFolder, RunMeta, alone
 from modeler.types import InputError
 from sequences import AbstractSequence, SensedSequence, frame_range, read_noise, survey
 from viz.stream import open_stream
@@ -47,35 +47,40 @@ def build(options: Build) -> int:
         settings=options.settings(),
         closure_expected=_comes_back(frames, modeler.closer.max_angle_deg),
     )
-    known = RunFolder(options.out).posteriors(meta) if options.resume else {}
-    modeler = replace(modeler, registrar=Remembered(modeler.registrar, known))
+    if options.resume and RunFolder(options.out).finished(meta):
+        print("modeler: the run had come to its end; --overwrite makes it anew", file=sys.stderr)
+        return _told(RunFolder(options.out).report(), options)
     scene = compose.scene(modeler, whole)
-    folder = RunFolder.open(options.out, overwrite=options.overwrite, resume=options.resume)
-    stream = open_stream(
-        frames.name,
-        save=folder.path / "recording.rrd",
-        spawn=options.view,
-        web=options.web,
-        connect=options.connect,
-        facts={"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings},
-    )
-    if remark:
-        print(f"modeler: {remark}", file=sys.stderr)
-    seconds = {"scene": time.perf_counter() - began, "registration": 0.0, "total": 0.0}
-    report: Mapping[str, Any] = {}
-    try:
-        with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
-            for step in modeler.run(interrupt.until(frames.until(lambda: interrupt.asked)), scene):
-                seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
-                seconds["total"] = time.perf_counter() - began
-                meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
-                report = folder.write(step, meta)
-                stream(step)
-                console(step)
-    finally:
-        stream.close()
-    _tell(report, options)
-    return 0 if report["trustworthy"] else 3
+    with alone(options.out):
+        folder = RunFolder.open(options.out, overwrite=options.overwrite, resume=options.resume)
+        modeler = replace(modeler, registrar=Remembered(modeler.registrar, folder.pairs))
+        stream = open_stream(
+            frames.name,
+            save=folder.path / "recording.rrd",
+            spawn=options.view,
+            web=options.web,
+            connect=options.connect,
+            facts={"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings},
+        )
+        if remark:
+            print(f"modeler: {remark}", file=sys.stderr)
+        seconds = {"scene": time.perf_counter() - began, "registration": 0.0, "total": 0.0}
+        report: Mapping[str, Any] = {}
+        try:
+            with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
+                for step in modeler.run(interrupt.until(frames.until(lambda: interrupt.asked)), scene):
+                    seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
+                    seconds["total"] = time.perf_counter() - began
+                    meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
+                    report = folder.write(step, meta)
+                    stream(step)
+                    console(step)
+        finally:
+            stream.close()
+        if not report:
+            raise KeyboardInterrupt  # before the first frame
+        folder.finish()
+    return _told(report, options)
 
 
 def _comes_back(frames: AbstractSequence, reach_deg: float) -> bool:
@@ -86,8 +91,8 @@ def _comes_back(frames: AbstractSequence, reach_deg: float) -> bool:
     return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
 
 
-def _tell(report: Mapping[str, Any], options: Build) -> None:
-    """Say on stderr what came out."""
+def _told(report: Mapping[str, Any], options: Build) -> int:
+    """Say on stderr what came out, and return the exit status."""
     accepted = sum(frame["outcome"] == "accepted" for frame in report["frames"])
     loop = "loop closed" if report["closed"] else "no loop closed"
     took = f"{report['seconds']['total']:.0f} s"
@@ -96,3 +101,4 @@ def _tell(report: Mapping[str, Any], options: Build) -> None:
         first, *others = report["reasons"]
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
         print(f"modeler: not to be trusted: {first}{more}", file=sys.stderr)
+    return 0 if report["trustworthy"] else 3

@@ -2,28 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
 from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
+from modeler.export import Pairs
 from modeler.types import AbstractMotion, AbstractRegistrar, Posterior, RayImage
+
+_DRAWN = 64  # motions by which one prior is told from another
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Remembered(AbstractRegistrar):
-    """Answers what is known from memory and asks another registrar for the rest."""
+    """Answers what is known from memory, asks another registrar for the rest, and keeps what it says at once."""
 
     registrar: AbstractRegistrar
     """Asked where memory ends."""
-    known: Mapping[tuple[int, int], Posterior]
-    """Posteriors by (source, target)."""
+    pairs: Pairs
+    """The memory."""
 
     def register(
         self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior of target_from_source."""
-        known = self.known.get((source.index, target.index))
-        return self.registrar.register(source, target, motion, rng=rng) if known is None else known
+        question = _question(self.registrar, (source, target), motion, rng)
+        known = self.pairs.get(source.index, target.index, question)
+        if known is not None:
+            return known
+        found = self.registrar.register(source, target, motion, rng=rng)
+        self.pairs.keep(found, question)
+        return found
+
+
+def _question(
+    registrar: AbstractRegistrar, views: tuple[RayImage, RayImage], motion: AbstractMotion, rng: np.random.Generator
+) -> str:
+    """Return a digest of all that an answer depends on.
+
+    A pair may be asked about more than once: with a prior that was grown, or that has learnt from frames in between.
+    """
+    digest = hashlib.blake2b(digest_size=12)
+    digest.update(f"{registrar!r} {rng.bit_generator.state} {motion.evidence}".encode())
+    for view in views:
+        frame = view.frame
+        digest.update(f"{frame.camera!r} {view.plane!r} {view.sigma_wh!r} {view.sigma_r_m!r}".encode())
+        for pixels in (frame.depth_m, frame.mask, frame.colour, view.points_m):
+            digest.update(b"none" if pixels is None else np.ascontiguousarray(pixels).tobytes())
+    drawn = motion.sample(_DRAWN, np.random.default_rng(0))
+    for numbers in (drawn, motion.log_density(drawn), motion.log_evidence(drawn)):
+        digest.update(np.ascontiguousarray(numbers).tobytes())
+    return digest.hexdigest()

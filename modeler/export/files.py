@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from modeler.types import InputError
@@ -26,3 +29,28 @@ def write_atomically(path: Path, content: str | bytes) -> None:
             part.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place with --out") from error
+
+
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Make a folder, if it is not there, and keep other programs that ask for the same out of it.
+
+    Raises:
+        InputError: where it cannot be made, or another program is in it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise InputError(f"{folder}: no run folder can be made ({error.strerror}); choose another --out") from error
+    try:
+        with contextlib.suppress(OSError):  # not every file system has locks
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError(
+                    f"{folder}: another run is writing to it; wait for its end, or choose another --out"
+                ) from None
+        yield
+    finally:
+        os.close(held)  # which a killed program does, too

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from modeler.export.files import PART, write_atomically
 from modeler.export.g2o import g2o_text
+from modeler.export.pairs import Pairs
 from modeler.export.ply import cloud_ply, mesh_ply
-from modeler.export.report import FrameRecord, RunMeta, frame_record, posteriors_of, report_of
+from modeler.export.report import FrameRecord, RunMeta, frame_record, report_of
 from modeler.export.tum import tum_text
-from modeler.types import InputError, Posterior, Step
+from modeler.types import InputError, Step
 
 _REPORT = "report.json"
-_OURS = ("model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd", _REPORT)
+_OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd")
+"""The report, without which nothing is resumed, goes first."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class RunFolder:
     """A sink for steps. Poses, graph and report are written after every step, clouds and mesh after the last.
 
     Each file is replaced in one go, the report after what it reports on: a run killed at any moment leaves no half
-    file. `RunFolder(path)` is for reading; `RunFolder.open` makes one to write to.
+    file. Until the run has ended each registration is kept as well. `RunFolder(path)` is for reading; `RunFolder.open`
+    makes one to write to.
     """
 
     path: Path
@@ -41,7 +43,7 @@ class RunFolder:
         Args:
             path: where.
             overwrite: delete the files of an earlier run first.
-            resume: keep them until they are replaced.
+            resume: keep them until they are replaced, unless no report says what they are of.
 
         Raises:
             InputError: where the folder has content and neither is given, or where it cannot be made or resumed.
@@ -50,13 +52,20 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
             if any(path.iterdir()) and not (overwrite or resume):
                 raise InputError(f"{path}: not empty; choose another --out, or give --overwrite or --resume")
+            resumes = resume and (path / _REPORT).exists()
             leftovers = [part for name in _OURS for part in path.glob(f".{name}.*{PART}")]
-            for file in [*leftovers, *(path / name for name in _OURS if overwrite)]:
+            for file in [*leftovers, *(path / name for name in _OURS if not resumes)]:
                 file.unlink(missing_ok=True)
+            if not resumes:
+                cls(path).pairs.drop()
         except OSError as error:
             raise InputError(f"{path}: no run folder can be made ({error.strerror}); choose another --out") from error
-        resumes = resume and (path / _REPORT).exists()
         return cls(path, len(cls(path).report()["frames"]) if resumes else 0)
+
+    @property
+    def pairs(self) -> Pairs:
+        """The registrations of a run that has not ended."""
+        return Pairs(self.path / ".pairs")
 
     def report(self) -> dict[str, Any]:
         """Return the report as it stands in the folder.
@@ -75,14 +84,14 @@ class RunFolder:
             raise InputError(f"{path}: not a report of schema 1; build again with --overwrite")
         return report
 
-    def posteriors(self, meta: RunMeta) -> Mapping[tuple[int, int], Posterior]:
-        """Return by (source, target) what an interrupted run has registered; empty where it had not got that far.
+    def finished(self, meta: RunMeta) -> bool:
+        """Return whether a run that is to be resumed had come to its end.
 
         Raises:
             InputError: where that run was made from other input or with other settings, or its report cannot be read.
         """
         if not (self.path / _REPORT).exists():
-            return {}
+            return False
         report = self.report()
         wanted = {"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, "settings": dict(meta.settings)}
         wanted = json.loads(json.dumps(wanted))
@@ -92,7 +101,7 @@ class RunFolder:
                     f"{self.path}: cannot resume, its {key} was {report.get(key)!r} and is now {value!r}; "
                     "use the same, or --overwrite"
                 )
-        return posteriors_of(report)
+        return report.get("complete") is True and not self.pairs.folder.exists()
 
     def write(self, step: Step, meta: RunMeta) -> dict[str, Any]:
         """Bring the folder up to date and return the report after this step.
@@ -113,6 +122,18 @@ class RunFolder:
             self._write("model.ply", mesh_ply(step.model))
         self._write(_REPORT, json.dumps(report, allow_nan=False) + "\n")
         return report
+
+    def finish(self) -> None:
+        """Forget the registrations, unless the run ended before its last frame and may be resumed.
+
+        Raises:
+            InputError: where they cannot be removed.
+        """
+        if self.report()["complete"]:
+            try:
+                self.pairs.drop()
+            except OSError as error:
+                raise InputError(f"{self.pairs.folder}: cannot be removed ({error.strerror}); remove it") from error
 
     def _write(self, name: str, content: str | bytes) -> None:
         write_atomically(self.path / name, content)

@@ -1,0 +1,100 @@
+"""Registrations of a run that has not ended, each kept as soon as it is made."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import shutil
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+
+from modeler.export.files import write_atomically
+from modeler.types import InputError, Mode, Outcome, PoseGaussian, Posterior
+
+_NUMBERS = ("overlap", "effective_samples", "pareto_k", "log_evidence", "seconds")
+
+
+@final
+@dataclass(frozen=True)
+class Pairs:
+    """A folder with one file a registration, so that a run that was killed need not make them again.
+
+    A file is named by the two frames and by what was asked of them: another question has another answer.
+    """
+
+    folder: Path
+    """It is made when there is something to keep."""
+
+    def get(self, source: int, target: int, question: str) -> Posterior | None:
+        """Return what was found, to the bit; None where it is not there.
+
+        Args:
+            source: frame number.
+            target: frame number.
+            question: a digest of all that the answer depends on.
+        """
+        try:
+            packed = io.BytesIO(self._path(source, target, question).read_bytes())
+            with np.load(packed, allow_pickle=False) as kept:
+                return _posterior(source, target, {name: kept[name] for name in kept.files})
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+
+    def keep(self, posterior: Posterior, question: str) -> None:
+        """Keep what was found. Where that cannot be, say for want of space, it will have to be found again."""
+        packed = io.BytesIO()
+        np.savez(packed, allow_pickle=False, **_arrays(posterior))
+        with contextlib.suppress(OSError, InputError):
+            self.folder.mkdir(exist_ok=True)
+            write_atomically(self._path(posterior.source, posterior.target, question), packed.getvalue())
+
+    def drop(self) -> None:
+        """Forget everything, or, where the program is killed at it, nothing.
+
+        Raises:
+            OSError: where that cannot be.
+        """
+        gone = self.folder.with_name(f"{self.folder.name}.dropped")
+        shutil.rmtree(gone, ignore_errors=True)
+        if self.folder.is_dir() and not self.folder.is_symlink():
+            self.folder.rename(gone)
+            shutil.rmtree(gone)
+
+    def _path(self, source: int, target: int, question: str) -> Path:
+        return self.folder / f"{source:06d}-{target:06d}-{question}.npz"
+
+
+def _arrays(posterior: Posterior) -> dict[str, np.ndarray]:
+    """Return a posterior as arrays."""
+    arrays = {
+        "mean": posterior.pose.mean,
+        "covariance": posterior.pose.covariance,
+        "outcome": np.array(posterior.outcome.label),
+        "samples": posterior.samples,
+        "weights": posterior.weights,
+        "numbers": np.array([getattr(posterior, name) for name in _NUMBERS]),
+        "mode_weights": np.array([mode.weight for mode in posterior.modes]),
+        "mode_means": np.array([mode.pose.mean for mode in posterior.modes]),
+        "mode_covariances": np.array([mode.pose.covariance for mode in posterior.modes]),
+    }
+    return arrays if posterior.information is None else arrays | {"information": posterior.information}
+
+
+def _posterior(source: int, target: int, arrays: dict[str, np.ndarray]) -> Posterior:
+    """Return the posterior that arrays hold."""
+    modes = zip(arrays["mode_weights"], arrays["mode_means"], arrays["mode_covariances"], strict=True)
+    return Posterior(
+        source=source,
+        target=target,
+        pose=PoseGaussian(arrays["mean"], arrays["covariance"]),
+        outcome=Outcome(str(arrays["outcome"])),
+        samples=arrays["samples"],
+        weights=arrays["weights"],
+        modes=tuple(Mode(float(weight), PoseGaussian(mean, covariance)) for weight, mean, covariance in modes),
+        information=arrays.get("information"),
+        **dict(zip(_NUMBERS, arrays["numbers"].tolist(), strict=True)),
+    )

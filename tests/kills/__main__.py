@@ -1,0 +1,51 @@
+"""Kill `modeler build` with SIGKILL at random moments, resume it, and compare with a run that nobody disturbed.
+
+    PYTHONPATH=tests python -m kills --count 50 --seed 0
+
+Trajectory, graph, mesh and cloud must be the same to the byte, and each kill may cost one pair at most. What fails is
+kept in the folder of --out, and the status is 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import shutil
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from kills.trials import KINDS, Trials
+from sequences import bundled
+
+
+def main() -> int:
+    """Run the trials and return the exit status."""
+    parser = argparse.ArgumentParser(prog="kills", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--count", type=int, default=50, help="how many kills")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--sequence", default=str(bundled("tube")))
+    parser.add_argument("--options", default="--prior table", help="further options of modeler build, as one word")
+    parser.add_argument("--out", type=Path, default=Path("runs/kills"), help="folder of the runs, which is emptied")
+    options = parser.parse_args()
+    shutil.rmtree(options.out, ignore_errors=True)
+    options.out.mkdir(parents=True)
+    trials = Trials((options.sequence, *shlex.split(options.options)), options.out)
+    whole = trials.undisturbed()
+    print(f"undisturbed: {whole.pairs} pairs, {whole.changes} changes of the folder, {whole.seconds:.1f} s", flush=True)
+    rng, began, survived, failed = np.random.default_rng(options.seed), time.monotonic(), 0, 0
+    while survived + failed < options.count:
+        kind = KINDS[(survived + failed) % len(KINDS)]
+        when, fault = trials.fault(whole, kind, f"{survived + failed:03d}", rng)
+        if fault == "it had ended before it was to be killed":
+            continue
+        survived, failed = survived + (not fault), failed + bool(fault)
+        print(f"{survived + failed:3d} {kind:9} {when:30} {fault or 'the same'}", flush=True)
+    print(f"{survived} of {options.count} kills survived in {time.monotonic() - began:.0f} s")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,214 @@
+"""A run that is killed is taken up where it was: the same bytes, and no pair registered twice but the one under way."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kills.trials import KINDS, SAME, Trials
+
+from modeler.cli import building, main
+from modeler.cli.remembered import Remembered
+from modeler.export import Pairs, RunFolder, alone
+from modeler.priors import GeneralPrior
+from modeler.rays import Sensor
+from modeler.registration import IcpRegistrar
+from modeler.types import AbstractMotion, InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage
+from sequences import bundled, open_sequence
+
+BOX = str(bundled("box"))
+QUICK = ("--prior", "table", "--method", "icp", "--frames", "0:3")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    assert main(["build", BOX, "--out", str(folder), *QUICK]) == 0
+    return folder
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+    """Return a list to which every registration is added."""
+    pairs, register = [], IcpRegistrar.register
+
+    def noted(
+        self: IcpRegistrar, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+    ) -> Posterior:
+        pairs.append((source.index, target.index))
+        return register(self, source, target, motion, rng=rng)
+
+    monkeypatch.setattr(IcpRegistrar, "register", noted)
+    return pairs
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in SAME}
+
+
+def test_a_killed_run_is_taken_up(whole: Path, tmp_path: Path, asked: list[tuple[int, int]]) -> None:
+    folder, kept = tmp_path / "run", tmp_path / "run" / ".pairs"
+    process = subprocess.Popen([sys.executable, "-m", "modeler", "build", BOX, "--out", str(folder), *QUICK])
+    while process.poll() is None and not (kept.is_dir() and len(list(kept.glob("*.npz"))) == 1):
+        time.sleep(0.005)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert not json.loads((folder / "report.json").read_bytes())["complete"]
+    known = len(list(kept.glob("*.npz")))
+    assert main(["build", BOX, "--out", str(folder), *QUICK]) == 2  # neither --resume nor --overwrite
+    assert main(["build", BOX, "--out", str(folder), *QUICK, "--resume", "--seed", "1"]) == 2
+    assert asked == []
+    assert main(["build", BOX, "--out", str(folder), *QUICK, "--resume"]) == 0
+    assert asked == [(1, 0), (2, 1)][known:]
+    assert contents(folder) == contents(whole)
+    assert {path.name for path in folder.iterdir()} == {path.name for path in whole.iterdir()}
+
+
+def test_a_run_that_had_ended_is_not_made_again(
+    whole: Path, asked: list[tuple[int, int]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path.name: path.stat().st_mtime_ns for path in whole.iterdir()}
+    assert main(["build", BOX, "--out", str(whole), *QUICK, "--resume"]) == 0
+    assert "had come to its end; --overwrite makes it anew" in capsys.readouterr().err
+    assert ({path.name: path.stat().st_mtime_ns for path in whole.iterdir()}, asked) == (before, [])
+
+
+def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(
+    whole: Path, tmp_path: Path, asked: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, write = tmp_path / "run", RunFolder.write
+
+    def pressed(self: RunFolder, step: building.Any, meta: building.RunMeta) -> dict:
+        if step.frame.index == 0:
+            signal.raise_signal(signal.SIGINT)
+        return write(self, step, meta)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "write", pressed)
+        assert main(["build", BOX, "--out", str(folder), *QUICK]) == 3
+    report = RunFolder(folder).report()
+    assert not report["complete"]
+    assert "the run was interrupted after frame" in report["reasons"][0]
+    assert (folder / "model.ply").stat().st_size > 1000
+    count = len(asked)
+    assert count == 1
+    assert main(["build", BOX, "--out", str(folder), *QUICK, "--resume"]) == 0
+    assert len(asked) == 2
+    assert contents(folder) == contents(whole)
+
+
+def test_ctrl_c_before_the_first_frame_ends_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Pressed(building.Interrupt):
+        @property
+        def asked(self) -> bool:
+            return True
+
+        def until(self, items: building.Any) -> building.Any:
+            return iter(())
+
+    monkeypatch.setattr(building, "Interrupt", Pressed)
+    assert main(["build", BOX, "--out", str(tmp_path / "run"), *QUICK]) == 130
+
+
+def test_two_runs_do_not_write_into_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with alone(tmp_path / "run"):
+        for flag in ("--resume", "--overwrite"):
+            assert main(["build", BOX, "--out", str(tmp_path / "run"), *QUICK, flag]) == 2
+            assert "another run is writing to it" in capsys.readouterr().err
+    with alone(tmp_path / "run"):
+        assert list((tmp_path / "run").iterdir()) == []
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="choose another --out"), alone(tmp_path / "file"):
+        pass
+
+
+def posterior(rng: np.random.Generator) -> Posterior:
+    """Return one with everything that a posterior may have."""
+    gaussian = PoseGaussian(rng.normal(size=(4, 4)), rng.normal(size=(6, 6)))
+    return Posterior(
+        source=7,
+        target=3,
+        pose=gaussian,
+        outcome=Outcome.AMBIGUOUS,
+        overlap=0.3,
+        samples=rng.normal(size=(5, 4, 4)),
+        weights=rng.random(5),
+        modes=(Mode(0.75, gaussian), Mode(0.25, gaussian.inverse())),
+        information=rng.normal(size=(6, 6)),
+        effective_samples=float("nan"),
+        pareto_k=float("inf"),
+        log_evidence=-float("inf"),
+        seconds=0.1,
+    )
+
+
+@pytest.mark.parametrize("bare", [False, True])
+def test_what_is_kept_comes_back_to_the_bit(tmp_path: Path, rng: np.random.Generator, bare: bool) -> None:
+    pairs, kept = Pairs(tmp_path / "pairs"), posterior(rng)
+    if bare:
+        kept = replace(kept, modes=(), information=None, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
+    pairs.keep(kept, "question")
+    back = pairs.get(7, 3, "question")
+    assert back is not None
+    assert (back.source, back.target, back.outcome, len(back.modes)) == (7, 3, kept.outcome, len(kept.modes))
+    for name in ("overlap", "samples", "weights", "information", *("effective_samples", "pareto_k", "log_evidence")):
+        np.testing.assert_equal(getattr(back, name), getattr(kept, name))
+    gaussians = [
+        (back.pose, kept.pose),
+        *((ours.pose, theirs.pose) for ours, theirs in zip(back.modes, kept.modes, strict=True)),
+    ]
+    for ours, theirs in gaussians:
+        assert (ours.mean.tobytes(), ours.covariance.tobytes()) == (theirs.mean.tobytes(), theirs.covariance.tobytes())
+    for other in ((7, 2, "question"), (6, 3, "question"), (7, 3, "another")):
+        assert pairs.get(*other) is None
+    pairs.drop()
+    pairs.drop()
+    assert pairs.get(7, 3, "question") is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_kept_and_broken_counts_as_lost(tmp_path: Path, rng: np.random.Generator) -> None:
+    pairs = Pairs(tmp_path / "pairs")
+    pairs.keep(posterior(rng), "question")
+    (file,) = pairs.folder.iterdir()
+    content = file.read_bytes()
+    for cut in (0, 10, len(content) // 2, len(content) - 3):
+        file.write_bytes(content[:cut])
+        assert pairs.get(7, 3, "question") is None
+    np.savez(file, mean=np.array([{}], dtype=object), allow_pickle=True)  # nothing is unpickled
+    assert pairs.get(7, 3, "question") is None
+    Pairs(tmp_path / "file" / "pairs").keep(posterior(rng), "question")  # nowhere to keep it: no fault
+
+
+def test_an_answer_is_to_one_question_only(tmp_path: Path, asked: list[tuple[int, int]]) -> None:
+    frames = [open_sequence(BOX).frame(index) for index in (0, 1)]
+    views = [Sensor().ray_image(frame, None) for frame in frames]
+    nearer = Sensor().ray_image(replace(frames[0], depth_m=frames[0].depth_m - np.float32(0.001)), None)
+    priors = [GeneralPrior(), GeneralPrior().grown(2)]
+    remembered = Remembered(IcpRegistrar(), Pairs(tmp_path))
+
+    def ask(target: RayImage, prior: int = 0, seed: int = 0) -> int:
+        motion = priors[prior].between(views[1], target)
+        remembered.register(views[1], target, motion, rng=np.random.default_rng(seed))
+        return len(asked)
+
+    assert [ask(views[0]), ask(views[0])] == [1, 1]
+    assert [ask(views[0], prior=1), ask(views[0], prior=1)] == [2, 2]
+    assert [ask(views[0], seed=1), ask(nearer), ask(views[0])] == [3, 4, 4]
+
+
+@pytest.mark.skipif("MODELER_SLOW" not in os.environ, reason="some minutes; set MODELER_SLOW=1 to run it")
+@pytest.mark.timeout(1200)
+def test_killed_at_random_moments(tmp_path: Path, rng: np.random.Generator) -> None:
+    trials = Trials((BOX, *QUICK), tmp_path)
+    whole = trials.undisturbed()
+    for kind in KINDS:
+        assert trials.fault(whole, kind, kind, rng)[1] in ("", "it had ended before it was to be killed")
