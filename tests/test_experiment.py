@@ -197,19 +197,55 @@ def trial(error_deg: float, *, nees: float = 5.0, usable: bool = True) -> Trial:
 
 
 def test_summaries_count_failures_and_leave_them_out_of_quantiles() -> None:
-    failed = Trial("box", "icp", 1, 3, 2, "too few points", usable=False)
+    failed = Trial("box", "icp", 1, 3, 2, "too few points", usable=False, rotation_deg=25.0)
     errors = [1.0, 2.0, 3.0, 4.0, 50.0]
     (row,) = summaries([*(trial(e) for e in errors), trial(5.0, nees=900.0, usable=False), failed], success_deg=16.2)
     assert (row.pairs, row.usable, row.successes) == (7, 5, 5)
-    assert row.rotation_error_deg == (2.25, 3.5, 4.75, 50.0)
+    assert row.rotation_error_deg == (2.25, 3.5, 4.75, 27.5, 50.0)
+    assert row.translation_error_mm == (2.0,) * 5
+    assert math.isnan(row.loop_deg)
     assert row.nees == pytest.approx((5 * 5.0 + 900.0) / 6)
     assert row.inside_95 == pytest.approx(5 / 6)
 
 
 def test_summaries_of_failures_alone_have_no_quantiles() -> None:
-    (row,) = summaries([Trial("box", "icp", 1, 1, 0, "too few points", usable=False)], success_deg=16.2)
+    failed = Trial("box", "icp", 1, 1, 0, "too few points", usable=False, rotation_deg=25.0)
+    (row,) = summaries([failed], success_deg=16.2)
     assert row.successes == 0
     assert all(math.isnan(value) for value in (*row.rotation_error_deg, row.nees, row.inside_95, row.seconds))
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_closed_turn_is_judged_by_what_all_its_steps_leave(known: bool) -> None:
+    @dataclass(frozen=True)
+    class Turning(AbstractRegistrar):
+        """Turns by a little too much about one axis at every step."""
+
+        def register(
+            self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        ) -> Posterior:
+            truth = POSES[target.index] @ se3.inverse(POSES[source.index])
+            posterior = Oracle().register(source, target, motion, rng=rng)
+            in_model = POSES[source.index] @ se3.exp(np.array([0, 0, 0.05, 0, 0, 0])) @ se3.inverse(POSES[source.index])
+            return replace(posterior, pose=replace(posterior.pose, mean=truth @ in_model))
+
+    plan = experiment(methods={"turning": Turning()}, pairing=Pairing(closed=True))
+    trials = list(plan.trials(Recording(known=known)))
+    assert len(trials) == plan.size(Recording(known=known)) == len(POSES)
+    (row,) = summaries(trials, 16.2, loops=plan.pairing.loops)
+    assert row.loop_deg == pytest.approx(np.degrees(0.05 * len(POSES)))
+    assert row.turned_deg == pytest.approx(2 * 15.0 * (len(POSES) - 1), abs=np.degrees(0.05 * len(POSES)))
+    assert row.successes == (len(POSES) if known else None)
+    assert math.isfinite(row.rotation_error_deg.median) == known
+    (row,) = summaries(plan.trials(Recording(known=known, lost=1)), 16.2, loops=True)
+    assert math.isnan(row.loop_deg)
+
+
+@pytest.mark.parametrize("pairing", [Pairing(), Pairing(closed=True, both_ways=True), Pairing((1, 2), closed=True)])
+def test_only_steps_once_round_are_a_loop(pairing: Pairing) -> None:
+    assert not pairing.loops
+    with pytest.raises(InputError, match="--closed"):
+        experiment(pairing=pairing).size(Recording(known=False))
 
 
 def run(out: Path, *recordings: Recording) -> list[Trial]:
@@ -227,6 +263,8 @@ def test_writes_json_csv_and_a_figure(tmp_path: Path) -> None:
     assert results["pairing"] == {"offsets": [1, 2], "both_ways": False, "closed": False}
     assert len(results["trials"]) == len(told) == 20
     assert len(results["summaries"]) == 8
+    assert results["summaries"][0]["rotation_error_deg"]["median"] < 3.0
+    assert np.shape(results["trials"][0]["target_from_source"]) == (16,)
     table = list(csv.DictReader(io.StringIO((folder / "results.csv").read_text())))
     assert len(table) == 20
     for row, record, one in zip(table, results["trials"], told, strict=True):

@@ -21,7 +21,7 @@ class Evaluate:
     """
 
     sequences: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SEQUENCE|RUN...")]
-    """BOP scene folders with scene_gt.json, or run folders made of such."""
+    """BOP scene folders with scene_gt.json, or run folders made of such; without, a full turn with --closed."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder for the results; those of an earlier evaluation are replaced at the end."""
     methods: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ",".join(get_args(Method))
@@ -31,7 +31,8 @@ class Evaluate:
     both_ways: bool = False
     """Register each pair in both directions, not only the later frame to the earlier."""
     closed: bool = False
-    """Take the sequence for a full turn: its last frame is followed by its first."""
+    """Take the sequence for a full turn: its last frame is followed by its first. What all its steps together
+    leave, of how much they turn one by one, is told too: it judges a sequence without ground truth."""
     points: Annotated[int | None, tyro.conf.arg(metavar="N"), tyro.conf.arg(help_behavior_hint="(default: all)")] = None
     """Keep so many of the object's surface points a view, drawn at random: very sparse clouds."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0

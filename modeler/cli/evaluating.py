@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import get_args
@@ -60,8 +61,8 @@ def evaluate(options: Evaluate) -> int:
 
 
 def table(rows: Sequence[Summary]) -> str:
-    """Return summaries as text in columns."""
-    heading = ("sequence", "method", "apart", "pairs", "usable", "right", "rot deg", "75 %", "max", "mm", "NEES", "s")
+    """Return summaries as text in columns; what nothing is known of is left out."""
+    heading = ("sequence", "method", "apart", "pairs", "usable", "right", "rot deg", "90 %", "max", "mm", "90 %", "max")
     cells = [
         (
             row.sequence,
@@ -69,15 +70,26 @@ def table(rows: Sequence[Summary]) -> str:
             str(row.offset),
             str(row.pairs),
             str(row.usable),
-            str(row.successes),
-            *(f"{value:.2f}" for value in row.rotation_error_deg[1:]),
-            f"{row.translation_error_mm:.2f}",
-            f"{row.median_nees:.1f}",
-            f"{row.seconds:.2f}",
+            "" if row.successes is None else str(row.successes),
+            *(
+                _number(value, 2)
+                for errors in (row.rotation_error_deg, row.translation_error_mm)
+                for value in (errors.median, errors.ninth_decile, errors.largest)
+            ),
+            _number(row.median_nees, 1),
+            _number(row.loop_deg, 2),
+            _number(row.turned_deg, 0),
+            _number(row.seconds, 2),
         )
         for row in rows
     ]
-    return columns([heading, *cells], left=2)
+    lines = [(*heading, "NEES", "loop deg", "of", "s"), *cells]
+    told = [number for number, column in enumerate(zip(*lines, strict=True)) if any(column[1:])]
+    return columns([tuple(line[number] for number in told) for line in lines], left=2)
+
+
+def _number(value: float, digits: int) -> str:
+    return "" if math.isnan(value) else f"{value:.{digits}f}"
 
 
 def columns(lines: Sequence[tuple[str, ...]], *, left: int) -> str:

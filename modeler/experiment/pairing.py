@@ -19,6 +19,11 @@ class Pairing:
     closed: bool = False
     """The sequence is a full turn: its last frame is followed by its first."""
 
+    @property
+    def loops(self) -> bool:
+        """Whether each frame is registered to the one before it all the way round: together they should do nothing."""
+        return self.closed and not self.both_ways and self.offsets == (1,)
+
     def pairs(self, indices: Sequence[int]) -> Iterator[tuple[int, int, int]]:
         """Yield source, target and offset of every pair of these frame numbers."""
         count = len(indices)

@@ -22,14 +22,14 @@ def evaluate(
     """Run an experiment and write `results.json`, `results.csv` and `rotation_errors.png` into a folder.
 
     Args:
-        sequences: with ground truth.
+        sequences: with ground truth, or such as are a closed turn where that is the pairing.
         experiment: what to do with each.
         out: folder, made where there is none; the three files of an earlier experiment are replaced at the end.
         draw: makes a PNG of the trials.
         told: hears of every trial as soon as it is done; there are `experiment.size(sequence)` for each sequence.
 
     Raises:
-        InputError: where a sequence has no ground truth or cannot be read, or `out` cannot be written.
+        InputError: where a sequence has nothing to be judged by or cannot be read, or `out` cannot be written.
     """
     names = [recorded.name for recorded in sequences]
     for recorded in sequences:
@@ -45,7 +45,7 @@ def evaluate(
         for trial in experiment.trials(recorded):
             trials.append(trial)
             told(trial)
-    rows = summaries(trials, experiment.success_deg)
+    rows = summaries(trials, experiment.success_deg, loops=experiment.pairing.loops)
     write_atomically(out / "results.json", results_json(experiment, trials, rows))
     write_atomically(out / "results.csv", results_csv(trials))
     write_atomically(out / "rotation_errors.png", draw(trials))

@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 import csv
+import functools
 import io
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
-from modeler.evaluation import coverage
+from modeler.evaluation import coverage, rotation_error_deg
 from modeler.experiment.trials import Experiment, Trial
 from modeler.types import Array
+
+
+class Quantiles(NamedTuple):
+    """How errors are spread; NaN where there is none."""
+
+    lower_quartile: float
+    median: float
+    upper_quartile: float
+    ninth_decile: float
+    largest: float
+
+    @staticmethod
+    def of(values: Array) -> Quantiles:
+        """Return the quantiles of numbers (n,)."""
+        shares = (0.25, 0.5, 0.75, 0.9, 1.0)
+        return Quantiles(*(float(np.quantile(values, share)) if len(values) else math.nan for share in shares))
 
 
 @final
@@ -32,12 +49,13 @@ class Summary:
     """Number of trials."""
     usable: int
     """How many the method stands by."""
-    successes: int
-    """How many rotation errors are below the limit of success, whether the method stands by them or not."""
-    rotation_error_deg: tuple[float, float, float, float]
-    """Lower quartile, median, upper quartile and maximum."""
-    translation_error_mm: float
-    """Median."""
+    successes: int | None
+    """How many rotation errors are below the limit of success, whether the method stands by them or not; None where
+    the truth is not known."""
+    rotation_error_deg: Quantiles
+    """Of the angle between estimate and truth."""
+    translation_error_mm: Quantiles
+    """Of the distance at the object's centroid between estimate and truth."""
     nees: float
     """Mean; 6 where covariances are true."""
     median_nees: float
@@ -46,39 +64,58 @@ class Summary:
     """Share of truths inside the region of 95 %."""
     seconds: float
     """Median."""
+    loop_deg: float = math.nan
+    """Rotation that is left of all steps round a closed turn; 0 where they are right. NaN where that was not asked."""
+    turned_deg: float = math.nan
+    """Rotation of those steps one by one, summed up: 360 where a steady turn was followed, much less where steps stuck,
+    much more where some were flipped."""
 
 
-def summaries(trials: Iterable[Trial], success_deg: float) -> list[Summary]:
-    """Return a row for each sequence, offset and method, in the order in which they appear."""
+def summaries(trials: Iterable[Trial], success_deg: float, *, loops: bool = False) -> list[Summary]:
+    """Return a row for each sequence, offset and method, in the order in which they appear.
+
+    Args:
+        trials: to summarise.
+        success_deg: rotation error below which one counts as right.
+        loops: whether the trials of a row are the steps round a closed turn, in order.
+    """
     groups: dict[tuple[str, int, str], list[Trial]] = {}
     for trial in trials:
         groups.setdefault((trial.sequence, trial.offset, trial.method), []).append(trial)
-    return [_summary(members, success_deg) for members in groups.values()]
+    return [_summary(members, success_deg, loops) for members in groups.values()]
 
 
-def _summary(trials: Sequence[Trial], success_deg: float) -> Summary:
+def _summary(trials: Sequence[Trial], success_deg: float, loops: bool) -> Summary:
     def known(values: Iterable[float]) -> Array:
         return np.array([value for value in values if math.isfinite(value)])
 
-    def quantile(values: Array, share: float) -> float:
-        return float(np.quantile(values, share)) if len(values) else math.nan
-
     rotation, squares = known(t.rotation_error_deg for t in trials), known(t.nees for t in trials)
-    low, median, high, most = (quantile(rotation, share) for share in (0.25, 0.5, 0.75, 1.0))
     return Summary(
         sequence=trials[0].sequence,
         method=trials[0].method,
         offset=trials[0].offset,
         pairs=len(trials),
         usable=sum(trial.usable for trial in trials),
-        successes=int(np.sum(rotation < success_deg)),
-        rotation_error_deg=(low, median, high, most),
-        translation_error_mm=quantile(known(t.translation_error_mm for t in trials), 0.5),
+        successes=None if math.isnan(trials[0].rotation_deg) else int(np.sum(rotation < success_deg)),
+        rotation_error_deg=Quantiles.of(rotation),
+        translation_error_mm=Quantiles.of(known(t.translation_error_mm for t in trials)),
         nees=float(np.mean(squares)) if len(squares) else math.nan,
-        median_nees=quantile(squares, 0.5),
+        median_nees=Quantiles.of(squares).median,
         inside_95=coverage(squares)[0.95],
-        seconds=quantile(known(t.seconds for t in trials), 0.5),
+        seconds=Quantiles.of(known(t.seconds for t in trials)).median,
+        **(_round(trials) if loops else {}),
     )
+
+
+def _round(trials: Sequence[Trial]) -> dict[str, float]:
+    """Return how much all steps turn, together and one by one; nothing where one is missing."""
+    if not all(trial.target_from_source for trial in trials):
+        return {}
+    steps = [np.array(trial.target_from_source).reshape(4, 4) for trial in trials]
+    return {
+        "loop_deg": rotation_error_deg(functools.reduce(np.matmul, steps), np.eye(4)),
+        "turned_deg": sum(rotation_error_deg(step, np.eye(4)) for step in steps),
+    }
 
 
 def results_json(experiment: Experiment, trials: Sequence[Trial], rows: Sequence[Summary]) -> str:
@@ -99,9 +136,10 @@ def results_json(experiment: Experiment, trials: Sequence[Trial], rows: Sequence
 
 
 def results_csv(trials: Sequence[Trial]) -> str:
-    """Return the trials as CSV, a field a column; numbers that are not finite are empty."""
+    """Return the trials as CSV, a field a column but for the estimate; numbers that are not finite are empty."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, [f.name for f in fields(Trial)], lineterminator="\n")
+    names = [f.name for f in fields(Trial) if f.name != "target_from_source"]
+    writer = csv.DictWriter(text, names, lineterminator="\n", extrasaction="ignore")
     writer.writeheader()
     writer.writerows(_finite(asdict(trial)) for trial in trials)
     return text.getvalue()
@@ -111,6 +149,8 @@ def _finite(record: Mapping[str, object]) -> dict[str, object]:
     """Return a record whose numbers JSON can hold: None for what is not finite."""
 
     def plain(value: object) -> object:
+        if isinstance(value, Quantiles):
+            return _finite(value._asdict())
         if isinstance(value, tuple):
             return [plain(entry) for entry in value]
         return None if isinstance(value, float) and not math.isfinite(value) else value

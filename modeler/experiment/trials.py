@@ -64,7 +64,7 @@ class Trial:
     usable: bool
     """Whether the method stands by its answer."""
     rotation_deg: float = math.nan
-    """True rotation between the frames."""
+    """True rotation between the frames, where it is known."""
     rotation_error_deg: float = math.nan
     """Angle between estimate and truth."""
     translation_error_mm: float = math.nan
@@ -77,6 +77,8 @@ class Trial:
     """Share of surface seen in both views, as the method has it."""
     seconds: float = math.nan
     """Wall time of the registration."""
+    target_from_source: tuple[float, ...] = ()
+    """The estimate, 16 numbers by row; empty where there is none."""
 
 
 @final
@@ -108,7 +110,7 @@ class Experiment:
         """Return the number of trials on a sequence.
 
         Raises:
-            InputError: where its truth is not known.
+            InputError: where its truth is not known and it is no closed turn either.
         """
         return len(self.methods) * len(list(self.pairing.pairs(self._frames(recorded))))
 
@@ -116,21 +118,27 @@ class Experiment:
         """Yield what each method makes of each pair.
 
         Raises:
-            InputError: where the truth of the motions is not known, or a frame cannot be read.
+            InputError: where the truth of the motions is not known and they are no closed turn either, or a frame
+                cannot be read.
         """
         indices = self._frames(recorded)
-        truth = recorded.truth() or {}
+        truth = recorded.truth()
         views = dict(self._views(recorded, indices))
         for source, target, offset in self.pairing.pairs(indices):
-            motion = true_motion(truth, target, source)
+            motion = None if truth is None else true_motion(truth, target, source)
             for name, method in self.methods.items():
                 blank = Trial(recorded.name, name, offset, source, target, outcome="", usable=False)
                 yield self._trial(method, views[source], views[target], blank=blank, truth=motion)
 
     def _frames(self, recorded: Recorded) -> tuple[int, ...]:
         truth = recorded.truth()
+        if truth is None and self.pairing.loops:
+            return recorded.indices
         if truth is None:
-            raise InputError(f"{recorded.name}: has no ground truth to compare with; add scene_gt.json.")
+            raise InputError(
+                f"{recorded.name}: has no ground truth to compare with; add scene_gt.json, or judge the loop of a full "
+                "turn by --closed."
+            )
         return tuple(index for index in recorded.indices if index in truth)
 
     def _views(self, recorded: Recorded, indices: Sequence[int]) -> Iterator[tuple[int, RayImage | Outcome]]:
@@ -158,9 +166,10 @@ class Experiment:
         target: RayImage | Outcome,
         *,
         blank: Trial,
-        truth: Array,
+        truth: Array | None,
     ) -> Trial:
-        blank = replace(blank, rotation_deg=rotation_error_deg(np.eye(4), truth))
+        if truth is not None:
+            blank = replace(blank, rotation_deg=rotation_error_deg(np.eye(4), truth))
         for view in (source, target):
             if isinstance(view, Outcome):
                 return replace(blank, outcome=view.label)
@@ -177,17 +186,23 @@ class Experiment:
         return _judged(blank, posterior, truth, source.centroid_m)
 
 
-def _judged(blank: Trial, posterior: Posterior, truth: Array, centroid_m: Array) -> Trial:
-    return replace(
+def _judged(blank: Trial, posterior: Posterior, truth: Array | None, centroid_m: Array) -> Trial:
+    trial = replace(
         blank,
         outcome=posterior.outcome.label,
         usable=posterior.usable,
-        rotation_error_deg=rotation_error_deg(posterior.pose.mean, truth),
-        translation_error_mm=1e3 * translation_error_m(posterior.pose.mean, truth, centroid_m),
-        nees=nees(posterior.pose, truth),
         sigma_deg=float(np.degrees(np.sqrt(np.trace(posterior.pose.covariance[:3, :3])))),
         overlap=posterior.overlap,
         seconds=posterior.seconds,
+        target_from_source=tuple(posterior.pose.mean.ravel().tolist()),
+    )
+    if truth is None:
+        return trial
+    return replace(
+        trial,
+        rotation_error_deg=rotation_error_deg(posterior.pose.mean, truth),
+        translation_error_mm=1e3 * translation_error_m(posterior.pose.mean, truth, centroid_m),
+        nees=nees(posterior.pose, truth),
     )
 
 
