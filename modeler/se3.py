@@ -8,11 +8,10 @@ leading axes.
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+
+from modeler.kernels import moves
 
 Array = npt.NDArray[np.float64]
-
-_SMALL_ANGLE_RAD = 1e-4  # below it the series of the coefficients is exact to rounding
 
 
 def hat(vector: Array) -> Array:
@@ -25,48 +24,16 @@ def hat(vector: Array) -> Array:
     return matrix
 
 
-def _coefficients(angle_rad: Array) -> tuple[Array, Array, Array]:
-    """Return sin(a)/a, (1 - cos a)/a², (a - sin a)/a³ with their limits at zero."""
-    small = angle_rad < _SMALL_ANGLE_RAD
-    safe = np.where(small, 1.0, angle_rad)
-    square = angle_rad**2
-    half = np.sin(0.5 * safe) / safe  # 1 - cos a = 2 sin²(a/2), which does not cancel
-    return (
-        np.where(small, 1.0 - square / 6.0, np.sin(safe) / safe),
-        np.where(small, 0.5 - square / 24.0, 2.0 * half**2),
-        np.where(small, 1.0 / 6.0 - square / 120.0, (safe - np.sin(safe)) / safe**3),
-    )
-
-
 def exp(xi: Array) -> Array:
     """Return the motions (..., 4, 4) of tangent vectors ξ (..., 6)."""
-    xi = np.asarray(xi, dtype=np.float64)
-    omega, upsilon = xi[..., :3], xi[..., 3:]
-    first, second, third = _coefficients(np.linalg.norm(omega, axis=-1))
-    cross = hat(omega)
-    square = cross @ cross
-    pose = np.zeros((*xi.shape[:-1], 4, 4))
-    pose[..., :3, :3] = np.eye(3) + first[..., None, None] * cross + second[..., None, None] * square
-    left_jacobian = np.eye(3) + second[..., None, None] * cross + third[..., None, None] * square
-    pose[..., :3, 3] = (left_jacobian @ upsilon[..., None])[..., 0]
-    pose[..., 3, 3] = 1.0
-    return pose
+    xi = np.ascontiguousarray(xi, dtype=np.float64)
+    return moves.exponentials(xi.reshape(-1, 6)).reshape(*xi.shape[:-1], 4, 4)
 
 
 def log(pose: Array) -> Array:
     """Return the tangent vectors ξ (..., 6) of motions (..., 4, 4), with rotation angles in [0, π]."""
-    pose = np.asarray(pose, dtype=np.float64)
-    flat = pose.reshape(-1, 4, 4)
-    omega = Rotation.from_matrix(flat[:, :3, :3]).as_rotvec()
-    angle = np.linalg.norm(omega, axis=-1)
-    first, second, _ = _coefficients(angle)
-    safe = np.where(angle < _SMALL_ANGLE_RAD, 1.0, angle)
-    # (1 - a sin(a) / (2 (1 - cos a))) / a², the last coefficient of the inverse left Jacobian.
-    last = np.where(angle < _SMALL_ANGLE_RAD, 1.0 / 12.0, (1.0 - first / (2.0 * second)) / safe**2)
-    cross = hat(omega)
-    inverse_jacobian = np.eye(3) - 0.5 * cross + last[:, None, None] * (cross @ cross)
-    upsilon = (inverse_jacobian @ flat[:, :3, 3, None])[..., 0]
-    return np.concatenate([omega, upsilon], axis=-1).reshape(*pose.shape[:-2], 6)
+    pose = np.ascontiguousarray(pose, dtype=np.float64)
+    return moves.logarithms(pose.reshape(-1, 4, 4)).reshape(*pose.shape[:-2], 6)
 
 
 def inverse(pose: Array) -> Array:
@@ -78,6 +45,20 @@ def inverse(pose: Array) -> Array:
     result[..., :3, 3] = -(rotation @ pose[..., :3, 3, None])[..., 0]
     result[..., 3, 3] = 1.0
     return result
+
+
+def moved(pose: Array, xi: Array, about_m: Array) -> Array:
+    """Return motions (..., 4, 4) after ξ (..., 6) about a point (3,) of what they move: pose · C · exp(ξ) · C⁻¹.
+
+    C is the shift to the point: about an object's centre rotation and translation have least to do with each other.
+    """
+    return pose @ translation(about_m) @ exp(xi) @ translation(-np.asarray(about_m))
+
+
+def difference(first: Array, second: Array, about_m: Array) -> Array:
+    """Return the ξ (..., 6) by which `moved` takes motions (..., 4, 4) to others, about a point (3,)."""
+    centre = translation(about_m)
+    return log(inverse(first @ centre) @ second @ centre)
 
 
 def adjoint(pose: Array) -> Array:
@@ -120,22 +101,38 @@ def composed_covariance(covariance_ab: Array, pose_bc: Array, covariance_bc: Arr
     return matrix @ covariance_ab @ matrix.T + covariance_bc
 
 
-def mean(poses: Array, weights: Array, start: Array | None = None, iterations: int = 20) -> tuple[Array, Array]:
-    """Return the intrinsic mean (4, 4) of weighted motions and their covariance (6, 6) about it.
+def mean(
+    poses: Array, weights: Array, *, about_m: Array | None = None, start: Array | None = None, iterations: int = 20
+) -> tuple[Array, Array]:
+    """Return the intrinsic mean (4, 4) of weighted motions, and the covariance (6, 6) of their ξ from it.
 
     Args:
         poses: (n, 4, 4).
         weights: (n,), non-negative, any positive sum.
+        about_m: (3,) point about which ξ turns, see `moved`; the origin without it.
         start: (4, 4) where the iteration begins; the heaviest motion without it.
         iterations: at most so many fixed-point steps.
     """
     weights = np.asarray(weights, dtype=np.float64) / np.sum(weights)
+    point_m = np.zeros(3) if about_m is None else np.asarray(about_m, dtype=np.float64)
+    flat = rows(poses)
     centre = poses[int(np.argmax(weights))] if start is None else start
     for _ in range(iterations):
-        step = weights @ log(inverse(centre) @ poses)
-        centre = centre @ exp(step)
+        step, _ = moves.moments(flat, weights, rows(centre), point_m)
+        centre = moved(centre, step, point_m)
         if np.linalg.norm(step) < 1e-12:
             break
-    xi = log(inverse(centre) @ poses)
-    covariance = (weights[:, None] * xi).T @ xi
-    return centre, 0.5 * (covariance + covariance.T)
+    return centre, moves.moments(flat, weights, rows(centre), point_m)[1]
+
+
+def rows(poses: Array) -> Array:
+    """Return the upper three rows (..., 12) of motions (..., 4, 4), as kernels take them."""
+    return np.ascontiguousarray(poses[..., :3, :], dtype=np.float64).reshape(*poses.shape[:-2], 12)
+
+
+def matrices(poses: Array) -> Array:
+    """Return motions (n, 4, 4) of their upper three rows (n, 12)."""
+    full = np.zeros((len(poses), 4, 4))
+    full[:, :3] = poses.reshape(-1, 3, 4)
+    full[:, 3, 3] = 1.0
+    return full

@@ -46,10 +46,13 @@ def paper_density(point_b, a_from_b, ranges_m, intrinsics, noise):
     return k2 * total
 
 
-def visibility(pose, points, cells, intrinsics, model, hidden):
+def visibility(pose, sight, model):
     """Log-likelihood of one pose and number of explained points: every point in turn, as `kernels.visibility` says."""
-    blur, silhouette_px, dead_px, clearance_m, low, high, worst, bend, unmeasured, typical = model
-    fx, fy, cx, cy = intrinsics
+    fx, fy, cx, cy, width, height = np.float64(sight.camera)
+    low, high = np.float64(sight.facing)
+    cells, points = sight.cells.reshape(int(height), int(width), -1), np.float64(sight.points.T)
+    blur, silhouette_px, dead_px, clearance_m, worst, bend, unmeasured, typical = map(np.float64, model[:-1])
+    hidden = np.exp(np.float64(model.table[0]))
     total, explained = 0.0, 0.0
     for point in points:
         position = pose[:3, :3] @ point[:3] + pose[:3, 3]

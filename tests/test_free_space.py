@@ -11,7 +11,7 @@ from modeler.kernels import free_space as kernel
 from modeler.kernels import paper
 from modeler.priors.general import GeneralMotion, GeneralPrior
 from modeler.registration.free_space import Draws, FreeSpace, Measured
-from modeler.registration.posterior import matrices, rows
+from modeler.se3 import matrices, rows
 
 CENTRE_M = np.array([0.02, -0.03, 0.8])
 MIDDLE = se3.exp(np.array([0.3, -0.5, 0.2, 0.0, 0.0, 0.0]))[:3, :3]

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from modeler import se3
-from modeler.kernels import moves, paper, planes, visibility
-from modeler.registration.posterior import matrices, rows
+from modeler.kernels import matching, moves, paper, planes, ridges, visibility
+from modeler.kernels.sight import Sight, buffers
+from modeler.se3 import matrices, rows
 
 INTRINSICS = np.array([40.0, 42.0, 9.3, 7.1])
 SHAPE = (16, 20)
@@ -88,24 +89,92 @@ def random_cells(rng):
     return cells
 
 
-IMAGE = np.array([*INTRINSICS, SHAPE[1], SHAPE[0]])
-MODEL = np.array([0.004, 1.5, 1.5, 0.006, 0.1, 0.35, 10.0, 2.0, -1.2, 0.4])
+CAMERA = np.array([*INTRINSICS, SHAPE[1], SHAPE[0]], dtype=np.float32)
+FACING = np.array([0.1, 0.35], dtype=np.float32)
 HIDDEN = 0.3
+
+
+def model(blur_m=0.004):
+    numbers = [np.float32(value) for value in (blur_m, 1.5, 1.5, 0.006, 10.0, 2.0, -1.2, 0.4)]
+    return visibility.Model(*numbers, table=visibility.match_table(HIDDEN))
+
+
+def random_sight(rng, count=40):
+    """Points with normals beside cells that they have nothing to do with."""
+    normals = rng.normal(size=(count, 3)) - [0, 0, 1.5]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = np.hstack([random_points(rng, count), normals, rng.uniform(1e-7, 1e-4, (count, 1))])
+    cells = random_cells(rng).reshape(-1, planes.CELL_SIZE)
+    return Sight(np.ascontiguousarray(points.T, dtype=np.float32), cells, CAMERA, FACING)
+
+
+def far_from_borders(sight, poses):
+    """The poses under which no point comes so near to a pixel's border that rounding decides on which side it falls."""
+    good = []
+    for pose in poses:
+        x, y, z = pose[:3, :3] @ sight.points[:3] + pose[:3, 3:]
+        where = np.stack([INTRINSICS[0] * x / z + INTRINSICS[2], INTRINSICS[1] * y / z + INTRINSICS[3]]) + 0.5
+        good.append(np.abs(where - np.round(where)).min() > 1e-3)
+    return np.array(good)
 
 
 @pytest.mark.parametrize("seed", range(10))
 def test_visibility_is_within_its_bound_of_its_twin(seed):
     rng = np.random.default_rng(seed)
-    cells = random_cells(rng)
-    normals = rng.normal(size=(40, 3)) - [0, 0, 1.5]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points = np.hstack([random_points(rng, 40), normals, rng.uniform(1e-7, 1e-4, (40, 1))])
-    poses = np.stack([random_pose(rng, 0.3) for _ in range(20)])
-    columns, table = np.ascontiguousarray(points.T), visibility.match_table(HIDDEN)
-    flat = cells.reshape(-1, planes.CELL_SIZE)
-    got = visibility.log_likelihoods(rows(poses), columns, flat, IMAGE, MODEL, table)
-    want = [naive.visibility(pose, points, cells, INTRINSICS, MODEL, HIDDEN) for pose in poses]
-    np.testing.assert_allclose(got, want, rtol=0, atol=4e-6 * len(points))
+    sights = random_sight(rng, 40), random_sight(rng, 30)
+    poses = np.stack([random_pose(rng, 0.3) for _ in range(60)])
+    poses = poses[far_from_borders(sights[0], poses) & far_from_borders(sights[1], se3.inverse(poses))]
+    assert len(poses) > 20
+    got = visibility.log_likelihoods(rows(poses), *sights, model(), model(0.006))
+    want = [
+        np.add(naive.visibility(pose, sights[0], model()), naive.visibility(se3.inverse(pose), sights[1], model(0.006)))
+        for pose in poses
+    ]
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-4 * 70)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_walk_along_a_ridge_rates_places_as_the_likelihood_does(seed):
+    rng = np.random.default_rng(seed)
+    sights, poses = (random_sight(rng, 40), random_sight(rng, 30)), np.stack([random_pose(rng, 0.3) for _ in range(5)])
+    ground = ridges.Ground(*sights, *sights, model(), model(), 0.5, 7.0, 0.3, -np.inf)
+    room = buffers(sights[0]), buffers(sights[1]), np.empty(12)
+    got = [ridges.height(row, ground, *room) for row in rows(poses)]
+    plain, explained = visibility.log_likelihoods(rows(poses), *sights, model(), model()).T
+    np.testing.assert_allclose(got, 0.5 * plain - 7.0 * np.exp(-0.3 * explained), rtol=1e-6)
+
+
+def test_a_walk_keeps_its_strides_and_ends_at_the_floor(rng):
+    """Where nothing matches nothing pulls a walker across: it goes straight on, as far as the ground is good."""
+    sights = random_sight(rng), random_sight(rng)
+    empty = tuple(sight._replace(cells=np.zeros_like(sight.cells)) for sight in sights)
+    start, spread = random_pose(rng, 0.1), np.diag([0.1, 0.1, 0.1, 0.01, 0.01, 0.01])
+    axis, centre_m = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.8])
+    pull = matching.Pull(rows(start), 1e-9 * np.eye(6), np.full(6, 1e-9), 0.2)
+    for floor, steps in ((np.inf, 0), (-np.inf, 4)):
+        ground = ridges.Ground(*empty, *empty, model(), model(), 0.5, 0.0, 0.3, floor)
+        visited, counts = ridges.walk(
+            rows(start[None]), spread[None], axis[None], np.array([2.0]), ground, centre_m, 0.001, pull, 4
+        )
+        assert counts.tolist() == [steps]
+    want = [se3.moved(start, number * 0.2 * axis, centre_m) for number in range(1, 5)]
+    np.testing.assert_allclose(matrices(visited[0]), want, atol=1e-6)
+
+
+def test_downhill_is_the_step_of_the_held_normal_equations(rng):
+    sights, centre_m = (random_sight(rng), random_sight(rng)), np.array([0.0, 0.0, 0.8])
+    poses = np.stack([random_pose(rng, 0.1) for _ in range(6)])
+    root = rng.normal(size=(6, 6))
+    pull = matching.Pull(rows(random_pose(rng, 0.1)), 100.0 * root @ root.T, np.arange(1.0, 7.0), 0.2)
+    gradients, matrices_ = matching.normal_equations(rows(poses), *sights, centre_m, 0.05)
+    got = matching.descend(rows(poses), *sights, centre_m, 0.05, pull, 1)
+    assert np.count_nonzero(np.abs(gradients).max(axis=1)) == len(poses)  # something matches
+    for pose, gradient, matrix, there in zip(poses, gradients, matrices_, matrices(got), strict=True):
+        away = se3.difference(matrices(pull.mean[None])[0], pose, centre_m)
+        held = matrix + pull.precision + np.diag(pull.damping)
+        step = np.linalg.solve(held, gradient - pull.precision @ away)
+        step *= min(1.0, 0.2 / np.linalg.norm(step[:3]))
+        np.testing.assert_allclose(there, se3.moved(pose, step, centre_m), atol=1e-9)
 
 
 @pytest.mark.parametrize("hidden", [0.05, 0.3, 0.6])
@@ -133,10 +202,9 @@ def test_verdicts_follow_from_where_a_point_lies():
         ([5.0, 0.0, 0.8], towards, visibility.UNKNOWN),
         ([0.0, 0.0, -0.8], towards, visibility.UNKNOWN),
     ]
-    points = np.array([[*position, *normal, 1e-6] for position, normal, _ in cases]).T.copy()
-    model = np.array([0.001, *MODEL[1:]])
-    flat = cells.reshape(-1, planes.CELL_SIZE)
-    verdicts = visibility.classify(rows(np.eye(4)[None])[0], points, flat, IMAGE, model)
+    points = np.array([[*position, *normal, 1e-6] for position, normal, _ in cases], dtype=np.float32).T.copy()
+    sight = Sight(points, cells.reshape(-1, planes.CELL_SIZE), CAMERA, FACING)
+    verdicts = visibility.classify(rows(np.eye(4)), sight, model(0.001))
     assert verdicts.tolist() == [want for *_, want in cases]
 
 

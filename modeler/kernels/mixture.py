@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from modeler.kernels.moves import logarithm
+from modeler.kernels.moves import difference
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -22,22 +22,9 @@ def log_densities(poses, means, roots, log_weights, centre):
     result = np.empty(poses.shape[0])
     half_dimensions = 3.0 * math.log(2.0 * math.pi)
     for i in numba.prange(poses.shape[0]):
-        r, shift, xi = np.empty((3, 3)), np.empty(3), np.empty(6)
-        b = poses[i]
-        total, top = 0.0, -np.inf
+        total, top, r = 0.0, -np.inf, np.empty((3, 3))
         for k in range(means.shape[0]):
-            a = means[k]
-            for u in range(3):
-                shift[u] = b[4 * u + 3] - a[4 * u + 3]
-                for v in range(3):
-                    shift[u] += b[4 * u + v] * centre[v]
-            moved_x = a[0] * shift[0] + a[4] * shift[1] + a[8] * shift[2] - centre[0]
-            moved_y = a[1] * shift[0] + a[5] * shift[1] + a[9] * shift[2] - centre[1]
-            moved_z = a[2] * shift[0] + a[6] * shift[1] + a[10] * shift[2] - centre[2]
-            for u in range(3):
-                for v in range(3):
-                    r[u, v] = a[u] * b[v] + a[4 + u] * b[4 + v] + a[8 + u] * b[8 + v]
-            xi[0], xi[1], xi[2], xi[3], xi[4], xi[5] = logarithm(r, moved_x, moved_y, moved_z)
+            xi = difference(means[k], poses[i], centre, r)
             density = log_weights[k] - half_dimensions
             for u in range(6):
                 z = 0.0
@@ -54,4 +41,29 @@ def log_densities(poses, means, roots, log_weights, centre):
             else:
                 total += math.exp(density - top)
         result[i] = top + math.log(total)
+    return result
+
+
+@numba.njit(cache=True)
+def distances(means, roots, centre):
+    """Return how far each Gaussian's mean lies from each: (k, k), row i in standard deviations of the i-th Gaussian.
+
+    Args:
+        means: (k, 12) rows of the poses.
+        roots: (k, 6, 6) lower triangular L with L Lᵀ the covariance of ξ about the centre.
+        centre: (3,) point in m.
+    """
+    count = len(means)
+    result, rotation, z = np.zeros((count, count)), np.empty((3, 3)), np.empty(6)
+    for i in range(count):
+        for j in range(count):
+            xi = difference(means[i], means[j], centre, rotation)
+            square = 0.0
+            for k in range(6):
+                z[k] = xi[k]
+                for m in range(k):
+                    z[k] -= roots[i, k, m] * z[m]
+                z[k] /= roots[i, k, k]
+                square += z[k] * z[k]
+            result[i, j] = math.sqrt(square)
     return result

@@ -1,6 +1,6 @@
-"""Steps on SE(3) along differences of poses: the proposals of an annealed sampler, all at once.
+"""The algebra of SE(3), many poses at once: exponentials, logarithms, and steps along differences of poses.
 
-Poses are rows of twelve numbers, the upper three rows of their matrices; `se3` is the readable twin of the algebra.
+Poses are rows of twelve numbers, the upper three rows of their matrices, or whole matrices; `se3` has the conventions.
 """
 
 import math
@@ -83,6 +83,42 @@ def exponential(wx, wy, wz, ux, uy, uz, r):
 
 
 @numba.njit(cache=True)
+def difference(first, second, centre, r):
+    """Return ξ (6 numbers: rad, m) of log(C⁻¹ first⁻¹ second C) for poses (12,), C the shift to `centre` (3,).
+
+    Room for a rotation, `r` (3, 3), is handed in.
+    """
+    b = second
+    # Where the poses put the centre, one beside the other; then seen from `first`.
+    x = b[3] - first[3] + b[0] * centre[0] + b[1] * centre[1] + b[2] * centre[2]
+    y = b[7] - first[7] + b[4] * centre[0] + b[5] * centre[1] + b[6] * centre[2]
+    z = b[11] - first[11] + b[8] * centre[0] + b[9] * centre[1] + b[10] * centre[2]
+    for k in range(3):
+        for m in range(3):
+            r[k, m] = first[k] * b[m] + first[4 + k] * b[4 + m] + first[8 + k] * b[8 + m]
+    return logarithm(
+        r,
+        first[0] * x + first[4] * y + first[8] * z - centre[0],
+        first[1] * x + first[5] * y + first[9] * z - centre[1],
+        first[2] * x + first[6] * y + first[10] * z - centre[2],
+    )
+
+
+@numba.njit(cache=True)
+def turn(pose, xi, centre, r, moved):
+    """Write pose · C · exp(ξ) · C⁻¹ into `moved` (12,), C the shift to `centre` (3,); room for a rotation is `r`."""
+    x, y, z = exponential(xi[0], xi[1], xi[2], xi[3], xi[4], xi[5], r)
+    x += centre[0] - r[0, 0] * centre[0] - r[0, 1] * centre[1] - r[0, 2] * centre[2]
+    y += centre[1] - r[1, 0] * centre[0] - r[1, 1] * centre[1] - r[1, 2] * centre[2]
+    z += centre[2] - r[2, 0] * centre[0] - r[2, 1] * centre[1] - r[2, 2] * centre[2]
+    for k in range(0, 12, 4):
+        a, b, c = pose[k], pose[k + 1], pose[k + 2]
+        for m in range(3):
+            moved[k + m] = a * r[0, m] + b * r[1, m] + c * r[2, m]
+        moved[k + 3] = a * x + b * y + c * z + pose[k + 3]
+
+
+@numba.njit(cache=True)
 def propose(moving, first, second, scales, jitter, centre):
     """Return moving · C · exp(scale · log(C⁻¹ first⁻¹ second C) + jitter) · C⁻¹, C the shift to `centre`.
 
@@ -94,37 +130,56 @@ def propose(moving, first, second, scales, jitter, centre):
         jitter: (m, 6) tangents added to the steps.
         centre: (3,) point of the source, in m, about which steps turn.
     """
-    moved = np.empty((len(moving), 12))
-    r, t, shift = np.empty((3, 3)), np.empty(3), np.empty(3)
+    moved, xi, r = np.empty((len(moving), 12)), np.empty(6), np.empty((3, 3))
     for i in range(len(moving)):
-        a, b, p = first[i], second[i], moving[i]
-        for k in range(3):
-            # Where `second` puts the centre, seen from `first`.
-            t[k] = b[4 * k + 3] - a[4 * k + 3]
-            for m in range(3):
-                t[k] += b[4 * k + m] * centre[m]
-        for k in range(3):
-            shift[k] = -centre[k]
-            for m in range(3):
-                shift[k] += a[4 * m + k] * t[m]
-                r[k, m] = a[k] * b[m] + a[4 + k] * b[4 + m] + a[8 + k] * b[8 + m]
-        wx, wy, wz, ux, uy, uz = logarithm(r, shift[0], shift[1], shift[2])
-        s = scales[i]
-        vx, vy, vz = exponential(
-            s * wx + jitter[i, 0],
-            s * wy + jitter[i, 1],
-            s * wz + jitter[i, 2],
-            s * ux + jitter[i, 3],
-            s * uy + jitter[i, 4],
-            s * uz + jitter[i, 5],
-            r,
-        )
-        t[0], t[1], t[2] = vx + centre[0], vy + centre[1], vz + centre[2]
-        for k in range(3):
-            for m in range(3):
-                t[k] -= r[k, m] * centre[m]
-        for k in range(3):
-            for m in range(3):
-                moved[i, 4 * k + m] = p[4 * k] * r[0, m] + p[4 * k + 1] * r[1, m] + p[4 * k + 2] * r[2, m]
-            moved[i, 4 * k + 3] = p[4 * k] * t[0] + p[4 * k + 1] * t[1] + p[4 * k + 2] * t[2] + p[4 * k + 3]
+        way = difference(first[i], second[i], centre, r)
+        for k in range(6):
+            xi[k] = scales[i] * way[k] + jitter[i, k]
+        turn(moving[i], xi, centre, r, moved[i])
     return moved
+
+
+@numba.njit(cache=True)
+def exponentials(xi):
+    """Return the motions (n, 4, 4) of tangents (n, 6)."""
+    poses = np.zeros((len(xi), 4, 4))
+    for i in range(len(xi)):
+        w = xi[i]
+        poses[i, 0, 3], poses[i, 1, 3], poses[i, 2, 3] = exponential(w[0], w[1], w[2], w[3], w[4], w[5], poses[i])
+        poses[i, 3, 3] = 1.0
+    return poses
+
+
+@numba.njit(cache=True)
+def logarithms(poses):
+    """Return the tangents (n, 6) of motions (n, 4, 4)."""
+    xi = np.empty((len(poses), 6))
+    for i in range(len(poses)):
+        p = poses[i]
+        w = logarithm(p, p[0, 3], p[1, 3], p[2, 3])
+        for k in range(6):
+            xi[i, k] = w[k]
+    return xi
+
+
+@numba.njit(cache=True)
+def moments(poses, weights, pose, about):
+    """Return Σ w ξ (6,) and Σ w ξ ξᵀ (6, 6) of ξ = log(C⁻¹ pose⁻¹ other C), C the shift to `about` (3,).
+
+    Args:
+        poses: (n, 12) the others.
+        weights: (n,).
+        pose: (12,) from which they are seen.
+        about: (3,) point in m.
+    """
+    first, second, r = np.zeros(6), np.zeros((6, 6)), np.empty((3, 3))
+    for i in range(len(poses)):
+        xi = difference(pose, poses[i], about, r)
+        for k in range(6):
+            first[k] += weights[i] * xi[k]
+            for m in range(k + 1):
+                second[k, m] += weights[i] * xi[k] * xi[m]
+    for k in range(6):
+        for m in range(k):
+            second[m, k] = second[k, m]
+    return first, second

@@ -71,10 +71,7 @@ def fitted(motions: Array, weights: Array, centre_m: Array, spread: float = 1.0)
         centre_m: (3,) point of the source whose place is told.
         spread: more than 1 for a proposal that is to cover them.
     """
-    centre = np.eye(4)
-    centre[:3, 3] = centre_m
-    mean = se3.mean(motions @ centre, weights)[0]
-    mean[:3, 3] -= mean[:3, :3] @ centre_m
+    mean, _ = se3.mean(motions, weights, about_m=centre_m)
     deviation = Gaussian(mean, np.eye(6), centre_m).deviations(motions)
     offset = weights @ deviation
     mean[:3, 3] += offset[3:]

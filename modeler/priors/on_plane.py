@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -27,7 +28,7 @@ class OnPlane:
     sigma_lift_m: float
     """Standard deviation of the motion along the normal."""
 
-    @property
+    @cached_property
     def axes(self) -> Array:
         """Two unit vectors that span the plane, and its normal (3, 3), right-handed."""
         return np.vstack([across_axis(self.normal), self.normal])

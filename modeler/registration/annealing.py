@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler.kernels.moves import propose
-from modeler.registration.posterior import matrices, rows
+from modeler.se3 import matrices, rows
 from modeler.types import AbstractMotion, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)

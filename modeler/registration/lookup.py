@@ -1,14 +1,16 @@
 """The points of one view, and the image of the other in which they are looked up."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from modeler.kernels import matching
 from modeler.kernels import visibility as kernel
+from modeler.kernels.sight import Sight
 from modeler.types import Array, RayImage
 
-FACING = (0.1, 0.35)  # cosines at which a point begins to face a camera and fully does
+FACING = np.array([0.1, 0.35], dtype=np.float32)  # cosines at which a point begins to face a camera and fully does
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,27 +32,17 @@ class Lookup:
     measured_share: float
     """Share of pixels around the surface that carry a measurement."""
 
-    def log_likelihoods(self, poses: Array, blur_m: float, *, stride: int, typical: float) -> Array:
-        """Return log-likelihood and number of explained points (m, 2) of poses (m, 12) over every `stride`-th point.
-
-        Typical is what a good match loses to its misfit (nats), see `misfits`.
-        """
-        columns, table = self._columns(stride), kernel.match_table(self.hidden_share)
-        model = self._model(blur_m, typical)
-        return kernel.log_likelihoods(poses, columns, self._cells, self._intrinsics, model, table)
-
     def verdicts(self, pose: Array) -> np.ndarray:
         """Return the verdict (n,) of `kernels.visibility` on each point under one pose (12,)."""
-        return kernel.classify(pose, self._columns(), self._cells, self._intrinsics, self._model(0.0))
+        return kernel.classify(pose, self.sight(), self.model(0.0))
 
     def matched_residuals(self, pose: Array, blur_m: float) -> Array:
         """Return squared distances (k,) in m² of matching points beyond their own variance, under one pose (12,)."""
-        return kernel.matched_residuals(pose, self._columns(), self._cells, self._intrinsics, self._model(blur_m))
+        return kernel.matched_residuals(pose, self.sight(), float(np.hypot(blur_m, self.surface_m)))
 
     def misfits(self, pose: Array, blur_m: float) -> Array:
         """Return what each match under one pose (12,) loses to distance and normals (nats), (k,)."""
-        surface_m = float(np.hypot(blur_m, self.surface_m))
-        found = self.matches(pose, surface_m)
+        found = self.matches(pose, float(np.hypot(blur_m, self.surface_m)))
         found = found[found[:, matching.WEIGHT] > 0.0]
         variance = found[:, matching.FACING] / found[:, matching.WEIGHT]
         agreement = np.sum(found[:, matching.OWN] * found[:, matching.OTHER], axis=1)
@@ -58,41 +50,49 @@ class Lookup:
 
     def matches(self, pose: Array, surface_m: float) -> Array:
         """Return what each point finds under one pose (12,): `kernels.matching.matches`."""
-        return matching.matches(pose, self._columns(), self._cells, self._intrinsics, np.array(FACING), surface_m)
+        return matching.matches(pose, self.sight(), surface_m)
 
-    def normal_equations(self, poses: Array, centres_m: Array, surface_m: float, *, stride: int = 1) -> Array:
-        """Return the normal equations (m, 27) of matching points under poses (m, 12) about centres (m, 3)."""
-        columns, facing = self._columns(stride), np.array(FACING)
-        return matching.normal_equations(poses, centres_m, columns, self._cells, self._intrinsics, facing, surface_m)
+    def sight(self, stride: int = 1) -> Sight:
+        """Return what every `stride`-th point meets, as kernels take it."""
+        return Sight(np.ascontiguousarray(self._columns[:, ::stride]), self._cells, self._camera, FACING)
 
-    def _columns(self, stride: int = 1) -> Array:
-        return np.ascontiguousarray(self.points[::stride].T)
+    def model(self, blur_m: float, typical: float = 0.5) -> kernel.Model:
+        """Return what the likelihood takes for granted where surfaces are blurred by so many m.
 
-    @property
+        Typical is what a good match loses to its misfit (nats), see `misfits`.
+        """
+        fx = self.image.frame.camera.fx
+        lateral_px = max(self.image.sigma_wh * fx, 1.0)
+        return kernel.Model(
+            blur_m=np.float32(np.hypot(blur_m, self.surface_m)),
+            silhouette_px=np.float32(lateral_px + blur_m * fx / self._distance_m),
+            dead_px=np.float32(1.25 * lateral_px),
+            clearance_m=np.float32(3.0 * self.image.sigma_r_m),
+            worst=np.float32(self.worst),
+            bend=np.float32(self.bend),
+            unmeasured=np.float32(np.log(max(self.hidden_share, 1.0 - self.measured_share))),
+            typical=np.float32(typical),
+            table=self._table,
+        )
+
+    @cached_property
+    def _columns(self) -> np.ndarray:
+        return np.ascontiguousarray(self.points.T, dtype=np.float32)
+
+    @cached_property
     def _cells(self) -> np.ndarray:
         cells = self.image.layers["cells"]
         return cells.reshape(-1, cells.shape[-1])
 
-    @property
-    def _intrinsics(self) -> Array:
+    @cached_property
+    def _camera(self) -> np.ndarray:
         camera = self.image.frame.camera
-        return np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
+        return np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float32)
 
-    def _model(self, blur_m: float, typical: float = 0.5) -> Array:
-        """Return the parameters (10,) of the kernel."""
-        camera = self.image.frame.camera
-        lateral_px = max(self.image.sigma_wh * camera.fx, 1.0)
-        blur_px = blur_m * camera.fx / max(float(np.median(self.points[:, 2])), 1e-3)
-        return np.array(
-            [
-                np.hypot(blur_m, self.surface_m),
-                lateral_px + blur_px,
-                1.25 * lateral_px,
-                3.0 * self.image.sigma_r_m,
-                *FACING,
-                self.worst,
-                self.bend,
-                np.log(max(self.hidden_share, 1.0 - self.measured_share)),
-                typical,
-            ]
-        )
+    @cached_property
+    def _distance_m(self) -> float:
+        return max(float(np.median(self.points[:, 2])), 1e-3)
+
+    @cached_property
+    def _table(self) -> np.ndarray:
+        return kernel.match_table(self.hidden_share)

@@ -9,7 +9,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.kernels import mixture
-from modeler.registration.posterior import rows
+from modeler.se3 import rows
 from modeler.types import AbstractMotion, Array
 
 
@@ -33,8 +33,7 @@ class MixtureMotion(AbstractMotion):
         """Draw motions (count, 4, 4)."""
         chosen = rng.choice(len(self.means), count, p=np.exp(self._log_shares))
         xi = (self.spreads[chosen] @ rng.normal(size=(count, 6, 1)))[:, :, 0]
-        centre = se3.translation(self.centre_m)
-        return self.means[chosen] @ centre @ se3.exp(xi) @ se3.inverse(centre)
+        return se3.moved(self.means[chosen], xi, self.centre_m)
 
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of motions (n, 4, 4)."""

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from modeler import se3
 from modeler.registration.posterior import weighted_gaussian
-from modeler.registration.search import Candidates, distances
+from modeler.registration.search import Candidates
 from modeler.types import Array, PoseGaussian
 
 
@@ -37,8 +36,7 @@ def separate(found: Candidates, centre_m: Array, *, apart: float = 3.5) -> list[
     Two candidates share a place where a chain of candidates leads from one to the other, each link within `apart`
     standard deviations of both its ends, or of a blunt one. A ridge, such as the spin of a can, is one place.
     """
-    centre = se3.translation(centre_m)
-    near = np.stack([distances(found, number, centre) <= apart for number in range(len(found))])
+    near = found.distances(centre_m) <= apart
     linked = (near & near.T) | (near & found.blunt[:, None] & ~found.blunt)
     linked |= linked.T
     place = np.arange(len(found))

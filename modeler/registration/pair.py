@@ -7,13 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
-from modeler.kernels import matching
+from modeler.kernels import matching, ridges
 from modeler.kernels import visibility as kernel
 from modeler.registration.lookup import Lookup
-from modeler.registration.posterior import rows
+from modeler.se3 import matrices, rows
 from modeler.types import Array
-
-_UPPER = np.triu_indices(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +50,9 @@ class Pair:
             stride: every so manieth point stands for the others.
             typical: what a good match loses to its misfit (nats), see `typical_misfit`.
         """
-        found = self.forward.log_likelihoods(rows(poses), blur_m, stride=stride, typical=typical)
-        back = rows(se3.inverse(poses))
-        found = stride * (found + self.backward.log_likelihoods(back, blur_m, stride=stride, typical=typical))
+        sights = self.forward.sight(stride), self.backward.sight(stride)
+        models = self.forward.model(blur_m, typical), self.backward.model(blur_m, typical)
+        found = stride * kernel.log_likelihoods(rows(poses), *sights, *models)
         return found[:, kernel.LOG_LIKELIHOOD], found[:, kernel.EXPLAINED] / self.points
 
     def tempered(
@@ -77,8 +75,8 @@ class Pair:
         """
         misfits = np.concatenate(
             [
-                self.forward.misfits(rows(pose[None])[0], blur_m),
-                self.backward.misfits(rows(se3.inverse(pose)[None])[0], blur_m),
+                self.forward.misfits(rows(pose), blur_m),
+                self.backward.misfits(rows(se3.inverse(pose)), blur_m),
             ]
         )
         if len(misfits) < 20:
@@ -92,20 +90,62 @@ class Pair:
         return 0.5 * (low + high)
 
     def normal_equations(self, poses: Array, surface_m: float, *, stride: int = 1) -> tuple[Array, Array]:
-        """Return gradients (n, 6) and matrices (n, 6, 6) of matching surface for ξ of poses (n, 4, 4) about the centre.
+        """Return gradients (n, 6), matrices (n, 6, 6) of matching surface for ξ of poses (n, 4, 4) about the centre."""
+        sights = self.forward.sight(stride), self.backward.sight(stride)
+        gradients, equations = matching.normal_equations(rows(poses), *sights, self.centre_m, surface_m)
+        return stride * gradients, stride * equations
 
-        Carried forward, a point moves by (R ω, R v) about the carried centre; carried back, by -ξ about the centre.
+    def downhill(self, poses: Array, surface_m: float, pull: matching.Pull, *, steps: int, stride: int) -> Array:
+        """Return poses (n, 4, 4) so many Gauss-Newton steps further down, each held by a pull."""
+        sights = self.forward.sight(stride), self.backward.sight(stride)
+        pull = _for_every(pull, stride)
+        return matrices(matching.descend(rows(poses), *sights, self.centre_m, surface_m, pull, steps))
+
+    def walked(
+        self,
+        poses: Array,
+        spreads: Array,
+        axes: Array,
+        *,
+        blur_m: float,
+        pull: matching.Pull,
+        effective_points: float,
+        floor: float,
+        stride: float,
+        max_strides: int,
+    ) -> Array:
+        """Return poses (n, 4, 4) on the way from some along their axes, as far as `tempered` is above a floor.
+
+        Args:
+            poses: (k, 4, 4) target_from_source.
+            spreads: (k, 6, 6) lower triangular roots of the covariances of ξ about the centre.
+            axes: (k, 6) unit vectors in units of those spreads.
+            blur_m: blur of the surfaces in m.
+            pull: what holds a walker on its way across.
+            effective_points: as for `tempered`.
+            floor: the least that a place is worth (nats).
+            stride: length of a stride in standard deviations.
+            max_strides: at most so many.
         """
-        rotation = poses[:, :3, :3]
-        carried_m = rotation @ self.centre_m + poses[:, :3, 3]
-        still_m = np.tile(self.centre_m, (len(poses), 1))
-        there = self.forward.normal_equations(rows(poses), carried_m, surface_m, stride=stride)
-        back = self.backward.normal_equations(rows(se3.inverse(poses)), still_m, surface_m, stride=stride)
-        both = np.zeros((len(poses), 6, 6))
-        both[:, :3, :3] = both[:, 3:, 3:] = rotation
-        gradient = (there[:, None, matching.GRADIENT] @ both)[:, 0] - back[:, matching.GRADIENT]
-        matrix = both.transpose(0, 2, 1) @ _symmetric(there) @ both + _symmetric(back)
-        return stride * gradient, stride * matrix
+        coarse, fine = 4, 2  # every so manieth point leads downhill, and tells how good a place is
+        ground = ridges.Ground(
+            forward=self.forward.sight(coarse),
+            backward=self.backward.sight(coarse),
+            all_forward=self.forward.sight(fine),
+            all_backward=self.backward.sight(fine),
+            forward_model=self.forward.model(blur_m),
+            backward_model=self.backward.model(blur_m),
+            per_point=fine * effective_points / self.points,
+            no_overlap=self.no_overlap,
+            per_explained=fine / (self.points * self.little_overlap),
+            floor=float(floor),
+        )
+        strides = np.full(len(poses), stride)
+        pull = _for_every(pull, coarse)
+        visited, counts = ridges.walk(
+            rows(poses), spreads, axes, strides, ground, self.centre_m, blur_m, pull, max_strides
+        )
+        return matrices(visited[np.arange(max_strides) < counts[:, None]])
 
     def surface_noise_m(self, poses: Array, blur_m: float) -> float:
         """Return the standard deviation in m of matching surfaces' distance, beyond their pixels' noise.
@@ -118,8 +158,8 @@ class Pair:
         for pose in poses[:: max(len(poses) // 20, 1)]:
             matched = np.concatenate(
                 [
-                    self.forward.matched_residuals(rows(pose[None])[0], blur_m),
-                    self.backward.matched_residuals(rows(se3.inverse(pose)[None])[0], blur_m),
+                    self.forward.matched_residuals(rows(pose), blur_m),
+                    self.backward.matched_residuals(rows(se3.inverse(pose)), blur_m),
                 ]
             )
             if len(matched) > 20:
@@ -130,8 +170,8 @@ class Pair:
         """Return the share of points that should be seen by both cameras and are."""
         verdicts = np.concatenate(
             [
-                self.forward.verdicts(rows(target_from_source[None])[0]),
-                self.backward.verdicts(rows(se3.inverse(target_from_source)[None])[0]),
+                self.forward.verdicts(rows(target_from_source)),
+                self.backward.verdicts(rows(se3.inverse(target_from_source))),
             ]
         )
         wrong = np.isin(verdicts, (kernel.BEHIND, kernel.IN_FRONT, kernel.IN_EMPTY_SPACE)).sum()
@@ -139,8 +179,6 @@ class Pair:
         return float(matched / max(matched + wrong, 1))
 
 
-def _symmetric(equations: Array) -> Array:
-    """Return the matrices (n, 6, 6) of normal equations (n, 27)."""
-    full = np.zeros((len(equations), 6, 6))
-    full[:, _UPPER[0], _UPPER[1]] = full[:, _UPPER[1], _UPPER[0]] = equations[:, matching.MATRIX]
-    return full
+def _for_every(pull: matching.Pull, stride: int) -> matching.Pull:
+    """Return the pull beside every `stride`-th point: it is lowered, instead of raising what the points say."""
+    return pull._replace(precision=pull.precision / stride, damping=pull.damping / stride)

@@ -10,7 +10,8 @@ from modeler import se3
 from modeler.kernels import paper as kernel
 from modeler.registration.annealing import effective_samples, pareto_tail
 from modeler.registration.free_space import Draws, FreeSpace, Measured
-from modeler.registration.posterior import failed, intrinsics, matrices, rows, weighted_gaussian
+from modeler.registration.posterior import failed, intrinsics, weighted_gaussian
+from modeler.se3 import matrices, rows
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, Posterior, RayImage
 
 _SAMPLES, _EVEN_SAMPLES = 200_000, 2_000_000

@@ -1,4 +1,4 @@
-"""What the sampling methods share: from samples to a Gaussian, and the arrays that kernels take."""
+"""What the sampling methods share: from samples to a Gaussian, and whether they lean on their limits."""
 
 import numpy as np
 
@@ -17,12 +17,11 @@ def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaus
         weights: (n,), any positive sum.
         centre_m: (3,) point of the source.
     """
-    centre = se3.translation(centre_m)
-    mean, covariance = se3.mean(poses @ centre, weights)
-    to_camera = se3.adjoint(centre)
+    mean, covariance = se3.mean(poses, weights, about_m=centre_m)
+    to_camera = se3.adjoint(se3.translation(centre_m))
     floor = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)  # keeps the covariance of a single sample positive definite
     covariance = to_camera @ (covariance + floor) @ to_camera.T
-    return PoseGaussian(mean @ se3.translation(-centre_m), 0.5 * (covariance + covariance.T))
+    return PoseGaussian(mean, 0.5 * (covariance + covariance.T))
 
 
 def share_at_limit(motion: AbstractMotion, poses: Array, centre_m: Array, rng: np.random.Generator) -> float:
@@ -31,8 +30,8 @@ def share_at_limit(motion: AbstractMotion, poses: Array, centre_m: Array, rng: n
     A posterior that leans on the end of its prior is cut off there, and what it would have found beyond is not known.
     The steps turn about `centre_m` (3,), a point of the source.
     """
-    nudges = se3.exp(rng.normal(size=(len(poses), 6)) * np.repeat([np.radians(1.0), 0.001], 3))
-    nudged = poses @ se3.translation(centre_m) @ nudges @ se3.translation(-centre_m)
+    nudges = rng.normal(size=(len(poses), 6)) * np.repeat([np.radians(1.0), 0.001], 3)
+    nudged = se3.moved(poses, nudges, centre_m)
     return float(np.mean(~np.isfinite(motion.log_density(nudged))))
 
 
@@ -40,19 +39,6 @@ def failed(source: RayImage, target: RayImage, outcome: Outcome) -> Posterior:
     """Return the posterior of a registration that could not be made: nothing is known."""
     pose = PoseGaussian(np.eye(4), np.diag(np.repeat([np.pi, 10.0], 3) ** 2))
     return Posterior(source=source.index, target=target.index, pose=pose, outcome=outcome, overlap=0.0)
-
-
-def rows(poses: Array) -> Array:
-    """Return the upper three rows (n, 12) of motions (n, 4, 4), as kernels take them."""
-    return np.ascontiguousarray(poses[:, :3].reshape(len(poses), 12))
-
-
-def matrices(poses: Array) -> Array:
-    """Return motions (n, 4, 4) of their upper three rows (n, 12)."""
-    full = np.zeros((len(poses), 4, 4))
-    full[:, :3] = poses.reshape(-1, 3, 4)
-    full[:, 3, 3] = 1.0
-    return full
 
 
 def intrinsics(view: RayImage) -> Array:

@@ -16,7 +16,7 @@ from modeler import se3
 from modeler.kernels import matching
 from modeler.registration.lookup import Lookup
 from modeler.registration.pair import Pair
-from modeler.registration.posterior import rows
+from modeler.se3 import rows
 from modeler.types import Array
 
 
@@ -46,11 +46,9 @@ class Refiner:
             rng: source of all randomness.
             fine_m: least blur in m at which surfaces are told apart.
         """
-        centre_m = pair.backward.image.centroid_m
-        centre = se3.translation(centre_m)
-        mean = se3.mean(poses @ centre, np.full(len(poses), 1.0 / len(poses)))[0] @ se3.inverse(centre)
-        xi = se3.log(se3.inverse(mean @ centre) @ poses @ centre)
-        covariance = xi.T @ xi / len(xi) + np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
+        centre_m = pair.centre_m
+        mean, covariance = se3.mean(poses, np.ones(len(poses)), about_m=centre_m)
+        covariance = covariance + np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
         spread = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
         mode, noise_m = _mode(pair, mean, spread, centre_m, fine_m=fine_m)
         basis, information = self._information(pair, mode, noise_m, spread, centre_m)
@@ -61,7 +59,7 @@ class Refiner:
         step = _steps(pair, poses, noise_m, spread, centre_m) @ to_basis.T @ information
         scatter = rng.normal(size=(len(poses), 6)) @ root.T
         moved = (step + scatter) @ narrowed.T @ basis.T
-        return poses @ centre @ se3.exp(moved) @ se3.inverse(centre)
+        return se3.moved(poses, moved, centre_m)
 
     def _information(
         self, pair: Pair, mode: Array, noise_m: float, spread: Array, centre_m: Array
@@ -90,15 +88,14 @@ class Refiner:
 def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: float) -> tuple[Array, float]:
     """Return where matching surface and the spread (6, 6) of the samples about their mean settle, and the noise."""
     precision = np.linalg.inv(spread @ spread.T)
-    centre = se3.translation(centre_m)
     pose, noise_m = start, pair.surface_noise_m(start[None], fine_m)
     for _ in range(8):
         gradient, matrix = pair.normal_equations(pose[None], noise_m)
-        away = se3.log(se3.inverse(start @ centre) @ pose @ centre)
+        away = se3.difference(start, pose, centre_m)
         step = np.linalg.solve(matrix[0] + precision, gradient[0] - precision @ away)
-        pose = pose @ centre @ se3.exp(step) @ se3.inverse(centre)
+        pose = se3.moved(pose, step, centre_m)
         noise_m = pair.surface_noise_m(pose[None], fine_m)
-        if np.abs(step).max() < 1e-6:
+        if np.linalg.norm(np.linalg.solve(spread, step)) < 0.01:  # standard deviations
             break
     return pose, noise_m
 
@@ -123,7 +120,7 @@ def _equations(pair: Pair, pose: Array, noise_m: float, centre_m: Array) -> tupl
         (pair.backward, se3.inverse(pose), -1.0),
     ]
     for lookup, there, sign in directions:
-        found = lookup.matches(rows(there[None])[0], noise_m)
+        found = lookup.matches(rows(there), noise_m)
         found = found[found[:, matching.WEIGHT] > 0.0]
         to_source = np.eye(4) if sign < 0.0 else se3.inverse(pose)
         arms = se3.transform(to_source, found[:, matching.POSITION]) - centre_m

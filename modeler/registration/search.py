@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
+from modeler.kernels import mixture
+from modeler.kernels.matching import Pull
 from modeler.registration.pair import Pair
 from modeler.types import AbstractMotion, Array, BoolArray, PoseGaussian
 
@@ -31,6 +33,13 @@ class Candidates:
     def __len__(self) -> int:
         """Return how many there are."""
         return len(self.poses)
+
+    def distances(self, centre_m: Array) -> Array:
+        """Return how far they are from each other (k, k), row i in standard deviations of the i-th one's surroundings.
+
+        The distances are of ξ about a point (3,) of the source.
+        """
+        return mixture.distances(se3.rows(self.poses), self.spreads, centre_m)
 
     def some(self, chosen: npt.NDArray[np.int64] | BoolArray) -> Candidates:
         """Return those chosen by number or by mask."""
@@ -97,13 +106,11 @@ class Search:
         plain, share = pair.log_likelihoods(poses, self.blurs[0] * pair.size_m, stride=8)
         look = plain - np.log(self.blurs[0]) * share * pair.points
         poses = poses[_best(look, starts)]
-        for _ in range(self.iterations):
-            poses = self._stepped(pair, poses, prior, self.blurs[1] * pair.size_m)
+        poses = self._led(pair, poses, prior, self.blurs[1] * pair.size_m)
         poses = poses[_best(self.scores(pair, poses, self.blurs[1] * pair.size_m), int(self.survivors * starts))]
         blunt = self._ranked(pair, motion, poses, prior, self.blurs[1] * pair.size_m)
         for blur in self.blurs[2:]:
-            for _ in range(self.iterations):
-                poses = self._stepped(pair, poses, prior, blur * pair.size_m)
+            poses = self._led(pair, poses, prior, blur * pair.size_m)
         fine_m = self.blurs[-1] * pair.size_m
         sharp = self._ranked(pair, motion, poses, prior, fine_m)
         if not len(sharp):
@@ -127,24 +134,18 @@ class Search:
         """
         best = found.some(np.arange(min(self.walkers, len(found))))
         scaled = best.spreads / self._basin(pair.size_m)[:, None]
-        axes = np.linalg.eigh(scaled.transpose(0, 2, 1) @ scaled)[1][:, :, -1:]  # in units of each one's own spread
-        poses, spreads, axes = (np.concatenate([part, part]) for part in (best.poses, best.spreads, axes))
-        stride = self.stride * np.repeat([1.0, -1.0], len(best))
-        floor, fine_m = found.scores[0] - self.negligible, self.blurs[-1] * pair.size_m
-        centre, visited = se3.translation(pair.centre_m), [poses[:0]]
-        for _ in range(self.max_strides):
-            out = (spreads @ axes)[:, :, 0] * stride[:, None]
-            poses = poses @ centre @ se3.exp(out) @ se3.inverse(centre)
-            for _ in range(2):
-                step = np.linalg.solve(spreads, self._step(pair, poses, prior, fine_m)[:, :, None])
-                across = (spreads @ (step - axes * (axes.transpose(0, 2, 1) @ step)))[:, :, 0]
-                poses = poses @ centre @ se3.exp(across) @ se3.inverse(centre)
-            good = self.scores(pair, poses, fine_m) > floor
-            if not good.any():
-                break
-            poses, spreads, axes, stride = poses[good], spreads[good], axes[good], stride[good]
-            visited.append(poses)
-        return np.concatenate(visited)
+        axes = np.linalg.eigh(scaled.transpose(0, 2, 1) @ scaled)[1][:, :, -1]  # in units of each one's own spread
+        return pair.walked(
+            np.concatenate([best.poses, best.poses]),
+            np.concatenate([best.spreads, best.spreads]),
+            np.concatenate([axes, -axes]),
+            blur_m=self.blurs[-1] * pair.size_m,
+            pull=self._pull(pair, prior),
+            effective_points=self.effective_points,
+            floor=found.scores[0] - self.negligible,
+            stride=self.stride,
+            max_strides=self.max_strides,
+        )
 
     def _starts(self, prior: PoseGaussian, size_m: float) -> int:
         """Return how many starts a prior is worth."""
@@ -176,51 +177,30 @@ class Search:
         """Return how good (n,) places are beside each other (nats)."""
         return pair.tempered(poses, blur_m, effective_points=self.effective_points)
 
-    def _stepped(self, pair: Pair, poses: Array, prior: PoseGaussian, blur_m: float) -> Array:
-        """Return motions one step further down."""
-        centre = se3.translation(pair.centre_m)
-        return poses @ centre @ se3.exp(self._step(pair, poses, prior, blur_m)) @ se3.inverse(centre)
+    def _led(self, pair: Pair, poses: Array, prior: PoseGaussian, blur_m: float) -> Array:
+        """Return motions led downhill on matching surface, held by what the prior says of them."""
+        return pair.downhill(poses, blur_m, self._pull(pair, prior), steps=self.iterations, stride=4)
 
-    def _step(self, pair: Pair, poses: Array, prior: PoseGaussian, blur_m: float) -> Array:
-        """Return the damped Gauss-Newton steps ξ (n, 6) of motions, held by what the prior says of them."""
-        gradient, matrix = pair.normal_equations(poses, blur_m, stride=4)
-        centre = se3.translation(pair.centre_m)
-        away = se3.log(se3.inverse(prior.mean) @ poses @ centre)
-        hold = np.linalg.inv(self.local_points / pair.points * prior.covariance)
-        count = 0.25 * pair.points
-        damping = np.diag(np.repeat([1.0 / self.max_step_rad, 1.0 / (self.max_step_rad * pair.size_m)], 3) ** 2)
-        held = matrix + hold + 0.01 * count * damping
-        step = np.linalg.solve(held, (gradient - away @ hold)[:, :, None])[:, :, 0]
-        angle = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
-        return step * np.minimum(1.0, self.max_step_rad / np.maximum(angle, 1e-12))
+    def _pull(self, pair: Pair, prior: PoseGaussian) -> Pull:
+        """Return what holds motions on their way down: the prior, and some damping."""
+        hold = np.asarray(np.linalg.inv(self.local_points / pair.points * prior.covariance), dtype=np.float64)
+        damping = np.repeat([1.0 / self.max_step_rad, 1.0 / (self.max_step_rad * pair.size_m)], 3) ** 2
+        return Pull(se3.rows(prior.mean), hold, 0.0025 * pair.points * damping, self.max_step_rad)
 
     def _distinct(self, found: Candidates, centre_m: Array) -> Candidates:
         """Return one of each group of candidates that lie within each other's reach."""
         kept: list[int] = []
-        left = np.ones(len(found), dtype=bool)
-        centre = se3.translation(centre_m)
+        left, near = np.ones(len(found), dtype=bool), found.distances(centre_m) <= self.reach
         for number in range(len(found)):
             if left[number]:
                 kept.append(number)
-                left &= distances(found, number, centre) > self.reach
+                left &= ~near[number]
         return found.some(np.array(kept, dtype=np.int64))
 
 
-def distances(found: Candidates, number: int, centre: Array) -> Array:
-    """Return how far (k,) candidates are from one of them, in standard deviations of its surroundings.
-
-    Args:
-        found: the candidates.
-        number: the one.
-        centre: (4, 4) shift to the source's centroid.
-    """
-    xi = se3.log(se3.inverse(found.poses[number] @ centre) @ found.poses @ centre)
-    return np.linalg.norm(np.linalg.solve(found.spreads[number], xi.T), axis=0)
-
-
 def _gaussian(poses: Array, centre_m: Array) -> PoseGaussian:
-    """Return the mean of poses · shift to the centre, and the covariance of ξ about it."""
-    mean, covariance = se3.mean(poses @ se3.translation(centre_m), np.full(len(poses), 1.0 / len(poses)))
+    """Return the mean of poses, and the covariance of ξ about it at the centre."""
+    mean, covariance = se3.mean(poses, np.ones(len(poses)), about_m=centre_m)
     return PoseGaussian(mean, covariance + np.diag(np.repeat([1e-4, 1e-5], 3) ** 2))
 
 

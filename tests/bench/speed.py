@@ -13,6 +13,7 @@ import reference
 
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.kernels import visibility
+from modeler.kernels.sight import Sight
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import PaperRegistrar, VisibilityRegistrar
@@ -160,12 +161,12 @@ def _counted(work: Callable[[], object]) -> tuple[int, float, float]:
     kernel = visibility.log_likelihoods
     count, spent_s = 0, 0.0
 
-    def counting(poses: Array, points: Array, *rest: Array) -> Array:
+    def counting(poses: Array, forward: Sight, backward: Sight, *models: visibility.Model) -> Array:
         nonlocal count, spent_s
         began = time.perf_counter()
-        result = kernel(poses, points, *rest)
+        result = kernel(poses, forward, backward, *models)
         spent_s += time.perf_counter() - began
-        count += len(poses) * points.shape[1]
+        count += len(poses) * (forward.points.shape[1] + backward.points.shape[1])
         return result
 
     with patch.object(visibility, "log_likelihoods", counting):

@@ -1,0 +1,111 @@
+"""Walks along ridges of the posterior: out along the least determined direction, and down only across it."""
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from modeler.kernels.matching import equations, held_step, workroom
+from modeler.kernels.moves import turn
+from modeler.kernels.sight import Sight, buffers, invert, look
+from modeler.kernels.visibility import Model, score
+
+
+class Ground(NamedTuple):
+    """What a walker looks at, and when it turns back."""
+
+    forward: Sight
+    """The source's points in the target, and"""
+    backward: Sight
+    """the target's in the source: those that lead downhill."""
+    all_forward: Sight
+    """Likewise, and"""
+    all_backward: Sight
+    """likewise: those that tell how good a place is."""
+    forward_model: Model
+    """The likelihood of either direction, and"""
+    backward_model: Model
+    """of the other."""
+    per_point: float
+    """Nats that a nat of the likelihood's is worth."""
+    no_overlap: float
+    """What it costs that no surface matches (nats)."""
+    per_explained: float
+    """By how many e-folds an explained point lowers that."""
+    floor: float
+    """A place worse than this is the end (nats)."""
+
+
+@numba.njit(cache=True)
+def height(pose, ground, there, back, inverse):
+    """Return how good a pose (12,) is (nats): the tempered likelihood; room for the search is handed in."""
+    look(pose, ground.all_forward, there[0], there[1], there[2])
+    total, explained = score(ground.all_forward.points, there[0], there[2], ground.forward_model)
+    invert(pose, inverse)
+    look(inverse, ground.all_backward, back[0], back[1], back[2])
+    more, further = score(ground.all_backward.points, back[0], back[2], ground.backward_model)
+    plain = ground.per_point * (np.float64(total) + np.float64(more))
+    return plain - ground.no_overlap * math.exp(-ground.per_explained * (np.float64(explained) + np.float64(further)))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def walk(poses, spreads, axes, strides, ground, centre, surface_m, pull, max_strides):
+    """Walk from each pose along its axis until it is no longer good, with two Gauss-Newton steps across after each.
+
+    Args:
+        poses: (k, 12) where walkers start.
+        spreads: (k, 6, 6) lower triangular roots of the covariances of ξ about the centre.
+        axes: (k, 6) unit vectors in units of those spreads.
+        strides: (k,) lengths in such units, negative for the other way.
+        ground: see `Ground`.
+        centre: (3,) point of the source in m.
+        surface_m: noise of the surfaces in m beyond that of points and planes.
+        pull: see `Pull`.
+        max_strides: a walker takes at most so many.
+
+    Returns:
+        (k, max_strides, 12) the places visited, and how many (k,) of them are good.
+    """
+    visited, counts = np.empty((len(poses), max_strides, 12)), np.zeros(len(poses), dtype=np.int64)
+    room, gradient, matrix = workroom(ground.forward, ground.backward), np.empty(6), np.empty((6, 6))
+    there, back, inverse = buffers(ground.all_forward), buffers(ground.all_backward), np.empty(12)
+    step, z, rotation = np.empty(6), np.empty(6), np.empty((3, 3))
+    pose, moved = np.empty(12), np.empty(12)
+    for i in range(len(poses)):
+        pose[:] = poses[i]
+        for number in range(max_strides):
+            for k in range(6):
+                z[k] = strides[i] * axes[i, k]
+            spread_out(spreads[i], z, step)
+            turn(pose, step, centre, rotation, moved)
+            pose[:] = moved
+            for _ in range(2):
+                equations(pose, ground.forward, ground.backward, centre, surface_m, room, gradient, matrix)
+                held_step(pose, pull, centre, gradient, matrix, step, rotation)
+                along = 0.0
+                for k in range(6):  # in units of the spread
+                    z[k] = step[k]
+                    for m in range(k):
+                        z[k] -= spreads[i, k, m] * z[m]
+                    z[k] /= spreads[i, k, k]
+                    along += axes[i, k] * z[k]
+                for k in range(6):
+                    z[k] -= along * axes[i, k]
+                spread_out(spreads[i], z, step)
+                turn(pose, step, centre, rotation, moved)
+                pose[:] = moved
+            if not height(pose, ground, there, back, inverse) > ground.floor:
+                break
+            visited[i, number] = pose
+            counts[i] = number + 1
+    return visited, counts
+
+
+@numba.njit(cache=True)
+def spread_out(root, z, xi):
+    """Write ξ (6,), a lower triangular root (6, 6) times z (6,)."""
+    for k in range(6):
+        xi[k] = 0.0
+        for m in range(k + 1):
+            xi[k] += root[k, m] * z[m]
