@@ -3,10 +3,11 @@
 # make test       the whole gate: format, lint, types, layers, tests
 # make calibrate  whether stated uncertainties are true, on rendered pairs (many minutes)
 # make bench      speed, against Open3D and the committed baseline
+# make audit      locked packages against published advisories, where these can be reached
 
 BIN := .venv/bin
 
-.PHONY: setup demo test calibrate bench
+.PHONY: setup demo test calibrate bench audit
 
 setup: .venv/.installed
 
@@ -34,3 +35,6 @@ calibrate: setup
 
 bench: setup
 	$(BIN)/python tests/bench
+
+audit: setup
+	.ci/audit
