@@ -11,6 +11,7 @@ from modeler import se3
 from modeler.priors import (
     AxesPrior,
     FeaturesPrior,
+    ForeseenPrior,
     GeneralPrior,
     HeldPrior,
     MixturePrior,
@@ -166,6 +167,13 @@ def velocity(camera: Array) -> AbstractPrior:
     return VelocityPrior().learned(solution(camera), ())
 
 
+def foreseen(camera: Array) -> AbstractPrior:
+    """A motion on the table that the graph foretells, about right."""
+    spread = se3.adjoint(camera) @ (0.02**2 * np.eye(6)) @ se3.adjoint(camera).T
+    about_right = camera @ turned(-STEP) @ se3.exp(np.full(6, 0.01)) @ se3.inverse(camera)
+    return ForeseenPrior(TablePrior(), PoseGaussian(about_right, spread))
+
+
 CASES: dict[str, Case] = {
     "general": Case(lambda _: GeneralPrior(max_rotation_deg=30, max_offset_m=0.03)),
     "table": Case(lambda _: TablePrior(max_rotation_deg=40, max_shift_m=0.03)),
@@ -192,6 +200,7 @@ CASES: dict[str, Case] = {
     "velocity on a table": Case(
         lambda camera: VelocityPrior(TablePrior()).learned(solution(camera), ()), proposes=True
     ),
+    "foreseen": Case(foreseen, proposes=True),
     "axes": Case(lambda _: AxesPrior(), proposes=True, shaken=0.1),
     "features": Case(lambda _: FeaturesPrior(), proposes=True, shaken=0.3),
     "held and table": Case(lambda camera: ProductPrior(held(camera), TablePrior()), shaken=0.03),

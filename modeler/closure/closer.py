@@ -9,8 +9,9 @@ import numpy as np
 
 from modeler import se3
 from modeler.closure.prospects import Outlook
+from modeler.closure.reckoning import came_back, continued, onwards
 from modeler.closure.verdict import Agreement, agreement, flaw, modes
-from modeler.closure.ways import Way, along, ways
+from modeler.closure.ways import Way, ways
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, RayImage, Solution
 
 
@@ -32,6 +33,12 @@ class Closer:
     """At most so many views besides the previous one are tried for a frame; 0 = never close."""
     min_gain_nats: float = 4.16
     """Least information that an edge must promise: the default makes six directions twice as sure, 6 log 2."""
+    max_spans: int = 1
+    """Once all frames are in, at most so many more views are tried for each of them; 0 = none."""
+    max_span_deg: float = 50.0
+    """Largest rotation in degrees to such a view."""
+    min_span_gain_nats: float = 1.0
+    """Least information that it must promise: an edge over two steps of 25° does."""
     max_relocations: int = 4
     """At most so many earlier views are tried for a frame that the previous view does not place."""
     min_overlap: float = 0.4
@@ -74,14 +81,36 @@ class Closer:
         chosen, spanned = [], False
         for prospect in outlook.prospects([frames[number] for number in near], angle_deg[near], self.min_gain_nats):
             if prospect.overlap >= self.min_overlap:
-                back = self._came_back(prospect.frame, base.source, outlook.reach, solution)
+                back = self._back(prospect.frame, base.source, outlook.reach, solution)
                 if back or not spanned:  # one large step over many small ones is enough
                     chosen.append(prospect.frame)
                 spanned = spanned or not back
         first = frames[0]
-        if first in chosen or (last and 0 in near and self._came_back(first, base.source, outlook.reach, solution)):
+        if first in chosen or (last and 0 in near and self._back(first, base.source, outlook.reach, solution)):
             chosen = [first, *(frame for frame in chosen if frame != first)]  # to close on the first is best
         return tuple(chosen[: self.max_closures])
+
+    def spans(
+        self, views: Mapping[int, RayImage], solution: Solution, known: Sequence[Edge]
+    ) -> tuple[tuple[int, int], ...]:
+        """Return pairs (source, target) of views to register once all are in: for each view those that tell most."""
+        frames = sorted(frame for frame in views if frame in solution.trajectory)
+        poses = np.stack([solution.trajectory[frame] for frame in frames]) if frames else np.zeros((0, 4, 4))
+        tried = {frozenset((edge.source, edge.target)) for edge in known}
+        pairs: list[tuple[int, int]] = []
+        for number, source in enumerate(frames if self.max_spans else ()):
+            angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses[:number]) @ poses[number]))
+            near = [k for k in np.flatnonzero(angle_deg <= self.max_span_deg) if {source, frames[k]} not in tried]
+            own = self._systematic(1, views[source].centroid_m)
+            outlook = Outlook(solution, views, known, source, poses[number], own, hangs=False)
+            found = outlook.prospects([frames[k] for k in near], angle_deg[near], self.min_span_gain_nats)
+            telling = [(source, prospect.frame) for prospect in found if prospect.overlap >= self.min_overlap]
+            pairs += telling[: self.max_spans]
+        return tuple(pairs)
+
+    def foreseen(self, base: Posterior, target: int, solution: Solution) -> PoseGaussian:
+        """Return target_from_source of the frame that a registration places and a view, as all edges tell it."""
+        return onwards(solution.relative_gaussian(target, base.target), modes(base)[0][1])
 
     def relocation(
         self,
@@ -111,7 +140,7 @@ class Closer:
             if angle_deg.min() <= self.max_angle_deg:
                 return left[int(np.argmin(angle_deg))]
         if len(tried) == 1:
-            expected = _continued(solution, frames, posteriors[0].source)
+            expected = continued(solution, frames, posteriors[0].source)
             return left[int(np.argmin(se3.rotation_angle(se3.inverse(poses) @ expected)))]
         apart = [se3.rotation_angle(se3.inverse(solution.trajectory[frame]) @ poses) for frame in tried]
         return left[int(np.argmax(np.min(apart, axis=0)))]
@@ -142,7 +171,7 @@ class Closer:
             return None, ""
         odometry, *others = posteriors
         frames = [frame for frame in views if frame in solution.trajectory]
-        expected = _continued(solution, frames, odometry.source)
+        expected = continued(solution, frames, odometry.source)
         # A pace that changes at random from step to step goes astray with the root of their number.
         reach_deg = float(np.sqrt(steps)) * self.max_angle_deg
         believed = steps == 1 or len(frames) == 1 or self._off_deg(odometry, expected, solution) <= reach_deg
@@ -186,7 +215,7 @@ class Closer:
         reach = ways(known, base.target) if base is not None and len(posteriors) > 1 else {}
         edges = []
         for number, posterior in enumerate(posteriors):
-            back = number > 0 and self._came_back(posterior.target, posterior.source, reach, solution)
+            back = number > 0 and self._back(posterior.target, posterior.source, reach, solution)
             if posterior is base:
                 accepted, reason = True, base_reason
             elif (found := flaw(posterior, self.min_overlap if number else None)) is not None:
@@ -201,20 +230,33 @@ class Closer:
             edges.append(Edge(posterior, "closure" if back else "odometry", accepted, reason))
         return tuple(edges)
 
-    def _came_back(self, target: int, source: int, reach: Mapping[int, Way], solution: Solution) -> bool:
-        """Return whether the object turned well away from a view before another frame, or on the way between the two.
+    def spanning(
+        self, posterior: Posterior, views: Mapping[int, RayImage], solution: Solution, known: Sequence[Edge]
+    ) -> Edge:
+        """Return the judged edge between two views of the graph.
 
         Args:
-            target: number of the view.
-            source: number of the other frame.
-            reach: ways from the view that it hangs on.
-            solution: the poses so far.
+            posterior: of a registration that the graph does not hold.
+            views: the accepted views.
+            solution: their poses.
+            known: every edge judged so far.
         """
-        frames = {frame for frame in solution.trajectory if min(target, source) < frame < max(target, source)}
-        frames |= set(along(reach, target))
-        rotations = np.stack([solution.trajectory[frame][:3, :3] for frame in (target, *frames)])
-        cosine = 0.5 * (np.einsum("ij,nij->n", rotations[0], rotations) - 1.0)
-        return bool(cosine.min() <= np.cos(np.radians(self.away_deg)))
+        reach, centroid_m = ways(known, posterior.source), views[posterior.source].centroid_m
+        kind = "closure" if self._back(posterior.target, posterior.source, reach, solution) else "odometry"
+        if (found := flaw(posterior, self.min_overlap)) is not None:
+            return Edge(posterior, kind, accepted=False, reason=found)
+        agreed = agreement(
+            posterior,
+            [(1.0, solution.relative_gaussian(posterior.target, posterior.source))],
+            systematic=self._systematic(reach[posterior.target].edges, centroid_m),
+            scale=self.sigma_scale,
+            centroid_m=centroid_m,
+        )
+        verdict = "spans several steps" if agreed.agrees else "contradicts the chain"
+        return Edge(posterior, kind, agreed.agrees, f"{verdict}: {agreed.words}")
+
+    def _back(self, target: int, source: int, reach: Mapping[int, Way], solution: Solution) -> bool:
+        return came_back(target, source, reach, solution, away_deg=self.away_deg)
 
     def _off_deg(self, posterior: Posterior, expected: Array, solution: Solution) -> float:
         """Return the angle between where a registration puts a frame and an object_from_camera (4, 4)."""
@@ -235,13 +277,7 @@ class Closer:
     ) -> Agreement:
         """Return how well a registration agrees with the way through the graph and along `base`."""
         way = solution.relative_gaussian(posterior.target, base.target)
-        predictions = [
-            (
-                weight,
-                PoseGaussian(way.mean @ pose.mean, se3.composed_covariance(way.covariance, pose.mean, pose.covariance)),
-            )
-            for weight, pose in modes(base)
-        ]
+        predictions = [(weight, onwards(way, pose)) for weight, pose in modes(base)]
         centroid_m = se3.transform(se3.inverse(modes(base)[0][1].mean), views[base.target].centroid_m[None])[0]
         surest = reach.get(posterior.target)
         length = abs(list(views).index(base.target) - list(views).index(posterior.target))
@@ -259,13 +295,3 @@ class Closer:
         sigmas = length * np.repeat([np.radians(self.drift_deg), self.drift_m], 3)
         camera_from_object = se3.adjoint(se3.translation(centroid_m))
         return camera_from_object @ np.diag(sigmas**2) @ camera_from_object.T
-
-
-def _continued(solution: Solution, frames: Sequence[int], source: int) -> Array:
-    """Return object_from_camera (4, 4) of a new frame if the last motion between `frames` goes on at its pace."""
-    last = frames[-1]
-    if len(frames) < 2:
-        return solution.trajectory[last]
-    before = frames[-2]
-    pace = max((source - last) / (last - before), 0.0)
-    return solution.trajectory[last] @ se3.exp(pace * se3.log(solution.relative(before, last)))

@@ -42,11 +42,13 @@ class Outlook:
     edges: Sequence[Edge]
     """Every edge judged so far."""
     previous: int
-    """The view that the new one hangs on."""
+    """The view that the new one hangs on; or the new view itself, where it is in the graph already."""
     expected: Array
     """object_from_camera (4, 4) of the new view."""
     systematic: Array
     """Covariance (6, 6) of an edge's systematic error, in the camera of the view that the new one hangs on."""
+    hangs: bool = True
+    """Whether the new view hangs on `previous` by an edge of its own; False: it is `previous`."""
 
     @cached_property
     def reach(self) -> Mapping[int, Way]:
@@ -77,14 +79,14 @@ class Outlook:
         for frame, angle in zip(frames, angle_deg, strict=True):
             if frame in self.reach:
                 way = self.reach[frame]
-                ratio = 1.0 + (way.variance_rad2 + way.edges * own_rad2) / variance_rad2
+                ratio = self.hangs + (way.variance_rad2 + way.edges * own_rad2) / variance_rad2
                 bound_nats = 3.0 * _chance(angle) * np.log1p(_tells(angle) * ratio)
                 bounded.append((float(bound_nats), frame, float(angle)))
         found = []
         for _, frame, angle in sorted((b for b in bounded if b[0] >= least_nats), reverse=True)[:_ASKED]:
             overlap = self._overlap(frame)
             known = self.solution.relative_covariance(frame, self.previous)
-            known = known + one_edge + self.reach[frame].edges * self.systematic
+            known = known + self.hangs * one_edge + self.reach[frame].edges * self.systematic
             ratio = overlap * _tells(angle) * np.linalg.solve(one_edge, known)
             gain_nats = _chance(angle) * 0.5 * float(np.linalg.slogdet(np.eye(6) + ratio)[1])
             if gain_nats >= least_nats:

@@ -10,7 +10,8 @@ import numpy as np
 
 from modeler.closure import Closer
 from modeler.fusion import Fuser, own_covariances
-from modeler.graph import CommonAxis
+from modeler.graph import CommonAxis, shared_noise
+from modeler.pipeline.pairing import Pairing
 from modeler.pipeline.state import Seen, State
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter
@@ -19,7 +20,6 @@ from modeler.types import (
     AbstractRegistrar,
     Edge,
     Frame,
-    InputError,
     ObjectModel,
     Outcome,
     Posterior,
@@ -29,7 +29,7 @@ from modeler.types import (
 )
 
 ACCEPTED = "accepted"
-_BEYOND = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # what a motion beyond the prior may look like
+_MOST_SHARED = 0.5  # loops tell of more, but do not see what adds up along a chain: errors common to all edges
 _PREVIEWED = 40  # views that the model is made of while frames still come
 
 
@@ -76,7 +76,10 @@ class Modeler:
                 for later, found in self._caught_up(state):
                     state = later
                     yield replace(found, model=self._fused(state, last=False))
-                state = state.solved(self._shared_axis(state))
+                state, spans = self._spanned(state)
+                state = self._solved(state)
+                step = replace(step, posteriors=(*step.posteriors, *(edge.posterior for edge in spans)))
+                step = replace(step, edges=(*step.edges, *spans))
                 step = replace(step, solution=state.solution, edges_so_far=state.graph.edges, views=state.views)
             if state.views and (last or step.outcome == ACCEPTED):
                 state = replace(state, model=self._fused(state, last=last))
@@ -117,11 +120,14 @@ class Modeler:
             last: whether it is the last.
             again: whether it was tried before.
         """
-        posteriors, flaw = self._registered(state, seen.view, previous, last=last, again=again)
-        lasting = [replace(p, samples=np.zeros((0, 4, 4)), weights=np.zeros(0)) for p in posteriors]
+        pairing, posteriors = self._pairing(), ()
+        if seen.view is not None and previous is not None:
+            posteriors = pairing.placed(state, seen.view, previous, last=last, again=again)
+        lasting = [_lasting(posterior) for posterior in posteriors]
         steps = state.steps(seen.frame.index, previous)
         edges = self.closer.edges(lasting, state.views, state.solution, state.graph.edges, steps=steps)
-        outcome = flaw or _outcome(seen, edges, first=not state.views)
+        edges = pairing.explained(edges)
+        outcome = _outcome(seen, edges, first=not state.views)
         state = state.joined(seen, edges, accepted=outcome == ACCEPTED)
         step = Step(
             frame=seen.frame,
@@ -151,66 +157,36 @@ class Modeler:
                 yield state, step
             waiting = [(seen, view) for seen, view in state.overdue() if (seen.frame.index, view) not in tried]
 
-    def _shared_axis(self, state: State) -> CommonAxis | None:
-        """Return the axis that all steps share, of which no edge knows; None where there is none.
+    def _spanned(self, state: State) -> tuple[State, tuple[Edge, ...]]:
+        """Return the state with edges beyond those that placed the frames, each judged, and these."""
+        pairing = self._pairing()
+        edges = [
+            self.closer.spanning(_lasting(posterior), state.views, state.solution, state.graph.edges)
+            for posterior in pairing.spanning(state)
+        ]
+        edges = pairing.explained(edges)
+        return state.spanned(edges), edges
 
-        The images of every pair say where it lies: solved for with all poses, it sharpens the first pairs as the last,
-        and what each pair says of it counts once.
+    def _solved(self, state: State) -> State:
+        """Return the state solved with what edges have in common.
+
+        That is an axis about which all steps turn: the images of every pair say where it lies, so that it sharpens the
+        first pairs as the last, and what each pair says of it counts once. Or it is the noise of a frame's image.
         """
-        shared = self.prior.shared_axis(list(state.views.values()))
-        if shared is None:
-            return None
-        return CommonAxis(sigma_tilt_rad=shared.sigma_tilt_rad, sigma_shift_m=shared.sigma_shift_m, sigma_lift_m=np.inf)
+        axis = self.prior.shared_axis(list(state.views.values()))
+        if axis is None:
+            share = min(shared_noise(state.graph, state.solution), _MOST_SHARED)
+            return state.solved(axis=None, shared=share)
+        common = CommonAxis(sigma_tilt_rad=axis.sigma_tilt_rad, sigma_shift_m=axis.sigma_shift_m, sigma_lift_m=np.inf)
+        return state.solved(axis=common, shared=0.0)
 
-    def _registered(
-        self, state: State, view: RayImage | None, previous: int | None, *, last: bool, again: bool
-    ) -> tuple[tuple[Posterior, ...], str | None]:
-        """Return the posteriors of a new view, and why there are none where the prior does not apply."""
-        if view is None or previous is None:
-            return (), None
-        steps = state.steps(view.index, previous)
-        prior, known = self.prior.learned(state.solution, state.graph.edges), state.graph.edges
-        try:
-            odometry = self._pair(state, view, previous, prior.grown(steps) if steps > 1 else prior)
-            posteriors = (odometry,)
-            base, _ = self.closer.base(posteriors, state.views, state.solution, known, steps=steps)
-            if base is None:
-                posteriors = self._relocalised(state, view, odometry, prior, again=again)
-                base, _ = self.closer.base(posteriors, state.views, state.solution, known, steps=steps)
-            if base is None:
-                return posteriors, None
-            tried = {previous, *(posterior.target for posterior in posteriors)}
-            tried |= {edge.target for edge in known if edge.source == view.index}
-            targets = self.closer.closures(base, state.views, state.solution, known, last=last)
-            targets = [target for target in targets if target not in tried]
-            apply = map if self.executor is None else self.executor.map
-            return (*posteriors, *apply(lambda target: self._pair(state, view, target, prior), targets)), None
-        except InputError as error:
-            return (), str(error)
-
-    def _relocalised(
-        self, state: State, view: RayImage, odometry: Posterior, prior: AbstractPrior, *, again: bool
-    ) -> tuple[Posterior, ...]:
-        """Return posteriors of a view that the previous one does not place: in a grown prior, and of other views."""
-        steps = state.steps(view.index, odometry.target)
-        grown = prior.grown(max(steps, 2))
-        if steps == 1 and odometry.outcome in _BEYOND:  # the motion may be larger than the prior allows for one step
-            wider = self._pair(state, view, odometry.target, grown)
-            odometry = replace(wider, seconds=odometry.seconds + wider.seconds)
-        posteriors, known = (odometry,), state.graph.edges
-        while not again and self.closer.base(posteriors, state.views, state.solution, known, steps=steps)[0] is None:
-            target = self.closer.relocation(posteriors, state.views, state.solution)
-            if target is None:
-                break
-            posteriors = (*posteriors, self._pair(state, view, target, grown))
-        return posteriors
-
-    def _pair(self, state: State, source: RayImage, target: int, prior: AbstractPrior) -> Posterior:
-        """Register a view against an accepted one."""
-        return self.register(source, self._ready(state, state.views[target]), prior)
+    def _pairing(self) -> Pairing:
+        return Pairing(self.prior, self.closer, self.register, self._ready, self.executor)
 
     def _ready(self, state: State, view: RayImage) -> RayImage:
         """Return a view with the images that a likelihood looks up."""
+        if view.layers:
+            return view
         return state.ready.get(view.index) or self.sensor.ray_image(view.frame, view.plane)
 
     def _fused(self, state: State, *, last: bool) -> ObjectModel:
@@ -220,6 +196,11 @@ class Modeler:
         frames = list(state.views)
         spread = np.unique(np.linspace(0, len(frames) - 1, _PREVIEWED).round().astype(int))
         return self.fuser.preview({frames[k]: state.views[frames[k]] for k in spread}, state.solution.trajectory)
+
+
+def _lasting(posterior: Posterior) -> Posterior:
+    """Return a posterior without its samples, which nothing asks for once it is judged."""
+    return replace(posterior, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
 
 
 def _with_last(frames: Iterable[Frame]) -> Iterator[tuple[Frame, bool]]:

@@ -76,9 +76,14 @@ class State:
             lost={frame: other for frame, other in self.lost.items() if frame != number},
         )
 
-    def solved(self, axis: CommonAxis | None) -> State:
-        """Return the state solved with an axis that all steps share, where there is one."""
-        return self if axis is None else replace(self, smoother=replace(self.smoother, axis=axis).to(self.graph))
+    def spanned(self, edges: Sequence[Edge]) -> State:
+        """Return the state with more edges between views that are in it."""
+        graph = self.graph.plus(edges)
+        return replace(self, graph=graph, smoother=self.smoother.to(graph))
+
+    def solved(self, *, axis: CommonAxis | None, shared: float) -> State:
+        """Return the state solved with an axis that all steps share and a share of noise that edges have in common."""
+        return replace(self, smoother=replace(self.smoother, axis=axis, shared=shared).to(self.graph))
 
     def overdue(self) -> Iterator[tuple[Seen, int]]:
         """Yield lost frames, newest first, each with the view that followed it soonest, if that was soon."""

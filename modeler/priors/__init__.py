@@ -2,6 +2,7 @@
 
 from modeler.priors.axes import AxesPrior as AxesPrior
 from modeler.priors.features import FeaturesPrior as FeaturesPrior
+from modeler.priors.foreseen import ForeseenPrior as ForeseenPrior
 from modeler.priors.general import GeneralPrior as GeneralPrior
 from modeler.priors.held import HeldPrior as HeldPrior
 from modeler.priors.mixture import MixturePrior as MixturePrior

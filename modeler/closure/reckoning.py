@@ -1,0 +1,43 @@
+"""Where motions lead: on from the last two frames, along the graph, and back to where the object was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from modeler import se3
+from modeler.closure.ways import Way, along
+from modeler.types import Array, PoseGaussian, Solution
+
+
+def came_back(target: int, source: int, reach: Mapping[int, Way], solution: Solution, *, away_deg: float) -> bool:
+    """Return whether the object turned well away from a view before another frame, or on the way between the two.
+
+    Args:
+        target: number of the view.
+        source: number of the other frame.
+        reach: ways from the view that it hangs on.
+        solution: the poses so far.
+        away_deg: what counts as well away.
+    """
+    frames = {frame for frame in solution.trajectory if min(target, source) < frame < max(target, source)}
+    frames |= set(along(reach, target))
+    rotations = np.stack([solution.trajectory[frame][:3, :3] for frame in (target, *frames)])
+    cosine = 0.5 * (np.einsum("ij,nij->n", rotations[0], rotations) - 1.0)
+    return bool(cosine.min() <= np.cos(np.radians(away_deg)))
+
+
+def onwards(way: PoseGaussian, motion: PoseGaussian) -> PoseGaussian:
+    """Return the motion that leads on along a way, for independent errors."""
+    return PoseGaussian(way.mean @ motion.mean, se3.composed_covariance(way.covariance, motion.mean, motion.covariance))
+
+
+def continued(solution: Solution, frames: Sequence[int], source: int) -> Array:
+    """Return object_from_camera (4, 4) of a new frame if the last motion between `frames` goes on at its pace."""
+    last = frames[-1]
+    if len(frames) < 2:
+        return solution.trajectory[last]
+    before = frames[-2]
+    pace = max((source - last) / (last - before), 0.0)
+    return solution.trajectory[last] @ se3.exp(pace * se3.log(solution.relative(before, last)))

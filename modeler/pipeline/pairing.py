@@ -1,0 +1,110 @@
+"""Which pairs of views are registered in the loop, and with what known beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+
+from modeler.closure import Closer
+from modeler.pipeline.state import State
+from modeler.priors import ForeseenPrior
+from modeler.registration.posterior import failed
+from modeler.types import AbstractPrior, Edge, InputError, Outcome, Posterior, RayImage
+
+_BEYOND = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # what a motion beyond the prior may look like
+_ROOM = 2.0  # steps for which limits hold where the graph foretells a motion: they are not to cut it off
+
+
+@dataclass(frozen=True, eq=False)
+class Pairing:
+    """Registers a new view against earlier ones, and views of the graph with each other."""
+
+    prior: AbstractPrior
+    """What is known of motions before the images are compared."""
+    closer: Closer
+    """Chooses the pairs."""
+    register: Callable[[RayImage, RayImage, AbstractPrior], Posterior]
+    """Of a source and a target."""
+    ready: Callable[[State, RayImage], RayImage]
+    """Makes a view ready for that."""
+    executor: Executor | None
+    """Where pairs are registered side by side; None: one after the other."""
+    refusals: dict[tuple[int, int], str] = field(default_factory=dict)
+    """Why the prior does not apply to a pair, in words, by (source, target): filled as pairs are registered."""
+
+    def placed(self, state: State, view: RayImage, previous: int, *, last: bool, again: bool) -> tuple[Posterior, ...]:
+        """Return the posteriors of a new view, against the previous one first.
+
+        Args:
+            state: what is known so far.
+            view: the new view.
+            previous: the view that it should hang on.
+            last: whether it is the last.
+            again: whether it was tried before: then no others are tried to place it.
+        """
+        steps = state.steps(view.index, previous)
+        prior, known = self.prior.learned(state.solution, state.graph.edges), state.graph.edges
+        odometry = self._pair(state, view, previous, prior.grown(steps) if steps > 1 else prior)
+        posteriors = (odometry,)
+        base, _ = self.closer.base(posteriors, state.views, state.solution, known, steps=steps)
+        if base is None:
+            posteriors = self._relocalised(state, view, odometry, prior, again=again)
+            base, _ = self.closer.base(posteriors, state.views, state.solution, known, steps=steps)
+        if base is None:
+            return posteriors
+        tried = {previous, *(posterior.target for posterior in posteriors)}
+        tried |= {edge.target for edge in known if edge.source == view.index}
+        targets = self.closer.closures(base, state.views, state.solution, known, last=last)
+        targets = [target for target in targets if target not in tried]
+        foreseen = [ForeseenPrior(prior, self.closer.foreseen(base, target, state.solution)) for target in targets]
+        return (*posteriors, *self._pairs(state, [(view, target) for target in targets], foreseen))
+
+    def spanning(self, state: State) -> Iterator[Posterior]:
+        """Yield posteriors of pairs of views of the graph that were not registered with each other yet."""
+        prior = self.prior.learned(state.solution, state.graph.edges).grown(_ROOM)
+        pairs = self.closer.spans(state.views, state.solution, state.graph.edges)
+        foreseen = [ForeseenPrior(prior, state.solution.relative_gaussian(t, s)) for s, t in pairs]
+        yield from self._pairs(state, [(state.views[source], target) for source, target in pairs], foreseen)
+
+    def explained(self, edges: Sequence[Edge]) -> tuple[Edge, ...]:
+        """Return judged edges, those to which the prior does not apply with the reason."""
+        return tuple(
+            replace(edge, reason=self.refusals.get((edge.source, edge.target), edge.reason))
+            if edge.posterior.outcome is Outcome.NOT_KNOWN
+            else edge
+            for edge in edges
+        )
+
+    def _relocalised(
+        self, state: State, view: RayImage, odometry: Posterior, prior: AbstractPrior, *, again: bool
+    ) -> tuple[Posterior, ...]:
+        """Return posteriors of a view that the previous one does not place: in a grown prior, and of other views."""
+        steps = state.steps(view.index, odometry.target)
+        grown = prior.grown(max(steps, 2))
+        if steps == 1 and odometry.outcome in _BEYOND:  # the motion may be larger than the prior allows for one step
+            wider = self._pair(state, view, odometry.target, grown)
+            odometry = replace(wider, seconds=odometry.seconds + wider.seconds)
+        posteriors, known = (odometry,), state.graph.edges
+        while not again and self.closer.base(posteriors, state.views, state.solution, known, steps=steps)[0] is None:
+            target = self.closer.relocation(posteriors, state.views, state.solution)
+            if target is None:
+                break
+            posteriors = (*posteriors, self._pair(state, view, target, grown))
+        return posteriors
+
+    def _pairs(
+        self, state: State, pairs: Sequence[tuple[RayImage, int]], priors: Sequence[AbstractPrior]
+    ) -> Iterator[Posterior]:
+        """Yield the posteriors of pairs, side by side where there is an executor."""
+        apply = map if self.executor is None else self.executor.map
+        yield from apply(lambda pair, prior: self._pair(state, pair[0], pair[1], prior), pairs, priors)
+
+    def _pair(self, state: State, source: RayImage, target: int, prior: AbstractPrior) -> Posterior:
+        """Register a view against an accepted one; where the prior does not apply, that is the outcome."""
+        view = self.ready(state, state.views[target])
+        try:
+            return self.register(self.ready(state, source), view, prior)
+        except InputError as error:
+            self.refusals[source.index, target] = str(error)
+            return failed(source, view, Outcome.NOT_KNOWN)
