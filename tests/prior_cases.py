@@ -200,7 +200,7 @@ CASES: dict[str, Case] = {
     "velocity on a table": Case(
         lambda camera: VelocityPrior(TablePrior()).learned(solution(camera), ()), proposes=True
     ),
-    "foreseen": Case(foreseen, proposes=True),
+    "foreseen": Case(foreseen, proposes=True, shaken=0.03),
     "axes": Case(lambda _: AxesPrior(), proposes=True, shaken=0.1),
     "features": Case(lambda _: FeaturesPrior(), proposes=True, shaken=0.3),
     "held and table": Case(lambda camera: ProductPrior(held(camera), TablePrior()), shaken=0.03),
