@@ -14,6 +14,7 @@ DEPTH = 6  # measured z, m
 SILHOUETTE = 7  # distance of a pixel outside the object from its silhouette, px
 CELL_SIZE = 8
 
+_NOWHERE_M = 1e9  # far from every ball
 MISSING, SURFACE, RAGGED, BACKGROUND = 0.0, 1.0, 2.0, 3.0  # RAGGED: object, but no plane to be trusted
 
 
@@ -43,6 +44,69 @@ def solve_symmetric_3(a00, a01, a02, a11, a12, a22, b0, b1, b2):
     )
 
 
+@numba.njit(cache=True)
+def bounds(mask):
+    """Return the first row, the row after the last, and likewise the columns, of what a mask (h, w) holds."""
+    top, bottom, left, right = mask.shape[0], 0, mask.shape[1], 0
+    for row in range(mask.shape[0]):
+        for column in range(mask.shape[1]):
+            if mask[row, column]:
+                top, bottom = min(top, row), row + 1
+                left, right = min(left, column), max(right, column + 1)
+    return min(top, bottom), bottom, min(left, right), right
+
+
+@numba.njit(cache=True)
+def padded(depth_m, mask, intrinsics, window, pad):
+    """Return x, y, z in m and 1/z in 1/m (4, h, w) of a mask's pixels in a window and `pad` around; else far away."""
+    top, bottom, left, right = window
+    fx, fy, cx, cy = intrinsics
+    points = np.full((4, bottom - top + 2 * pad, right - left + 2 * pad), _NOWHERE_M, dtype=np.float32)
+    for row in range(top, bottom):
+        for column in range(left, right):
+            z = depth_m[row, column]
+            if mask[row, column] and z > 0.0:
+                r, c = row - top + pad, column - left + pad
+                points[0, r, c], points[1, r, c] = z * (column - cx) / fx, z * (row - cy) / fy
+                points[2, r, c], points[3, r, c] = z, 1.0 / z
+    return points
+
+
+@numba.njit(cache=True, fastmath={"contract", "nsz"})
+def add_line(points, row, shift, pad, radius_m2, step, sums):
+    """Add up, for every pixel of a row, its neighbours on one line that lie within the ball around it.
+
+    Args:
+        points: of `padded`.
+        row: the pixels' row, and
+        shift: by how much the line lies below it.
+        pad: of `padded`; the line is read as far as this to either side.
+        radius_m2: square of the ball's radius.
+        step: between the pixels that are read.
+        sums: (6, w) out: number n, Σ x, Σ x², Σ b, Σ x b, Σ b², with x the columns from the pixel and b the
+            difference in 1/z.
+    """
+    sums[:] = 0.0
+    here, there = row + pad, row + pad + shift
+    for dx in range(-pad, pad + 1, step):
+        x = np.float32(dx)
+        for j in range(sums.shape[1]):
+            k = np.uint32(j + pad)
+            m = np.uint32(j + pad + dx)
+            away_x = points[0, there, m] - points[0, here, k]
+            away_y = points[1, there, m] - points[1, here, k]
+            away_z = points[2, there, m] - points[2, here, k]
+            b = points[3, there, m] - points[3, here, k]
+            inside = away_x * away_x + away_y * away_y + away_z * away_z <= radius_m2
+            one, weighted = np.float32(1.0) if inside else np.float32(0.0), b if inside else np.float32(0.0)
+            sums[0, j] += one
+            sums[1, j] += x * one
+            sums[2, j] += x * x * one
+            sums[3, j] += weighted
+            sums[4, j] += x * weighted
+            sums[5, j] += weighted * weighted
+
+
 @numba.njit(cache=True, parallel=True)
 def local_planes(depth_m, mask, intrinsics, ball, sigma_inverse):
     """Fit a plane to every object pixel's neighbours within a ball.
@@ -55,7 +119,7 @@ def local_planes(depth_m, mask, intrinsics, ball, sigma_inverse):
         depth_m: (h, w) z in m, NaN = missing.
         mask: (h, w) bool, object.
         intrinsics: (4,) fx, fy, cx, cy in px.
-        ball: radius in m; largest half-width of its window in px; step between the pixels that are read.
+        ball: radius in m; half-width of its window in px; step between the pixels that are read.
         sigma_inverse: sensor noise of 1/z, in 1/m.
 
     Returns:
@@ -63,99 +127,102 @@ def local_planes(depth_m, mask, intrinsics, ball, sigma_inverse):
     """
     height, width = depth_m.shape
     fx, fy, cx, cy = intrinsics
-    radius_m, max_radius_px, stride = ball
-    cells = np.zeros((height, width, CELL_SIZE), dtype=np.float32)
+    radius_m, reach, stride = ball
+    window = bounds(mask)
+    top, bottom, left, right = window
+    points = padded(depth_m, mask, intrinsics, window, reach)
+    cells = np.empty((height, width, CELL_SIZE), dtype=np.float32)
     for row in numba.prange(height):
         for column in range(width):
-            z = depth_m[row, column]
-            if not z > 0.0:
-                continue
-            cells[row, column, DEPTH] = z
-            if not mask[row, column]:
-                cells[row, column, KIND] = BACKGROUND
-                continue
-            cells[row, column, KIND] = RAGGED
-            w0, h0 = (column - cx) / fx, (row - cy) / fy
-            reach = min(math.ceil(radius_m * max(fx, fy) / z), max_radius_px)
-            n = swx = swy = sxx = sxy = syy = sb = sxb = syb = sbb = 0.0
-            inverse0 = 1.0 / z
-            for dr in range(-reach, reach + 1, stride):
-                r = row + dr
-                if r < 0 or r >= height:
-                    continue
-                for dc in range(-reach, reach + 1, stride):
-                    c = column + dc
-                    if c < 0 or c >= width or not mask[r, c]:
-                        continue
-                    zi = depth_m[r, c]
-                    if not zi > 0.0:
-                        continue
-                    dx = zi * (c - cx) / fx - z * w0
-                    dy = zi * (r - cy) / fy - z * h0
-                    dz = zi - z
-                    if dx * dx + dy * dy + dz * dz > radius_m * radius_m:
-                        continue
-                    x, y, b = dc * 1.0, dr * 1.0, 1.0 / zi - inverse0
-                    n += 1.0
-                    swx += x
-                    swy += y
-                    sxx += x * x
-                    sxy += x * y
-                    syy += y * y
-                    sb += b
-                    sxb += x * b
-                    syb += y * b
-                    sbb += b * b
-            if n < 6.0:
-                continue
-            offset, slope_x, slope_y, leverage, determinant = solve_symmetric_3(
-                n, swx, swy, sxx, sxy, syy, sb, sxb, syb
-            )
-            if determinant == 0.0:
-                continue
-            # 1/z = inverse0 + offset + slope_x (c - column) + slope_y (r - row), turned into N · (w, h, 1).
-            plane_x, plane_y = slope_x * fx, slope_y * fy
-            plane_z = inverse0 + offset - plane_x * w0 - plane_y * h0
-            norm = math.sqrt(plane_x * plane_x + plane_y * plane_y + plane_z * plane_z)
-            along = inverse0 + offset
-            if along <= 0.0:
-                continue
-            residual = sbb - offset * sb - slope_x * sxb - slope_y * syb
-            spread = max(residual / max(n - 3.0, 1.0), sigma_inverse * sigma_inverse)
-            cells[row, column, NORMAL_X] = -plane_x / norm
-            cells[row, column, NORMAL_Y] = -plane_y / norm
-            cells[row, column, NORMAL_Z] = -plane_z / norm
-            cells[row, column, DISTANCE] = 1.0 / norm
-            # The distance of a point from the plane is (1 - N · p) / |N|: its noise is z times that of 1/z over |N|.
-            cells[row, column, VARIANCE] = z * z * spread * leverage / (norm * norm)
-            # A lopsided neighbourhood is the rim of a silhouette or a fold: its plane leans on one side only.
-            if n >= 8.0 and leverage * n < 1.6:
-                cells[row, column, KIND] = SURFACE
+            for k in range(CELL_SIZE):
+                cells[row, column, k] = 0.0
+            if depth_m[row, column] > 0.0:
+                cells[row, column, DEPTH] = depth_m[row, column]
+                cells[row, column, KIND] = RAGGED if mask[row, column] else BACKGROUND
+        if row < top or row >= bottom:
+            continue
+        line, sums = np.empty((6, right - left), dtype=np.float32), np.zeros((10, right - left))
+        for dy in range(-reach, reach + 1, stride):
+            add_line(points, row - top, dy, reach, np.float32(radius_m * radius_m), stride, line)
+            for j in range(right - left):
+                n, x, b = line[0, j], line[1, j], line[3, j]
+                sums[0, j] += n
+                sums[1, j] += x
+                sums[2, j] += dy * n
+                sums[3, j] += line[2, j]
+                sums[4, j] += dy * x
+                sums[5, j] += dy * dy * n
+                sums[6, j] += b
+                sums[7, j] += line[4, j]
+                sums[8, j] += dy * b
+                sums[9, j] += line[5, j]
+        for column in range(left, right):
+            if cells[row, column, KIND] == RAGGED:
+                w, h = (column - cx) / fx, (row - cy) / fy
+                fit_plane(cells[row, column], sums[:, column - left], w, h, fx, fy, sigma_inverse)
     return cells
+
+
+@numba.njit(cache=True)
+def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse):
+    """Write the plane through a pixel's neighbours into its cell (8,), where they determine one.
+
+    Args:
+        cell: with the depth of the pixel.
+        sums: (10,) n, Σ x, Σ y, Σ x², Σ xy, Σ y², Σ b, Σ xb, Σ yb, Σ b² of columns and rows from the pixel and of the
+            difference in 1/z.
+        w: (column - cx) / fx of the pixel, and
+        h: (row - cy) / fy.
+        fx: focal length in px, along rows, and
+        fy: along columns.
+        sigma_inverse: least noise of 1/z, in 1/m.
+    """
+    n, swx, swy, sxx, sxy, syy, sb, sxb, syb, sbb = sums
+    if n < 6.0:
+        return
+    offset, slope_x, slope_y, leverage, determinant = solve_symmetric_3(n, swx, swy, sxx, sxy, syy, sb, sxb, syb)
+    z = np.float64(cell[DEPTH])
+    along = 1.0 / z + offset
+    if determinant == 0.0 or along <= 0.0:
+        return
+    # 1/z = along + slope_x (c - column) + slope_y (r - row), turned into N · (w, h, 1).
+    plane_x, plane_y = slope_x * fx, slope_y * fy
+    plane_z = along - plane_x * w - plane_y * h
+    norm = math.sqrt(plane_x * plane_x + plane_y * plane_y + plane_z * plane_z)
+    residual = sbb - offset * sb - slope_x * sxb - slope_y * syb
+    spread = max(residual / max(n - 3.0, 1.0), sigma_inverse * sigma_inverse)
+    cell[NORMAL_X], cell[NORMAL_Y], cell[NORMAL_Z] = -plane_x / norm, -plane_y / norm, -plane_z / norm
+    cell[DISTANCE] = 1.0 / norm
+    # The distance of a point from the plane is (1 - N · p) / |N|: its noise is z times that of 1/z over |N|.
+    cell[VARIANCE] = z * z * spread * leverage / (norm * norm)
+    # A lopsided neighbourhood is the rim of a silhouette or a fold: its plane leans on one side only.
+    if n >= 8.0 and leverage * n < 1.6:
+        cell[KIND] = SURFACE
 
 
 @numba.njit(cache=True)
 def silhouette_distance(mask, limit_px):
     """Return the distance (h, w) float32 in px of every pixel from the mask, cut at `limit_px`; by chamfer sweeps."""
-    height, width = mask.shape
-    distance = np.empty((height, width), dtype=np.float32)
-    for row in range(height):
-        for column in range(width):
-            best = 0.0 if mask[row, column] else limit_px
+    distance = np.full(mask.shape, limit_px, dtype=np.float32)
+    top, bottom, left, right = bounds(mask)
+    reach = math.ceil(limit_px)  # farther from the mask nothing changes
+    near = slice(max(top - reach, 0), bottom + reach), slice(max(left - reach, 0), right + reach)
+    sweep(mask[near[0], near[1]], distance[near[0], near[1]])
+    sweep(mask[near[0], near[1]][::-1, ::-1], distance[near[0], near[1]][::-1, ::-1])
+    return distance
+
+
+@numba.njit(cache=True)
+def sweep(mask, distance):
+    """Hand distances (h, w) on from each pixel to the next, and from each row to the one below."""
+    for row in range(mask.shape[0]):
+        for column in range(mask.shape[1]):
+            best = np.float32(0.0) if mask[row, column] else distance[row, column]
             if best > 0.0 and column > 0:
-                best = min(best, distance[row, column - 1] + 1.0)
+                best = min(best, distance[row, column - 1] + np.float32(1.0))
             if best > 0.0 and row > 0:
                 best = min(best, row_above(distance[row - 1], column))
             distance[row, column] = best
-    for row in range(height - 1, -1, -1):
-        for column in range(width - 1, -1, -1):
-            best = distance[row, column]
-            if best > 0.0 and column + 1 < width:
-                best = min(best, distance[row, column + 1] + 1.0)
-            if best > 0.0 and row + 1 < height:
-                best = min(best, row_above(distance[row + 1], column))
-            distance[row, column] = best
-    return distance
 
 
 @numba.njit(cache=True, inline="always")

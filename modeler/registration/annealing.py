@@ -33,16 +33,18 @@ class Population:
 class AnnealedSampler:
     """Sequential Monte Carlo: weight, resample, move; temperatures bridge the steps where weights would collapse."""
 
-    initial: int = 1500
+    initial: int = 1000
     """Samples drawn at first."""
     particles: int = 500
     """Samples kept from the first weighting on."""
-    moves: int = 2
+    moves: int = 1
     """Rounds of moves after a weighting."""
     final_particles: int = 1000
     """Samples of the result."""
-    final_moves: int = 2
-    """Rounds of moves after the last weighting."""
+    final_moves: int = 4
+    """At most so many rounds of moves after the last weighting."""
+    enough: float = 600.0
+    """They end when the effective size of the result is this."""
     min_share: float = 0.4
     """Least effective share of the samples that a weighting may leave; with less, the step is cut."""
 
@@ -79,9 +81,10 @@ class AnnealedSampler:
                 blend = _Blend(motion, previous, level, reached)
                 for _ in range(self.final_moves if last else self.moves):
                     _move(poses, (prior, before, after), blend=blend, centre_m=centre_m, rng=rng)
+                    if last and _distinct(poses) >= self.enough:
+                        break
             before, previous = after, level
-        _, copies = np.unique(poses[:, :3, 3], axis=0, return_counts=True)
-        return Population(poses, evidence, len(poses) ** 2 / float(np.sum(copies**2)), worst_tail)
+        return Population(poses, evidence, _distinct(poses), worst_tail)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +153,12 @@ def _move(
             values[winners] = new[accept]
 
 
+def _distinct(poses: Array) -> float:
+    """Return the effective number of motions (n, 4, 4) of which some are copies of others."""
+    _, copies = np.unique(poses[:, 0, 3], return_counts=True)
+    return len(poses) ** 2 / float(np.sum(copies**2))
+
+
 def effective_samples(log_weights: Array) -> float:
     """Return Kish's effective sample size of unnormalised log weights (n,)."""
     weights = np.exp(log_weights - np.max(log_weights))
@@ -182,7 +191,7 @@ def _largest_step(difference: Array, remaining: float, share: float) -> float:
     if effective_samples(remaining * difference) >= least:
         return remaining
     low, high = 0.0, remaining
-    for _ in range(40):
+    for _ in range(16):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if effective_samples(middle * difference) > least else (low, middle)
     return min(max(low, 1e-4), remaining)

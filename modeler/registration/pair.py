@@ -83,7 +83,7 @@ class Pair:
             return 0.5
         hidden = self.forward.hidden_share
         low, high = 0.0, 2.0
-        for _ in range(30):  # the mean grows with what is taken for typical
+        for _ in range(16):  # the mean grows with what is taken for typical
             middle = 0.5 * (low + high)
             mean = np.mean(np.log((1.0 - hidden) * np.exp(middle - misfits) + hidden))
             low, high = (middle, high) if mean < 0.0 else (low, middle)
