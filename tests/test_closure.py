@@ -256,6 +256,82 @@ def test_closures_need_overlap_and_a_usable_outcome() -> None:
         assert not any(edge.accepted for edge in run.closures())
 
 
+def _witnessed(posterior: Posterior, nats: float) -> Posterior:
+    return replace(posterior, log_evidence=nats)
+
+
+def _told(source: int, *, scatter: float = 4.0, wrong: float = -90.0) -> Callable[[Posterior], Posterior]:
+    """Give evidence to registrations: as edges have it, and to those over more than one step from `source` far less."""
+
+    def told(posterior: Posterior) -> Posterior:
+        doubtful = posterior.source == source and posterior.source - posterior.target > 1
+        return _witnessed(posterior, wrong if doubtful else scatter * float(np.sin(3.0 * posterior.source)) - 20.0)
+
+    return told
+
+
+def test_closure_that_the_images_contradict_is_refused_though_it_agrees() -> None:
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(), _told(13))
+    (closure,) = [edge for edge in run.judged[13] if edge.target == 0]
+    assert not closure.accepted
+    assert closure.reason.startswith("the images contradict it: log evidence -90, of others -2")
+    taken = Run(list(REGULAR_DEG))
+    taken.run(Closer(), _told(13, wrong=-45.0))
+    assert all(edge.accepted for edge in taken.judged[13])
+
+
+def test_evidence_that_scatters_or_is_not_told_refuses_nothing() -> None:
+    for spoil in (_told(13, scatter=15.0), lambda posterior: _witnessed(posterior, np.nan)):
+        run = Run(list(REGULAR_DEG))
+        run.run(Closer(), spoil)
+        assert all(edge.accepted for edge in run.judged[13])
+
+
+def test_previous_view_is_not_believed_after_lost_frames_where_the_images_contradict_it() -> None:
+    run = Run(list(REGULAR_DEG[:9]))
+    run.run(Closer(), _told(-1))
+    truth, solution = run.measured(7, 8, np.random.default_rng(0), np.zeros(6)), run.solution
+    doubtful = _witnessed(replace(truth, source=12, target=8), -90.0)
+    judging = (run.views, solution, run.graph.edges)
+    assert Closer().base([doubtful], *judging, steps=1)[0] is doubtful
+    assert Closer().base([doubtful], *judging, steps=4)[0] is None
+    assert Closer().edges([doubtful], *judging, steps=4)[0].reason.startswith("the images contradict it")
+    assert Closer().base([_witnessed(doubtful, -30.0)], *judging, steps=4)[0] is not None
+
+
+def test_once_all_frames_are_in_each_is_tried_over_two_steps() -> None:
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(max_closures=0))
+    pairs = Closer().spans(run.views, run.solution, run.graph.edges)
+    assert {(source, source - 2) for source in range(2, 12)} <= set(pairs)
+    assert {source for source, _ in pairs} == set(range(2, 14))
+    assert Closer(max_spans=0).spans(run.views, run.solution, run.graph.edges) == ()
+    assert Closer(max_span_deg=40.0).spans(run.views, run.solution, run.graph.edges[:11]) == ()
+    rng = np.random.default_rng(1)
+    for source, target in pairs:
+        true = run.measured(target, source, rng, np.zeros(6))
+        edge = Closer().spanning(true, run.views, run.solution, run.graph.edges)
+        assert edge.accepted
+        assert edge.kind == ("closure" if source - target > 3 else "odometry")
+        turned = replace(true, pose=PoseGaussian(true.pose.mean @ _turned(30.0), COVARIANCE))
+        edge = Closer().spanning(turned, run.views, run.solution, run.graph.edges)
+        assert not edge.accepted
+        assert edge.reason.startswith("contradicts the chain: ")
+        assert Closer().spanning(_witnessed(true, -1e9), run.views, run.solution, run.graph.edges).accepted
+
+
+def test_of_small_steps_the_widest_that_tells_most_is_tried() -> None:
+    run = Run(list(3.0 * np.arange(30)))
+    run.run(Closer(max_closures=0))
+    pairs = Closer().spans(run.views, run.solution, run.graph.edges)
+    apart = [source - target for source, target in pairs if source > 20]
+    assert len(apart) == 9
+    assert min(apart) >= 4
+    assert 3.0 * max(apart) <= 55.0
+    assert len(set(pairs)) == len(pairs)
+
+
 def test_closure_takes_the_place_of_failed_odometry() -> None:
     run = Run(list(REGULAR_DEG))
     run.run(Closer(), lambda p: replace(p, outcome=Outcome.NO_OVERLAP) if (p.source, p.target) == (13, 12) else p)

@@ -10,9 +10,9 @@ import numpy as np
 from modeler import se3
 from modeler.closure.prospects import Outlook
 from modeler.closure.reckoning import came_back, continued, onwards
-from modeler.closure.verdict import Agreement, agreement, flaw, modes
+from modeler.closure.verdict import Agreement, Standard, agreement, flaw, modes, standard, stands
 from modeler.closure.ways import Way, ways
-from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, RayImage, Solution
+from modeler.types import Array, Edge, PoseGaussian, Posterior, RayImage, Solution
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,16 @@ class Closer:
     """Least information that an edge must promise: the default makes six directions twice as sure, 6 log 2."""
     max_spans: int = 1
     """Once all frames are in, at most so many more views are tried for each of them; 0 = none."""
-    max_span_deg: float = 50.0
-    """Largest rotation in degrees to such a view."""
+    max_span_deg: float = 55.0
+    """Largest rotation in degrees to such a view: two steps of the usual 25°."""
     min_span_gain_nats: float = 1.0
     """Least information that it must promise: an edge over two steps of 25° does."""
     max_relocations: int = 4
     """At most so many earlier views are tried for a frame that the previous view does not place."""
     min_overlap: float = 0.4
     """Smallest overlap (0..1) of an edge to any but the previous view, predicted and found."""
+    max_evidence_drop_nats: float = 40.0
+    """How far the evidence of such an edge may lie below that of the others, half a nat an effective point."""
     sigma_scale: float = 2.0
     """How many times the standard deviations of edges may understate their random errors."""
     drift_deg: float = 0.15
@@ -117,6 +119,7 @@ class Closer:
         posteriors: Sequence[Posterior],
         views: Mapping[int, RayImage],
         solution: Solution,
+        known: Sequence[Edge] = (),
     ) -> int | None:
         """Return the earlier view to register a lost frame against next; None: it is given up.
 
@@ -127,14 +130,16 @@ class Closer:
             posteriors: what was tried for the frame, the previous view first.
             views: the accepted views, in order of acceptance.
             solution: the poses so far.
+            known: every edge judged so far.
         """
+        asked = self._asked(known)
         tried = [posterior.target for posterior in posteriors]
         frames = [frame for frame in views if frame in solution.trajectory]
         left = [frame for frame in frames if frame not in tried]
         if not left or len(tried) > self.max_relocations:
             return None
         poses = np.stack([solution.trajectory[frame] for frame in left])
-        for posterior in filter(self._stands, posteriors):
+        for posterior in (posterior for posterior in posteriors if stands(posterior, asked)):
             placed = solution.trajectory[posterior.target] @ posterior.pose.mean
             angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ placed))
             if angle_deg.min() <= self.max_angle_deg:
@@ -175,9 +180,11 @@ class Closer:
         # A pace that changes at random from step to step goes astray with the root of their number.
         reach_deg = float(np.sqrt(steps)) * self.max_angle_deg
         believed = steps == 1 or len(frames) == 1 or self._off_deg(odometry, expected, solution) <= reach_deg
-        if flaw(odometry) is None and believed:
+        asked = self._asked(known)
+        contradicted = steps > 1 and odometry.log_evidence < asked.least_nats
+        if flaw(odometry) is None and believed and not contradicted:
             return odometry, f"joins the previous view: {odometry.outcome.label}, overlap {odometry.overlap:.2f}"
-        standing = sorted(filter(self._stands, others), key=lambda posterior: -posterior.overlap)
+        standing = sorted((other for other in others if stands(other, asked)), key=lambda other: -other.overlap)
         for posterior in standing:
             reason = f"joins in place of the failed previous view: overlap {posterior.overlap:.2f}"
             off_deg = self._off_deg(posterior, expected, solution)
@@ -213,12 +220,12 @@ class Closer:
         """
         base, base_reason = self.base(posteriors, views, solution, known, steps=steps)
         reach = ways(known, base.target) if base is not None and len(posteriors) > 1 else {}
-        edges = []
+        edges, asked = [], self._asked(known)
         for number, posterior in enumerate(posteriors):
             back = number > 0 and self._back(posterior.target, posterior.source, reach, solution)
             if posterior is base:
                 accepted, reason = True, base_reason
-            elif (found := flaw(posterior, self.min_overlap if number else None)) is not None:
+            elif (found := flaw(posterior, asked if number or steps > 1 else None)) is not None:
                 accepted, reason = False, found
             elif base is None:
                 accepted, reason = False, "neither the previous view nor another one places the frame with certainty"
@@ -233,17 +240,10 @@ class Closer:
     def spanning(
         self, posterior: Posterior, views: Mapping[int, RayImage], solution: Solution, known: Sequence[Edge]
     ) -> Edge:
-        """Return the judged edge between two views of the graph.
-
-        Args:
-            posterior: of a registration that the graph does not hold.
-            views: the accepted views.
-            solution: their poses.
-            known: every edge judged so far.
-        """
+        """Return the judged edge between two views of the graph, from a registration that it does not hold yet."""
         reach, centroid_m = ways(known, posterior.source), views[posterior.source].centroid_m
         kind = "closure" if self._back(posterior.target, posterior.source, reach, solution) else "odometry"
-        if (found := flaw(posterior, self.min_overlap)) is not None:
+        if (found := flaw(posterior, self._asked(known))) is not None:
             return Edge(posterior, kind, accepted=False, reason=found)
         agreed = agreement(
             posterior,
@@ -252,7 +252,8 @@ class Closer:
             scale=self.sigma_scale,
             centroid_m=centroid_m,
         )
-        verdict = "spans several steps" if agreed.agrees else "contradicts the chain"
+        agreeing = "closes the loop" if kind == "closure" else "spans several steps"
+        verdict = agreeing if agreed.agrees else "contradicts the chain"
         return Edge(posterior, kind, agreed.agrees, f"{verdict}: {agreed.words}")
 
     def _back(self, target: int, source: int, reach: Mapping[int, Way], solution: Solution) -> bool:
@@ -263,9 +264,8 @@ class Closer:
         placed = solution.trajectory[posterior.target] @ modes(posterior)[0][1].mean
         return float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ placed)))
 
-    def _stands(self, posterior: Posterior) -> bool:
-        """Return whether a registration could place a frame without the previous view."""
-        return posterior.outcome is Outcome.CONVERGED and flaw(posterior, self.min_overlap) is None
+    def _asked(self, known: Sequence[Edge]) -> Standard:
+        return standard(known, min_overlap=self.min_overlap, drop_nats=self.max_evidence_drop_nats)
 
     def _agreement(
         self,

@@ -4,18 +4,52 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import islice, product
 
 import numpy as np
 
 from modeler import se3
-from modeler.types import Array, PoseGaussian, Posterior
+from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior
 
 RADIUS = 4.7390  # √χ²₆(0.999): Mahalanobis distance that 1 of 1000 true closures exceeds
+_RECENT, _FEWEST = 30, 5  # edges whose evidence tells what is usual
 _LEAST_WEIGHT = 0.05  # modes that agree with the prediction must hold so much of the posterior's mass
 
 
-def flaw(posterior: Posterior, min_overlap: float | None = None) -> str | None:
+@dataclass(frozen=True)
+class Standard:
+    """What is asked of a registration besides that it came to an end."""
+
+    min_overlap: float
+    """Smallest overlap (0..1)."""
+    usual_nats: float = float("nan")
+    """Median log evidence of the run's edges; NaN: not known yet."""
+    least_nats: float = -float("inf")
+    """Below it the images speak against any surface in common, and rather for none."""
+
+
+def standard(edges: Sequence[Edge], *, min_overlap: float, drop_nats: float) -> Standard:
+    """Return what the edges of a run so far, between neighbours, ask of further ones.
+
+    How well two views of one object match depends on its shape and on the sensor, so that evidence tells little by
+    itself. Beside that of others it does: a wrong place matches by far worse than the edges of the run scatter.
+
+    Args:
+        edges: every edge judged so far.
+        min_overlap: smallest overlap (0..1).
+        drop_nats: how far evidence may lie below the median; or eight times their scatter, if that is more.
+    """
+    accepted = (edge for edge in reversed(edges) if edge.accepted and edge.kind == "odometry")
+    nats = [edge.posterior.log_evidence for edge in islice(accepted, _RECENT)]
+    told = np.array([evidence for evidence in nats if np.isfinite(evidence)])
+    if len(told) < _FEWEST:
+        return Standard(min_overlap)
+    usual = float(np.median(told))
+    scatter = 1.4826 * float(np.median(np.abs(told - usual)))
+    return Standard(min_overlap, usual, usual - max(drop_nats, 8.0 * scatter))
+
+
+def flaw(posterior: Posterior, asked: Standard | None = None) -> str | None:
     """Return what keeps a posterior out of the graph whatever the others say; None: nothing."""
     if not posterior.usable:
         return f"{posterior.outcome.label}: {posterior.outcome.advice}"
@@ -25,9 +59,16 @@ def flaw(posterior: Posterior, min_overlap: float | None = None) -> str | None:
     variances = np.linalg.eigvalsh(pose.covariance)
     if variances[0] <= 1e-15 * variances[-1]:
         return "the covariance is not positive definite: the registration is degenerate"
-    if min_overlap is not None and not posterior.overlap >= min_overlap:
-        return f"the overlap {posterior.overlap:.2f} is below {min_overlap:.2f}"
+    if asked is not None and not posterior.overlap >= asked.min_overlap:
+        return f"the overlap {posterior.overlap:.2f} is below {asked.min_overlap:.2f}"
+    if asked is not None and posterior.log_evidence < asked.least_nats:
+        return f"the images contradict it: log evidence {posterior.log_evidence:.0f}, of others {asked.usual_nats:.0f}"
     return None
+
+
+def stands(posterior: Posterior, asked: Standard) -> bool:
+    """Return whether a registration could place a frame without the previous view."""
+    return posterior.outcome is Outcome.CONVERGED and flaw(posterior, asked) is None
 
 
 @dataclass(frozen=True)

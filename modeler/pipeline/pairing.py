@@ -87,7 +87,7 @@ class Pairing:
             odometry = replace(wider, seconds=odometry.seconds + wider.seconds)
         posteriors, known = (odometry,), state.graph.edges
         while not again and self.closer.base(posteriors, state.views, state.solution, known, steps=steps)[0] is None:
-            target = self.closer.relocation(posteriors, state.views, state.solution)
+            target = self.closer.relocation(posteriors, state.views, state.solution, known)
             if target is None:
                 break
             posteriors = (*posteriors, self._pair(state, view, target, grown))
