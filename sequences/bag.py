@@ -5,26 +5,32 @@ from __future__ import annotations
 import bz2
 import struct
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
+from urllib.parse import quote
 
 import lz4.frame
 from rosbags import rosbag1, rosbag2
 from rosbags.rosbag1.reader import Chunk
+from rosbags.rosbag2 import storage_mcap
+from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from modeler.types import InputError
+from sequences.broken import told
+from sequences.folders import entries, inside
+from sequences.unpacking import check_file, from_bz2, from_lz4, from_zstd, of_size
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
 
-MAX_CHUNK_BYTES = 1 << 30
-"""Chunks that would unpack to more are refused."""
+# The library unpacks chunks of MCAP to whatever they hold, and has no other place to say how.
+storage_mcap.DECOMPRESSORS.update(lz4=of_size(from_lz4), zstd=of_size(from_zstd))
 
 
 @final
@@ -67,7 +73,7 @@ class Bag:
         Raises:
             InputError: where the bag is broken.
         """
-        with self._told():
+        with told(self.path, "bag", self._advice):
             stamp = Stamp(-1)
             for count, (connection, received_ns, data) in enumerate(self._reader.messages(self._of(topic))):
                 if count == most:
@@ -82,7 +88,7 @@ class Bag:
         Raises:
             InputError: where the bag is broken.
         """
-        with self._told():
+        with told(self.path, "bag", self._advice):
             start = stamp.received_ns
             found = self._reader.messages(self._of(topic), start=start, stop=start + 1)
             for place, (connection, _, data) in enumerate(found):
@@ -94,40 +100,35 @@ class Bag:
         return [connection for connection in self._reader.connections if str(connection.topic) == topic]
 
     def _message(self, connection: Connection, data: bytes) -> Any:
-        store, kind = _typestore(ros1=self.is_ros1), str(connection.msgtype)
+        store, kind, data = _typestore(ros1=self.is_ros1), str(connection.msgtype), self._opened[1](data)
         if not self.is_ros1:
             return store.deserialize_cdr(data, kind)
         return store.deserialize_ros1(_image_alone(data) if kind == "sensor_msgs/msg/Image" else data, kind)
 
-    @cached_property
+    @property
+    def _advice(self) -> str:
+        return "reindex it (rosbag reindex), or record it anew" if self.is_ros1 else "record or copy it anew"
+
+    @property
     def _reader(self) -> rosbag1.Reader | rosbag2.Reader:
-        """Return the open reader; it is closed when this bag is forgotten."""
-        with self._told():
+        return self._opened[0]
+
+    @cached_property
+    def _opened(self) -> tuple[rosbag1.Reader | rosbag2.Reader, Callable[[bytes], bytes]]:
+        """Return the open reader, which is closed when this bag is forgotten, and what unpacks its messages."""
+        unpack: Callable[[bytes], bytes] = bytes
+        with told(self.path, "bag", self._advice):
             if self.is_ros1:
                 reader = rosbag1.Reader(self.path)
                 reader.open()
                 reader.chunks = {place: _bounded(chunk) for place, chunk in reader.chunks.items()}
             else:
-                reader = rosbag2.Reader(self.path)
-                reader.open()
+                reader = _ros2(self.path)
+                if reader.compression_mode == "message":  # which we unpack ourselves
+                    reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
+                    unpack = from_zstd
             weakref.finalize(self, reader.close)
-            return reader
-
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Turn whatever the library says of a broken file into one line."""
-        try:
-            yield
-        except (InputError, GeneratorExit):
-            raise
-        except FileNotFoundError as error:
-            raise InputError(f"{self.path}: is no complete bag ({_line(error)}); copy all of it.") from None
-        except OSError as error:
-            why = error.strerror or _line(error)
-            raise InputError(f"{self.path}: cannot be read ({why}); check the path and its permissions.") from None
-        except Exception as error:  # a broken file can make the library raise anything
-            advice = "reindex it (rosbag reindex)" if "index" in str(error) else "record or copy it anew"
-            raise InputError(f"{self.path}: is not a readable bag ({_line(error)}); {advice}.") from None
+            return reader, unpack
 
 
 def _image_alone(data: bytes) -> bytes:
@@ -137,11 +138,6 @@ def _image_alone(data: bytes) -> bytes:
         (length,) = struct.unpack_from("<I", data, at)
         at += 4 + length + fixed
     return data[:at]
-
-
-def _line(error: Exception) -> str:
-    words = " ".join(str(error).split()) or type(error).__name__
-    return words if len(words) <= 120 else words[:117] + "..."
 
 
 @lru_cache(maxsize=2)
@@ -155,23 +151,24 @@ def _typestore(*, ros1: bool) -> Typestore:
 
 def _bounded(chunk: Chunk) -> Chunk:
     """Return a chunk that refuses to unpack to something enormous."""
-    unpack = {bz2.decompress: _bz2, lz4.frame.decompress: _lz4}.get(chunk.decompressor)
+    unpack = {bz2.decompress: from_bz2, lz4.frame.decompress: from_lz4}.get(chunk.decompressor)
     return chunk if unpack is None else chunk._replace(decompressor=unpack)
 
 
-def _bz2(data: bytes) -> bytes:
-    unpacker = bz2.BZ2Decompressor()
-    unpacked = unpacker.decompress(data, MAX_CHUNK_BYTES)
-    return _whole(unpacked, bool(unpacker.eof))
+def _ros2(path: Path) -> rosbag2.Reader:
+    """Return an open reader of a bag of ROS 2."""
+    reader = rosbag2.Reader(path)
+    if isinstance(reader.storage, DirectoryReader):
+        for entry in entries(path):
+            check_file(inside(entry, path))
+        storage: Any = reader.storage
+        storage.STORAGE_PLUGINS = {**storage.STORAGE_PLUGINS, "sqlite3": lambda file: Sqlite3Reader(_in_address(file))}
+    elif isinstance(reader.storage, Sqlite3Reader):
+        reader.storage.path = _in_address(path)
+    reader.open()
+    return reader
 
 
-def _lz4(data: bytes) -> bytes:
-    unpacker = lz4.frame.LZ4FrameDecompressor()
-    unpacked = unpacker.decompress(data, MAX_CHUNK_BYTES)
-    return _whole(unpacked, bool(unpacker.eof))
-
-
-def _whole(unpacked: bytes, ended: bool) -> bytes:
-    if not ended:
-        raise ValueError(f"a chunk is cut off, or larger than {MAX_CHUNK_BYTES >> 20} MB")
-    return unpacked
+def _in_address(path: Path) -> Path:
+    """Return a path as it stands in an address, which is what the library makes of it without further ado."""
+    return Path(quote(str(path)))

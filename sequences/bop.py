@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Array, BoolArray, Camera, Frame, InputError
-from sequences.base import span
 from sequences.bop_entries import camera_from_model, depth_scale_mm, intrinsics
 from sequences.folders import entries, frame_number, inside
 from sequences.given import Given
@@ -48,7 +47,7 @@ class BopSequence(AbstractRecording):
     def frame(self, index: int) -> Frame:
         """Return the frame with number `index`, depth in m and NaN where nothing was measured."""
         if index not in self._depth_paths:
-            raise InputError(f"{self.path}: has no frame {index}; its frames are {span(self.indices)}.")
+            raise self.absent(index)
         path = self._depth_paths[index]
         raw = read_depth(path)
         check_size(path, raw.shape, self._size)

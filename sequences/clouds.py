@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Array, Camera, Frame, InputError
-from sequences.base import span
+from sequences.broken import told
 from sequences.colour_depth import told_numbers
 from sequences.folders import pictures
 from sequences.given import Given, Intrinsics, sane
@@ -56,7 +56,7 @@ class CloudSequence(AbstractRecording):
         """Return the frame with number `index`: each point falls into the pixel that sees it, the nearest counts."""
         path = self.clouds.get(index)
         if path is None:
-            raise InputError(f"{self.path}: has no frame {index}; its frames are {span(self.indices)}.")
+            raise self.absent(index)
         points, colours = _points(path)
         camera, size = self._camera, (self._camera.height, self._camera.width)
         if points.shape[:2] != size:
@@ -186,11 +186,8 @@ def fitted(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
 def _points(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8] | None]:
     """Return the points (h, w, 3) of a cloud, NaN where there is none, and their colours (h, w, 3)."""
     width, height = organised(path)
-    try:
+    with told(path, "cloud", "save it anew"):
         points, colours = _read_pcd(path) if path.suffix.lower() == ".pcd" else _read_ply(path)
-    except Exception as error:  # a broken cloud can make the libraries raise anything
-        why = " ".join(str(error).split())[:120] or type(error).__name__
-        raise InputError(f"{path}: is not a readable cloud ({why}); save it anew.") from None
     if points.shape != (width * height, 3):
         raise InputError(f"{path}: is cut off or broken, {len(points)} points could be read; save it anew.")
     points = np.where(np.isfinite(points) & (np.abs(points) < 1e9), points, np.nan).reshape(height, width, 3)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import weakref
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy.typing as npt
 
 from modeler.types import Array, Frame, InputError
 from sequences.alignment import Alignment
-from sequences.base import span
+from sequences.broken import told
 from sequences.given import Given
 from sequences.images import MAX_PIXELS, Packed, read_colour
 from sequences.json_input import Node
@@ -28,6 +27,7 @@ from sequences.recording import AbstractRecording
 from sequences.tum import MAX_APART_S, nearest
 
 ADVICE = "pip install 'modeler[kinect]'"
+_AGAIN = "record or copy it anew"
 
 
 @final
@@ -54,7 +54,7 @@ class KinectSequence(AbstractRecording):
     def frame(self, index: int) -> Frame:
         """Return the frame with number `index`, without the lens's distortion."""
         if index not in self.shots:
-            raise InputError(f"{self.path}: has no frame {index}; its frames are {span(self.indices)}.")
+            raise self.absent(index)
         stamp, partner = self.shots[index]
         camera = self.lens.camera
         data, time_s = self.file.packet("DEPTH", stamp)
@@ -135,7 +135,7 @@ class Matroska:
         Raises:
             InputError: where nothing of the kind is attached.
         """
-        with self._told():
+        with told(self.path, "recording", _AGAIN):
             for attached in self._container.streams.attachments:
                 if attached.name == "calibration.json":
                     return json.loads(bytes(attached.data).rstrip(b"\0").decode("utf-8-sig"))
@@ -143,13 +143,13 @@ class Matroska:
 
     def size(self, title: str) -> tuple[int, int] | None:
         """Return the (width, height) of a track; None where there is none."""
-        with self._told():
+        with told(self.path, "recording", _AGAIN):
             track = self._track(title)
             return None if track is None else (int(track.width), int(track.height))
 
     def stamps(self, title: str) -> list[tuple[float, int]]:
         """Return the times in s and time stamps of a track's images, in order, each once."""
-        with self._told():
+        with told(self.path, "recording", _AGAIN):
             track = self._track(title)
             if track is None or track.time_base is None:
                 return []
@@ -159,13 +159,13 @@ class Matroska:
 
     def packet(self, title: str, stamp: int) -> tuple[bytes, float]:
         """Return the bytes of one image and its time in s."""
-        with self._told():
+        with told(self.path, "recording", _AGAIN):
             packet = self._find(title, stamp)
             return bytes(packet), float(stamp * (packet.time_base or 0))
 
     def picture(self, title: str, stamp: int, where: str) -> npt.NDArray[np.uint8]:
         """Return one image as RGB (h, w, 3)."""
-        with self._told():
+        with told(self.path, "recording", _AGAIN):
             packet = self._find(title, stamp)
             content = bytes(packet)
             if content[:2] == b"\xff\xd8":
@@ -200,14 +200,3 @@ class Matroska:
         container = av.open(str(self.path), mode="r")
         weakref.finalize(self, container.close)
         return container
-
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Turn whatever the library says of a broken file into one line."""
-        try:
-            yield
-        except (InputError, GeneratorExit):
-            raise
-        except Exception as error:  # a broken file can make the library raise anything
-            why = " ".join(str(error).split()).replace(str(self.path), "the file")[:120] or type(error).__name__
-            raise InputError(f"{self.path}: is not a readable recording ({why}); record or copy it anew.") from None

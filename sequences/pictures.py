@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Array, Camera, Frame, InputError
-from sequences.base import span
 from sequences.given import Intrinsics
 from sequences.images import read_colour, read_depth, read_mask
 from sequences.recording import AbstractRecording
@@ -70,7 +69,7 @@ class PictureSequence(AbstractRecording):
         """Return the frame with number `index`, depth in m and NaN where nothing was measured."""
         shot = self.shots.get(index)
         if shot is None:
-            raise InputError(f"{self.path}: has no frame {index}; its frames are {span(self.indices)}.")
+            raise self.absent(index)
         raw = read_depth(shot.depth)
         check_size(shot.depth, raw.shape, self._size)
         mask = None if shot.mask is None else read_mask(shot.mask)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from sequences.base import AbstractSequence
+from modeler.types import InputError
+from sequences.base import AbstractSequence, span
 from sequences.folders import inside
 from sequences.json_input import Node, read_tree
 
@@ -45,14 +46,21 @@ class AbstractRecording(AbstractSequence):
     @property
     def robot_path(self) -> Path | None:
         """`robot.txt`, where there is one."""
-        path = self.path / "robot.txt"
-        return path if self._is_folder and path.is_file() else None
+        return self._beside("robot.txt")
 
     @property
     def model_path(self) -> Path | None:
         """`model.ply`, where there is one: the true surface in m."""
-        path = self.path / "model.ply"
-        return path if self._is_folder and path.is_file() else None
+        return self._beside("model.ply")
+
+    def absent(self, index: int) -> InputError:
+        """Return the error that says that there is no frame of that number."""
+        return InputError(f"{self.path}: has no frame {index}; its frames are {span(self.indices)}.")
+
+    def _beside(self, name: str) -> Path | None:
+        """Return a file in the folder, where there is one; one to which a link leads out of it is refused."""
+        path = self.path / name
+        return inside(path, self.path) if self._is_folder and path.is_file() else None
 
     @cached_property
     def _is_folder(self) -> bool:

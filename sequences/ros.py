@@ -14,7 +14,6 @@ from modeler.types import Array, Frame, InputError
 from sequences import ros_images
 from sequences import ros_topics as topics
 from sequences.bag import Bag, Stamp
-from sequences.base import span
 from sequences.given import Given
 from sequences.lens import Lens
 from sequences.recording import AbstractRecording
@@ -51,7 +50,7 @@ class RosSequence(AbstractRecording):
     def frame(self, index: int) -> Frame:
         """Return the frame with number `index`, without the lens's distortion."""
         if index not in self.shots:
-            raise InputError(f"{self.path}: has no frame {index}; its frames are {span(self.indices)}.")
+            raise self.absent(index)
         time_s, depth_stamp, colour_stamp = self.shots[index]
         where = f"{self.path}: {self.depth_topic}, image {index}"
         depth_m = ros_images.depth_m(self.bag.message(self.depth_topic, depth_stamp), self.unit_mm, where)

@@ -34,6 +34,8 @@ class Recorder:
     """D of both cameras."""
     compression: rosbag1.Writer.CompressionFormat | None = None
     """Of ROS 1 bags."""
+    packed: rosbag2.CompressionMode | None = None
+    """What of ROS 2 bags is packed by zstd."""
     camera_info: bool = True
     """Whether it is recorded."""
     names: dict[str, str] = field(
@@ -57,6 +59,8 @@ class Recorder:
         else:
             plugin = rosbag2.StoragePlugin.SQLITE3 if path.suffix == ".db3" else rosbag2.StoragePlugin.MCAP
             writer = rosbag2.Writer(path.with_suffix(""), version=9, storage_plugin=plugin)
+            if self.packed is not None:
+                writer.set_compression(self.packed, rosbag2.CompressionFormat.ZSTD)
         with writer:
             self._fill(writer, frames)
         if path.suffix in (".mcap", ".db3"):

@@ -359,7 +359,7 @@ def test_no_damage_to_a_picture_escapes(tmp_path_factory: pytest.TempPathFactory
 def test_a_missing_folder_and_frame_are_named(tmp_path: Path, scene: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         open_sequence(tmp_path / "nowhere")
-    with pytest.raises(InputError, match=r"no such folder"):
+    with pytest.raises(InputError, match="a file of this kind holds no sequence"):
         open_sequence(scene / "scene_camera.json")
     with pytest.raises(InputError, match=r"no frame 4; .* 3 to 12, 3 frames"):
         open_sequence(scene).frame(4)

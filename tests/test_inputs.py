@@ -14,6 +14,7 @@ import pytest
 from bags import Recorder
 from PIL import Image
 from recordings import raw_depth, save, small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
+from test_inputs_clouds import WRITERS as CLOUDS
 
 from modeler import se3
 from modeler.cli import main
@@ -118,6 +119,29 @@ def test_paths_with_spaces_and_other_letters_are_read(folder: Path, tmp_path: Pa
     assert len(list(open_sequence(strange))) == 4
     (tmp_path / "link").symlink_to(strange)
     assert len(list(open_sequence(tmp_path / "link"))) == 4
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3", "", ".pcd", ".ply"])
+@pytest.mark.parametrize("name", ["Gefäß 三", "100% sure", "a#b?c=d&e", "%41[0]*"])
+def test_files_of_any_name_are_read(tmp_path: Path, frames: list[Frame], suffix: str, name: str) -> None:
+    folder = tmp_path / name
+    folder.mkdir()
+    if suffix in (".pcd", ".ply"):
+        kind = {".pcd": "pcd binary", ".ply": "ply binary"}[suffix]
+        CLOUDS[kind][1](folder / f"{name}{suffix}", frames[0])
+        path = folder
+    else:
+        plain = Recorder().write(tmp_path / f"s{suffix or '.db3'}", frames[:1])
+        path = folder / f"{name}{suffix}"
+        if suffix:
+            plain.rename(path)
+        else:  # a folder of ROS 2 with a database of a strange name
+            shutil.copytree(tmp_path / "s", path)
+            plain.rename(path / f"{name}.db3")
+            meta = (path / "metadata.yaml").read_text()
+            (path / "metadata.yaml").write_text(meta.replace("s.db3", json.dumps(f"{name}.db3")))
+    (read,) = open_sequence(path)
+    np.testing.assert_allclose(read.depth_m, frames[0].depth_m, rtol=0, atol=1e-5)
 
 
 def test_what_a_person_says_counts_more(folder: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from bags import START_NS, Recorder
 from recordings import small_frames
-from rosbags import rosbag1
+from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -72,6 +72,13 @@ def test_every_way_of_storing_pixels_is_read(
         assert wrote.colour is not None
         expected = wrote.colour[..., 1:2].repeat(3, axis=2) if recorder.colour == "mono8" else wrote.colour
         assert np.abs(read.colour.astype(float) - expected).mean() < (3.0 if recorder.colour == "jpeg" else 1e-9)
+
+
+@pytest.mark.parametrize("packed", rosbag2.CompressionMode)
+def test_packed_bags_of_ros_2_are_read(tmp_path: Path, frames: list[Frame], packed: rosbag2.CompressionMode) -> None:
+    sequence = open_sequence(Recorder(packed=packed).write(tmp_path / "s", frames))
+    for index in (2, 0, 1):
+        np.testing.assert_allclose(sequence.frame(index).depth_m, frames[index].depth_m, rtol=0, atol=1e-6)
 
 
 def test_converting_a_bag_gives_a_scene(tmp_path: Path, frames: list[Frame]) -> None:
