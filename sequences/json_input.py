@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,9 @@ from modeler.types import Array, InputError
 
 MAX_BYTES = 64_000_000
 """Larger text is refused."""
+
+
+_CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 @final
@@ -75,9 +79,9 @@ class Node:
         return node
 
     def text(self) -> str:
-        """Return a string that is not empty."""
-        if not isinstance(self.value, str) or not self.value.strip():
-            raise self.fault("a text that is not empty")
+        """Return a string that is not empty, without control characters, which would steer a terminal."""
+        if not isinstance(self.value, str) or not self.value.strip() or _CONTROLS.search(self.value):
+            raise self.fault("a printable text that is not empty")
         return self.value
 
     def number(self, low: float = -math.inf, high: float = math.inf) -> float:

@@ -32,6 +32,8 @@ def open_sequence(path: str | Path, given: Given | None = None) -> AbstractSeque
         InputError: where it does not hold a readable sequence.
     """
     path, given = Path(path), given or Given()
+    if not _is_text(path):
+        raise InputError(f"{path}: its name is not UTF-8; rename it.")
     if str(path).startswith(SCHEME):
         return open_camera(str(path).removeprefix(SCHEME), given)
     try:
@@ -66,6 +68,14 @@ def _open(path: Path, given: Given) -> AbstractSequence:
     if (path / "depth").is_dir():
         return open_colour_depth(path, given)
     raise InputError(f"{path}: {_advice(path)}")
+
+
+def _is_text(path: Path) -> bool:
+    """Return whether a path can be written out: on Linux a name is any bytes."""
+    try:
+        return bool(str(path).encode())
+    except UnicodeEncodeError:
+        return False
 
 
 def _holds_clouds(path: Path) -> bool:

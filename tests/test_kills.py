@@ -54,6 +54,10 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in SAME}
 
 
+def pairs_of(run: Path) -> set[tuple[int, int]]:
+    return {(edge["source"], edge["target"]) for edge in RunFolder(run).report()["edges"]}
+
+
 def test_a_killed_run_is_taken_up(whole: Path, tmp_path: Path, asked: list[tuple[int, int]]) -> None:
     folder, kept = tmp_path / "run", tmp_path / "run" / ".pairs"
     process = subprocess.Popen([sys.executable, "-m", "modeler", "build", BOX, "--out", str(folder), *QUICK])
@@ -62,12 +66,12 @@ def test_a_killed_run_is_taken_up(whole: Path, tmp_path: Path, asked: list[tuple
     process.kill()
     assert process.wait() == -signal.SIGKILL
     assert not json.loads((folder / "report.json").read_bytes())["complete"]
-    known = len(list(kept.glob("*.npz")))
+    known = {tuple(map(int, path.name.split("-")[:2])) for path in kept.glob("*.npz")}
     assert main(["build", BOX, "--out", str(folder), *QUICK]) == 2  # neither --resume nor --overwrite
     assert main(["build", BOX, "--out", str(folder), *QUICK, "--resume", "--seed", "1"]) == 2
     assert asked == []
     assert main(["build", BOX, "--out", str(folder), *QUICK, "--resume"]) == 0
-    assert asked == [(1, 0), (2, 1)][known:]
+    assert sorted(asked) == sorted(pairs_of(whole) - known)
     assert contents(folder) == contents(whole)
     assert {path.name for path in folder.iterdir()} == {path.name for path in whole.iterdir()}
 
@@ -99,9 +103,10 @@ def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(
     assert "the run was interrupted after frame" in report["reasons"][0]
     assert (folder / "model.ply").stat().st_size > 1000
     count = len(asked)
-    assert count == 1
+    before = set(asked)
+    assert count >= 1
     assert main(["build", BOX, "--out", str(folder), *QUICK, "--resume"]) == 0
-    assert len(asked) == 2
+    assert sorted(asked[count:]) == sorted(pairs_of(whole) - before)
     assert contents(folder) == contents(whole)
 
 

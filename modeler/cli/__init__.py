@@ -4,6 +4,7 @@ Each command is a frozen dataclass whose fields are its options; `run` returns t
 imported when a command runs, so that help appears at once.
 """
 
+import io
 import logging
 import os
 import sys
@@ -25,6 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.WARNING, format="modeler: %(message)s")  # to stderr
     # Rerun complains in its own way of a viewer that was closed, which is nobody's error; we tell what matters.
     os.environ.setdefault("RUST_LOG", "warn,re_sdk=off,re_grpc_client=off")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be text
     try:
         try:
             return _run(parsed(sys.argv[1:] if arguments is None else arguments))
@@ -46,5 +49,7 @@ def _run(command: Command) -> int:
         with terminable():
             return command.run()
     except InputError as error:
-        print(f"modeler: {' '.join(str(error).split()).removesuffix('.')}", file=sys.stderr)
+        words = " ".join(str(error).split()).removesuffix(".")
+        # Names in inputs shall not steer the terminal.
+        print("modeler:", "".join(c if c.isprintable() else ascii(c)[1:-1] for c in words), file=sys.stderr)
         return 2

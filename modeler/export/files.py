@@ -39,10 +39,13 @@ def alone(folder: Path) -> Iterator[None]:
         InputError: where it cannot be made, or another program is in it.
     """
     try:
+        str(folder).encode()
         folder.mkdir(parents=True, exist_ok=True)
         held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
         raise InputError(f"{folder}: no run folder can be made ({error.strerror}); choose another --out") from error
+    except UnicodeEncodeError:
+        raise InputError(f"{folder}: its name is not UTF-8; rename it, or choose another --out") from None
     try:
         with contextlib.suppress(OSError):  # not every file system has locks
             try:

@@ -54,7 +54,8 @@ class RunFolder:
                 raise InputError(f"{path}: not empty; choose another --out, or give --overwrite or --resume")
             resumes = resume and (path / _REPORT).exists()
             leftovers = [part for name in _OURS for part in path.glob(f".{name}.*{PART}")]
-            for file in [*leftovers, *(path / name for name in _OURS if not resumes)]:
+            links = [file for file in (path / _OURS[-1], cls(path).pairs.folder) if file.is_symlink()]
+            for file in [*leftovers, *links, *(path / name for name in _OURS if not resumes)]:
                 file.unlink(missing_ok=True)
             if not resumes:
                 cls(path).pairs.drop()

@@ -1,0 +1,139 @@
+"""Sequences that are short, long, or show something else than one object: a result with its reasons, or one line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fuzz.targets import tiny
+from recordings import small_frames
+
+from modeler.cli import main
+from modeler.types import Camera, Frame
+from sequences import open_sequence, write_bop
+
+QUICK = ("--prior", "table", "--method", "icp")
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return small_frames(6)
+
+
+def built(frames: list[Frame], folder: Path, *options: str) -> tuple[int, dict]:
+    """Return the status and the report of a build."""
+    write_bop(folder / "in", frames, depth_scale_mm=1.0)
+    status = main(["build", str(folder / "in"), "--out", str(folder / "run"), *QUICK, *options])
+    return status, json.loads((folder / "run" / "report.json").read_text())
+
+
+def bare(frame: Frame) -> Frame:
+    """Return a frame without its object: what the table would measure there."""
+    assert frame.mask is not None
+    rows, columns = np.nonzero(np.isfinite(frame.depth_m) & ~frame.mask & (np.indices(frame.mask.shape)[0] > 60))
+    design = np.stack([rows, columns, np.ones(rows.size)], axis=1)
+    plane, *_ = np.linalg.lstsq(design, 1.0 / frame.depth_m[rows, columns].astype(float), rcond=None)
+    inside = np.argwhere(frame.mask)
+    depth_m = frame.depth_m.copy()
+    depth_m[frame.mask] = 1.0 / (np.column_stack([inside, np.ones(len(inside))]) @ plane)
+    return replace(frame, depth_m=depth_m, mask=None)
+
+
+def unmasked(frame: Frame) -> Frame:
+    return replace(frame, mask=None)
+
+
+def filled(frame: Frame) -> Frame:
+    """Return the part of a frame in which there is nothing but the object."""
+    assert frame.mask is not None
+    assert frame.colour is not None
+    rows, columns = np.nonzero(frame.mask)
+    top, left = int(np.percentile(rows, 30)), int(np.percentile(columns, 30))
+    cut = slice(top, top + 24), slice(left, left + 24)
+    camera = Camera(24, 24, frame.camera.fx, frame.camera.fy, frame.camera.cx - left, frame.camera.cy - top)
+    return replace(frame, depth_m=frame.depth_m[cut], mask=None, colour=frame.colour[cut], camera=camera)
+
+
+def doubled(frame: Frame) -> Frame:
+    """Return a frame with the object a second time, farther to the left."""
+    assert frame.mask is not None
+    depth_m = frame.depth_m.copy()
+    other = np.roll(frame.mask, -45, axis=1)
+    depth_m[other] = np.roll(frame.depth_m, -45, axis=1)[other]
+    return replace(frame, depth_m=depth_m, mask=None)
+
+
+def test_one_frame_is_a_view_and_no_model(frames: list[Frame], tmp_path: Path) -> None:
+    status, report = built(frames[:1], tmp_path)
+    assert status == 3
+    assert report["complete"]
+    assert any("fewer than two frames" in reason for reason in report["reasons"])
+    assert len((tmp_path / "run" / "trajectory.txt").read_text().splitlines()) == 1
+
+
+def test_two_frames_are_a_model(frames: list[Frame], tmp_path: Path) -> None:
+    status, report = built(frames[:2], tmp_path)
+    assert (status, len(report["poses"]), len(report["edges"])) == (0, 2, 1)
+
+
+def test_an_object_that_leaves_is_told_frame_by_frame(
+    frames: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    left = [*map(unmasked, frames[:3]), bare(frames[3]), bare(frames[4])]
+    status, report = built(left, tmp_path)
+    assert status == 3
+    assert [frame["outcome"] == "accepted" for frame in report["frames"]] == [True, True, True, False, False]
+    said = capsys.readouterr().err
+    assert [f"frame {index} is left out: " in said for index in range(5)] == [False, False, False, True, True]
+
+
+def test_an_object_that_comes_back_is_found_again(frames: list[Frame], tmp_path: Path) -> None:
+    shown = [frames[0], frames[1], replace(frames[1], mask=np.zeros_like(frames[1].mask)), frames[2], frames[3]]
+    _, report = built([replace(frame, index=k, time_s=0.1 * k) for k, frame in enumerate(shown)], tmp_path)
+    assert [frame["outcome"] == "accepted" for frame in report["frames"]] == [True, True, False, True, True]
+
+
+@pytest.mark.parametrize("change", [filled, doubled, bare])
+def test_what_is_no_single_object_ends_with_a_reason_or_a_model(
+    frames: list[Frame], tmp_path: Path, change: Callable[[Frame], Frame], capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, report = built([change(frame) for frame in frames[:3]], tmp_path)
+    lost = [frame for frame in report["frames"] if frame["outcome"] != "accepted"]
+    assert status == (3 if report["reasons"] else 0)
+    assert bool(report["reasons"]) == (not report["trustworthy"])
+    assert capsys.readouterr().err.count("is left out") == len(lost)
+    if change is bare:
+        assert len(lost) == 3
+
+
+def test_an_object_that_fills_the_image_is_modelled_where_masks_say_so(frames: list[Frame], tmp_path: Path) -> None:
+    close = [replace(filled(frame), mask=np.ones((24, 24), dtype=bool)) for frame in frames[:2]]
+    status, report = built(close, tmp_path, "--prior", "general")
+    assert status in (0, 3)
+    assert report["frames"][0]["outcome"] == "accepted"
+
+
+def test_a_thousand_frames_are_read_and_converted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pattern = tiny(4)
+    write_bop(tmp_path / "in", (replace(pattern[k % 4], index=k, time_s=0.1 * k) for k in range(1000)))
+    assert main(["info", str(tmp_path / "in"), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["frames"]) == 1000
+    assert main(["convert", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--every", "2"]) == 0
+    assert open_sequence(tmp_path / "out").indices == tuple(range(0, 1000, 2))
+
+
+def test_frames_far_apart_in_number_stay_so(frames: list[Frame], tmp_path: Path) -> None:
+    numbered = [replace(frame, index=number) for frame, number in zip(frames[:2], (7, 999_999_999), strict=True)]
+    status, report = built(numbered, tmp_path)
+    assert (status, [frame["id"] for frame in report["frames"]]) == (0, [7, 999_999_999])
+
+
+def test_every_frame_alike_is_no_motion(frames: list[Frame], tmp_path: Path) -> None:
+    status, report = built([replace(frames[0], index=k, time_s=float(k)) for k in range(3)], tmp_path)
+    assert status == 0
+    for pose in report["poses"]:
+        np.testing.assert_allclose(np.reshape(pose["object_from_camera"], (4, 4)), np.eye(4), atol=1e-3)

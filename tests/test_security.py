@@ -1,0 +1,123 @@
+"""Inputs cannot make the program run their code, write where it was not told to, or speak to the terminal."""
+
+from __future__ import annotations
+
+import ast
+import json
+from pathlib import Path
+
+import pytest
+from recordings import small_frames, small_truth, write_open3d
+
+from modeler.cli import main
+from sequences import open_sequence, write_bop
+
+PACKAGES = [Path(__file__).parent.parent / name for name in ("modeler", "sequences", "viz")]
+EVIL = "../../../../evil <script>alert(1)</script>"
+QUICK = ("--prior", "table", "--method", "icp")
+RUNS_CODE = {"pickle", "cPickle", "dill", "joblib", "marshal", "shelve", "torch", "yaml", "runpy", "code"}
+
+
+@pytest.mark.parametrize(
+    "path", [path for root in PACKAGES for path in sorted(root.rglob("*.py"))], ids=lambda p: p.stem
+)
+def test_nothing_is_unpickled_and_no_text_is_run(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            assert not {alias.name.split(".")[0] for alias in node.names} & RUNS_CODE
+        if isinstance(node, ast.ImportFrom):
+            assert (node.module or "").split(".")[0] not in RUNS_CODE
+        if not isinstance(node, ast.Call):
+            continue
+        called = ast.unparse(node.func)
+        assert called not in ("eval", "exec", "compile", "os.system", "os.popen")
+        told = {word.arg: ast.unparse(word.value) for word in node.keywords}
+        assert told.get("shell", "False") == "False"
+        assert told.get("allow_pickle", "False") == "False"
+        if called == "np.load":
+            assert told["allow_pickle"] == "False"
+
+
+def everything(root: Path, but: Path) -> set[Path]:
+    """Return what lies below a folder, but for one folder in it."""
+    return {path for path in root.rglob("*") if not path.is_relative_to(but)}
+
+
+def test_outputs_stay_where_they_are_told_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    deep = tmp_path / "a" / "b" / "c" / "d" / "e"
+    deep.mkdir(parents=True)
+    source, out = deep / "in", deep / "out"
+    write_bop(source, small_frames(2), small_truth(2), {"name": EVIL})
+    out.mkdir()
+    before = everything(tmp_path, out)
+    assert main(["build", str(source), "--out", str(out / "run"), *QUICK]) == 0
+    assert main(["report", str(out / "run"), "--out", str(out / "page.html")]) == 0
+    assert main(["export", str(out / "run"), "--out", str(out / "m.obj")]) == 0
+    assert main(["convert", str(source), "--out", str(out / "bop")]) == 0
+    assert main(["convert", str(out / "run"), "--out", str(out / "scene_gt.json")]) == 0
+    assert main(["evaluate", str(source), "--out", str(out / "figures"), "--methods", "icp", *QUICK[:2]]) == 0
+    assert main(["info", str(source)]) == 0
+    assert "<script>alert" not in (out / "page.html").read_text()
+    assert everything(tmp_path, out) == before
+    assert open_sequence(out / "bop").name == EVIL
+
+
+def test_links_in_a_run_folder_are_replaced_and_not_followed(tmp_path: Path) -> None:
+    outside, folder = tmp_path / "outside", tmp_path / "run"
+    outside.mkdir()
+    for name in ("model.ply", "report.json", "recording.rrd", "trajectory.txt"):
+        (outside / name).write_text("precious")
+    write_bop(tmp_path / "in", small_frames(2))
+    command = ["build", str(tmp_path / "in"), "--out", str(folder), *QUICK]
+    assert main(command) == 0
+    report = json.loads((folder / "report.json").read_text())
+    for flag in ("--overwrite", "--resume"):
+        (folder / "report.json").write_text(json.dumps(report | {"complete": False}))
+        for name in ("model.ply", "recording.rrd", "trajectory.txt"):
+            (folder / name).unlink()
+            (folder / name).symlink_to(outside / name)
+        (folder / ".pairs").symlink_to(outside)
+        assert main([*command, flag]) == 0
+        assert not any(path.is_symlink() for path in folder.iterdir())
+    assert {path.read_text() for path in outside.iterdir()} == {"precious"}
+    assert len(list(outside.iterdir())) == 4
+
+
+@pytest.mark.parametrize("name", ["model.ply", "robot.txt", "sequence.json"])
+def test_what_lies_beside_the_frames_may_not_be_a_link_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    write_bop(tmp_path / "in", small_frames(2), small_truth(2))
+    (tmp_path / "in" / name).unlink(missing_ok=True)
+    (tmp_path / "secret").write_text("secret")
+    (tmp_path / "in" / name).symlink_to(tmp_path / "secret")
+    assert main(["convert", str(tmp_path / "in"), "--out", str(tmp_path / "out")]) == 2
+    assert "leads out of the sequence" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_said_does_not_steer_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_open3d(tmp_path / "in", small_frames(2))
+    (tmp_path / "in" / "sequence.json").write_text(json.dumps({"name": "\x1b[2Jcup"}))
+    assert main(["info", str(tmp_path / "in")]) == 2
+    said = capsys.readouterr().err
+    assert "printable" in said
+    (tmp_path / "in" / "sequence.json").unlink()
+    (tmp_path / "in" / "depth" / "\x1b[2J.png").write_text("")
+    assert main(["info", str(tmp_path / "in")]) == 2
+    said += capsys.readouterr().err
+    assert main(["info", str(tmp_path / "\x1b[2J")]) == 2
+    said += capsys.readouterr().err
+    assert said.replace("\n", "").isprintable()
+    assert said.count("\n") == 3
+
+
+def test_names_that_are_no_text_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A path on Linux is bytes; what is not UTF-8 in it comes as lone surrogates, which the viewer does not take."""
+    write_bop(tmp_path / "in", small_frames(2))
+    assert main(["info", str(tmp_path / "cup \udcff")]) == 2
+    assert main(["build", str(tmp_path / "in"), "--out", str(tmp_path / "run \udcff"), *QUICK]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == said.count("is not UTF-8; rename") == 2
+    assert said.count("\\udcff") == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
