@@ -17,9 +17,14 @@ import test_inputs_kinect as kinect
 import test_inputs_realsense as realsense
 import test_inputs_ros as ros
 
+import sequences
 from modeler import se3
+from modeler.cli import converting
+from modeler.cli.convert import Convert
 from modeler.types import Camera, Frame
 from sequences import open_sequence, read_noise, survey, write_bop
+from sequences.recipe import load_recipe
+from sequences.tum import trajectory
 
 
 @dataclass(frozen=True)
@@ -144,6 +149,77 @@ TARGETS: dict[str, Target] = {
 
 if importlib.util.find_spec("av") is not None:
     TARGETS["mkv"] = Target(_kinect, ("s.mkv",), read_all, 0.5)
+
+
+def _packed(mode: bags.rosbag2.CompressionMode) -> Callable[[Path], Path]:
+    return _bag("s", bags.Recorder(packed=mode))
+
+
+def _tum_pairs(folder: Path) -> Path:
+    """Write lists of which times and paths must be told apart from each other: many pictures, masks, no order."""
+    recordings.write_tum(folder / "s", tiny(6), truth(6))
+    for picture in sorted((folder / "s" / "depth").iterdir())[::2]:
+        recordings.save(folder / "s" / "mask" / picture.name, np.full((16, 24), 255, np.uint8))
+    return folder / "s"
+
+
+def _intrinsics(name: str, content: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        recordings.write_open3d(folder / "s", tiny(), truth())
+        (folder / "s" / "camera_intrinsic.json").unlink()
+        (folder / "s" / name).write_text(content)
+        return folder / "s"
+
+    return make
+
+
+def _robot(folder: Path) -> Path:
+    rows = (f"{0.1 * k} {0.01 * k} 0.2 -0.3 0 0 {np.sin(0.1 * k)} {np.cos(0.1 * k)}" for k in range(9))
+    (folder / "robot.txt").write_text("# time tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n")
+    return folder / "robot.txt"
+
+
+def _recipe(folder: Path) -> Path:
+    shutil.copy(Path(sequences.__file__).parent / "recipes" / "figurine.json", folder / "s.json")
+    return folder / "s.json"
+
+
+def _run(folder: Path) -> Path:
+    pose = {"object_from_camera": np.eye(4).ravel().tolist(), "covariance": np.eye(6).ravel().tolist()}
+    report = {
+        "schema": 1,
+        "frames": [{"id": k, "timestamp": 0.1 * k, "points": 9, "outcome": "accepted"} for k in range(3)],
+        "poses": [{"id": k, **pose} for k in range(3)],
+    }
+    (folder / "report.json").write_text(json.dumps(report))
+    return folder
+
+
+def _poses(path: Path) -> None:
+    converting.convert(Convert(path, path.parent / "poses.json"))
+
+
+_MODES = bags.rosbag2.CompressionMode
+TARGETS |= {
+    "mcap packed": Target(_packed(_MODES.STORAGE), ("s/*.mcap",), read_all, 2.0),
+    "ros2 messages": Target(_packed(_MODES.MESSAGE), ("s/*.mcap", "s/metadata.yaml"), read_all),
+    "ros2 files": Target(_packed(_MODES.FILE), ("s/*.zstd", "s/metadata.yaml"), read_all, 0.5),
+    "mcap fixed": Target(_bag("s.mcap", ros.Rig(colour_scale=1.1)), ("s.mcap",), read_all),
+    "tum pairs": Target(_tum_pairs, ("s/*.txt",), read_all, 2.0),
+    "ply ascii": Target(_cloud("ply ascii"), ("s.ply",), read_all),
+    "named": Target(
+        _intrinsics("intrinsics.json", '{"intrinsic": {"fx": 30, "fy": 30.5, "ppx": 11.5, "ppy": 7.5}}'),
+        ("s/*.json",),
+        read_all,
+    ),
+    "nested": Target(
+        _intrinsics("camera.json", '{"K": [[30, 0, 11.5], [0, 30.5, 7.5], [0, 0, 1]]}'), ("s/*.json",), read_all
+    ),
+    "plain": Target(_intrinsics("intrinsics.txt", "30 30.5 11.5 7.5\n"), ("s/*.txt",), read_all, 0.5),
+    "robot": Target(_robot, ("robot.txt",), trajectory),
+    "recipe": Target(_recipe, ("s.json",), load_recipe),
+    "run": Target(_run, ("report.json",), _poses),
+}
 
 
 def fresh(target: Target, folder: Path) -> tuple[Path, list[Path]]:
