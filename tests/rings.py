@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from modeler import se3
 from modeler.graph import PoseGraph
@@ -32,10 +33,20 @@ def covariance(rng: np.random.Generator, sigma_rad: float = 0.01, sigma_m: float
     return adjoint @ scale @ factor @ factor.T @ scale @ adjoint.T
 
 
+def spin(rotation_rad: npt.ArrayLike) -> Array:
+    """Motion (4, 4) of an object turned through itself by a rotation vector (3,)."""
+    return se3.translation(OBJECT_M) @ se3.exp(np.append(rotation_rad, np.zeros(3))) @ se3.translation(-OBJECT_M)
+
+
+def spun(of: Edge, rotation_rad: npt.ArrayLike) -> Edge:
+    """The edge, wrong by a turn of the object through itself."""
+    pose = of.posterior.pose
+    return edge(of.target, of.source, PoseGaussian(pose.mean @ spin(rotation_rad), pose.covariance), of.kind)
+
+
 def turn(angle_rad: float) -> Array:
     """Motion (4, 4) of an object turned about a tilted axis through itself."""
-    about = se3.exp(np.array([0.1, angle_rad, -0.05 * angle_rad, 0.0, 0.0, 0.0]))
-    return se3.translation(OBJECT_M) @ about @ se3.translation(-OBJECT_M)
+    return spin([0.1, angle_rad, -0.05 * angle_rad])
 
 
 def turntable(count: int, per_turn: int | None = None) -> dict[int, Array]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import gtsam
 import numpy as np
 import pytest
-from rings import OBJECT_M
+from rings import OBJECT_M, spin
 from rings import covariance as _covariance
 from rings import edge as _edge
 from rings import measured as _measured
@@ -224,10 +224,7 @@ def test_direction_nobody_observed_keeps_its_spread(sigma_roll_rad: float) -> No
     about_object = np.diag([1e-5, sigma_roll_rad, 1e-5, 1e-5, 1e-5, 1e-5]) ** 2  # the same in every frame
     adjoint = se3.adjoint(se3.translation(OBJECT_M))
     covariance = adjoint @ about_object @ adjoint.T
-    stops = [
-        se3.translation(OBJECT_M) @ se3.exp(np.array([0.0, angle, 0.0, 0.0, 0.0, 0.0])) @ se3.translation(-OBJECT_M)
-        for angle in np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-    ]
+    stops = [spin([0.0, angle, 0.0]) for angle in np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)]
     step = se3.inverse(stops[1])
     edges = [_edge(k - 1, k, PoseGaussian(step, covariance)) for k in range(1, count)]
     closure = _edge(0, count - 1, PoseGaussian(se3.inverse(step), covariance), "closure")

@@ -7,7 +7,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from rings import OBJECT_M, edge, ring
+from rings import edge, ring, spin
 
 from modeler import se3
 from modeler.export import g2o_text, tum_text
@@ -18,11 +18,11 @@ from modeler.types import Mode, PoseGaussian
 def _graph() -> PoseGraph:
     """A loop with an edge of two modes, whose wrong one is the heavier, and a closure that lies."""
     graph, truth = ring(12, np.random.default_rng(1), [(0, 11), (0, 6), (3, 9)])
-    spin = se3.translation(OBJECT_M) @ se3.exp(np.array([0, np.pi / 2, 0, 0, 0, 0])) @ se3.translation(-OBJECT_M)
+    quarter = spin([0.0, np.pi / 2, 0.0])
     several, right = graph.edges[4], graph.edges[4].posterior.pose
-    wrong = PoseGaussian(right.mean @ spin, right.covariance)
+    wrong = PoseGaussian(right.mean @ quarter, right.covariance)
     modes = [Mode(0.6, wrong), Mode(0.4, right)]
-    lie = PoseGaussian(se3.inverse(truth[1]) @ truth[8] @ spin, right.covariance)
+    lie = PoseGaussian(se3.inverse(truth[1]) @ truth[8] @ quarter, right.covariance)
     edges = [*graph.edges, edge(1, 8, lie, "closure")]
     edges[4] = edge(several.target, several.source, wrong, modes=modes)
     return PoseGraph(tuple(edges))

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from rings import OBJECT_M, edge, measured, turntable
+from rings import edge, measured, spin, spun, turntable
 
-from modeler import se3
 from modeler.graph import PoseGraph, Smoother, smoother, solve
 from modeler.types import Edge, Mode, PoseGaussian, Solution
 
@@ -19,11 +18,10 @@ COUNT, PER_TURN = 40, 12
 def _arrivals(rng: np.random.Generator, *, false: float = 0.0, modes: bool = False) -> list[list[Edge]]:
     """The edges that each frame of a turntable brings: to the last view, the one before it, and a turn ago."""
     truth = turntable(COUNT, PER_TURN)
-    spin = se3.translation(OBJECT_M) @ se3.exp(np.array([0, np.pi / 2, 0, 0, 0, 0])) @ se3.translation(-OBJECT_M)
     arrivals = []
     for k in range(1, COUNT):
         pose = measured(truth, k - 1, k, rng)
-        spun = PoseGaussian(pose.mean @ spin, pose.covariance)
+        spun = PoseGaussian(pose.mean @ spin([0.0, np.pi / 2, 0.0]), pose.covariance)
         both = (Mode(0.6, spun), Mode(0.4, pose)) if modes and k % 5 == 3 else ()
         edges = [edge(k - 1, k, both[0].pose if both else pose, modes=both)]
         edges += [edge(t, k, measured(truth, t, k, rng), "closure") for t in (k - 2, k - PER_TURN) if t >= 0]
@@ -34,10 +32,7 @@ def _arrivals(rng: np.random.Generator, *, false: float = 0.0, modes: bool = Fal
 
 def _spoilt(of: Edge, rng: np.random.Generator) -> Edge:
     axis = rng.normal(size=3)
-    turn = np.concatenate([axis / np.linalg.norm(axis) * rng.uniform(0.8, 2.5), np.zeros(3)])
-    about = se3.translation(OBJECT_M) @ se3.exp(turn) @ se3.translation(-OBJECT_M)
-    pose = of.posterior.pose
-    return edge(of.target, of.source, PoseGaussian(pose.mean @ about, pose.covariance), of.kind)
+    return spun(of, axis / np.linalg.norm(axis) * rng.uniform(0.8, 2.5))
 
 
 def _assert_same(one: Solution, other: Solution) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rings import OBJECT_M, covariance, edge, measured, nees, ring, rotation_error, turntable
+from rings import covariance, edge, measured, nees, ring, rotation_error, spin, turntable
 
 from modeler import se3
 from modeler.graph import PoseGraph, Smoother, solve
@@ -19,8 +19,7 @@ WRONG_RAD = (np.pi / 2, -np.pi / 2, np.pi)
 
 def _spun(pose: PoseGaussian, angle_rad: float) -> PoseGaussian:
     """The same bump where the object has turned by a further angle about its own axis, as a square box might have."""
-    about = se3.translation(OBJECT_M) @ se3.exp(np.array([0, angle_rad, 0, 0, 0, 0])) @ se3.translation(-OBJECT_M)
-    return PoseGaussian(pose.mean @ about, pose.covariance)
+    return PoseGaussian(pose.mean @ spin([0.0, angle_rad, 0.0]), pose.covariance)
 
 
 def _ambiguous(truth: Mapping[int, Array], target: int, source: int, *, rng: np.random.Generator, weights: list[float],
@@ -133,8 +132,7 @@ def test_without_a_loop_an_edge_stands_at_its_heaviest_mode_as_wide_as_all() -> 
 def test_what_a_loop_cannot_tell_apart_keeps_its_weights() -> None:
     """Two edges each turned by 90° or not, and a loop that allows one turn: which of them it was stays open."""
     rng = np.random.default_rng(7)
-    truth = {k: se3.inverse(se3.translation(OBJECT_M) @ se3.exp(np.array([0, 0.5 * k, 0, 0, 0, 0]))
-                            @ se3.translation(-OBJECT_M)) for k in range(3)}  # fmt: skip
+    truth = {k: se3.inverse(spin([0.0, 0.5 * k, 0.0])) for k in range(3)}
     edges = []
     for source in (1, 2):
         spread = covariance(rng, 0.01, 0.002)

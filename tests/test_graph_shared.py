@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from rings import OBJECT_M, edge, nees, ring
+from rings import OBJECT_M, edge, nees, ring, spin
 
 from modeler import se3
 from modeler.graph import PoseGraph, Smoother, shared_noise, solve
@@ -18,14 +18,7 @@ ABOUT = se3.adjoint(se3.translation(OBJECT_M))
 WHOLE = ABOUT @ np.diag(SIGMAS**2) @ ABOUT.T  # an edge's covariance, the same from every side of the object
 
 
-def _truth() -> dict[int, Array]:
-    turns = [se3.exp(np.array([0.0, 2.0 * np.pi * k / COUNT, 0.0, 0.0, 0.0, 0.0])) for k in range(COUNT)]
-    return {
-        k: se3.inverse(se3.translation(OBJECT_M) @ turn @ se3.translation(-OBJECT_M)) for k, turn in enumerate(turns)
-    }
-
-
-TRUTH = _truth()
+TRUTH = {k: se3.inverse(spin([0.0, 2.0 * np.pi * k / COUNT, 0.0])) for k in range(COUNT)}
 PAIRS = [(k - step, k) for step in (1, 2, 3) for k in range(step, COUNT)] + [(0, COUNT - 1), (0, COUNT - 2)]
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rings import OBJECT_M, edge, measured, ring, turntable
+from rings import OBJECT_M, edge, measured, ring, spin, turntable
 
 from modeler import se3
 from modeler.export import edge_record, g2o_text
@@ -102,8 +102,8 @@ def test_a_ball_is_free_to_turn_at_all() -> None:
 
 def _two_modes() -> Posterior:
     sure = _posterior(SURE_RAD, SURE_M)
-    about = se3.translation(OBJECT_M) @ se3.exp(np.array([*(np.pi / 2 * NORMAL), 0, 0, 0])) @ se3.translation(-OBJECT_M)
-    modes = (Mode(0.7, sure.pose), Mode(0.3, PoseGaussian(sure.pose.mean @ about, sure.pose.covariance)))
+    turned = PoseGaussian(sure.pose.mean @ spin(np.pi / 2 * NORMAL), sure.pose.covariance)
+    modes = (Mode(0.7, sure.pose), Mode(0.3, turned))
     wide = PoseGaussian(sure.pose.mean, sure.pose.covariance + 0.3 * np.eye(6))
     return replace(sure, pose=wide, modes=modes)
 
