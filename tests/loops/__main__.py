@@ -11,6 +11,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +21,10 @@ from modeler.closure import Closer
 from modeler.export import write_atomically
 from modeler.types import Step
 
-_WIDTHS = (16, 8, 6, 6, 6, 6, 9, 9, 9, 9, 9, 9, 9, 8)
+_WIDTHS = (19, 8, 6, 6, 6, 7, 9, 8, 10, 9, 7, 7, 9, 10, 8, 6)
 _HEADS = (
     *("case", "joined", "regs", "close", "span", "reject", "before°", "after°", "before mm", "after mm"),
-    *("turned°", "residual°", "after°", "s"),
+    *("NEES", "after", "turned°", "residual°", "after°", "s"),
 )
 
 
@@ -32,32 +33,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="loops", description=__doc__)
     parser.add_argument("--cases", nargs="+", metavar="NAME", help="only these")
     parser.add_argument("--shape", default="figurine", help="recipe of the rendered object")
-    parser.add_argument("--seed", type=int, default=0, help="of noise and registration")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of noise and registration, a run each")
+    parser.add_argument("--lies", type=float, default=0.0, metavar="SHARE", help="of closures that come out wrong")
     parser.add_argument("--long", type=int, metavar="N", help="instead: N small frames at 3°, and what each costs")
     parser.add_argument("--told-truth", action="store_true", help="register by the truth: what all else costs")
     parser.add_argument("--out", type=Path, default=Path("runs/loops"), help="folder of the results")
-    for field, kind in (("max_closures", int), ("min_gain_nats", float)):
+    for field, kind in (("max_closures", int), ("min_gain_nats", float), ("max_spans", int)):
         parser.add_argument(f"--{field.replace('_', '-')}", type=kind, default=getattr(Closer, field), help="of Closer")
     options = parser.parse_args(arguments)
-    closer = Closer(max_closures=options.max_closures, min_gain_nats=options.min_gain_nats)
-    if options.long:
-        angles_deg = 3.0 * np.arange(options.long)
-        cases = [Case(f"{options.long}-at-3deg", turned(angles_deg, shape=options.shape, width=320, seed=options.seed))]
-    else:
-        cases = [*rendered(options.shape, options.seed), *bundled(), *real()]
-        cases = [case for case in cases if not options.cases or case.name in options.cases]
+    closer = Closer(max_closures=options.max_closures, min_gain_nats=options.min_gain_nats, max_spans=options.max_spans)
+    cases = [(case, seed) for seed in options.seeds for case in _cases(options, seed)]
     if not cases:
         parser.error("no case is left; check --cases")
     options.out.mkdir(parents=True, exist_ok=True)
     print(_row(_HEADS), flush=True)
     results = []
-    for case in cases:
-        maker = modeler(case, closer, options.seed, told_truth=options.told_truth)
+    for case, seed in cases:
+        maker = modeler(case, closer, seed, told_truth=options.told_truth, lies=options.lies)
         results.append(run(maker, case, _Progress(case.name, every=20 if options.long else 0)))
         print(_row(_cells(results[-1])), flush=True)
+    if len(options.seeds) > 1:
+        print(_row(_cells(_mean(results))), flush=True)
     write_atomically(options.out / "loops.json", json.dumps([result.values() for result in results], indent=1) + "\n")
-    exact = {case.name for case in rendered(options.shape, options.seed)}
+    exact = {case.name for case in rendered(options.shape, 0)}
     return 1 if any(_fails(result) for result in results if result.name in exact) else 0
+
+
+def _cases(options: argparse.Namespace, seed: int) -> list[Case]:
+    """Return the cases asked for; those that are not rendered are the same for every seed."""
+    if options.long:
+        angles_deg = 3.0 * np.arange(options.long)
+        return [Case(f"{options.long}-at-3deg", turned(angles_deg, shape=options.shape, width=320, seed=seed))]
+    cases = [*rendered(options.shape, seed), *bundled(), *real()]
+    return [case for case in cases if not options.cases or case.name in options.cases]
+
+
+def _mean(results: Sequence[Result]) -> Result:
+    """Return the mean of results, over those that have each figure."""
+    columns: dict[str, Any] = {}
+    for name in results[0].values():
+        told = [value for result in results if isinstance(value := result.values()[name], int | float)]
+        columns[name] = float(np.mean(told)) if told else None
+    for name in ("frames", "joined", "registrations", "closures", "spanning", "rejected"):
+        columns[name] = round(columns[name])
+    columns["name"] = f"mean of {len(results)}"
+    return Result(**columns)
 
 
 def _fails(result: Result) -> bool:
@@ -69,6 +89,7 @@ def _fails(result: Result) -> bool:
 def _cells(result: Result) -> list[str]:
     counts = (result.registrations, result.closures, result.spanning, result.rejected)
     figures = (result.before_deg, result.after_deg, result.before_mm, result.after_mm)
+    figures += (result.nees_before, result.nees_after)
     residuals = (result.turned_deg, result.residual_before_deg, result.residual_after_deg)
     numbers = ["-" if number is None else f"{number:.2f}" for number in (*figures, *residuals)]
     return [result.name, f"{result.joined}/{result.frames}", *map(str, counts), *numbers, f"{result.seconds:.0f}"]

@@ -12,16 +12,18 @@ import numpy as np
 
 from loops.cases import Case
 from loops.known import Known
+from loops.lies import Lying
 from modeler import se3
 from modeler.closure import Closer
-from modeler.evaluation import trajectory_errors
+from modeler.evaluation import nees, trajectory_errors, true_motion
 from modeler.fusion import Fuser
+from modeler.graph import PoseGraph, solve
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Segmenter, telling
-from modeler.types import Array, Solution, Step
+from modeler.types import Array, Edge, PoseGaussian, Solution, Step
 
 _PAGE_BYTES = 4096
 
@@ -45,6 +47,9 @@ class Result:
     before_mm: float | None
     """Largest translation error at the object."""
     after_mm: float | None
+    nees_before: float | None
+    """NEES of the poses but the first, an average a degree of freedom: 1 where covariances are true."""
+    nees_after: float | None
     turned_deg: float
     """Rotation summed over the chain."""
     residual_before_deg: float | None
@@ -59,15 +64,16 @@ class Result:
         return asdict(self)
 
 
-def modeler(case: Case, closer: Closer, seed: int, *, told_truth: bool = False) -> Modeler:
+def modeler(case: Case, closer: Closer, seed: int, *, told_truth: bool = False, lies: float = 0.0) -> Modeler:
     """Return the loop for a case; its model is coarse, for nobody looks at it."""
     noise = case.sequence.sensor()
     truth = case.truth() if told_truth else None
+    registrar = VisibilityRegistrar() if truth is None else Known(truth)
     return Modeler(
         segmenter=Segmenter(),
         sensor=Sensor() if noise is None else Sensor(*noise),
         prior=TablePrior() if case.prior == "table" else GeneralPrior(),
-        registrar=VisibilityRegistrar() if truth is None else Known(truth),
+        registrar=Lying(registrar, lies) if lies else registrar,
         closer=closer,
         fuser=Fuser(voxel_m=0.01),
         seed=seed,
@@ -94,7 +100,7 @@ def _figures(case: Case, step: Step, registrations: int, seconds: float, peak_mi
     solution, truth = step.solution, case.truth()
     taking_part = [edge for edge in step.edges_so_far if edge.accepted and edge not in step.solution.outliers]
     loops = [edge for edge in taking_part if edge.kind == "closure"]
-    errors: list[float | None] = [None] * 4
+    errors: list[float | None] = [None] * 6
     if truth is not None and solution.trajectory and all(frame in truth for frame in solution.trajectory):
         centroid_m = step.views[min(solution.trajectory)].centroid_m
         chain, whole = (trajectory_errors(t, truth, centroid_m) for t in (solution.odometry, solution.trajectory))
@@ -103,6 +109,8 @@ def _figures(case: Case, step: Step, registrations: int, seconds: float, peak_mi
             whole.max_rotation_deg,
             1e3 * chain.max_translation_m,
             1e3 * whole.max_translation_m,
+            _nees(_chain(step), truth),
+            _nees(solution, truth),
         ]
     measured = {(edge.target, edge.source): edge.posterior.pose.mean for edge in loops}
     return Result(
@@ -117,12 +125,34 @@ def _figures(case: Case, step: Step, registrations: int, seconds: float, peak_mi
         after_deg=errors[1],
         before_mm=errors[2],
         after_mm=errors[3],
+        nees_before=errors[4],
+        nees_after=errors[5],
         turned_deg=_turned_deg(solution),
         residual_before_deg=_residual_deg(measured, solution.odometry),
         residual_after_deg=_residual_deg(measured, solution.trajectory),
         seconds=seconds,
         peak_mib=peak_mib,
     )
+
+
+def _chain(step: Step) -> Solution:
+    """Return the solution of the edges alone that placed the frames."""
+    placed: dict[int, Edge] = {}
+    for edge in step.edges_so_far:
+        if edge.accepted:
+            placed.setdefault(edge.source, edge)
+    first = next(iter(step.solution.trajectory))
+    return solve(PoseGraph(tuple(placed.values()), first=first), {})
+
+
+def _nees(solution: Solution, truth: Mapping[int, Array]) -> float | None:
+    """Return the mean NEES of the poses relative to the first, a degree of freedom."""
+    first, *others = solution.trajectory
+    values = [
+        nees(PoseGaussian(solution.trajectory[k], solution.covariances[k]), true_motion(truth, first, k))
+        for k in others
+    ]
+    return float(np.mean(values)) / 6.0 if values else None
 
 
 def _turned_deg(solution: Solution) -> float:
