@@ -22,6 +22,7 @@ from sequences import bundled
 from viz import entities
 from viz.report import write_page
 from viz.report.mesh import read_mesh, scene
+from viz.report.recorded import recorded, surfaces
 from viz.report.result import Result
 from viz.stream import open_stream
 
@@ -82,7 +83,7 @@ def test_the_page_is_whole_and_needs_no_network(page: str) -> None:
 def test_every_section_is_there(page: str) -> None:
     headings = Elements(page).headings
     assert ODD_NAME in headings
-    wanted = ["Model", "Camera around the object", "Uncertainty", "Errors against ground truth"]
+    wanted = ["Model", "Camera around the object", "Uncertainty", "Merged points", "Errors against ground truth"]
     assert [heading for heading in headings if heading in wanted] == wanted
     assert {"Are the covariances true?", "Pairs", "Settings"} <= set(headings)
 
@@ -96,6 +97,23 @@ def test_every_pair_is_told_with_its_pictures(page: str, run: Path) -> None:
     assert page.count("data:image/jpeg") - 1 == 3 * sum(edge.kind == "odometry" for edge in result.edges)
     assert "5 of 6" in page
     assert f"frame {LOST} was left out" in page
+
+
+def test_merged_points_are_those_of_the_views(run: Path) -> None:
+    views = next(step.views for step in steps(COUNT, lost=LOST) if step.last)
+    found = surfaces(recorded(run / "recording.rrd"), first=0)
+    assert found.keys() == {*views, LOST}
+    for frame, view in views.items():
+        np.testing.assert_allclose(found[frame], view.points_m, atol=1e-6)  # few enough that all are recorded
+
+
+def test_without_a_closure_there_is_nothing_to_compare(run: Path, tmp_path: Path) -> None:
+    report = json.loads((run / "report.json").read_text())
+    report["edges"] = [edge for edge in report["edges"] if edge["kind"] == "odometry"]
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    (tmp_path / "recording.rrd").write_bytes((run / "recording.rrd").read_bytes())
+    write_page(tmp_path, tmp_path / "page.html")
+    assert "Merged points" not in (tmp_path / "page.html").read_text()
 
 
 def test_settings_and_names_are_text_and_nothing_more(page: str) -> None:
@@ -160,6 +178,7 @@ def test_without_truth_recording_or_mesh_the_page_says_so(run: Path, tmp_path: P
     assert Elements(page).open == []
     assert "The true motion is not known here" in page
     assert "recording.rrd is missing" in page
+    assert "Merged points" not in page
     assert "left no mesh" in page
 
 

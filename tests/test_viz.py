@@ -505,6 +505,9 @@ def test_every_pair_is_put_into_words(run: list[Step], recording: Recording) -> 
             assert readings.pair_words(edge, step) in now
             assert edge.posterior.outcome.advice in now
             assert ("rejected" in readings.pair_words(edge, step)) == (not edge.accepted)
+            assert now.count(edge.posterior.outcome.advice) == sum(
+                other.posterior.outcome is edge.posterior.outcome for other in step.edges
+            )
     assert "nan" not in " ".join(row["text"][0] for row in recording[entities.NOW].values())
 
 

@@ -84,7 +84,9 @@ def pair_words(edge: Edge, step: Step) -> str:
         f"{readings[entities.EFFECTIVE_SAMPLES]:.0f} effective samples",
         f"{readings[entities.SECONDS]:.2g} s",
     ]
-    verdict = edge.kind if edge.accepted else f"{edge.kind} rejected ({edge.reason})"
+    verdict = edge.kind if edge.accepted else f"{edge.kind} rejected"
+    if not edge.accepted and posterior.usable:  # else the outcome is the reason
+        verdict += f" ({edge.reason})"
     known = ", ".join(part for part in parts if not part.startswith("nan") and " nan" not in part)
     return f"{edge.source} → {edge.target} {verdict}: {posterior.outcome.label}; {known}"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 from collections.abc import Mapping, Sequence
@@ -10,19 +9,23 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from PIL import Image
 
 from modeler import evaluation, se3
 from modeler.export import write_atomically
-from modeler.types import Array, Edge
+from modeler.types import Array
 from viz.pictures import look_at, shade
 from viz.report import plots
+from viz.report.cards import pair_cards
+from viz.report.elements import data_address, figure
+from viz.report.merged import merged_clouds
 from viz.report.mesh import MOST_SIGMA_M, Mesh, read_mesh, scene
-from viz.report.pairs import Thumbnails, thumbnails
-from viz.report.result import Result, sd_of
+from viz.report.pairs import thumbnails
+from viz.report.recorded import Row, recorded, surfaces
+from viz.report.result import Result
 
 _SHAPE_POINTS: Final = 6_000
 _CAMERA_SHARE: Final = 0.12  # length of a drawn camera, as a share of its distance
@@ -43,8 +46,9 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
     result = Result.read(run, truth)
     mesh = read_mesh(run / "model.ply")
     centre_m = se3.transform(result.poses[result.first].mean, np.zeros((1, 3)))[0] if mesh is None else mesh.centre_m
+    rows = recorded(run / "recording.rrd")
     parts = [_head(result, mesh), *_model(result, mesh), *_trajectory(result, mesh, centre_m)]
-    parts += [*_accuracy(result, centre_m), *_pairs(result, thumbnails(run / "recording.rrd"), centre_m)]
+    parts += [*_closure(result, rows), *_accuracy(result, centre_m), *pair_cards(result, thumbnails(rows), centre_m)]
     parts.append(_settings(result))
     page = Template(_asset("page.html")).substitute(
         title=escape(f"{_name(result)}: model report"), body="\n".join(parts)
@@ -111,16 +115,32 @@ def _trajectory(result: Result, mesh: Mesh | None, centre_m: Array) -> Sequence[
     shape_m = shape_m[:: max(len(shape_m) // _SHAPE_POINTS, 1)]
     return [
         "<h2>Camera around the object</h2>",
-        _figure(
+        figure(
             plots.trajectory(result, shape_m),
             "Positions of the camera in the object frame; the black dot is the first frame. Ellipses hold three "
             "standard deviations of the position, to scale.",
         ),
         "<h2>Uncertainty</h2>",
-        _figure(
+        figure(
             plots.uncertainty(result, centre_m),
             "Standard deviation along the worst axis: of each edge, and of each pose relative to the first along the "
             "chain of edges and after optimisation. What loop closure is worth is the gap between the two lines.",
+        ),
+    ]
+
+
+def _closure(result: Result, rows: Mapping[str, Mapping[int, Row]]) -> Sequence[str]:
+    """Return what loop closure did to the merged points, where there was one and the recording has the points."""
+    surfaces_m = surfaces(rows, result.first)
+    if not surfaces_m or not any(edge.kind == "closure" and edge.accepted for edge in result.edges):
+        return []
+    return [
+        "<h2>Merged points</h2>",
+        figure(
+            merged_clouds(result, surfaces_m),
+            "What all frames saw, laid together along the chain of edges and after optimisation, a colour a frame from "
+            "dark to bright. Where a loop was open, bright points lie beside dark ones.",
+            kind="png",
         ),
     ]
 
@@ -136,13 +156,14 @@ def _accuracy(result: Result, centre_m: Array) -> Sequence[str]:
     inside = evaluation.coverage(nees)[0.95]
     return [
         "<h2>Errors against ground truth</h2>",
-        _figure(
+        figure(
             plots.errors(result, centre_m),
             "Lines are errors relative to the first frame, bands the standard deviation that the result states along "
-            "its worst axis. Errors well above their band would mean a result too sure of itself.",
+            "its worst axis. Errors well above their band mean a result too sure of itself, or a truth that is "
+            "itself not so true.",
         ),
         "<h2>Are the covariances true?</h2>",
-        _figure(
+        figure(
             plots.coverage(result),
             "Share of truths inside the region of a given probability. On the diagonal: calibrated; below: too sure; "
             f"above: too modest; grey: what chance allows. Of {len(nees)} edges {100.0 * inside:.0f} % have the truth "
@@ -151,67 +172,6 @@ def _accuracy(result: Result, centre_m: Array) -> Sequence[str]:
             kind="png",
         ),
     ]
-
-
-def _pairs(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Array) -> Sequence[str]:
-    """Return every pair with its pictures, its outcome and why it was or was not joined."""
-    note = (
-        "From left: the frame; its surface (<span class='orange'>orange</span>) and that of the view it is registered "
-        "to (<span class='teal'>teal</span>) before and after alignment."
-        if pictures
-        else "There are no pictures, for recording.rrd is missing."
-    )
-    cards = [
-        _pair(result, edge, record, pictures.get(edge.source), centre_m)
-        for edge, record in zip(result.edges, result.report["edges"], strict=True)
-    ]
-    return [f"<h2>Pairs</h2><p class='quiet'>{note}</p><div class='pairs'>{''.join(cards)}</div>"]
-
-
-def _mode_words(modes: Sequence[Mapping[str, Any]]) -> str:
-    """Return how the probability is shared among the modes of an edge, where there are several."""
-    if len(modes) < 2:
-        return ""
-    shares = [f"{100.0 * mode['weight']:.0f} %" for mode in modes]
-    left = [f"{100.0 * mode['weight_in_graph']:.0f} %" for mode in modes if mode.get("weight_in_graph") is not None]
-    graph = f"; all edges together leave {', '.join(left)}" if left else ""
-    return f"<p>{len(modes)} modes: {', '.join(shares)}{graph}.</p>"
-
-
-def _pair(result: Result, edge: Edge, record: Mapping[str, Any], pictures: Thumbnails | None, centre_m: Array) -> str:
-    posterior = edge.posterior
-    shown = ""
-    if pictures is not None and edge.kind == "odometry":
-        images = [image for image in (pictures.colour, pictures.before, pictures.after) if image is not None]
-        shown = "".join(f"<img src='{_data(image, 'jpeg')}' alt=''>" for image in images)
-        shown = f"<div class='pictures'>{shown}</div>"
-    seen_m = centre_m
-    if edge.source in result.poses:
-        seen_m = se3.transform(se3.inverse(result.poses[edge.source].mean), centre_m[None])[0]
-    sd = sd_of(posterior.pose, seen_m)
-    facts = {
-        "rotation sd {:.2g}°": sd.rotation_deg,
-        "translation sd {:.2g} mm": sd.translation_mm,
-        "overlap {:.0f} %": 100.0 * posterior.overlap,
-        "{:.0f} effective samples": posterior.effective_samples,
-        "{:.2g} s": posterior.seconds,
-    }
-    truth = result.true_motion(edge)
-    if truth is not None:
-        facts |= {
-            "rotation off by {:.2f}°": evaluation.rotation_error_deg(posterior.pose.mean, truth),
-            "translation by {:.1f} mm": 1000.0 * evaluation.translation_error_m(posterior.pose.mean, truth, seen_m),
-        }
-    words = ", ".join(form.format(value) for form, value in facts.items() if np.isfinite(value))
-    open_words = _mode_words(record.get("modes", [])) + "".join(
-        f"<p>{escape(words)}.</p>" for words in record.get("undetermined", [])
-    )
-    verdict = edge.kind if edge.accepted else f"{edge.kind}, rejected"
-    return (
-        f"<div class='pair{'' if edge.accepted else ' no'}'><h3>{edge.source} → {edge.target}: {verdict}, "
-        f"{posterior.outcome.label}</h3>{shown}<p>{words}.</p>{open_words}"
-        f"<p class='quiet'>{escape(edge.reason)}</p></div>"
-    )
 
 
 def _settings(result: Result) -> str:
@@ -248,7 +208,7 @@ def _poster(mesh: Mesh) -> str:
     picture = shade(mesh.vertices_m, mesh.triangles, mesh.colours, camera, (460, 1048))
     content = io.BytesIO()
     Image.fromarray(picture).save(content, "JPEG", quality=85)
-    return _data(content.getvalue(), "jpeg")
+    return data_address(content.getvalue(), "jpeg")
 
 
 def _scale() -> str:
@@ -259,15 +219,6 @@ def _scale() -> str:
         f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b, _ in 255.0 * colormaps["cividis"](np.linspace(0, 1, 9))
     )
     return f"0 <i style='background:linear-gradient(90deg,{stops})'></i>"
-
-
-def _figure(picture: bytes, caption: str, *, style: str = "", kind: str = "svg+xml") -> str:
-    image = f"<img class='{style}' src='{_data(picture, kind)}' alt=''>"
-    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
-
-
-def _data(content: bytes, kind: str) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def _asset(name: str) -> str:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import io
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +14,10 @@ from PIL import Image
 from modeler.types import Array
 from viz import entities
 from viz.blueprint import FROM_THE_SIDE
+from viz.report.recorded import FRAME_PATHS, Row, cloud
 
 _SIZE: Final = (150, 200)  # height and width in px
 _JPEG_QUALITY: Final = 82
-_WANTED: Final = (entities.COLOUR, entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER)
 _BACKGROUND: Final = 250
 _DOT: Final = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])  # pixels of a point
 
@@ -36,54 +34,23 @@ class Thumbnails:
     """The same under the mean of the posterior."""
 
 
-def thumbnails(recording: Path) -> dict[int, Thumbnails]:
-    """Return the pictures by frame number; empty where there is no recording that can be read."""
-    try:
-        rows = _rows(recording)
-    except (OSError, ValueError, RuntimeError):
-        return {}
+def thumbnails(rows: Mapping[str, Mapping[int, Row]]) -> dict[int, Thumbnails]:
+    """Return the pictures by frame number.
+
+    Args:
+        rows: what the recording holds, as `recorded` returns it.
+    """
     frames = sorted({frame for entity in rows.values() for frame in entity})
-    return {frame: _of_frame({path: rows[path].get(frame, {}) for path in _WANTED}) for frame in frames}
+    return {frame: _of_frame({path: rows[path].get(frame, {}) for path in FRAME_PATHS}) for frame in frames}
 
 
-def _rows(recording: Path) -> dict[str, dict[int, dict[str, Any]]]:
-    """Return what a recording holds on the entities wanted, by frame and component."""
-    import rerun.chunk
-
-    rows: dict[str, dict[int, dict[str, Any]]] = {path: {} for path in _WANTED}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a run that was killed leaves a recording without its last page
-        for chunk in rerun.chunk.RrdReader(recording).stream():
-            entity = rows.get(str(chunk.entity_path).removeprefix("/"))
-            if entity is None or chunk.is_static:
-                continue
-            batch = chunk.to_record_batch()
-            for name in batch.schema.names:
-                component = name.partition(":")[2]
-                if component in ("blob", "positions", "colors"):
-                    for frame, value in zip(batch[entities.FRAME].to_pylist(), batch[name], strict=True):
-                        if value.is_valid:
-                            entity.setdefault(frame, {})[component] = value
-    return rows
-
-
-def _of_frame(rows: Mapping[str, Mapping[str, Any]]) -> Thumbnails:
+def _of_frame(rows: Mapping[str, Row]) -> Thumbnails:
     blob = rows[entities.COLOUR].get("blob")
     colour = None if blob is None else _small(bytes(blob.values[0].values.to_numpy()))
-    target, before, after = (_cloud(rows[path]) for path in _WANTED[1:])
+    target, before, after = (cloud(rows[path]) for path in FRAME_PATHS[1:])
     if target is None or before is None or after is None:
         return Thumbnails(colour, None, None)
     return Thumbnails(colour, _pair(target, before), _pair(target, after))
-
-
-def _cloud(row: Mapping[str, Any]) -> tuple[Array, npt.NDArray[np.uint8]] | None:
-    """Return points (n, 3) and colours (n, 3) as recorded."""
-    if "positions" not in row or "colors" not in row:
-        return None
-    points = np.array(row["positions"].as_py(), dtype=np.float64).reshape(-1, 3)
-    packed = np.array(row["colors"].as_py(), dtype=np.uint32)
-    colours = np.stack([packed >> 24, packed >> 16, packed >> 8], axis=1).astype(np.uint8)
-    return points, np.broadcast_to(colours, points.shape)
 
 
 def _pair(*clouds: tuple[Array, npt.NDArray[np.uint8]]) -> bytes:

@@ -33,14 +33,10 @@ def trajectory(result: Result, shape_m: Array) -> bytes:
         result: the run.
         shape_m: (n, 3) points of the object, in the object frame.
     """
-    figure = _figure(9.0, 4.6)
+    figure = new_figure(9.0, 4.6)
     centres = np.array([pose.mean[:3, 3] for pose in result.poses.values()])
     middle = centres.mean(axis=0)
-    spread = np.linalg.svd(centres - middle)[2] if len(centres) > 2 else np.eye(3)[[0, 2, 1]]
-    # From above the ring of cameras, the first one's left on the left; from the side, its up is up.
-    across = spread[0] * (np.sign(spread[0, 0]) or 1.0)
-    up = np.cross(spread[0], spread[1])
-    up = -up if up[1] > 0 else up  # y is down
+    across, up = ring_axes(centres)
     plans = (("from above", np.stack([across, np.cross(up, across)])), ("from the side", np.stack([across, up])))
     for axis, (title, axes) in zip(figure.subplots(1, 2), plans, strict=True):
         flat = (shape_m - middle) @ axes.T
@@ -53,6 +49,21 @@ def trajectory(result: Result, shape_m: Array) -> bytes:
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=8, frameon=False, loc="outside upper center", ncols=4)
     return _svg(figure)
+
+
+def ring_axes(centres_m: Array) -> tuple[Array, Array]:
+    """Return what is across (3,) and what is up (3,) in pictures of a ring of cameras.
+
+    From above the first camera's left is on the left; from the side, its up is up.
+
+    Args:
+        centres_m: (n, 3) where the cameras are, in the object frame.
+    """
+    middle = centres_m.mean(axis=0)
+    spread = np.linalg.svd(centres_m - middle)[2] if len(centres_m) > 2 else np.eye(3)[[0, 2, 1]]
+    across = spread[0] * (np.sign(spread[0, 0]) or 1.0)
+    up = np.cross(spread[0], spread[1])
+    return across, -up if up[1] > 0 else up  # y is down
 
 
 def _cameras(axis: Axes, result: Result, axes: Array, middle: Array) -> None:
@@ -82,7 +93,7 @@ def uncertainty(result: Result, centre_m: Array) -> bytes:
         result: the run.
         centre_m: (3,) the object's centre, in the object frame.
     """
-    figure = _figure(9.0, 4.0)
+    figure = new_figure(9.0, 4.0)
     of_rotation, of_translation = figure.subplots(1, 2)
     for label, poses, colour in (("before closure", result.chain, BEFORE), ("after optimisation", result.poses, AFTER)):
         spread, frames = sds(poses, centre_m), list(poses)
@@ -109,7 +120,7 @@ def errors(result: Result, centre_m: Array) -> bytes:
         result: with the truth of at least its first frame.
         centre_m: (3,) the object's centre, in the object frame.
     """
-    figure = _figure(9.0, 3.8)
+    figure = new_figure(9.0, 3.8)
     of_rotation, of_translation = figure.subplots(1, 2)
     for label, poses, colour in (("before closure", result.chain, BEFORE), ("after optimisation", result.poses, AFTER)):
         known = {k: pose for k, pose in poses.items() if result.true_pose(k) is not None}
@@ -160,7 +171,8 @@ def _root(covariance: Array) -> Array:
     return axes * np.sqrt(np.maximum(variances, 0.0))
 
 
-def _figure(width_in: float, height_in: float) -> Figure:
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Return an empty figure as the page has them."""
     from matplotlib.figure import Figure  # slow to load
 
     return Figure(figsize=(width_in, height_in), layout="constrained")
@@ -182,6 +194,9 @@ def _plain(axis: Axes) -> None:
     axis.grid(color="#e4e6e9", linewidth=0.6)
     axis.set_axisbelow(True)
     axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(labelsize=8)
+    for label in (axis.xaxis.label, axis.yaxis.label):
+        label.set_fontsize(9)
 
 
 def _svg(figure: Figure) -> bytes:
