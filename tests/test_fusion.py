@@ -375,7 +375,6 @@ def test_without_colour_the_model_has_none(ball):
     assert model.colours is None
     assert model.vertex_colours is None
     assert np.array_equal(model.vertices_m, ball.vertices_m)
-    assert FUSER.preview(views, tabletop.trajectory(POSES)).colours is None
 
 
 def test_the_model_moves_with_the_object_frame(ball):
@@ -399,8 +398,7 @@ def test_neither_order_nor_threads_change_a_bit(ball):
 
 def test_views_without_a_pose_are_left_out():
     views, trajectory = tabletop.views(BALL, POSES[:4]), tabletop.trajectory(POSES[:3])
-    for method in (FUSER.fuse, FUSER.preview):
-        assert same(method(views, trajectory), method({k: views[k] for k in range(3)}, trajectory))
+    assert same(FUSER.fuse(views, trajectory), FUSER.fuse({k: views[k] for k in range(3)}, trajectory))
 
 
 def test_a_view_that_looks_elsewhere_changes_nothing_and_one_of_nothing_neither():
@@ -421,7 +419,7 @@ def test_a_handful_of_pixels_is_no_reason_to_fail():
     model = FUSER.fuse({0: few}, {0: np.eye(4)})
     assert model.triangles.shape == (len(model.triangles), 3)
     assert np.isfinite(model.vertices_m).all()
-    assert len(FUSER.preview({0: few}, {0: np.eye(4)}).points_m) > 0
+    assert np.isfinite(FUSER.preview({0: few}, {0: np.eye(4)}).model().points_m).all()
 
 
 def test_input_that_cannot_be_fused_is_refused():
@@ -444,17 +442,6 @@ def test_the_voxels_follow_the_pixels_and_stay_within_their_number(ball):
     pixel_m = tabletop.DISTANCE_M / tabletop.CAMERA.fx
     assert spacing(Fuser().fuse(views, trajectory)) / spacing(ball) == pytest.approx(pixel_m / VOXEL_M, rel=0.1)
     assert len(replace(FUSER, max_voxels=20**3).fuse(views, trajectory).vertices_m) < 0.3 * len(ball.vertices_m)
-
-
-def test_a_preview_is_the_cloud_alone_one_point_a_voxel():
-    views, trajectory = tabletop.views(BRICK, POSES), tabletop.trajectory(POSES)
-    model = FUSER.preview(views, trajectory)
-    assert model.triangles.shape == (0, 3)
-    assert np.abs(BRICK.distance(model.points_m)).max() < 2.0 * VOXEL_M
-    np.testing.assert_allclose(np.linalg.norm(model.normals, axis=1), 1.0)
-    low = np.concatenate([se3.transform(trajectory[k], view.points_m) for k, view in views.items()]).min(axis=0)
-    cells = np.floor((model.points_m - low) / (2.0 * VOXEL_M) + 1e-9).astype(int)
-    assert len(np.unique(cells, axis=0)) == len(cells)
 
 
 # What is known of each vertex, and of colours.
@@ -529,7 +516,8 @@ def test_differences_of_exposure_are_evened_out(brick):
 def test_a_view_without_colour_leaves_the_colours_to_others(brick):
     views = tabletop.views(BRICK, POSES)
     views[4] = replace(views[4], frame=replace(views[4].frame, colour=None))
-    for model in (FUSER.fuse(views, tabletop.trajectory(POSES)), FUSER.preview(views, tabletop.trajectory(POSES))):
+    trajectory = tabletop.trajectory(POSES)
+    for model in (FUSER.fuse(views, trajectory), FUSER.preview(views, trajectory).model()):
         assert model.colours is not None
         top = (np.abs(model.points_m[:, :2]) < [0.05, 0.03]).all(axis=1) & (model.points_m[:, 2] > 0.03)
         assert np.abs(model.colours[top].astype(int) - [128, 128, 228]).max() <= 2

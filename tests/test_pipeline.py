@@ -139,12 +139,13 @@ def test_true_edges_give_the_true_trajectory_in_the_camera_frame_of_the_first_vi
     assert trajectory_error(last) < 1e-6
 
 
-def test_each_frame_gives_one_step_and_the_last_one_the_mesh() -> None:
+def test_each_frame_gives_one_step_with_a_preview_and_the_last_one_the_model() -> None:
     steps = run()
     assert [step.frame.index for step in steps] == list(range(9))
     assert [step.last for step in steps] == [False] * 8 + [True]
     models = [step.model for step in steps if step.model is not None]
-    assert [len(model.triangles) > 0 for model in models] == [False] * 8 + [True]
+    assert all(len(model.triangles) > 0 for model in models)
+    assert [model.vertex_views is not None for model in models] == [False] * 8 + [True]  # made with care
     assert all(len(model.points_m) > 0 for model in models)
 
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
-from modeler.fusion import cloud, grid
+from modeler.fusion import grid
+from modeler.fusion.growing import Growing
 from modeler.fusion.scan import Scan
-from modeler.fusion.stack import GREY, SMOOTHED, colours_at, posed, spread, stack
+from modeler.fusion.stack import SMOOTHED, posed, spread, stack
 from modeler.types import Array, InputError, ObjectModel, RayImage
 
 
@@ -29,7 +30,11 @@ class Fuser:
     max_voxels: int = 192**3
     """The voxels grow until the object's box holds no more than so many."""
     preview_voxels: float = 2.0
-    """Spacing of the cloud of a preview, in voxels."""
+    """Side of a voxel of a preview, in voxels of the model."""
+    preview_limit: int = 128**3
+    """The voxels of a preview grow until its box holds no more than so many."""
+    preview_moves: int = 8
+    """At most so many views whose poses have moved are carried along from one preview to the next."""
     min_cosine: float = 0.15
     """Surface seen at a more grazing angle than this cosine (normal to ray) is not used."""
     edge_weight: float = 0.1
@@ -50,41 +55,19 @@ class Fuser:
     """Loose pieces of the mesh smaller than this share of the largest piece's area are removed."""
 
     def preview(
-        self,
-        views: Mapping[int, RayImage],
-        trajectory: Mapping[int, Array],
-        covariances: Mapping[int, Array] | None = None,
-    ) -> ObjectModel:
-        """Return the merged cloud alone, one point a voxel, without a mesh: cheap enough for every frame.
+        self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array], before: Growing | None = None
+    ) -> Growing:
+        """Return a coarse model that costs little more than what has changed since the one before.
 
         Args:
             views: by frame number; those without a pose are left out.
             trajectory: object_from_camera (4, 4) by frame number.
-            covariances: of the poses; a preview does not look at them.
+            before: what this returned for fewer views or older poses; None: begin afresh.
 
         Raises:
             InputError: where no view with surface points has a pose.
         """
-        pairs = posed(views, trajectory)
-        points, normals, colours = cloud.painted(
-            np.concatenate([se3.transform(pose, view.points_m) for view, pose in pairs]),
-            np.concatenate([view.normals @ pose[:3, :3].T for view, pose in pairs]),
-            np.concatenate([colours_at(view) for view, _ in pairs]),
-            np.concatenate([np.full(len(view.points_m), view.frame.colour is not None) for view, _ in pairs]),
-            voxel_m=self.preview_voxels * self._voxel_m(pairs),
-            max_voxels=self.max_voxels,
-            unknown=GREY,
-        )
-        coloured = any(view.frame.colour is not None for view, _ in pairs)
-        return ObjectModel(
-            points_m=points,
-            normals=normals,
-            colours=colours if coloured else None,
-            vertices_m=np.zeros((0, 3)),
-            triangles=np.zeros((0, 3), dtype=np.int64),
-            vertex_normals=np.zeros((0, 3)),
-            vertex_colours=np.zeros((0, 3), dtype=np.uint8) if coloured else None,
-        )
+        return (before or Growing(self)).to(views, trajectory)
 
     def fuse(
         self,
@@ -117,7 +100,7 @@ class Fuser:
         """Return the views laid together in one volume, from which models are made; arguments as of `fuse`."""
         pairs = posed(views, trajectory)
         noise_m = float(np.median([view.sigma_r_m for view, _ in pairs]))
-        voxel_m = self._voxel_m(pairs)
+        voxel_m = self.side_m(pairs)
         box = grid.around(
             np.concatenate([se3.transform(pose, view.points_m) for view, pose in pairs]),
             voxel_m=voxel_m,
@@ -138,7 +121,7 @@ class Fuser:
         tau_m = self.truncation_m or 3.0 * box.voxel_m + 2.0 * spread_m
         return Scan(self, seen.carving(tau_m), box, tau_m, box.voxel_m + 2.0 * spread_m, sigma_m)
 
-    def _voxel_m(self, pairs: list[tuple[RayImage, Array]]) -> float:
+    def side_m(self, pairs: list[tuple[RayImage, Array]]) -> float:
         """Return the side of a voxel, before the box is known."""
         if self.voxel_m is not None:
             if not self.voxel_m > 0.0:

@@ -20,7 +20,6 @@ from modeler.types import (
     AbstractRegistrar,
     Edge,
     Frame,
-    ObjectModel,
     Outcome,
     Posterior,
     RayImage,
@@ -30,7 +29,6 @@ from modeler.types import (
 
 ACCEPTED = "accepted"
 _MOST_SHARED = 0.5  # loops tell of more, but do not see what adds up along a chain: errors common to all edges
-_PREVIEWED = 40  # views that the model is made of while frames still come
 
 
 @dataclass(frozen=True)
@@ -74,15 +72,15 @@ class Modeler:
             state, step = self._joined(state.read(frame.index), seen, state.latest, last=last)
             if last:
                 for later, found in self._caught_up(state):
-                    state = later
-                    yield replace(found, model=self._fused(state, last=False))
+                    state = self._fused(replace(later, growing=state.growing), last=False)
+                    yield replace(found, model=state.model)
                 state, spans = self._spanned(state)
                 state = self._solved(state)
                 step = replace(step, posteriors=(*step.posteriors, *(edge.posterior for edge in spans)))
                 step = replace(step, edges=(*step.edges, *spans))
                 step = replace(step, solution=state.solution, edges_so_far=state.graph.edges, views=state.views)
             if state.views and (last or step.outcome == ACCEPTED):
-                state = replace(state, model=self._fused(state, last=last))
+                state = self._fused(state, last=last)
             yield replace(step, model=state.model, last=last)
 
     def view(self, frame: Frame, scene: Scene) -> tuple[Segmentation, RayImage | None]:
@@ -189,13 +187,13 @@ class Modeler:
             return view
         return state.ready.get(view.index) or self.sensor.ray_image(view.frame, view.plane)
 
-    def _fused(self, state: State, *, last: bool) -> ObjectModel:
+    def _fused(self, state: State, *, last: bool) -> State:
+        """Return the state with its model: that of before brought up to date, or in the end one made with care."""
         if last:
             sure = own_covariances(state.solution, state.graph.edges)
-            return self.fuser.fuse(state.views, state.solution.trajectory, sure)
-        frames = list(state.views)
-        spread = np.unique(np.linspace(0, len(frames) - 1, _PREVIEWED).round().astype(int))
-        return self.fuser.preview({frames[k]: state.views[frames[k]] for k in spread}, state.solution.trajectory)
+            return replace(state, model=self.fuser.fuse(state.views, state.solution.trajectory, sure))
+        growing = self.fuser.preview(state.views, state.solution.trajectory, state.growing)
+        return replace(state, growing=growing, model=growing.model())
 
 
 def _lasting(posterior: Posterior) -> Posterior:

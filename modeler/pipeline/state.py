@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from modeler.fusion import Growing
 from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.types import Edge, Frame, ObjectModel, RayImage, Segmentation, Solution
 
@@ -40,6 +41,8 @@ class State:
     """Frames that show the object and were left out."""
     model: ObjectModel | None = None
     """The newest model."""
+    growing: Growing | None = None
+    """What it grows from while frames still come."""
 
     @property
     def solution(self) -> Solution:
