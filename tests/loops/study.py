@@ -109,8 +109,8 @@ def _figures(case: Case, step: Step, registrations: int, seconds: float, peak_mi
             whole.max_rotation_deg,
             1e3 * chain.max_translation_m,
             1e3 * whole.max_translation_m,
-            _nees(_chain(step), truth),
-            _nees(solution, truth),
+            mean_nees(_chain(step), truth),
+            mean_nees(solution, truth),
         ]
     measured = {(edge.target, edge.source): edge.posterior.pose.mean for edge in loops}
     return Result(
@@ -145,7 +145,7 @@ def _chain(step: Step) -> Solution:
     return solve(PoseGraph(tuple(placed.values()), first=first), {})
 
 
-def _nees(solution: Solution, truth: Mapping[int, Array]) -> float | None:
+def mean_nees(solution: Solution, truth: Mapping[int, Array]) -> float | None:
     """Return the mean NEES of the poses relative to the first, a degree of freedom."""
     first, *others = solution.trajectory
     values = [
