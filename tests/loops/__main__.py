@@ -1,7 +1,7 @@
 """Build whole sequences and report the error before and after loop closure: `PYTHONPATH=tests python -m loops`.
 
-The table goes to stdout, progress to stderr, and loops.json into a folder. The status is 1 where, on a rendered case,
-the error after is more than 0.6 of that before, or above 1°.
+The table goes to stdout, progress to stderr, and loops.json into a folder, for a long sequence beside costs.png. The
+status is 1 where, on a rendered case, the error after is more than 0.6 of that before, or above 1°.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from loops.cases import Case, bundled, real, rendered, turned
+from loops.costs import Cost, drawn
 from loops.study import Result, modeler, run
 from modeler.closure import Closer
 from modeler.export import write_atomically
@@ -50,8 +51,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     results = []
     for case, seed in cases:
         maker = modeler(case, closer, seed, told_truth=options.told_truth, lies=options.lies)
-        results.append(run(maker, case, _Progress(case.name, every=20 if options.long else 0)))
+        progress = _Progress(case.name, every=20 if options.long else 0)
+        results.append(run(maker, case, progress))
         print(_row(_cells(results[-1])), flush=True)
+        if options.long:
+            costs = [cost.values() for cost in progress.costs]
+            write_atomically(options.out / "costs.json", json.dumps(costs, indent=1) + "\n")
+            write_atomically(options.out / "costs.png", drawn(progress.costs))
     if len(options.seeds) > 1:
         print(_row(_cells(_mean(results))), flush=True)
     write_atomically(options.out / "loops.json", json.dumps([result.values() for result in results], indent=1) + "\n")
@@ -106,17 +112,17 @@ class _Progress:
     """Tells on stderr what frames cost, `every` so many; 0: only of frames left out."""
 
     def __init__(self, name: str, *, every: int) -> None:
-        self._name, self._every, self._spent, self._steps = name, every, [], 0
+        self._name, self._every = name, every
+        self.costs: list[Cost] = []
 
     def __call__(self, step: Step, seconds: float, memory_mib: float) -> None:
-        self._spent.append(seconds)
-        self._steps += 1
+        self.costs.append(Cost(step.frame.index, seconds, len(step.posteriors), memory_mib))
         if step.outcome != "accepted":
             print(f"{self._name}: frame {step.frame.index}: {step.outcome}", file=sys.stderr, flush=True)
-        if self._every and self._steps % self._every == 0:
-            figures = f"{np.median(self._spent):.2f} s a frame (mean {np.mean(self._spent):.2f}), {memory_mib:.0f} MiB"
+        if self._every and len(self.costs) % self._every == 0:
+            spent = [cost.seconds for cost in self.costs[-self._every :]]
+            figures = f"{np.median(spent):.2f} s a frame (mean {np.mean(spent):.2f}), {memory_mib:.0f} MiB"
             print(f"{self._name}: to frame {step.frame.index}: {figures}", file=sys.stderr, flush=True)
-            self._spent = []
 
 
 if __name__ == "__main__":
