@@ -33,17 +33,25 @@ class Sensor:
             plane: the support plane, where one is seen.
         """
         camera = frame.camera
-        seen = np.isfinite(frame.depth_m) & (frame.depth_m > 0)
-        mask = seen if frame.mask is None else seen & frame.mask
-        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         depth_m = np.ascontiguousarray(frame.depth_m, dtype=np.float32)
-        cells = planes.local_planes(
-            depth_m, mask, intrinsics, self._ball(frame, mask), self._sigma_inverse(frame, mask)
-        )
+        mask = (depth_m > 0) & (depth_m < np.inf)  # not NaN either
+        if frame.mask is not None:
+            mask &= frame.mask
         # Object pixels that carry no depth still hide what is behind them: the silhouette is the whole mask's.
         outline = mask if frame.mask is None else frame.mask
-        cells[..., planes.SILHOUETTE] = planes.silhouette_distance(outline, self.max_silhouette_px)
-        rows, columns = np.nonzero(cells[..., planes.KIND] == planes.SURFACE)
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        rows, columns = _places(mask)
+        ball, sigma_inverse = self._smoothing(frame, rows, columns)
+        cells = planes.local_planes(
+            depth_m,
+            mask,
+            planes.silhouette_distance(outline, self.max_silhouette_px),
+            intrinsics,
+            ball,
+            sigma_inverse,
+        )
+        smooth = cells[rows, columns, planes.KIND] == planes.SURFACE
+        rows, columns = rows[smooth], columns[smooth]
         points_m, normals = surface_points(cells, rows, columns, intrinsics)
         cosine = -np.sum(points_m * normals, axis=1) / np.linalg.norm(points_m, axis=1)
         frontal = cosine > self.min_cosine
@@ -59,30 +67,34 @@ class Sensor:
             layers={"cells": cells, "variance_m2": cells[rows, columns, planes.VARIANCE].astype(np.float64)},
         )
 
-    def _ball(self, frame: Frame, mask: np.ndarray) -> tuple[float, int, int]:
-        """Return the radius in m of the smoothing ball, in px at the nearest point, and the step between its pixels."""
-        rows, columns = np.nonzero(mask)
+    def _smoothing(self, frame: Frame, rows: np.ndarray, columns: np.ndarray) -> tuple[tuple[float, int, int], float]:
+        """Return how the object at some pixels is smoothed.
+
+        Returns:
+            Radius in m of the ball, in px at the nearest point, and the step between its pixels; and the least noise of
+            inverse depth (1/m) that a plane's residuals are taken to show.
+        """
         if rows.size == 0:
-            return 0.01, 1, 1
+            return (0.01, 1, 1), self.sigma_r_m
         depth_m = frame.depth_m[rows, columns]
-        middle_m = float(np.median(depth_m))
+        nearest_m, middle_m = (float(value) for value in np.percentile(depth_m, [2, 50]))
         metres_per_px = middle_m / frame.camera.fx
         extent_m = metres_per_px * float(np.hypot(np.ptp(rows), np.ptp(columns)))
         density = rows.size / max(float(frame.mask.sum()) if frame.mask is not None else rows.size, 1.0)
         sparse_px = np.sqrt(self.min_neighbours / (np.pi * max(density, 0.01)))
         radius_m = max(self.smoothing * extent_m, sparse_px * metres_per_px)
-        nearest_m = float(np.percentile(depth_m, 2))
         reach_px = int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, 16))
         # Every second pixel in a row is enough where a wide window holds many.
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours
-        return radius_m, reach_px, 2 if reach_px > 4 and enough else 1
-
-    def _sigma_inverse(self, frame: Frame, mask: np.ndarray) -> float:
-        """Return the least noise of inverse depth (1/m) that a plane's residuals are taken to show."""
-        if not mask.any():
-            return self.sigma_r_m
         # A tenth of the sensor's noise: neighbouring pixels may agree better than they are true.
-        return 0.1 * self.sigma_r_m / float(np.median(frame.depth_m[mask])) ** 2
+        return (radius_m, reach_px, 2 if reach_px > 4 and enough else 1), 0.1 * self.sigma_r_m / middle_m**2
+
+
+def _places(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows and columns (n,) of the pixels that a mask (h, w) holds."""
+    top, bottom, left, right = planes.bounds(mask)
+    rows, columns = np.nonzero(mask[top:bottom, left:right])
+    return rows + top, columns + left
 
 
 def surface_points(cells: np.ndarray, rows: np.ndarray, columns: np.ndarray, intrinsics: Array) -> tuple[Array, Array]:

@@ -120,7 +120,7 @@ def mean(
     for _ in range(iterations):
         step, _ = moves.moments(flat, weights, rows(centre), point_m)
         centre = moved(centre, step, point_m)
-        if np.linalg.norm(step) < 1e-12:
+        if np.linalg.norm(step) < 1e-10:
             break
     return centre, moves.moments(flat, weights, rows(centre), point_m)[1]
 

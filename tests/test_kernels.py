@@ -225,10 +225,11 @@ def test_local_planes_are_least_squares_in_inverse_depth(rng):
     depth_m[rng.random(SHAPE) < 0.1] = np.nan
     mask = np.zeros(SHAPE, dtype=bool)
     mask[2:14, 3:17] = True
-    radius_m = 0.09
-    cells = planes.local_planes(depth_m.astype(np.float32), mask, INTRINSICS, (radius_m, 4, 1), 1e-6)
+    radius_m, edge_px = 0.09, rng.random(SHAPE).astype(np.float32)
+    cells = planes.local_planes(depth_m.astype(np.float32), mask, edge_px, INTRINSICS, (radius_m, 4, 1), 1e-6)
     fitted = np.argwhere(cells[..., planes.VARIANCE] > 0)
     assert len(fitted) > 60
+    np.testing.assert_array_equal(cells[..., planes.SILHOUETTE], edge_px)
     for pixel in fitted[::5]:
         want = naive.local_plane(np.where(mask, depth_m, 0).astype(np.float32), mask, INTRINSICS, pixel, radius_m)
         got = -cells[(*pixel, slice(0, 3))] / cells[(*pixel, planes.DISTANCE)]
@@ -240,9 +241,9 @@ def test_a_noise_free_plane_is_found_whatever_its_tilt():
     normal = np.array([0.5, -0.3, -0.8])
     plane = -normal / np.linalg.norm(normal) / 0.6
     depth_m = 1 / (plane[0] * w[None, :] + plane[1] * w[:, None] + plane[2])
-    mask = np.ones((64, 64), dtype=bool)
+    mask, edge_px = np.ones((64, 64), dtype=bool), np.zeros((64, 64), dtype=np.float32)
     intrinsics = np.array([100.0, 100.0, 31.5, 31.5])
-    cells = planes.local_planes(depth_m.astype(np.float32), mask, intrinsics, (0.04, 6, 2), 1e-6)
+    cells = planes.local_planes(depth_m.astype(np.float32), mask, edge_px, intrinsics, (0.04, 6, 2), 1e-6)
     inner = cells[20:44, 20:44]
     assert (inner[..., planes.KIND] == planes.SURFACE).all()
     got = -inner[..., :3] / inner[..., planes.DISTANCE, None]

@@ -108,7 +108,7 @@ def add_line(points, row, shift, pad, radius_m2, step, sums):
 
 
 @numba.njit(cache=True, parallel=True)
-def local_planes(depth_m, mask, intrinsics, ball, sigma_inverse):
+def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse):
     """Fit a plane to every object pixel's neighbours within a ball.
 
     A plane is linear in inverse depth over the image (1/z = N · (w, h, 1)), and the noise of a triangulating camera
@@ -118,12 +118,13 @@ def local_planes(depth_m, mask, intrinsics, ball, sigma_inverse):
     Args:
         depth_m: (h, w) z in m, NaN = missing.
         mask: (h, w) bool, object.
+        silhouette_px: (h, w) of `silhouette_distance`, taken over into the cells.
         intrinsics: (4,) fx, fy, cx, cy in px.
         ball: radius in m; half-width of its window in px; step between the pixels that are read.
         sigma_inverse: sensor noise of 1/z, in 1/m.
 
     Returns:
-        (h, w, 8) float32 cells, columns as above; the silhouette column is left at 0.
+        (h, w, 8) float32 cells, columns as above.
     """
     height, width = depth_m.shape
     fx, fy, cx, cy = intrinsics
@@ -136,6 +137,7 @@ def local_planes(depth_m, mask, intrinsics, ball, sigma_inverse):
         for column in range(width):
             for k in range(CELL_SIZE):
                 cells[row, column, k] = 0.0
+            cells[row, column, SILHOUETTE] = silhouette_px[row, column]
             if depth_m[row, column] > 0.0:
                 cells[row, column, DEPTH] = depth_m[row, column]
                 cells[row, column, KIND] = RAGGED if mask[row, column] else BACKGROUND

@@ -209,23 +209,22 @@ def classify(pose, sight, model):
 
 
 @numba.njit(cache=True)
-def matched_residuals(pose, sight, blur_m):
+def excess(pose, sight, blur_m):
     """Return what surface noise explains the matched points of a `Sight` under one pose (12,).
 
     Returns:
-        (k,) squared distance from the surface, less the variances of point and plane, in m², of the points that are
-        no farther than 4 standard deviations, of which `blur_m` is a part.
+        Sum in m² of the squared distances from the surface, less the variances of point and plane, over the points that
+        are no farther than 4 standard deviations, of which `blur_m` is a part; and how many they are.
     """
     carried, pixels, found = buffers(sight)
     look(pose, sight, carried, pixels, found)
-    squares = np.empty(pixels.shape[0])
-    count = 0
+    total, count = 0.0, 0
     for j in range(pixels.shape[0]):
         if found[KIND, j] != SURFACE or carried[FACES, j] < 0.5:
             continue
         square = np.float64(height_over(carried, found, j)) ** 2
         known = np.float64(sight.points[VARIANCE_M2, j]) + np.float64(found[VARIANCE, j])
         if square < 16.0 * (known + blur_m * blur_m):
-            squares[count] = square - known
+            total += square - known
             count += 1
-    return squares[:count]
+    return total, count

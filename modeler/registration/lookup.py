@@ -36,9 +36,9 @@ class Lookup:
         """Return the verdict (n,) of `kernels.visibility` on each point under one pose (12,)."""
         return kernel.classify(pose, self.sight(), self.model(0.0))
 
-    def matched_residuals(self, pose: Array, blur_m: float) -> Array:
-        """Return squared distances (k,) in m² of matching points beyond their own variance, under one pose (12,)."""
-        return kernel.matched_residuals(pose, self.sight(), float(np.hypot(blur_m, self.surface_m)))
+    def excess(self, pose: Array, blur_m: float) -> tuple[float, int]:
+        """Return the sum in m² of squared distances of matches beyond their variances under a pose (12,); how many."""
+        return kernel.excess(pose, self.sight(), float(np.hypot(blur_m, self.surface_m)))
 
     def misfits(self, pose: Array, blur_m: float) -> Array:
         """Return what each match under one pose (12,) loses to distance and normals (nats), (k,)."""

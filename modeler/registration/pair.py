@@ -13,6 +13,8 @@ from modeler.registration.lookup import Lookup
 from modeler.se3 import matrices, rows
 from modeler.types import Array
 
+_FEW = 20  # so many matches say nothing of their noise
+
 
 @dataclass(frozen=True, eq=False)
 class Pair:
@@ -79,7 +81,7 @@ class Pair:
                 self.backward.misfits(rows(se3.inverse(pose)), blur_m),
             ]
         )
-        if len(misfits) < 20:
+        if len(misfits) <= _FEW:
             return 0.5
         hidden = self.forward.hidden_share
         low, high = 0.0, 2.0
@@ -147,24 +149,18 @@ class Pair:
         )
         return matrices(visited[np.arange(max_strides) < counts[:, None]])
 
-    def surface_noise_m(self, poses: Array, blur_m: float) -> float:
+    def surface_noise_m(self, pose: Array, blur_m: float) -> float:
         """Return the standard deviation in m of matching surfaces' distance, beyond their pixels' noise.
 
-        It holds what smoothing does to curved surfaces, the sensor's noise that neighbours share, and what is left of
-        the spread of the samples `poses` (n, 4, 4): a nuisance parameter, at its most likely value given the samples.
-        Points farther apart than 4 standard deviations of the present blur do not match.
+        It holds what smoothing does to curved surfaces and the sensor's noise that neighbours share: a nuisance
+        parameter, at its most likely value given a pose (4, 4). Points farther apart than 4 standard deviations of the
+        present blur do not match.
         """
-        variances = []
-        for pose in poses[:: max(len(poses) // 20, 1)]:
-            matched = np.concatenate(
-                [
-                    self.forward.matched_residuals(rows(pose), blur_m),
-                    self.backward.matched_residuals(rows(se3.inverse(pose)), blur_m),
-                ]
-            )
-            if len(matched) > 20:
-                variances.append(np.mean(matched))
-        return float(np.sqrt(max(np.median(variances), 0.0))) if variances else blur_m
+        there, matched = self.forward.excess(rows(pose), blur_m)
+        back, matched_back = self.backward.excess(rows(se3.inverse(pose)), blur_m)
+        if matched + matched_back <= _FEW:
+            return blur_m
+        return float(np.sqrt(max((there + back) / (matched + matched_back), 0.0)))
 
     def overlap(self, target_from_source: Array) -> float:
         """Return the share of points that should be seen by both cameras and are."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
-from modeler.kernels import matching
+from modeler.kernels import matching, patches
 from modeler.registration.lookup import Lookup
 from modeler.registration.pair import Pair
 from modeler.se3 import rows
@@ -73,10 +73,10 @@ class Refiner:
         # The noise of either surface's normals would add up in its own square; in their product it averages out.
         products = 0.5 * weights[:, None, None] * (by_own[:, :, None] * by_other[:, None, :])
         sensitivity, axes = np.linalg.eigh((products + products.transpose(0, 2, 1)).sum(axis=0))
-        patches, count = _patches(places, halvings), 2**halvings
+        numbers, count = patches.halved(places, halvings), 2**halvings
         scores, parts = np.zeros((count, 6)), np.zeros((count, 6))
-        np.add.at(scores, patches, 0.5 * (by_own + by_other) @ axes * (weights * residuals)[:, None])
-        np.add.at(parts, patches, (by_own @ axes) * (by_other @ axes) * weights[:, None])
+        np.add.at(scores, numbers, 0.5 * (by_own + by_other) @ axes * (weights * residuals)[:, None])
+        np.add.at(parts, numbers, (by_own @ axes) * (by_other @ axes) * weights[:, None])
         variability = scores.T @ scores * count / (count - 1.0)
         error = np.std(parts, axis=0, ddof=1) * np.sqrt(count)
         sure = np.diag(np.maximum(sensitivity - self.caution * error, 0.0))
@@ -88,13 +88,13 @@ class Refiner:
 def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: float) -> tuple[Array, float]:
     """Return where matching surface and the spread (6, 6) of the samples about their mean settle, and the noise."""
     precision = np.linalg.inv(spread @ spread.T)
-    pose, noise_m = start, pair.surface_noise_m(start[None], fine_m)
+    pose, noise_m = start, pair.surface_noise_m(start, fine_m)
     for _ in range(8):
         gradient, matrix = pair.normal_equations(pose[None], noise_m)
         away = se3.difference(start, pose, centre_m)
         step = np.linalg.solve(matrix[0] + precision, gradient[0] - precision @ away)
         pose = se3.moved(pose, step, centre_m)
-        noise_m = pair.surface_noise_m(pose[None], fine_m)
+        noise_m = pair.surface_noise_m(pose, fine_m)
         if np.linalg.norm(np.linalg.solve(spread, step)) < 0.01:  # standard deviations
             break
     return pose, noise_m
@@ -129,19 +129,3 @@ def _equations(pair: Pair, pose: Array, noise_m: float, centre_m: Array) -> tupl
         parts.append((arms, *derivatives, found[:, matching.RESIDUAL], found[:, matching.WEIGHT]))
     arms, by_own, by_other, residuals, weights = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return arms, by_own, by_other, residuals, weights
-
-
-def _patches(points_m: Array, halvings: int) -> np.ndarray:
-    """Return the patch number (n,) of each point (n, 3): halves of halves, each cut across its longest side."""
-    patches = np.zeros(len(points_m), dtype=np.int64)
-    groups = [np.arange(len(points_m))]
-    for _ in range(halvings):
-        cut = []
-        for group in groups:
-            side = int(np.argmax(np.ptp(points_m[group], axis=0)))
-            ordered = group[np.argsort(points_m[group, side], kind="stable")]
-            cut += [ordered[: len(ordered) // 2], ordered[len(ordered) // 2 :]]
-        groups = cut
-    for number, group in enumerate(groups):
-        patches[group] = number
-    return patches

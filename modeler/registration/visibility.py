@@ -88,8 +88,8 @@ class VisibilityRegistrar(AbstractRegistrar):
         )
         samples = np.concatenate([place.poses for _, place in places])
         weights = np.concatenate([np.full(len(place.poses), share / len(place.poses)) for share, place in places])
-        pose = weighted_gaussian(samples, weights, pair.centre_m)
         modes = tuple(Mode(share, place.gaussian(pair.centre_m)) for share, place in places)
+        pose = modes[0].pose if len(modes) == 1 else weighted_gaussian(samples, weights, pair.centre_m)
         overlap = pair.overlap(modes[0].pose.mean)
         effective = 1.0 / sum(share**2 / place.effective_samples for share, place in places)
         beyond = candidates.beyond > self.max_beyond
@@ -111,7 +111,7 @@ class VisibilityRegistrar(AbstractRegistrar):
     def _place(self, pair: Pair, motion: AbstractMotion, candidates: Candidates, rng: np.random.Generator) -> Place:
         """Return samples of one place, sharpened by matching surface but where that would leave what is possible."""
         fine_m = self.search.blurs[-1] * pair.size_m
-        noise_m = pair.surface_noise_m(candidates.poses[:1], fine_m)
+        noise_m = pair.surface_noise_m(candidates.poses[0], fine_m)
         likelihood = partial(
             pair.tempered,
             blur_m=noise_m,
