@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -24,6 +24,7 @@ _SIDE: Final = np.array([0, 1])  # across and up: the plane of a picture from th
 _ABOVE: Final = np.array([0, 2])  # across and away: the plane of one from above
 _NEARNESS: Final = np.array([0.0, 1.0, -1.0])  # to the eye of both pictures, along what their planes leave out
 _STRAY: Final = 0.002  # the share of points at either end that may lie outside the picture
+_TALLEST_IN: Final = 7.0  # the picture, so that a page shows it whole
 _LEVEL_COLOUR: Final = "#c8453f"
 
 
@@ -42,12 +43,6 @@ class _Cloud:
         kept = away_m <= np.quantile(away_m, _SLICE)
         return _Cloud(self.points_m[kept], self.order[kept])
 
-    def box_m(self, plane: npt.NDArray[np.int64]) -> Array:
-        """Return the lowest and the highest coordinates (2, 2) in a plane, with a margin, without a few strays."""
-        low, high = np.quantile(self.points_m[:, plane], (_STRAY, 1.0 - _STRAY), axis=0)
-        margin_m = _MARGIN * float((high - low).max()) + 1e-6
-        return np.array([low - margin_m, high + margin_m])
-
 
 def merged_clouds(result: Result, surfaces_m: Mapping[int, Array]) -> bytes:
     """Draw merged clouds before and after closure, from the side and in a slice from above, coloured by frame, as PNG.
@@ -58,12 +53,12 @@ def merged_clouds(result: Result, surfaces_m: Mapping[int, Array]) -> bytes:
     """
     axes = _broadside(result, surfaces_m)
     before, after = (_merged(poses, surfaces_m, axes) for poses in (result.chain, result.poses))
-    box_m = after.box_m(_SIDE)
+    box_m = _box_m((before, after), _SIDE)
     level_m = float(box_m[:, 1].mean())
     slices = [cloud.near(level_m) for cloud in (before, after)]
-    slice_box_m = slices[1].box_m(_ABOVE)
+    slice_box_m = _box_m(slices, _ABOVE)
     shares = [float(np.ptp(box[:, 1]) / np.ptp(box[:, 0])) for box in (box_m, slice_box_m)]
-    figure = new_figure(9.0, 4.4 * sum(shares) + 0.6)
+    figure = new_figure(9.0, min(4.4 * sum(shares) + 0.6, _TALLEST_IN))
     (top, bottom) = figure.subplots(2, 2, height_ratios=shares)
     for axis, cloud, title in zip(top, (before, after), ("before closure", "after closure"), strict=True):
         _draw(axis, cloud, _SIDE, box_m, size=0.5)
@@ -93,6 +88,14 @@ def _merged(poses: Mapping[int, PoseGaussian], surfaces_m: Mapping[int, Array], 
         se3.transform(pose.mean, surfaces_m[frame]) @ axes.T for frame, pose in poses.items() if frame in surfaces_m
     ]
     return _Cloud(np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts]))
+
+
+def _box_m(clouds: Sequence[_Cloud], plane: npt.NDArray[np.int64]) -> Array:
+    """Return the lowest and the highest coordinates (2, 2) in a plane, with a margin, without a few strays."""
+    places_m = np.concatenate([cloud.points_m[:, plane] for cloud in clouds])
+    low, high = np.quantile(places_m, (_STRAY, 1.0 - _STRAY), axis=0)
+    margin_m = _MARGIN * float((high - low).max()) + 1e-6
+    return np.array([low - margin_m, high + margin_m])
 
 
 def _draw(axis: Axes, cloud: _Cloud, plane: npt.NDArray[np.int64], box_m: Array, *, size: float) -> None:
