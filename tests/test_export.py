@@ -19,9 +19,10 @@ from modeler import se3
 from modeler.export import (
     RunFolder,
     RunMeta,
+    edges_of,
     export_mesh,
     g2o_text,
-    posteriors_of,
+    poses_of,
     read_model,
     simplified,
     textured,
@@ -442,17 +443,20 @@ def test_posteriors_come_back_from_the_report_to_the_bit(tmp_path: Path) -> None
     )  # fmt: skip
     edges = (replace(step.edges_so_far[0], posterior=rich), *step.edges_so_far[1:])
     run.write(replace(step, edges_so_far=edges), META)
-    back = posteriors_of(run.report())
-    assert set(back) == {(edge.source, edge.target) for edge in edges}
-    for edge in edges:
-        posterior = back[edge.source, edge.target]
+    report = run.report()
+    for edge, back in zip(edges, edges_of(report), strict=True):
+        posterior = back.posterior
+        assert (back.source, back.target, back.kind) == (edge.source, edge.target, edge.kind)
+        assert (back.accepted, back.reason) == (edge.accepted, edge.reason)
         np.testing.assert_array_equal(posterior.pose.mean, edge.posterior.pose.mean)
         np.testing.assert_array_equal(posterior.pose.covariance, edge.posterior.pose.covariance)
         assert posterior.outcome is edge.posterior.outcome
         for name in ("overlap", "effective_samples", "pareto_k", "log_evidence", "seconds"):
             np.testing.assert_equal(getattr(posterior, name), getattr(edge.posterior, name))
-    np.testing.assert_array_equal(back[5, 3].information, information)
-    assert back[7, 5].information is None
+        np.testing.assert_array_equal(posterior.information, edge.posterior.information)
+    for frame, pose in poses_of(report).items():
+        np.testing.assert_array_equal(pose.mean, step.solution.trajectory[frame])
+        np.testing.assert_array_equal(pose.covariance, step.solution.covariances[frame])
 
 
 def test_existing_run_is_not_written_over_unasked(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from rings import OBJECT_M, edge, measured, ring, spin, turntable
 
 from modeler import se3
 from modeler.export import edge_record, g2o_text
-from modeler.export.report import posteriors_of
+from modeler.export.reading import edges_of
 from modeler.export.words import undetermined
 from modeler.graph import PoseGraph, solve
 from modeler.types import Array, Camera, Frame, Mode, Outcome, Plane, PoseGaussian, Posterior, RayImage, Solution
@@ -124,7 +124,7 @@ def test_report_holds_modes_words_and_what_the_graph_made_of_them() -> None:
         assert [mode["weight"] for mode in record["modes"]] == [0.7, 0.3]
         np.testing.assert_allclose([mode["weight_in_graph"] for mode in record["modes"]], wanted, atol=1e-6)
         np.testing.assert_array_equal(record["modes"][1]["target_from_source"], posterior.modes[1].pose.mean.ravel())
-        back = posteriors_of({"edges": [record]})[1, 0]
+        back = edges_of({"edges": [record]})[0].posterior
         assert [mode.weight for mode in back.modes] == [0.7, 0.3]
         for mode, other in zip(back.modes, posterior.modes, strict=True):
             np.testing.assert_array_equal(mode.pose.mean, other.pose.mean)
@@ -135,10 +135,10 @@ def test_report_holds_modes_words_and_what_the_graph_made_of_them() -> None:
     assert (plain["modes"], plain["undetermined"]) == ([], [])
 
 
-def test_report_of_a_run_without_modes_still_resumes() -> None:
+def test_report_of_a_run_without_modes_is_read_back() -> None:
     record = edge_record(edge(0, 1, _posterior(SURE_RAD, SURE_M).pose), Solution())
     del record["modes"]
-    assert posteriors_of({"edges": [record]})[1, 0].modes == ()
+    assert edges_of({"edges": [record]})[0].posterior.modes == ()
 
 
 def test_graph_file_holds_the_mode_that_was_chosen() -> None:

@@ -7,11 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from modeler.cli import compose
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
-from modeler.export import RunFolder, posteriors_of
+from modeler.export import RunFolder, edges_of, poses_of
 from modeler.fusion import Fuser, Scan, own_covariances
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline import ACCEPTED
@@ -79,21 +77,7 @@ def reopened(run: Path, sequence: Path | None = None) -> Reopened:
         views[record["id"]] = view
     edges = edges_of(report)
     sensor = Sensor() if noise is None else Sensor(*noise)
-    return Reopened(whole.name, report, sensor, views, edges, solved(edges, poses_of(report)), whole)
-
-
-def edges_of(report: Mapping[str, Any]) -> tuple[Edge, ...]:
-    """Return the edges in a report, without their samples."""
-    posteriors = posteriors_of(report)
-    return tuple(
-        Edge(posteriors[edge["source"], edge["target"]], edge["kind"], edge["accepted"], edge.get("reason", ""))
-        for edge in report["edges"]
-    )
-
-
-def poses_of(report: Mapping[str, Any]) -> dict[int, Array]:
-    """Return object_from_camera (4, 4) by frame number."""
-    return {pose["id"]: np.array(pose["object_from_camera"]).reshape(4, 4) for pose in report["poses"]}
+    return Reopened(whole.name, report, sensor, views, edges, solved(edges, _means(report)), whole)
 
 
 def solved(edges: tuple[Edge, ...], poses: Mapping[int, Array]) -> Solution:
@@ -107,12 +91,17 @@ def renumbered(view: RayImage, offset: int) -> RayImage:
     return replace(view, frame=replace(view.frame, index=view.frame.index + offset))
 
 
+def _means(report: Mapping[str, Any]) -> dict[int, Array]:
+    """Return object_from_camera (4, 4) by frame number."""
+    return {frame: pose.mean for frame, pose in poses_of(report).items()}
+
+
 def _joined(run: Path, report: Mapping[str, Any]) -> Reopened:
     """Return a joined run, made of its two parts."""
     first, second = (reopened(Path(part)) for part in report["settings"]["joined"])
     offset = int(report["settings"]["offset"])
     views = dict(first.views) | {frame + offset: renumbered(view, offset) for frame, view in second.views.items()}
-    edges, poses = edges_of(report), poses_of(report)
+    edges, poses = edges_of(report), _means(report)
     if not poses.keys() <= views.keys():
         raise InputError(f"{run}: its parts have changed since they were joined; join them again")
     return Reopened(first.name, report, first.sensor, views, edges, solved(edges, poses), None)

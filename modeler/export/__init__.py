@@ -10,10 +10,11 @@ from modeler.export.mesh import mesh_of as mesh_of
 from modeler.export.mesh import write_mesh as write_mesh
 from modeler.export.pairs import Pairs as Pairs
 from modeler.export.ply import ply_bytes as ply_bytes
+from modeler.export.reading import edges_of as edges_of
+from modeler.export.reading import poses_of as poses_of
 from modeler.export.reading import read_model as read_model
 from modeler.export.report import RunMeta as RunMeta
 from modeler.export.report import edge_record as edge_record
-from modeler.export.report import posteriors_of as posteriors_of
 from modeler.export.report import report_of as report_of
 from modeler.export.run_folder import RunFolder as RunFolder
 from modeler.export.simplify import simplified as simplified

@@ -1,12 +1,31 @@
-"""A fused mesh read back from its PLY file."""
+"""A run read back from what it left on disk: edges and poses from its report, the mesh from its PLY file."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from modeler.types import InputError, ObjectModel
+from modeler.types import Array, Edge, InputError, Mode, ObjectModel, Outcome, PoseGaussian, Posterior
+
+
+def edges_of(report: Mapping[str, Any]) -> tuple[Edge, ...]:
+    """Return the edges in a report, in order, as they were judged; their posteriors are without samples."""
+    return tuple(
+        Edge(_posterior(record), record["kind"], record["accepted"], record.get("reason", ""))
+        for record in report["edges"]
+    )
+
+
+def poses_of(report: Mapping[str, Any]) -> dict[int, PoseGaussian]:
+    """Return object_from_camera of the accepted frames in a report, by frame number."""
+    return {
+        record["id"]: PoseGaussian(_matrix(record["object_from_camera"], 4), _matrix(record["covariance"], 6))
+        for record in report["poses"]
+    }
 
 
 def read_model(path: Path) -> ObjectModel:
@@ -45,3 +64,33 @@ def read_model(path: Path) -> ObjectModel:
         vertex_views=np.asarray(columns["views"], dtype=np.int64).ravel() if "views" in names else None,
         vertex_sigmas_m=None if sigmas_m is None else np.where(sigmas_m < 0.0, np.inf, sigmas_m),
     )
+
+
+def _posterior(edge: Mapping[str, Any]) -> Posterior:
+    information = edge["information"]
+    return Posterior(
+        source=edge["source"],
+        target=edge["target"],
+        pose=_gaussian(edge),
+        modes=tuple(Mode(_number(mode["weight"]), _gaussian(mode)) for mode in edge.get("modes", ())),
+        outcome=Outcome(edge["outcome"]),
+        overlap=_number(edge["overlap"]),
+        information=None if information is None else _matrix(information, 6),
+        effective_samples=_number(edge["effective_samples"]),
+        pareto_k=_number(edge["pareto_k"]),
+        log_evidence=_number(edge["log_evidence"]),
+        seconds=_number(edge["seconds"]),
+    )
+
+
+def _gaussian(record: Mapping[str, Any]) -> PoseGaussian:
+    return PoseGaussian(_matrix(record["target_from_source"], 4), _matrix(record["covariance"], 6))
+
+
+def _matrix(numbers: Sequence[float | None], size: int) -> Array:
+    return np.array([_number(number) for number in numbers]).reshape(size, size)
+
+
+def _number(value: float | None) -> float:
+    """Return a number, NaN for what was not finite."""
+    return math.nan if value is None else float(value)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from modeler.export.words import undetermined
-from modeler.types import Array, Edge, Mode, Outcome, PoseGaussian, Posterior, RayImage, Solution, Step
+from modeler.types import Edge, Mode, RayImage, Solution, Step
 
 _SCHEMA = 1
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
@@ -105,11 +105,6 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
     return _json(report)
 
 
-def posteriors_of(report: Mapping[str, Any]) -> dict[tuple[int, int], Posterior]:
-    """Return the posteriors in a report by (source, target), without samples: what a resumed run need not redo."""
-    return {(edge["source"], edge["target"]): _posterior(edge) for edge in report["edges"]}
-
-
 def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> list[str]:
     """Return in words why the model is not to be trusted; empty where it is."""
     reasons = list(meta.doubts)
@@ -182,35 +177,6 @@ def _mode_record(mode: Mode, left: float | None) -> dict[str, Any]:
         "target_from_source": mode.pose.mean,
         "covariance": mode.pose.covariance,
     }
-
-
-def _posterior(edge: Mapping[str, Any]) -> Posterior:
-    information = edge["information"]
-    return Posterior(
-        source=edge["source"],
-        target=edge["target"],
-        pose=_gaussian(edge),
-        modes=tuple(Mode(_number(mode["weight"]), _gaussian(mode)) for mode in edge.get("modes", ())),
-        outcome=Outcome(edge["outcome"]),
-        overlap=_number(edge["overlap"]),
-        information=None if information is None else _matrix(information, 6),
-        effective_samples=_number(edge["effective_samples"]),
-        pareto_k=_number(edge["pareto_k"]),
-        log_evidence=_number(edge["log_evidence"]),
-        seconds=_number(edge["seconds"]),
-    )
-
-
-def _gaussian(record: Mapping[str, Any]) -> PoseGaussian:
-    return PoseGaussian(_matrix(record["target_from_source"], 4), _matrix(record["covariance"], 6))
-
-
-def _matrix(numbers: Sequence[float | None], size: int) -> Array:
-    return np.array([_number(number) for number in numbers]).reshape(size, size)
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
 
 
 def _json(value: Any) -> Any:

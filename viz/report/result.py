@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from modeler import se3
-from modeler.export import RunFolder, posteriors_of
+from modeler.export import RunFolder, edges_of, poses_of
 from modeler.types import Array, Edge, InputError, PoseGaussian
 from viz import chain
 from viz.readings import worst_axis_sd
@@ -43,22 +43,12 @@ class Result:
     @cached_property
     def edges(self) -> list[Edge]:
         """Every edge, in order."""
-        posteriors = posteriors_of(self.report)
-        return [
-            Edge(posteriors[edge["source"], edge["target"]], edge["kind"], edge["accepted"], edge["reason"])
-            for edge in self.report["edges"]
-        ]
+        return list(edges_of(self.report))
 
     @cached_property
     def poses(self) -> dict[int, PoseGaussian]:
         """object_from_camera after optimisation, by frame number."""
-        return {
-            pose["id"]: PoseGaussian(
-                np.array(pose["object_from_camera"], dtype=np.float64).reshape(4, 4),
-                np.array([np.nan if value is None else value for value in pose["covariance"]]).reshape(6, 6),
-            )
-            for pose in self.report["poses"]
-        }
+        return poses_of(self.report)
 
     @cached_property
     def chain(self) -> dict[int, PoseGaussian]:
