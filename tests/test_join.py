@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,43 +18,44 @@ from modeler.fusion import Fuser, Matcher
 from modeler.graph import PoseGraph, solve
 from modeler.rays import Sensor
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Segmentation, Step
-from sequences.bop import BopSequence
+from sequences import BopSequence, write_bop
+from sequences.recipe import Recipe, Table, Viewpoint
+from sequences.renderer import RenderedSequence
+from sequences.shapes import Capsule, Compound, Cylinder, Part, Sphere
+from sequences.trajectory import Turntable
 
-FIGURE = {
-    "kind": "compound",
-    "parts": [
-        {"shape": {"kind": "sphere", "radius_m": 0.045}, "offset_m": [0, 0, 0.05], "stretch": [1, 0.8, 1.1]},
-        {"shape": {"kind": "sphere", "radius_m": 0.03}, "offset_m": [0.015, -0.005, 0.12], "rgb": [90, 160, 90]},
-        {
-            "shape": {"kind": "capsule", "radius_m": 0.013, "height_m": 0.05},
-            "offset_m": [0.03, 0.04, 0.07],
-            "rotation_deg": [35, 60, 0],
-        },
-        {"shape": {"kind": "cylinder", "radius_m": 0.036, "height_m": 0.014}, "offset_m": [0.004, 0, 0.007]},
-    ],
-}
+FIGURE = Compound(
+    (
+        Part(Sphere(0.045), offset_m=(0.0, 0.0, 0.05), stretch=(1.0, 0.8, 1.1)),
+        Part(Sphere(0.03), offset_m=(0.015, -0.005, 0.12), rgb=(90, 160, 90)),
+        Part(Capsule(0.013, 0.05), offset_m=(0.03, 0.04, 0.07), rotation_deg=(35.0, 60.0, 0.0)),
+        Part(Cylinder(0.036, 0.014), offset_m=(0.004, 0.0, 0.007)),
+    )
+)
+COUNT = 9  # frames of each run
 LYING = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.045], [0.0, 0.0, 0.0, 1.0]])
 COVARIANCE = np.diag([1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4]) ** 2
 
 
-def recipe(name: str, shape: dict[str, Any], seed: int) -> dict[str, Any]:
-    return {
-        "name": name,
-        "seed": seed,
-        "object": shape,
-        "trajectory": {"kind": "turntable", "frames": 9, "step_deg": 40, "step_sigma_deg": 0.5},
-        "view": {"width": 320, "height": 240, "focal_px": 400, "distance_m": 0.7, "look_height_m": 0.04},
-        "table": {"size_m": [0.64, 0.84]},
-        "colour": "png",
-    }
+def rendered(name: str, shape: Compound, seed: int) -> RenderedSequence:
+    return RenderedSequence(
+        Recipe(
+            shape,
+            name,
+            seed,
+            trajectory=Turntable(COUNT, 360.0 / COUNT, 0.5),
+            view=Viewpoint(240, 180, 300.0, 0.7, look_height_m=0.04),
+            table=Table((0.64, 0.84)),
+            colour="png",
+        )
+    )
 
 
-def true_run(sequence: BopSequence, path: Path) -> None:
-    """Write the run folder of a build that found every motion."""
-    truth, noise = sequence.truth(), sequence.sensor()
-    assert truth is not None
-    assert noise is not None
-    views = {frame.index: Sensor(*noise).ray_image(frame) for frame in sequence}
+def true_run(sequence: RenderedSequence, scene: Path, path: Path) -> None:
+    """Write the scene folder of a sequence, and the run folder of a build of it that found every motion."""
+    truth, (sigma_wh, sigma_r_m) = sequence.truth(), sequence.sensor()
+    write_bop(scene, sequence, truth, {"sensor": {"sigma_wh": sigma_wh, "sigma_r_m": sigma_r_m}})
+    views = {frame.index: Sensor(sigma_wh, sigma_r_m).ray_image(frame) for frame in BopSequence(scene)}
     edges = []
     for before, after in [*zip(sequence.indices, sequence.indices[1:], strict=False), (0, sequence.indices[-1])]:
         pose = PoseGaussian(truth[before] @ se3.inverse(truth[after]), COVARIANCE)
@@ -63,7 +63,7 @@ def true_run(sequence: BopSequence, path: Path) -> None:
         edges.append(Edge(Posterior(after, before, pose, Outcome.CONVERGED, overlap=0.9), kind, True, "true"))
     solution = solve(PoseGraph(tuple(edges), first=0), {})
     folder = RunFolder.open(path)
-    meta = RunMeta(sequence=str(sequence.path), seed=0, prior="turntable")
+    meta = RunMeta(sequence=str(scene), seed=0, prior="turntable")
     for k, view in views.items():
         last = k == max(views)
         assert view.frame.mask is not None
@@ -87,16 +87,15 @@ def true_run(sequence: BopSequence, path: Path) -> None:
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path, dict[int, Array]]:
     """Return two runs, the run that joins them, and true object_from_camera but for the object frame, by number."""
     folder = tmp_path_factory.mktemp("join")
-    lying = {"kind": "compound", "parts": [{"shape": FIGURE, "offset_m": [0, 0, 0.045], "rotation_deg": [90, 0, 0]}]}
+    lying = Compound((Part(FIGURE, offset_m=(0.0, 0.0, 0.045), rotation_deg=(90.0, 0.0, 0.0)),))
     poses: dict[int, Array] = {}
-    for name, shape, seed in (("upright", FIGURE, 3), ("lying", lying, 4)):
-        (folder / f"{name}.json").write_text(json.dumps(recipe(name, shape, seed)))
-        assert main(["render", str(folder / f"{name}.json"), "--out", str(folder / name)]) == 0
-        sequence = BopSequence(folder / name)
-        true_run(sequence, folder / f"{name}_run")
-        upright_from_model = np.eye(4) if name == "upright" else se3.inverse(LYING)
-        for k, pose in (sequence.truth() or {}).items():
-            poses[k + (9 if name == "lying" else 0)] = upright_from_model @ se3.inverse(pose)
+    for first, name, shape, upright_from_model in (
+        (0, "upright", FIGURE, np.eye(4)),
+        (COUNT, "lying", lying, se3.inverse(LYING)),
+    ):
+        sequence = rendered(name, shape, 3 + first)
+        true_run(sequence, folder / name, folder / f"{name}_run")
+        poses |= {first + k: upright_from_model @ se3.inverse(pose) for k, pose in sequence.truth().items()}
     parts = folder / "upright_run", folder / "lying_run"
     status = main(["join", *map(str, parts), "--out", str(folder / "joined"), "--pairs", "4"])
     assert status == 0
@@ -105,7 +104,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path, di
 
 def test_frames_of_both_runs_find_their_places(runs: tuple[Path, Path, Path, dict[int, Array]]) -> None:
     report = RunFolder(runs[2]).report()
-    assert [frame["id"] for frame in report["frames"]] == list(range(18))
+    assert [frame["id"] for frame in report["frames"]] == list(range(2 * COUNT))
     assert report["settings"]["joined"] == [str(run) for run in runs[:2]]
     poses = {pose["id"]: np.reshape(pose["object_from_camera"], (4, 4)) for pose in report["poses"]}
     base = poses[0] @ se3.inverse(runs[3][0])
@@ -115,7 +114,7 @@ def test_frames_of_both_runs_find_their_places(runs: tuple[Path, Path, Path, dic
     assert {path.name for path in runs[2].iterdir()} == {
         "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd", "report.json"
     }  # fmt: skip
-    joining = [edge for edge in report["edges"] if edge["source"] >= 9 > edge["target"]]
+    joining = [edge for edge in report["edges"] if edge["source"] >= COUNT > edge["target"]]
     assert len(joining) == 4
     assert sum(edge["accepted"] for edge in joining) >= 2
 
@@ -136,7 +135,7 @@ def test_exports_made_anew_from_the_frames(
 ) -> None:
     out = tmp_path / "figure.stl"
     assert main(["export", str(runs[2]), "--out", str(out), "--watertight", "--triangles", "4000"]) == 0
-    assert "% of the vertices of" in capfd.readouterr().err
+    assert "% of the vertices made up" in capfd.readouterr().err
     mesh = trimesh.load_mesh(out)
     assert mesh.is_volume
     assert 3000 < len(mesh.faces) <= 4000
