@@ -12,7 +12,8 @@ from modeler.types import Array, ObjectModel
 
 LARGEST_PX = 4096
 PADDING_PX = 4  # charts keep this distance, so that colours do not bleed when the image is shrunk
-TRIANGLES = 8_000  # of a mesh whose detail is in the image; unwrapping takes long with more
+TRIANGLES = 8_000  # of a mesh whose detail is in the image
+PIECE = 1_000  # triangles that are unwrapped at once: the time grows with more than the square of their number
 
 Paint = Callable[[Array, Array], npt.NDArray[np.uint8]]
 """From points (n, 3) and normals (n, 3) in the object frame to RGB (n, 3)."""
@@ -43,14 +44,20 @@ def textured(model: ObjectModel, paint: Paint, texel_m: float) -> tuple[ObjectMo
     texel_m = max(texel_m, float(np.sqrt(area_m2 / 0.6)) / LARGEST_PX)
     atlas = xatlas.Atlas()
     # In texels and from the origin: the library compares lengths with constants.
-    atlas.add_mesh(
-        ((model.vertices_m - model.vertices_m.mean(axis=0)) / texel_m).astype(np.float32),
-        model.triangles.astype(np.uint32),
-    )
+    texels = ((model.vertices_m - model.vertices_m.mean(axis=0)) / texel_m).astype(np.float32)
+    used = []
+    for piece in _pieces(corners.mean(axis=1), PIECE):
+        vertices, triangles = np.unique(model.triangles[piece], return_inverse=True)
+        atlas.add_mesh(texels[vertices], triangles.reshape(-1, 3).astype(np.uint32))
+        used.append(vertices)
     charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
     packing.texels_per_unit, packing.padding, packing.bilinear = 1.0, PADDING_PX, True
     atlas.generate(charts, packing)
-    origin, triangles, places = atlas[0]
+    parts = [atlas[number] for number in range(len(used))]
+    origin = np.concatenate([vertices[part[0]] for vertices, part in zip(used, parts, strict=True)])
+    starts = np.cumsum([0, *(len(part[0]) for part in parts)])
+    triangles = np.concatenate([part[1] + start for part, start in zip(parts, starts, strict=False)])
+    places = np.concatenate([part[2] for part in parts])
     wrapped = replace(
         model,
         vertices_m=model.vertices_m[origin],
@@ -63,6 +70,20 @@ def textured(model: ObjectModel, paint: Paint, texel_m: float) -> tuple[ObjectMo
     size = np.array([atlas.width, atlas.height])
     image = _baked(wrapped, places.astype(np.float64) * size, size, paint)
     return wrapped, Texture(np.stack([places[:, 0], 1.0 - places[:, 1]], axis=1).astype(np.float64), image)
+
+
+def _pieces(centres_m: Array, most: int) -> list[npt.NDArray[np.int64]]:
+    """Return the numbers of triangles in compact pieces of at most so many, given their centres (t, 3)."""
+    waiting, pieces = [np.arange(len(centres_m))], []
+    while waiting:
+        piece = waiting.pop()
+        if len(piece) <= most:
+            pieces.append(piece)
+            continue
+        axis = int(np.argmax(np.ptp(centres_m[piece], axis=0)))
+        order = piece[np.argsort(centres_m[piece, axis], kind="stable")]
+        waiting += [order[: len(order) // 2], order[len(order) // 2 :]]
+    return pieces
 
 
 def _baked(model: ObjectModel, places_px: Array, size: npt.NDArray[np.int64], paint: Paint) -> npt.NDArray[np.uint8]:
