@@ -264,10 +264,9 @@ def test_build_fills_a_run_folder(built: Path) -> None:
     assert told["settings"] == {"method": "icp", "every": 1, "frames": "0:3"}
     assert (told["complete"], told["trustworthy"], told["reasons"]) == (True, True, [])
     assert [(frame["id"], frame["outcome"]) for frame in told["frames"]] == [(k, "accepted") for k in range(3)]
-    assert [(edge["source"], edge["target"], edge["accepted"]) for edge in told["edges"]] == [
-        (1, 0, True),
-        (2, 1, True),
-    ]
+    edges = {(edge["source"], edge["target"]): edge["accepted"] for edge in told["edges"]}
+    assert {(1, 0), (2, 1)} <= set(edges)
+    assert all(edges.values())
     poses = np.array([pose["object_from_camera"] for pose in told["poses"]]).reshape(-1, 4, 4)
     assert np.allclose(poses[0], np.eye(4), atol=1e-9)
     assert told["seconds"]["total"] > told["seconds"]["registration"] > 0.0
@@ -346,7 +345,8 @@ def test_evaluate_writes_errors_and_prints_a_table(run: Run, tmp_path: Path) -> 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "glb", "stl"])
 def test_export_keeps_the_mesh(run: Run, built: Path, tmp_path: Path, suffix: str) -> None:
     ended = run("export", built, "--out", tmp_path / f"box.{suffix}")
-    assert (ended.status, ended.out, ended.err) == (0, "", "")
+    assert (ended.status, ended.out) == (0, "")
+    assert re.fullmatch(rf"modeler: \d+ triangles: \S+/box\.{suffix}\n", ended.err)
     mesh, original = (trimesh.load_mesh(path) for path in (tmp_path / f"box.{suffix}", built / "model.ply"))
     assert len(mesh.faces) == len(original.faces)
     assert np.allclose(mesh.bounds, original.bounds, atol=1e-5)
