@@ -6,9 +6,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from modeler.types import Array, BoolArray
+from modeler.types import Array, BoolArray, Float32Array
 
-Float32 = npt.NDArray[np.float32]
 Labels = npt.NDArray[np.int32]
 
 _JUMP_SHARE = 0.03  # of the depth; neighbours of a thinned image that lie farther apart are on two surfaces
@@ -18,7 +17,7 @@ _SEEN_SHARE = 0.4  # of a row or column with measurements, for it not to be blin
 _EVERYWHERE = np.ones((3, 3, 3), dtype=np.bool_)
 
 
-def pieces(depth_m: Float32, within: BoolArray) -> Labels:
+def pieces(depth_m: Float32Array, within: BoolArray) -> Labels:
     """Label the pieces (h, w) of a region that hang together without a jump; 0 = outside it or before a jump."""
     kept = within.copy()
     limit = np.float32(_JUMP_SHARE) * depth_m
@@ -46,7 +45,7 @@ def voxel_clusters(points: npt.NDArray[np.floating], *, low_m: Array, high_m: Ar
     return _label(filled, structure=_EVERYWHERE)[cell[:, 0], cell[:, 1], cell[:, 2]]
 
 
-def mixed_pixels(depth_m: Float32, *, tolerance_m: Float32, pixel_m: Float32) -> BoolArray:
+def mixed_pixels(depth_m: Float32Array, *, tolerance_m: Float32Array, pixel_m: Float32Array) -> BoolArray:
     """Return the pixels (h, w) between two surfaces: nearer than one neighbour and farther than another, by a jump.
 
     Args:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from modeler.segmentation.clusters import mixed_pixels, voxel_clusters, without_specks
 from modeler.segmentation.layers import planning_stride, point_image
 from modeler.segmentation.noise import DepthNoise
 from modeler.segmentation.scene import Scene
-from modeler.types import Array, BoolArray, Camera
+from modeler.types import Array, BoolArray, Camera, Float32Array
 
-Float32 = npt.NDArray[np.float32]
 Window = tuple[slice, slice]
 
 _ZONE_MARGIN_M = 0.1  # how far the object may stray from where it was seen
@@ -42,7 +40,7 @@ class Found:
     """Merit of the second-best cluster as a part of the best's."""
 
 
-def find(depth_m: Float32, camera: Camera, scene: Scene, noise: DepthNoise, *, gap_m: float) -> Found:
+def find(depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, gap_m: float) -> Found:
     """Find the object in a depth image, NaN where nothing was measured or no object may be.
 
     Plans on a thinned image: what is above the support and before the scenery forms clusters in space, and the one that
@@ -50,37 +48,40 @@ def find(depth_m: Float32, camera: Camera, scene: Scene, noise: DepthNoise, *, g
     """
     if scene.zone_m is None:
         return Found(np.zeros(depth_m.shape, dtype=np.bool_))
-    chosen, area_m2, rival = _choose(depth_m, camera, scene, noise, gap_m=gap_m)
-    return Found(_refine(depth_m, camera, scene, noise, chosen=chosen), area_m2, rival)
+    chosen = _choose(depth_m, camera, scene, noise, zone_m=scene.zone_m, gap_m=gap_m)
+    mask = _refine(depth_m, camera, scene, noise, chosen=chosen.mask, reach_m=_reach_m(scene.zone_m))
+    return replace(chosen, mask=mask)
 
 
 def _choose(
-    depth_m: Float32, camera: Camera, scene: Scene, noise: DepthNoise, *, gap_m: float
-) -> tuple[BoolArray, float, float]:
-    """Return the object's pixels in the thinned image, the area it shows, and the merit of its rival."""
+    depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, zone_m: Array, gap_m: float
+) -> Found:
+    """Return what is found in the thinned image."""
     stride = planning_stride(camera)
     thin = np.ascontiguousarray(depth_m[::stride, ::stride])
     chosen = np.zeros(thin.shape, dtype=np.bool_)
-    low, high = _reach(scene)
+    low, high = _reach_m(zone_m)
     window = _window((thin > low[2]) & (thin < high[2]), margin=0)
     row, column = window[0].start * stride, window[1].start * stride
     points = point_image(thin[window], camera, stride=stride, row=row, column=column)
     fore, _ = _foreground(points, window, scene, noise, thinning=1)
     fore &= _inside(points, low, high)
-    if scene.zone_m is None or not fore.any():
-        return chosen, 0.0, 0.0
+    if not fore.any():
+        return Found(chosen)
     candidates = points[fore]
     labels = voxel_clusters(candidates, low_m=low, high_m=high, gap_m=gap_m)
-    in_zone = _inside(candidates, *scene.zone_m)
+    in_zone = _inside(candidates, *zone_m)
     area = candidates[:, 2] ** 2 * (stride**2 / (camera.fx * camera.fy))
     merit = np.bincount(labels, area * np.where(in_zone, 1.0, _STRAY_WEIGHT))
     best = int(merit.argmax())
     chosen[window][fore] = labels == best
     rival = float(np.delete(merit, best).max(initial=0.0) / merit[best])
-    return chosen, float(area[labels == best].sum()), rival
+    return Found(chosen, float(area[labels == best].sum()), rival)
 
 
-def _refine(depth_m: Float32, camera: Camera, scene: Scene, noise: DepthNoise, *, chosen: BoolArray) -> BoolArray:
+def _refine(
+    depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, chosen: BoolArray, reach_m: Array
+) -> BoolArray:
     """Return the object's pixels at full resolution, given those in the thinned image."""
     stride = planning_stride(camera)
     mask = np.zeros(depth_m.shape, dtype=np.bool_)
@@ -91,12 +92,11 @@ def _refine(depth_m: Float32, camera: Camera, scene: Scene, noise: DepthNoise, *
         slice(rows.start * stride, min(rows.stop * stride, height)),
         slice(columns.start * stride, min(columns.stop * stride, width)),
     )
-    depth: Float32 = depth_m[window]
+    depth: Float32Array = depth_m[window]
     points = point_image(depth, camera, row=window[0].start, column=window[1].start)
     fore, above_m = _foreground(points, window, scene, noise, thinning=stride)
-    low, high = _reach(scene)
     fore &= np.repeat(np.repeat(near, stride, axis=0), stride, axis=1)[: depth.shape[0], : depth.shape[1]]
-    fore &= (depth > low[2]) & (depth < high[2])
+    fore &= (depth > reach_m[0, 2]) & (depth < reach_m[1, 2])
     if not fore.any():
         return mask
     if above_m is not None:
@@ -107,7 +107,7 @@ def _refine(depth_m: Float32, camera: Camera, scene: Scene, noise: DepthNoise, *
     return mask
 
 
-def _inside(points: Float32, low: Array, high: Array) -> BoolArray:
+def _inside(points: Float32Array, low: Array, high: Array) -> BoolArray:
     """Return which points (..., 3) lie in a box."""
     inside = np.ones(points.shape[:-1], dtype=np.bool_)
     for axis in range(3):
@@ -115,18 +115,16 @@ def _inside(points: Float32, low: Array, high: Array) -> BoolArray:
     return inside
 
 
-def _reach(scene: Scene) -> tuple[Array, Array]:
-    """Return low and high corner (3,) of the box the object may have strayed to."""
-    if scene.zone_m is None:
-        return np.zeros(3), np.zeros(3)
-    low, high = scene.zone_m
+def _reach_m(zone_m: Array) -> Array:
+    """Return low and high corner (2, 3) of the box the object may have strayed to, of that (2, 3) where it was seen."""
+    low, high = zone_m
     margin = max(_ZONE_MARGIN_M, _ZONE_MARGIN_SHARE * float((high - low).max()))
-    return low - margin, high + margin
+    return np.array([low - margin, high + margin])
 
 
 def _foreground(
-    points: Float32, window: Window, scene: Scene, noise: DepthNoise, *, thinning: int
-) -> tuple[BoolArray, Float32 | None]:
+    points: Float32Array, window: Window, scene: Scene, noise: DepthNoise, *, thinning: int
+) -> tuple[BoolArray, Float32Array | None]:
     """Return what is above the support and before the scenery (h, w), and its height (h, w) where there is a support.
 
     Args:
@@ -150,7 +148,7 @@ def _foreground(
     return fore, height
 
 
-def _not_a_crease(height_m: Float32, fore: BoolArray, reach_px: float) -> BoolArray:
+def _not_a_crease(height_m: Float32Array, fore: BoolArray, reach_px: float) -> BoolArray:
     """Return the pixels (h, w) that are high above the support or near some that are."""
     low = min(_LOW_M, _LOW_SHARE * float(np.percentile(height_m[fore], 95)))
     high = (fore & (height_m > low)).astype(np.uint8)

@@ -7,13 +7,10 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from modeler.segmentation.noise import DepthNoise
-from modeler.types import BoolArray, Camera
-
-Float32 = npt.NDArray[np.float32]
+from modeler.types import BoolArray, Camera, Float32Array
 
 _PLANNING_WIDTH_PX = 320  # images are thinned to about this for planning
 _OUTLIERS_IN = 7  # one reading in so many may lie behind the backdrop by mistake
@@ -28,23 +25,23 @@ _MOVING_CAMERA_SHARE = 0.5  # of the image that changes: the camera moves, not t
 class Layers:
     """What a few frames of a still camera show, thinned."""
 
-    points: Float32
+    back_m: Float32Array
     """(h, w, 3) the backdrop: the farthest surface that frames agree on, in camera coordinates."""
-    front: Float32
+    front_m: Float32Array
     """(h, w, 3) what typically comes in front of it; the backdrop where nothing does."""
-    rays: Float32
+    rays: Float32Array
     """(h, w, 3) points at depth 1 m."""
     moved: BoolArray
     """(h, w) True where things come in front of the backdrop."""
     still: BoolArray
     """(h, w) True where almost all frames see the backdrop."""
-    share: Float32
+    front_share: Float32Array
     """(h, w) share of the readings in front of the backdrop."""
 
     @property
     def camera_moves(self) -> bool:
         """Whether so much of the image changes that it must be the camera that moves."""
-        seen = np.count_nonzero(np.isfinite(self.points[..., 2]))
+        seen = np.count_nonzero(np.isfinite(self.back_m[..., 2]))
         return bool(np.count_nonzero(self.moved) > _MOVING_CAMERA_SHARE * max(1, seen))
 
 
@@ -53,7 +50,9 @@ def planning_stride(camera: Camera) -> int:
     return max(1, round(camera.width / _PLANNING_WIDTH_PX))
 
 
-def point_image(depth_m: Float32, camera: Camera, *, stride: int = 1, row: int = 0, column: int = 0) -> Float32:
+def point_image(
+    depth_m: Float32Array, camera: Camera, *, stride: int = 1, row: int = 0, column: int = 0
+) -> Float32Array:
     """Return the points (h, w, 3) of a depth image that was thinned by `stride` and starts at a row and column."""
     w = ((np.arange(depth_m.shape[1]) * stride + column - camera.cx) / camera.fx).astype(np.float32)
     h = ((np.arange(depth_m.shape[0]) * stride + row - camera.cy) / camera.fy).astype(np.float32)
@@ -64,7 +63,7 @@ def point_image(depth_m: Float32, camera: Camera, *, stride: int = 1, row: int =
     return points
 
 
-def take_apart(depths_m: Sequence[Float32], camera: Camera, noise: DepthNoise) -> Layers:
+def take_apart(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> Layers:
     """Take depth images (n of (h, w), NaN = no measurement) of a still camera apart."""
     stride = planning_stride(camera)
     stack = np.sort(np.stack([depth[::stride, ::stride] for depth in depths_m]), axis=0)  # NaN comes last

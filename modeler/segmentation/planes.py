@@ -6,14 +6,11 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from modeler.segmentation.noise import DepthNoise
 from modeler.segmentation.plane_fit import fit_plane, heights, least_squares
-from modeler.types import Array, BoolArray, Plane
-
-Float32 = npt.NDArray[np.float32]
+from modeler.types import Array, BoolArray, Float32Array, Plane
 
 _CELL_PX = 5
 _CELL_SHARE = 0.7  # of a cell's pixels that must have been measured
@@ -61,7 +58,7 @@ class _Cells:
 
 
 def dominant_planes(
-    points: Float32, noise: DepthNoise, *, least_share: float = 0.006, prefer_level: bool = False
+    points: Float32Array, noise: DepthNoise, *, least_share: float = 0.006, prefer_level: bool = False
 ) -> Array:
     """Find the planes that cover most of an image, largest first.
 
@@ -94,7 +91,7 @@ def dominant_planes(
     return np.array(planes).reshape(-1, 4)
 
 
-def choose_support(planes: Array, body: Float32, ground: Float32, noise: DepthNoise) -> Array | None:
+def choose_support(planes: Array, body: Float32Array, ground: Float32Array, noise: DepthNoise) -> Array | None:
     """Choose the plane that an object stands on.
 
     That is the highest plane with almost all of the object above it that is seen near the object and not far below it.
@@ -130,7 +127,7 @@ def choose_support(planes: Array, body: Float32, ground: Float32, noise: DepthNo
     return found
 
 
-def fit_beside(ground: Float32, body: Float32, *, guess: Array, noise: DepthNoise) -> Plane | None:
+def fit_beside(ground: Float32Array, body: Float32Array, *, guess: Array, noise: DepthNoise) -> Plane | None:
     """Fit the support of an object.
 
     Args:
@@ -146,7 +143,7 @@ def fit_beside(ground: Float32, body: Float32, *, guess: Array, noise: DepthNois
     return fit_plane(points, sigma_m=noise.sigma_m(points[:, 2]), guess=guess, foot_m=foot)
 
 
-def surroundings(points: Float32, found: BoolArray) -> BoolArray:
+def surroundings(points: Float32Array, found: BoolArray) -> BoolArray:
     """Return the pixels (h, w) near an object and not of it, where its support may be seen.
 
     Args:
@@ -164,7 +161,7 @@ def surroundings(points: Float32, found: BoolArray) -> BoolArray:
     return beside & (square < (_REACH_SIZES * size) ** 2)
 
 
-def extent(points: Float32) -> tuple[Array, float]:
+def extent(points: Float32Array) -> tuple[Array, float]:
     """Return the median (3,) of points (n, 3) and the length of the box that holds most of them."""
     low, centre, high = np.percentile(points, [5.0, 50.0, 95.0], axis=0).astype(np.float64)
     return centre, float(np.linalg.norm(high - low))
@@ -197,7 +194,7 @@ def _largest(cells: _Cells, free: BoolArray, level: Array | None) -> Array:
     return plane
 
 
-def _flat_cells(points: Float32, noise: DepthNoise) -> _Cells:
+def _flat_cells(points: Float32Array, noise: DepthNoise) -> _Cells:
     """Return the flat cells of an image of points (h, w, 3)."""
     rows, columns = points.shape[0] // _CELL_PX, points.shape[1] // _CELL_PX
     block = points[: rows * _CELL_PX, : columns * _CELL_PX].reshape(rows, _CELL_PX, columns, _CELL_PX, 3)

@@ -14,9 +14,7 @@ from modeler.segmentation.layers import Layers
 from modeler.segmentation.noise import DepthNoise
 from modeler.segmentation.plane_fit import heights
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings, upright
-from modeler.types import Array, BoolArray, Plane
-
-Float32 = npt.NDArray[np.float32]
+from modeler.types import Array, BoolArray, Float32Array, Plane
 
 _CARRIED_SHARE = 0.2  # of a pile that stands on its upper plane, for that to be a support and not a lid
 _NEIGHBOUR_SIZES = 0.5  # how far from what moves most, in its sizes, its other parts move
@@ -34,9 +32,9 @@ class Scene:
 
     plane: Plane | None = None
     """The support plane, where one was found."""
-    still_m: Float32 | None = None
+    still_m: Float32Array | None = None
     """(h, w), thinned: depth of all that stands still; NaN where there is nothing."""
-    scenery_m: Float32 | None = None
+    scenery_m: Float32Array | None = None
     """(h, w), thinned: depth of walls and things that stand about, at and beyond which is no object; else infinite."""
     zone_m: Array | None = None
     """(2, 3) low and high corner, in camera coordinates, of the box in which the object was seen."""
@@ -65,21 +63,21 @@ def learn(layers: Layers, allowed: BoolArray, noise: DepthNoise, *, least_points
     """
     found, sure = _moving_object(layers, allowed)
     moves = bool(np.count_nonzero(found) >= least_points)
-    planes = dominant_planes(layers.points, noise, prefer_level=moves)
+    planes = dominant_planes(layers.back_m, noise, prefer_level=moves)
     guess: Array | None = None
     if moves:
-        ground = layers.points[layers.still & surroundings(layers.front, found)]
-        guess = choose_support(planes, layers.front[found], ground, noise)
+        ground = layers.back_m[layers.still & surroundings(layers.front_m, found)]
+        guess = choose_support(planes, layers.front_m[found], ground, noise)
     else:
-        guess, found, sure = _standing_object(planes, layers.points, allowed, noise)
-    still = np.where(layers.still, layers.points[..., 2], np.float32(np.nan))
+        guess, found, sure = _standing_object(planes, layers.back_m, allowed, noise)
+    still = np.where(layers.still, layers.back_m[..., 2], np.float32(np.nan))
     if not found.any():
         return Scene(still_m=still)
-    zone = np.percentile(layers.front[found], [1.0, 99.0], axis=0).astype(np.float64)
+    zone = np.percentile(layers.front_m[found], [1.0, 99.0], axis=0).astype(np.float64)
     plane = None
     if guess is not None:
-        ground = layers.points[layers.still & surroundings(layers.front, found)]
-        plane = fit_beside(ground, layers.front[found], guess=guess, noise=noise)
+        ground = layers.back_m[layers.still & surroundings(layers.front_m, found)]
+        plane = fit_beside(ground, layers.front_m[found], guess=guess, noise=noise)
     guess = None if plane is None else guess
     return Scene(plane, still, _scenery(layers, found, planes, guess, noise), zone, sure=sure)
 
@@ -90,20 +88,20 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     Returns:
         Its pixels (h, w), and whether nothing else moves nearly as much.
     """
-    depth = layers.front[..., 2]
+    depth = layers.front_m[..., 2]
     labels = pieces(depth, layers.moved & allowed)
-    merit = _central(labels, depth, layers.share)
+    merit = _central(labels, depth, layers.front_share)
     if merit.max() <= 0.0:
         return np.zeros_like(layers.moved), True
-    low, high = np.percentile(layers.front[labels == int(merit.argmax())], [2.0, 98.0], axis=0)
+    low, high = np.percentile(layers.front_m[labels == int(merit.argmax())], [2.0, 98.0], axis=0)
     margin = _NEIGHBOUR_SIZES * float(np.linalg.norm(high - low))
-    near = ((layers.front > low - margin) & (layers.front < high + margin)).all(axis=-1)
-    elsewhere = _central(np.where(near, 0, labels), depth, layers.share).sum()
+    near = ((layers.front_m > low - margin) & (layers.front_m < high + margin)).all(axis=-1)
+    elsewhere = _central(np.where(near, 0, labels), depth, layers.front_share).sum()
     return layers.moved & allowed & near, bool(elsewhere < _RIVAL * merit.sum())
 
 
 def _standing_object(
-    planes: Array, points: Float32, allowed: BoolArray, noise: DepthNoise
+    planes: Array, points: Float32Array, allowed: BoolArray, noise: DepthNoise
 ) -> tuple[Array | None, BoolArray, bool]:
     """Find, in one image, the support at the centre and what stands on it.
 
@@ -135,7 +133,7 @@ def _standing_object(
     return support, found, levels_used == 1
 
 
-def _central(labels: Labels, depth_m: Float32, weight: Float32) -> npt.NDArray[np.float64]:
+def _central(labels: Labels, depth_m: Float32Array, weight: Float32Array) -> npt.NDArray[np.float64]:
     """Return the merit of each label, 0 for label 0: its weight near the image's centre, nearer things first."""
     rows, columns = (np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in labels.shape)
     centred = np.exp(-2.0 * (rows[:, None] ** 2 + columns**2))
@@ -144,7 +142,7 @@ def _central(labels: Labels, depth_m: Float32, weight: Float32) -> npt.NDArray[n
     return merit.astype(np.float64)
 
 
-def _walls(planes: Array, points: Float32, noise: DepthNoise) -> list[Array]:
+def _walls(planes: Array, points: Float32Array, noise: DepthNoise) -> list[Array]:
     """Return those planes that run out of the image."""
     edge = edge_of(np.isfinite(points[..., 2]))
     rim = points[edge]
@@ -153,26 +151,26 @@ def _walls(planes: Array, points: Float32, noise: DepthNoise) -> list[Array]:
     return [plane for plane in planes if np.count_nonzero(np.abs(heights(rim, plane)) < tolerance) > least]
 
 
-def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | None, noise: DepthNoise) -> Float32:
+def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | None, noise: DepthNoise) -> Float32Array:
     """Return the depth (h, w) at and beyond which is no object, infinite where that is not known.
 
     A still piece above the support that does not run out of the image may be the object's own: the middle of a mug on
     a turntable looks still, and only its handle moves. Without a support, nothing still is the object's. Walls with all
     of the object before them go on behind it.
     """
-    back = layers.points[..., 2]
+    back = layers.back_m[..., 2]
     above = layers.still & ~found
     if support is not None:
-        above &= heights(layers.points, support) > noise.tolerance_m(back)
+        above &= heights(layers.back_m, support) > noise.tolerance_m(back)
     labels = pieces(back, above)
     touching = np.bincount(labels[edge_of(np.isfinite(back))], minlength=int(labels.max()) + 1)
     outside = touching >= _TOUCHING_PX
     outside |= support is None
     outside[0] = False
     depth = np.where(outside[labels], back, np.float32(np.inf))
-    body = layers.front[found]
+    body = layers.front_m[found]
     tolerance = noise.tolerance_m(body[:, 2])
-    for wall in _walls(planes, layers.points, noise):
+    for wall in _walls(planes, layers.back_m, noise):
         is_support = support is not None and bool((wall == support).all())
         if is_support or np.mean(heights(body, wall) > -tolerance) < _IN_FRONT_SHARE:
             continue

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
 from modeler.segmentation.clusters import edge_of
 from modeler.segmentation.finder import Found, find
@@ -15,9 +14,7 @@ from modeler.segmentation.layers import planning_stride, point_image, take_apart
 from modeler.segmentation.noise import DepthNoise
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
 from modeler.segmentation.scene import Scene, learn
-from modeler.types import BoolArray, Frame, InputError, Outcome, Plane, Segmentation
-
-Float32 = npt.NDArray[np.float32]
+from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation
 
 _RIVAL = 0.4  # of the best cluster's merit: from here on the choice is unsure
 _CUT_SHARE = 0.1  # of the mask's width; more on the edge of the image means that the object is cut off
@@ -109,7 +106,7 @@ class Segmenter:
         if layers.camera_moves:
             return Scene()
         stride = planning_stride(camera)
-        allowed = self._allowed(layers.front[..., 2], stride)
+        allowed = self._allowed(layers.front_m[..., 2], stride)
         scene = learn(layers, allowed, self.noise, least_points=self.min_points / stride**2)
         return replace(scene, still=len(frames) > 1)
 
@@ -119,7 +116,7 @@ class Segmenter:
         depth[~self._allowed(depth)] = np.nan
         return find(depth, frame.camera, scene, self.noise, gap_m=self.gap_m)
 
-    def _allowed(self, depth_m: Float32, stride: int = 1) -> BoolArray:
+    def _allowed(self, depth_m: Float32Array, stride: int = 1) -> BoolArray:
         """Return the pixels (h, w) of a thinned depth image that region and greatest depth leave."""
         allowed = np.ones(depth_m.shape, dtype=np.bool_) if self.max_depth_m is None else ~(depth_m > self.max_depth_m)
         if self.roi is not None:
@@ -152,11 +149,11 @@ class Segmenter:
         return None if guess is None else fit_beside(ground, body, guess=guess, noise=self.noise)
 
 
-def _measured(frame: Frame) -> Float32:
+def _measured(frame: Frame) -> Float32Array:
     """Return a copy of the depth (h, w) with NaN for everything that is no measurement."""
     return np.where(frame.depth_m > 0.0, frame.depth_m, np.float32(np.nan)).astype(np.float32, copy=False)
 
 
-def _points(frame: Frame, stride: int = 1) -> Float32:
+def _points(frame: Frame, stride: int = 1) -> Float32Array:
     """Return the thinned points (h, w, 3) of a frame."""
     return point_image(_measured(frame)[::stride, ::stride], frame.camera, stride=stride)
