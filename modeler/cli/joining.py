@@ -66,7 +66,11 @@ def join(options: Join) -> int:
         sequence=f"{first.report['sequence']} + {second.report['sequence']}",
         seed=options.seed,
         prior="none",
-        settings={"joined": [str(options.run_a), str(options.run_b)], "offset": offset, "pairs": options.pairs},
+        settings={
+            "joined": [str(options.run_a.absolute()), str(options.run_b.absolute())],
+            "offset": offset,
+            "pairs": options.pairs,
+        },
         doubts=_doubts(matches),
         seconds={"total": time.perf_counter() - began},
     )
