@@ -5,18 +5,16 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import struct
 import subprocess
 import sys
 import tempfile
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from recordings import save, small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
+from recordings import png_claiming, save, small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
 
 from modeler.cli import main
 from sequences import write_bop
@@ -103,14 +101,6 @@ def link_out(pattern: str, *, place: int = 1) -> Damage:
         path.symlink_to(outside)
 
     return damage
-
-
-def png_claiming(width: int, height: int) -> bytes:
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b"")
 
 
 def swap_lines(first: int, other: int) -> Callable[[str], str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from refusal import refused
 
 from modeler import se3
 from modeler.types import InputError
@@ -269,12 +270,8 @@ def test_every_fault_is_one_line_that_names_the_recipe(tmp_path: Path, fault: st
     text, says = FAULTS[fault]
     path = tmp_path / "r.json"
     path.write_text(text)
-    with pytest.raises(InputError) as caught:
+    with refused(says, str(path)):
         load_recipe(path)
-    message = str(caught.value)
-    assert says in message
-    assert str(path) in message
-    assert "\n" not in message
 
 
 def test_a_recipe_nested_without_end_is_refused(tmp_path: Path) -> None:
@@ -296,9 +293,8 @@ def test_unknown_recipes_and_meshes_are_named(tmp_path: Path) -> None:
     (tmp_path / "broken.ply").write_bytes(b"ply\nnonsense")
     (tmp_path / "empty.obj").write_bytes(b"# nothing\n")
     for name in ("broken.ply", "empty.obj"):
-        with pytest.raises(InputError, match=name) as caught:
+        with refused(name):
             MeshFile(tmp_path / name).mesh()
-        assert "\n" not in str(caught.value)
 
 
 def test_the_camera_looks_at_the_table() -> None:

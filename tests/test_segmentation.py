@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusal import refused
 from scipy.spatial.transform import Rotation
 
 from modeler.segmentation import Scene, Segmenter
 from modeler.segmentation.clusters import edge_of, mixed_pixels, pieces, voxel_clusters, without_specks
-from modeler.types import Camera, Frame, InputError, Outcome
+from modeler.types import Camera, Frame, Outcome
 from sequences.bop import BopSequence
 
 CAMERA = Camera(width=240, height=180, fx=220.0, fy=220.0, cx=119.5, cy=89.5)
@@ -259,9 +260,8 @@ def test_the_same_frames_give_the_same_masks(rng):
 
 @pytest.mark.parametrize("fields", [{"roi": (5, 5, 5, 9)}, {"roi": (-1, 0, 5, 9)}, {"max_depth_m": 0.0}])
 def test_bad_parameters_are_refused_in_one_line(fields):
-    with pytest.raises(InputError, match="give") as error:
+    with refused("give"):
         Segmenter(**fields)
-    assert "\n" not in str(error.value)
 
 
 def test_mixed_pixels_against_a_naive_twin(rng):

@@ -23,6 +23,7 @@ import pytest
 import rerun as rr
 import rerun.chunk
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from turning_box import CENTRE_M, COVARIANCE, HALF_M, object_from_camera, steps
 
 from modeler import se3
@@ -414,7 +415,7 @@ def test_ellipsoids_are_the_covariance_as_magnified(run: list[Step], recording: 
         for n, index in enumerate(sorted(step.solution.covariances)):
             rotation = step.solution.trajectory[index][:3, :3]
             wanted = rotation @ step.solution.covariances[index][3:, 3:] @ rotation.T
-            axes = se3.Rotation.from_quat(one["quaternions"][n]).as_matrix()
+            axes = Rotation.from_quat(one["quaternions"][n]).as_matrix()
             got = axes @ np.diag((np.array(one["half_sizes"][n]) / factor) ** 2) @ axes.T
             np.testing.assert_allclose(got, wanted, atol=1e-3 * np.trace(wanted))
             np.testing.assert_allclose(one["centers"][n], step.solution.trajectory[index][:3, 3], atol=1e-6)
