@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -13,14 +12,12 @@ import rerun as rr
 from modeler import se3
 from modeler.types import Array, ObjectModel, Posterior, RayImage, Step
 from viz import entities
-
-Drawing = Iterator[tuple[str, rr.AsComponents]]
+from viz.drawings import CLEAR, Drawing
 
 _PAIR_POINTS: Final = 6_000
 _MODEL_POINTS: Final = 15_000
 _TRIANGLES: Final = 60_000
 _PLAIN: Final = 215.0  # grey of surface without colour
-_CLEAR: Final = rr.Clear(recursive=False)
 _POINT_SIZE: Final = rr.Radius.ui_points(1.75)
 
 
@@ -35,7 +32,7 @@ def pair_drawing(step: Step) -> Drawing:
     posterior = shown_posterior(step)
     if posterior is None or step.view is None:
         for path in (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER, entities.PAIR_CAPTION):
-            yield path, _CLEAR
+            yield path, CLEAR
         return
     identity = np.eye(4)
     yield entities.PAIR_TARGET, _view_points(step.views[posterior.target], identity, entities.TARGET_RGB)
@@ -66,13 +63,13 @@ def model_drawing(step: Step) -> Drawing:
     model = step.model
     meshed = step.last and model is not None and len(model.triangles) > 0
     if model is None or meshed:
-        yield entities.CLOUD, _CLEAR
+        yield entities.CLOUD, CLEAR
     else:
         stride = math.ceil(max(len(model.points_m), 1) / _MODEL_POINTS)
         normals = model.normals[::stride]
         colours = shaded((215, 215, 215), normals) if model.colours is None else model.colours[::stride]
         yield entities.CLOUD, rr.Points3D(model.points_m[::stride], colors=colours, radii=_POINT_SIZE)
-    yield entities.MESH, _mesh(model) if model is not None and meshed else _CLEAR
+    yield entities.MESH, _mesh(model) if model is not None and meshed else CLEAR
 
 
 def shaded(rgb: entities.Rgb, normals: Array) -> npt.NDArray[np.uint8]:

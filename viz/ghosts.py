@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,8 +14,7 @@ import rerun as rr
 from modeler import se3
 from modeler.types import Array, Mode, Posterior, RayImage, Step
 from viz import clouds, entities, spread, uncertainty
-
-Drawing = Iterator[tuple[str, rr.AsComponents]]
+from viz.drawings import CLEAR, Drawing
 
 _GHOSTS: Final = 20
 _GHOST_POINTS: Final = 200
@@ -23,7 +22,6 @@ _MEAN_POINTS: Final = 1_500
 _SHOWN_SD: Final = 0.12  # of the farthest point under the widest mode, as a share of its distance from the centre
 _MOST_RAD: Final = 0.25  # sd of the rotation as drawn: beyond it a magnified spread no longer looks like one
 _GHOST_LIGHT: Final = 0.55
-_CLEAR: Final = rr.Clear(recursive=False)
 _PATHS: Final = (
     entities.GHOSTS,
     entities.GHOST_MEANS,
@@ -53,7 +51,7 @@ def drawing(step: Step) -> Drawing:
     posterior = clouds.shown_posterior(step)
     if posterior is None or step.view is None or not np.isfinite(posterior.pose.covariance).all():
         for path in _PATHS:
-            yield path, _CLEAR
+            yield path, CLEAR
         return
     view, ghosts = step.view, magnified(posterior, step.view)
     colours = np.array([entities.MODE_RGB[k % len(entities.MODE_RGB)] for k in range(len(ghosts.modes))])

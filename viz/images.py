@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -14,8 +13,7 @@ from PIL import Image
 
 from modeler.types import BoolArray, Frame, Step
 from viz import entities
-
-Drawing = Iterator[tuple[str, rr.AsComponents]]
+from viz.drawings import Drawing
 
 _PIXELS: Final = 500_000  # larger images are shown at a whole fraction of their size
 _DEPTH_PIXELS: Final = 100_000

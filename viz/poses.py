@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -12,8 +12,7 @@ import rerun as rr
 from modeler import se3
 from modeler.types import Array, Camera, Edge, Step
 from viz import entities
-
-Drawing = Iterator[tuple[str, rr.AsComponents]]
+from viz.drawings import CLEAR, Drawing
 
 OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
 """From the object towards the eye that looks at the whole graph."""
@@ -21,7 +20,6 @@ OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
 _POSES: Final = 150  # of more than so many poses every n-th is drawn
 _CAMERA_SIZE: Final = 0.1  # as a share of the distance to the object
 _CAPTION: Final = 1.0  # of captions below the object, as a share of the distance to it
-_CLEAR: Final = rr.Clear(recursive=False)
 
 
 def drawing(step: Step) -> Drawing:
@@ -33,7 +31,7 @@ def drawing(step: Step) -> Drawing:
     yield entities.AXES, _axes(poses, size_m)
     current = trajectory.get(step.frame.index)
     if current is None:
-        yield entities.CURRENT, _CLEAR
+        yield entities.CURRENT, CLEAR
     else:
         style = (entities.CURRENT_RGB, 3.0)
         yield entities.CURRENT, _frusta(current[None], step.frame.camera, 1.3 * size_m, style)
@@ -91,7 +89,7 @@ def _edges(step: Step) -> Drawing:
 
 def _lines(strips: Sequence[Array | list[Array]], rgb: entities.Rgb, points: float) -> rr.AsComponents:
     """Return line strips `points` wide on the screen, or nothing where there are none."""
-    return rr.LineStrips3D(strips, colors=rgb, radii=rr.Radius.ui_points(points)) if strips else _CLEAR
+    return rr.LineStrips3D(strips, colors=rgb, radii=rr.Radius.ui_points(points)) if strips else CLEAR
 
 
 def _frusta(poses: Array, camera: Camera, size_m: float, style: tuple[entities.Rgb, float]) -> rr.AsComponents:
@@ -107,7 +105,7 @@ def _frusta(poses: Array, camera: Camera, size_m: float, style: tuple[entities.R
 def _axes(poses: Array, size_m: float) -> rr.AsComponents:
     """Return the axes of the poses (n, 4, 4): x red, y green, z blue."""
     if len(poses) == 0:
-        return _CLEAR
+        return CLEAR
     return rr.Arrows3D(
         origins=np.repeat(poses[:, :3, 3], 3, axis=0),
         vectors=size_m * np.swapaxes(poses[:, :3, :3], 1, 2).reshape(-1, 3),

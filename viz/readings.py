@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import rerun as rr
 
-from modeler import se3
 from modeler.export.words import undetermined
-from modeler.types import Array, Edge, Posterior, Step
-from viz import entities, poses
-
-Drawing = Iterator[tuple[str, rr.AsComponents]]
+from modeler.types import Array, Edge, PoseGaussian, Posterior, Step
+from viz import certainty, entities, poses
+from viz.drawings import Drawing
 
 _SERIES_RGB = {"odometry": entities.ODOMETRY_RGB, "closure": entities.CLOSURE_RGB, "pose": entities.UNCERTAINTY_RGB}
 
@@ -58,7 +56,8 @@ def drawing(step: Step) -> Drawing:
                     yield f"{reading}/{kind}", rr.Scalars(value)
     covariance = step.solution.covariances.get(step.frame.index)
     if covariance is not None and np.isfinite(covariance).all():
-        for reading, value in _sds(covariance, _centre_m(step)).items():
+        pose = PoseGaussian(step.solution.trajectory[step.frame.index], covariance)
+        for reading, value in _sds(pose, _centre_m(step)).items():
             yield f"{reading}/pose", rr.Scalars(value)
 
 
@@ -76,18 +75,10 @@ def words(step: Step) -> Drawing:
 def pair_words(edge: Edge, step: Step) -> str:
     """Say in one line how the registration of a pair ended and how sure it is."""
     posterior = edge.posterior
-    readings = _readings(posterior, step)
-    parts = [
-        f"rotation sd {readings[entities.ROTATION_SD]:.2g}°",
-        f"translation sd {readings[entities.TRANSLATION_SD]:.2g} mm",
-        f"overlap {readings[entities.OVERLAP]:.0f}%",
-        f"{readings[entities.EFFECTIVE_SAMPLES]:.0f} effective samples",
-        f"{readings[entities.SECONDS]:.2g} s",
-    ]
     verdict = edge.kind if edge.accepted else f"{edge.kind} rejected"
     if not edge.accepted and posterior.usable:  # else the outcome is the reason
         verdict += f" ({edge.reason})"
-    known = ", ".join(part for part in parts if not part.startswith("nan") and " nan" not in part)
+    known = ", ".join(certainty.words(posterior, _centre_m(step)))
     return f"{edge.source} → {edge.target} {verdict}: {posterior.outcome.label}; {known}"
 
 
@@ -117,32 +108,19 @@ def now_words(step: Step) -> str:
     return "\n".join(lines)
 
 
-def worst_axis_sd(covariance: Array) -> float:
-    """Return the sd along the least certain axis of a covariance (3, 3)."""
-    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
-
-
 def _readings(posterior: Posterior, step: Step) -> dict[str, float]:
     """Return the readings of a pair by entity path, NaN where a method does not give one."""
-    return _sds(posterior.pose.covariance, _centre_m(step)) | {
+    return _sds(posterior.pose, _centre_m(step)) | {
         entities.EFFECTIVE_SAMPLES: posterior.effective_samples,
         entities.OVERLAP: 100.0 * posterior.overlap,
         entities.SECONDS: posterior.seconds,
     }
 
 
-def _sds(covariance: Array, centre_m: Array) -> dict[str, float]:
-    """Return the sd of the rotation in degrees and of the point `centre_m` (3,) in mm, by entity path.
-
-    The translation of the camera's own origin says little: it is the rotation times the distance of the object.
-    """
-    if not np.isfinite(covariance).all():
-        return {entities.ROTATION_SD: math.nan, entities.TRANSLATION_SD: math.nan}
-    jacobian = np.concatenate([-se3.hat(centre_m), np.eye(3)], axis=1)
-    return {
-        entities.ROTATION_SD: math.degrees(worst_axis_sd(covariance[:3, :3])),
-        entities.TRANSLATION_SD: 1000.0 * worst_axis_sd(jacobian @ covariance @ jacobian.T),
-    }
+def _sds(pose: PoseGaussian, centre_m: Array) -> dict[str, float]:
+    """Return how sure a motion is by entity path."""
+    sd = certainty.sd_of(pose, centre_m)
+    return {entities.ROTATION_SD: sd.rotation_deg, entities.TRANSLATION_SD: sd.translation_mm}
 
 
 def _centre_m(step: Step) -> Array:

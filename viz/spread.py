@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -11,20 +10,18 @@ import rerun as rr
 from modeler import se3
 from modeler.types import Array, Posterior, RayImage, Step
 from viz import clouds, entities
-
-Drawing = Iterator[tuple[str, rr.AsComponents]]
+from viz.drawings import CLEAR, Drawing
 
 _DRAWS: Final = 80
 _LENGTH: Final = 1.1  # of the axes, in distances of the farthest point from the centroid: they stick out of the object
-_CLEAR: Final = rr.Clear(recursive=False)
 
 
 def drawing(step: Step) -> Drawing:
     """Yield the axes of the source at the mean of the pair's posterior, and their ends under draws from it."""
     posterior = clouds.shown_posterior(step)
     if posterior is None or step.view is None or not np.isfinite(posterior.pose.covariance).all():
-        yield entities.PAIR_AXES, _CLEAR
-        yield entities.PAIR_DRAWS, _CLEAR
+        yield entities.PAIR_AXES, CLEAR
+        yield entities.PAIR_DRAWS, CLEAR
         return
     centre = step.view.centroid_m
     length_m = axes_length_m(step.view)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -13,12 +13,10 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.types import Array, Edge, Step
 from viz import chain, clouds, entities, poses
-
-Drawing = Iterator[tuple[str, rr.AsComponents]]
+from viz.drawings import CLEAR, Drawing
 
 _LARGEST_3_SIGMA: Final = 0.3  # half axis of the largest ellipsoid of a chain, as a share of the object's distance
 _LARGEST_EDGE_SIGMA: Final = 0.12  # half axis of the largest ellipsoid of an edge, as a share of that distance
-_CLEAR: Final = rr.Clear(recursive=False)
 _AFTER: Final = (
     entities.POSITION_1_SIGMA,
     entities.POSITION_3_SIGMA,
@@ -53,7 +51,7 @@ def _of_poses(
     covariances = {k: covariance for k, covariance in covariances.items() if np.isfinite(covariance).all()}
     if not covariances or not step.views:
         for path in paths:
-            yield path, _CLEAR
+            yield path, CLEAR
         return
     size_m = poses.camera_size_m(step)
     known_poses = np.array([trajectory[k] for k in covariances])
@@ -109,8 +107,8 @@ def _of_edges(step: Step) -> Drawing:
     ]
     edges = [edge for edge in edges if np.isfinite(edge.posterior.pose.covariance).all()]
     if not edges or not step.views:
-        yield entities.EDGES_1_SIGMA, _CLEAR
-        yield entities.EDGES_MAGNIFICATION, _CLEAR
+        yield entities.EDGES_1_SIGMA, CLEAR
+        yield entities.EDGES_MAGNIFICATION, CLEAR
         return
     ends = np.array([[trajectory[edge.target][:3, 3], trajectory[edge.source][:3, 3]] for edge in edges])
     rotations = np.array([trajectory[edge.source][:3, :3] for edge in edges])

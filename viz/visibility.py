@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,8 +14,7 @@ from scipy import ndimage
 from modeler import se3
 from modeler.types import Array, BoolArray, RayImage, Step
 from viz import clouds, entities, images
-
-Drawing = Iterator[tuple[str, rr.AsComponents]]
+from viz.drawings import CLEAR, Drawing
 
 MISSING, BACKGROUND, OBJECT = 0, 1, 2
 """Areas of a picture: nothing was measured, something other than the object was, the object was."""
@@ -26,7 +24,6 @@ AGREES, HIDDEN, VIOLATION, NO_SAY = 0, 1, 2, 3
 _POINTS: Final = 1_200
 _SIGMAS: Final = 4.0  # closer to the surface than this a point agrees with it
 _DEAD: Final = 1.25  # width of the rim of the silhouette, in lateral sds, where pixels are mixed and judge nothing
-_CLEAR: Final = rr.Clear(recursive=False)
 _PATHS: Final = {
     AGREES: (entities.VISIBILITY_AGREES, entities.AGREES_RGB, 1.25),
     HIDDEN: (entities.VISIBILITY_HIDDEN, entities.HIDDEN_RGB, 1.0),
@@ -59,7 +56,7 @@ def drawing(step: Step) -> Drawing:
     paths = (entities.VISIBILITY_AREAS, entities.VISIBILITY_CAPTION, *(path for path, _, _ in _PATHS.values()))
     if posterior is None or step.view is None or not np.isfinite(posterior.pose.mean).all():
         for path in paths:
-            yield path, _CLEAR
+            yield path, CLEAR
         return
     target = step.views[posterior.target]
     stride = images.depth_stride_px(target.frame)
@@ -68,7 +65,7 @@ def drawing(step: Step) -> Drawing:
     for order, (verdict, (path, rgb, points)) in enumerate(_PATHS.items()):
         chosen = shown.pixels[shown.verdicts == verdict]
         if len(chosen) == 0:
-            yield path, _CLEAR
+            yield path, CLEAR
         else:
             radius = rr.Radius.ui_points(points)
             yield path, rr.Points2D(chosen / stride, colors=rgb, radii=radius, draw_order=10.0 + order)

@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-import numpy as np
-
 from modeler import evaluation, se3
 from modeler.types import Array, Edge
+from viz import certainty
 from viz.report.elements import data_address
 from viz.report.pairs import Thumbnails
-from viz.report.result import Result, sd_of
+from viz.report.result import Result
 
 
 def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Array) -> Sequence[str]:
@@ -56,21 +55,14 @@ def _pair(result: Result, edge: Edge, record: Mapping[str, Any], pictures: Thumb
     seen_m = centre_m
     if edge.source in result.poses:
         seen_m = se3.transform(se3.inverse(result.poses[edge.source].mean), centre_m[None])[0]
-    sd = sd_of(posterior.pose, seen_m)
-    facts = {
-        "rotation sd {:.2g}°": sd.rotation_deg,
-        "translation sd {:.2g} mm": sd.translation_mm,
-        "overlap {:.0f} %": 100.0 * posterior.overlap,
-        "{:.0f} effective samples": posterior.effective_samples,
-        "{:.2g} s": posterior.seconds,
-    }
+    facts = certainty.words(posterior, seen_m)
     truth = result.true_motion(edge)
     if truth is not None:
-        facts |= {
-            "rotation off by {:.2f}°": evaluation.rotation_error_deg(posterior.pose.mean, truth),
-            "translation by {:.1f} mm": 1000.0 * evaluation.translation_error_m(posterior.pose.mean, truth, seen_m),
-        }
-    words = ", ".join(form.format(value) for form, value in facts.items() if np.isfinite(value))
+        facts += [
+            f"rotation off by {evaluation.rotation_error_deg(posterior.pose.mean, truth):.2f}°",
+            f"translation by {1000.0 * evaluation.translation_error_m(posterior.pose.mean, truth, seen_m):.1f} mm",
+        ]
+    words = ", ".join(facts)
     open_words = _mode_words(record.get("modes", [])) + "".join(
         f"<p>{escape(words)}.</p>" for words in record.get("undetermined", [])
     )

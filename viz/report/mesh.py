@@ -6,17 +6,15 @@ import base64
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types import Array
+from modeler.export import read_model
+from modeler.types import Array, InputError
 from viz import entities
 from viz.clouds import coarsened
-
-if TYPE_CHECKING:
-    import trimesh
 
 MOST_SIGMA_M: Final = 2e-3
 """Standard deviation of a vertex at the end of the scale of colours."""
@@ -54,42 +52,27 @@ class Mesh:
 
 
 def read_mesh(path: Path) -> Mesh | None:
-    """Return the mesh of a PLY file; None where there is none, or it has no triangles."""
-    import trimesh  # slow to load
-    from trimesh.visual import ColorVisuals
-
-    if not path.is_file():
+    """Return the mesh of a PLY file; None where there is none that can be drawn."""
+    try:
+        model = read_model(path)
+    except InputError:
         return None
-    mesh = trimesh.load(path, process=False)
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        return None
-    attributes = [np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)]
-    visual = mesh.visual
-    coloured = isinstance(visual, ColorVisuals) and visual.kind == "vertex"
-    if isinstance(visual, ColorVisuals) and coloured:
-        attributes.append(np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3])
-    sigmas_m = _sigmas_m(mesh)
-    if sigmas_m is not None:
-        attributes.append(_certainty(sigmas_m))
-    triangles = np.asarray(mesh.faces, dtype=np.int64)
-    vertices, kept = coarsened(np.concatenate(attributes, axis=1, dtype=np.float64), triangles, _TRIANGLES)
+    attributes = [model.vertices_m, model.vertex_normals]
+    if model.vertex_colours is not None:
+        attributes.append(model.vertex_colours.astype(np.float64))
+    if model.vertex_sigmas_m is not None:
+        attributes.append(_certainty(model.vertex_sigmas_m))
+    vertices, kept = coarsened(np.concatenate(attributes, axis=1), model.triangles, _TRIANGLES)
     used, kept = np.unique(kept, return_inverse=True)
     vertices = vertices[used]
     return Mesh(
         vertices_m=vertices[:, :3],
         normals=vertices[:, 3:6] / np.maximum(np.linalg.norm(vertices[:, 3:6], axis=1, keepdims=True), 1e-12),
         triangles=kept.reshape(-1, 3),
-        colours=np.rint(vertices[:, 6:9]).astype(np.uint8) if coloured else None,
-        certainty=None if sigmas_m is None else np.rint(vertices[:, -3:]).astype(np.uint8),
-        total=len(triangles),
+        colours=None if model.vertex_colours is None else np.rint(vertices[:, 6:9]).astype(np.uint8),
+        certainty=None if model.vertex_sigmas_m is None else np.rint(vertices[:, -3:]).astype(np.uint8),
+        total=len(model.triangles),
     )
-
-
-def _sigmas_m(mesh: trimesh.Trimesh) -> Array | None:
-    """Return the sd (v,) that the file states for each vertex, negative where it is made up; None without."""
-    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
-    names = getattr(raw, "dtype", np.dtype([])).names or ()
-    return np.asarray(raw["sigma_m"], dtype=np.float64) if raw is not None and "sigma_m" in names else None
 
 
 def _certainty(sigmas_m: Array) -> Array:
@@ -97,7 +80,7 @@ def _certainty(sigmas_m: Array) -> Array:
     from matplotlib import colormaps
 
     rgb = 255.0 * colormaps["cividis"](np.clip(sigmas_m / MOST_SIGMA_M, 0.0, 1.0))[:, :3]
-    rgb[sigmas_m < 0.0] = entities.MADE_UP_RGB
+    rgb[np.isinf(sigmas_m)] = entities.MADE_UP_RGB
     return rgb
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -10,7 +11,8 @@ import numpy as np
 from modeler import evaluation, se3
 from modeler.types import Array, PoseGaussian
 from viz.calibration import Curve, Panel, coverage_curves
-from viz.report.result import Result, sd_of, sds
+from viz.certainty import Sd, sd_of
+from viz.report.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -96,7 +98,7 @@ def uncertainty(result: Result, centre_m: Array) -> bytes:
     figure = new_figure(9.0, 4.0)
     of_rotation, of_translation = figure.subplots(1, 2)
     for label, poses, colour in (("before closure", result.chain, BEFORE), ("after optimisation", result.poses, AFTER)):
-        spread, frames = sds(poses, centre_m), list(poses)
+        spread, frames = _sds(poses, centre_m), list(poses)
         for axis, values in (
             (of_rotation, [sd.rotation_deg for sd in spread]),
             (of_translation, [sd.translation_mm for sd in spread]),
@@ -125,7 +127,7 @@ def errors(result: Result, centre_m: Array) -> bytes:
     for label, poses, colour in (("before closure", result.chain, BEFORE), ("after optimisation", result.poses, AFTER)):
         known = {k: pose for k, pose in poses.items() if result.true_pose(k) is not None}
         off = evaluation.trajectory_errors({k: pose.mean for k, pose in known.items()}, result.truth, centre_m)
-        stated = sds(known, centre_m)
+        stated = _sds(known, centre_m)
         for axis, values, sd in (
             (of_rotation, list(off.rotation_deg.values()), [one.rotation_deg for one in stated]),
             (of_translation, [1000.0 * v for v in off.translation_m.values()], [one.translation_mm for one in stated]),
@@ -163,6 +165,11 @@ def _poses(result: Result) -> list[tuple[PoseGaussian, Array]]:
 def _seen_m(result: Result, frame: int, centre_m: Array) -> Array:
     """Return the object's centre (3,) in the camera of a frame."""
     return se3.transform(se3.inverse(result.poses[frame].mean), centre_m[None])[0]
+
+
+def _sds(poses: Mapping[int, PoseGaussian], centre_m: Array) -> list[Sd]:
+    """Return how sure poses object_from_camera are, the object's centre (3,) given in the object frame."""
+    return [sd_of(pose, se3.transform(se3.inverse(pose.mean), centre_m[None])[0]) for pose in poses.values()]
 
 
 def _root(covariance: Array) -> Array:

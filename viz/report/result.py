@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from modeler import se3
 from modeler.export import RunFolder, edges_of, poses_of
 from modeler.types import Array, Edge, InputError, PoseGaussian
 from viz import chain
-from viz.readings import worst_axis_sd
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,32 +69,3 @@ class Result:
         if edge.source not in self.truth or edge.target not in self.truth:
             return None
         return self.truth[edge.target] @ se3.inverse(self.truth[edge.source])
-
-
-@dataclass(frozen=True)
-class Sd:
-    """How sure a motion is, along its worst axes."""
-
-    rotation_deg: float
-    """Standard deviation of the rotation."""
-    translation_mm: float
-    """Standard deviation of the object's centre."""
-
-
-def sd_of(pose: PoseGaussian, centre_m: Array) -> Sd:
-    """Return how sure a motion is; NaN where its covariance is not finite.
-
-    Args:
-        pose: with ξ in the coordinates in which `centre_m` is given.
-        centre_m: (3,) the object's centre.
-    """
-    if not np.isfinite(pose.covariance).all():
-        return Sd(float("nan"), float("nan"))
-    jacobian = np.concatenate([-se3.hat(centre_m), np.eye(3)], axis=1)
-    shift = worst_axis_sd(jacobian @ pose.covariance @ jacobian.T)
-    return Sd(float(np.degrees(worst_axis_sd(pose.covariance[:3, :3]))), 1000.0 * shift)
-
-
-def sds(poses: Mapping[int, PoseGaussian], centre_m: Array) -> Sequence[Sd]:
-    """Return how sure poses object_from_camera are, the object's centre (3,) given in the object frame."""
-    return [sd_of(pose, se3.transform(se3.inverse(pose.mean), centre_m[None])[0]) for pose in poses.values()]
