@@ -24,8 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: what follows the program's name; those of the process without it.
     """
     logging.basicConfig(level=logging.WARNING, format="modeler: %(message)s")  # to stderr
-    # Rerun complains in its own way of a viewer that was closed, which is nobody's error; we tell what matters.
-    os.environ.setdefault("RUST_LOG", "warn,re_sdk=off,re_grpc_client=off")
+    # Rerun complains in its own way of a viewer that was closed, which is nobody's error, and of a disk that is full;
+    # we tell what matters.
+    os.environ.setdefault("RUST_LOG", "warn,re_sdk=off,re_grpc_client=off,re_log_encoding=off")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be text
     try:

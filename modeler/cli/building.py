@@ -17,6 +17,7 @@ from modeler.cli.watching import watched
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.types import InputError
 from sequences import AbstractSequence, SensedSequence, frame_range, read_noise, survey
+from viz.ending import ends_whole
 from viz.stream import open_stream
 
 
@@ -80,6 +81,11 @@ def build(options: Build) -> int:
         if not report:
             raise KeyboardInterrupt  # before the first frame
         folder.finish()
+    if not ends_whole(folder.path / "recording.rrd"):
+        print(
+            f"modeler: {folder.path / 'recording.rrd'}: is cut off (is the disk full?); the rest is whole",
+            file=sys.stderr,
+        )
     return _told(report, options)
 
 
