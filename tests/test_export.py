@@ -24,6 +24,7 @@ from modeler.export import (
     g2o_text,
     poses_of,
     read_model,
+    report_of,
     simplified,
     textured,
     tinted,
@@ -535,6 +536,30 @@ def test_run_has_finished_when_its_registrations_are_forgotten(tmp_path: Path) -
     run.finish()
     assert not run.finished(META)
     assert run.pairs.folder.exists()
+
+
+def test_a_folder_that_takes_long_to_write_is_written_less_often(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s, written = 0.0, []
+    run, steps = RunFolder.open(tmp_path), _steps(40)
+
+    def slow(step: Step, frames: list, meta: RunMeta) -> dict:
+        nonlocal now_s
+        now_s += 2.0
+        written.append(step.frame.index)
+        return report_of(step, frames, meta)
+
+    monkeypatch.setattr("modeler.export.run_folder.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("modeler.export.run_folder.report_of", slow)
+    report = run.newest
+    for step in steps:
+        now_s += 1.0
+        report = run.write(step, META)
+    assert written == [3, 39, 75, 81]  # of 3, 5, 7 …: every eighteenth second, and the last
+    assert report == run.report()
+    assert len(report["frames"]) == 40
+    assert len((tmp_path / "odometry.txt").read_text().splitlines()) == 40
 
 
 def test_what_no_report_tells_of_is_not_resumed(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,32 @@ from modeler.types import InputError, Step
 _REPORT = "report.json"
 _OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd")
 """The report, without which nothing is resumed, goes first."""
+_NO_TIME_S = 0.1
+
+
+@dataclass
+class Pace:
+    """Sees to it that what is done again and again, and takes ever longer, takes a tenth of the time at most."""
+
+    resting_until_s: float = 0.0
+    """By `time.monotonic`."""
+
+    @property
+    def rests(self) -> bool:
+        """Whether it is too early to do it again."""
+        return time.monotonic() < self.resting_until_s
+
+    def took(self, seconds: float) -> None:
+        """Note that it was done and how long that took; what takes no time may always be done."""
+        if seconds > _NO_TIME_S:
+            self.resting_until_s = time.monotonic() + 9.0 * seconds
 
 
 @dataclass(frozen=True)
 class RunFolder:
     """A sink for steps. Poses, graph and report are written after every step, clouds and mesh after the last.
 
+    Where that takes long, as of a thousand frames, some steps are passed over: it gets a tenth of the time at most.
     Each file is replaced in one go, the report after what it reports on: a run killed at any moment leaves no half
     file. Until the run has ended each registration is kept as well. `RunFolder(path)` is for reading; `RunFolder.open`
     makes one to write to.
@@ -35,6 +56,10 @@ class RunFolder:
     """Number of frames that a resumed run had got to: until it is there again its files stay as they are."""
     frames: dict[int, FrameRecord] = field(default_factory=dict, init=False, repr=False)
     """What became of the frames so far; a step knows only its own."""
+    newest: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+    """The report that was written last."""
+    pace: Pace = field(default_factory=Pace, init=False, repr=False)
+    """When it may be written again."""
 
     @classmethod
     def open(cls, path: Path, *, overwrite: bool = False, resume: bool = False) -> RunFolder:
@@ -105,15 +130,16 @@ class RunFolder:
         return report.get("complete") is True and not self.pairs.folder.exists()
 
     def write(self, step: Step, meta: RunMeta) -> dict[str, Any]:
-        """Bring the folder up to date and return the report after this step.
+        """Bring the folder up to date and return the report that stands there then.
 
         Raises:
             InputError: where a file cannot be written.
         """
         self.frames[step.frame.index] = frame_record(step)
+        if not step.last and (len(self.frames) < self.already or self.pace.rests):
+            return self.newest
+        began_s = time.monotonic()
         report = report_of(step, list(self.frames.values()), meta)
-        if len(self.frames) < self.already and not step.last:
-            return report
         times_s = {frame: view.frame.time_s for frame, view in step.views.items()}
         self._write("trajectory.txt", tum_text(step.solution.trajectory, times_s))
         self._write("odometry.txt", tum_text(step.solution.odometry, times_s))
@@ -122,7 +148,9 @@ class RunFolder:
             self._write("cloud.ply", cloud_ply(step.model))
             self._write("model.ply", mesh_ply(step.model))
         self._write(_REPORT, json.dumps(report, allow_nan=False) + "\n")
-        return report
+        self.newest.update(report)
+        self.pace.took(time.monotonic() - began_s)
+        return self.newest
 
     def finish(self) -> None:
         """Forget the registrations, unless the run ended before its last frame and may be resumed.
