@@ -19,6 +19,7 @@ from bags import Recorder
 from PIL import Image
 from recordings import small_frames, write_open3d
 from rosbags import rosbag1, rosbag2
+from test_inputs_clouds import WRITERS as CLOUDS
 
 from modeler.cli import main
 from sequences import open_sequence, unpacking
@@ -198,3 +199,15 @@ def test_pictures_that_claim_to_be_huge_are_not_unpacked(
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "million pixels" in said
+
+
+def test_a_cloud_that_claims_more_than_its_bytes_can_hold_is_not_unpacked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "s.pcd"
+    CLOUDS["pcd compressed"][1](path, small_frames(1)[0])
+    (tmp_path / "intact.pcd").write_bytes(path.read_bytes())
+    assert len(open_sequence(tmp_path / "intact.pcd")) == 1
+    large = path.read_bytes().replace(b"WIDTH 160", b"WIDTH 7000").replace(b"HEIGHT 120", b"HEIGHT 7000")
+    path.write_bytes(large.replace(b"POINTS 19200", b"POINTS 49000000"))
+    assert "is cut off" in refused(path, capsys)

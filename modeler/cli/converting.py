@@ -25,6 +25,10 @@ LIVE_REACH_M = 16.0
 """What lies farther away of what a live camera sees is an error of its."""
 
 
+FARTHEST_M = 1e6
+"""No pose lies farther away."""
+
+
 def convert(options: Convert) -> int:
     """Write an input as a BOP scene folder, or the poses of a run.
 
@@ -72,6 +76,13 @@ def _meta(sequence: AbstractSequence) -> dict[str, object]:
     return meta
 
 
+def _rigid(pose: np.ndarray) -> bool:
+    """Return whether a matrix (4, 4) of whatever numbers is a rigid motion."""
+    if not (np.abs(pose) < FARTHEST_M).all():  # not so of NaN
+        return False
+    return np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < 1e-6 and (pose[3] == (0.0, 0.0, 0.0, 1.0)).all()
+
+
 def _poses(run: Path, out: Path) -> int:
     """Write the poses of a run as BOP's scene_gt.json, with the object frame as model frame, or as TUM lines.
 
@@ -80,16 +91,17 @@ def _poses(run: Path, out: Path) -> int:
     """
     report = RunFolder(run).report()
     try:
-        poses = {int(entry["id"]): np.reshape(entry["object_from_camera"], (4, 4)) for entry in report["poses"]}
+        entries = {int(entry["id"]): np.array(entry["object_from_camera"], float) for entry in report["poses"]}
+        poses = {index: entry.reshape(4, 4) for index, entry in entries.items()}
         times_s = {int(frame["id"]): float(frame["timestamp"]) for frame in report["frames"]}
-        missing = poses.keys() - times_s.keys()
+        missing = poses.keys() - times_s.keys() or {index for index, pose in poses.items() if not _rigid(pose)}
     except (KeyError, TypeError, ValueError):
         missing, poses, times_s = {-1}, {}, {}
     if missing:
-        raise InputError(f"{run / 'report.json'}: lacks poses or frames; build again with --overwrite")
+        raise InputError(f"{run / 'report.json'}: lacks frames, or poses that are any; build again with --overwrite")
     if out.suffix == ".json":
-        entries = (f' "{index}": {json.dumps([pose_entry(se3.inverse(pose))])}' for index, pose in poses.items())
-        write_atomically(out, "{\n" + ",\n".join(entries) + "\n}\n")
+        lines = (f' "{index}": {json.dumps([pose_entry(se3.inverse(pose))])}' for index, pose in poses.items())
+        write_atomically(out, "{\n" + ",\n".join(lines) + "\n}\n")
     elif out.suffix == ".txt":
         write_atomically(out, tum_text(poses, times_s))
     else:
