@@ -49,6 +49,9 @@ class Outlook:
     """Covariance (6, 6) of an edge's systematic error, in the camera of the view that the new one hangs on."""
     hangs: bool = True
     """Whether the new view hangs on `previous` by an edge of its own; False: it is `previous`."""
+    power: float = 2.0
+    """Of cos θ by which an edge over a turn θ tells less. More of them prefers small turns, which err less in ways that
+    edges have in common and no loop shows."""
 
     @cached_property
     def reach(self) -> Mapping[int, Way]:
@@ -59,10 +62,10 @@ class Outlook:
         """Return the most promising of `frames`, whose predicted rotations to the new view are `angle_deg` (n,).
 
         An edge of covariance R between two frames whose motion is known with covariance P adds ½ log |1 + P R⁻¹| nats,
-        if it is found. R is taken to be the mean of the newest edges', over the share of surface seen again and over
-        cos² θ, as errors grow with the turn θ; the chance to find it to be what a sphere shows again, (1 + cos θ) / 2.
-        The surest way through the graph bounds P, so that P itself is worked out for a few frames only, however long
-        the sequence.
+        if it is found. R is taken to be the mean of the newest edges', over the share of surface seen again and over a
+        power of cos θ, as errors grow with the turn θ; the chance to find it to be what a sphere shows again,
+        (1 + cos θ) / 2. The surest way through the graph bounds P, so that P itself is worked out for a few frames
+        only, however long the sequence.
 
         Args:
             frames: numbers of earlier views.
@@ -80,18 +83,22 @@ class Outlook:
             if frame in self.reach:
                 way = self.reach[frame]
                 ratio = self.hangs + (way.variance_rad2 + way.edges * own_rad2) / variance_rad2
-                bound_nats = 3.0 * _chance(angle) * np.log1p(_tells(angle) * ratio)
+                bound_nats = 3.0 * _chance(angle) * np.log1p(self._tells(angle) * ratio)
                 bounded.append((float(bound_nats), frame, float(angle)))
         found = []
         for _, frame, angle in sorted((b for b in bounded if b[0] >= least_nats), reverse=True)[:_ASKED]:
             overlap = self._overlap(frame)
             known = self.solution.relative_covariance(frame, self.previous)
             known = known + self.hangs * one_edge + self.reach[frame].edges * self.systematic
-            ratio = overlap * _tells(angle) * np.linalg.solve(one_edge, known)
+            ratio = overlap * self._tells(angle) * np.linalg.solve(one_edge, known)
             gain_nats = _chance(angle) * 0.5 * float(np.linalg.slogdet(np.eye(6) + ratio)[1])
             if gain_nats >= least_nats:
                 found.append(Prospect(frame, angle, overlap, gain_nats))
         return sorted(found, key=lambda prospect: -prospect.gain_nats)
+
+    def _tells(self, angle_deg: float) -> float:
+        """Return how much an edge over an angle tells, against one over none."""
+        return float(np.cos(np.radians(min(angle_deg, 90.0))) ** self.power)
 
     def _overlap(self, frame: int) -> float:
         """Return the share of a view's surface that should face the new view's camera."""
@@ -110,8 +117,3 @@ def _rotation_variance(covariance: Array) -> float:
 def _chance(angle_deg: float) -> float:
     """Return how much of a sphere is shown again after a turn."""
     return float(np.cos(np.radians(angle_deg) / 2.0) ** 2)
-
-
-def _tells(angle_deg: float) -> float:
-    """Return how much an edge over an angle tells, against one over none."""
-    return float(np.cos(np.radians(angle_deg)) ** 2)
