@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -517,8 +518,12 @@ def test_resuming_with_other_settings_is_refused(tmp_path: Path) -> None:
     RunFolder.open(tmp_path).write(_steps()[0], META)
     run = RunFolder.open(tmp_path, resume=True)
     assert not run.finished(META)
-    for other in (replace(META, seed=4), replace(META, prior="general"), replace(META, settings={"every": 2})):
-        with pytest.raises(InputError, match="cannot resume"):
+    for other, words in (
+        (replace(META, seed=META.seed + 1), f"seed was {META.seed} and is now {META.seed + 1};"),
+        (replace(META, prior="general"), f"prior was {META.prior} and is now general;"),
+        (replace(META, settings={**META.settings, "max_depth_m": 2.0}), "max-depth-m was not given and is now 2.0;"),
+    ):
+        with pytest.raises(InputError, match=rf"cannot resume, {re.escape(words)}"):
             run.finished(other)
 
 

@@ -21,7 +21,7 @@ class Register:
     """
 
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SEQUENCE")]
-    """BOP scene folder."""
+    """A sequence in any format that `modeler build` takes."""
     source: Annotated[tyro.conf.Positional[int], tyro.conf.arg(metavar="SOURCE")]
     """Number of the frame whose points are carried over."""
     target: Annotated[tyro.conf.Positional[int], tyro.conf.arg(metavar="TARGET")]

@@ -119,12 +119,16 @@ class RunFolder:
         if not (self.path / _REPORT).exists():
             return False
         report = self.report()
-        wanted = {"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, "settings": dict(meta.settings)}
-        wanted = json.loads(json.dumps(wanted))
-        for key, value in wanted.items():
-            if report.get(key) != value:
+        settings = report.get("settings")
+        before = {name: report.get(name) for name in ("sequence", "seed", "prior")}
+        before |= settings if isinstance(settings, dict) else {}
+        now = {"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings}
+        now = json.loads(json.dumps(now))
+        for name in [*now, *sorted(before.keys() - now.keys())]:
+            was, is_now = (values.get(name, "not given") for values in (before, now))
+            if was != is_now:
                 raise InputError(
-                    f"{self.path}: cannot resume, its {key} was {report.get(key)!r} and is now {value!r}; "
+                    f"{self.path}: cannot resume, {name.replace('_', '-')} was {was} and is now {is_now}; "
                     "use the same, or --overwrite"
                 )
         return report.get("complete") is True and not self.pairs.folder.exists()
