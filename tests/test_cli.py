@@ -37,7 +37,7 @@ COMMANDS = "build register evaluate render view report export join info convert 
 DOCUMENTED = """out prior seed resume overwrite every frames roi max-depth-m max-rotation-deg max-offset-m max-shift-m
 step-deg step-sigma-deg held-sigma-deg held-sigma-m
 method view web"""
-QUICK = ("--prior", "table", "--method", "icp", "--frames", "0:3")
+QUICK = ("--prior", "table", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:3")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -243,7 +243,7 @@ def test_the_sequence_says_what_is_known_and_the_user_is_told(run: Run, tmp_path
     assert told.status == 0
     assert "prior table, as sequence.json says" in told.err
     assert told.out == run("register", BOX, "1", "0", "--method", "icp", "--prior", "table").out
-    ended = run("build", BOX, "--out", tmp_path / "run", "--method", "icp", "--frames", "0:2")
+    ended = run("build", BOX, "--out", tmp_path / "run", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:2")
     assert ended.err.startswith("modeler: prior table, as sequence.json says\n")
     assert report(tmp_path / "run")["prior"] == "table"
 
@@ -262,7 +262,7 @@ def test_build_fills_a_run_folder(built: Path) -> None:
     assert {path.name for path in built.iterdir()} == FILES
     told = report(built)
     assert (told["schema"], told["seed"], told["prior"]) == (1, 0, "table")
-    assert told["settings"] == {"method": "icp", "every": 1, "frames": "0:3"}
+    assert told["settings"] == {"method": "icp", "voxel_m": 0.004, "every": 1, "frames": "0:3"}
     assert (told["complete"], told["trustworthy"], told["reasons"]) == (True, True, [])
     assert [(frame["id"], frame["outcome"]) for frame in told["frames"]] == [(k, "accepted") for k in range(3)]
     edges = {(edge["source"], edge["target"]): edge["accepted"] for edge in told["edges"]}
