@@ -1,5 +1,6 @@
 """Writer of BOP scene folders."""
 
+import glob
 import json
 import os
 import shutil
@@ -43,6 +44,7 @@ def write_bop(
         raise InputError(f"{folder}: exists already; remove it or give another --out.")
     partial = folder.parent / f".{folder.name}.{os.getpid()}.partial"
     try:
+        _tidy(folder)
         partial.mkdir(parents=True)
         _fill(partial, frames, truth, meta or {}, depth_scale_mm=depth_scale_mm, colour_suffix=colour_suffix)
         for name, content in (files or {}).items():
@@ -52,6 +54,18 @@ def write_bop(
         raise InputError(f"{folder}: cannot be written ({error.strerror}); check space and permissions.") from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _tidy(folder: Path) -> None:
+    """Remove what programs that were killed have left of the folder beside it."""
+    for left in folder.parent.glob(f".{glob.escape(folder.name)}.*.partial"):
+        process = left.name.split(".")[-2]
+        try:
+            os.kill(int(process), 0)
+        except (ProcessLookupError, OverflowError):
+            shutil.rmtree(left, ignore_errors=True)
+        except (ValueError, PermissionError):
+            pass  # not ours, or still at it
 
 
 def _fill(

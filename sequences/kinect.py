@@ -188,6 +188,8 @@ class Matroska:
         track = next(named, None)
         if track is not None and not 0 < track.width * track.height <= MAX_PIXELS:
             raise InputError(f"{self.path}: {title} has {track.width} x {track.height} pixels; record it anew.")
+        if track is not None and not track.codec_context.is_open:  # the images may claim more than their track
+            track.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
         return track
 
     @cached_property

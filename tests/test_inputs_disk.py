@@ -152,5 +152,15 @@ def test_a_closed_folder_is_said(
     assert list(closed.iterdir()) == []
 
 
+def test_what_a_killed_program_left_is_tidied_up(tmp_path: Path) -> None:
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    for process in (str(ended.pid), str(os.getppid()), "other"):
+        (tmp_path / f".scene.{process}.partial" / "depth").mkdir(parents=True)
+    write_bop(tmp_path / "scene", small_frames(1))
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"scene", f".scene.{os.getppid()}.partial", ".scene.other.partial"}
+
+
 def test_the_sequence_is_intact(sequence: Path) -> None:
     assert len(list(open_sequence(sequence))) == 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from modeler.types import Camera, InputError
 from sequences import Given, open_sequence
 from sequences.alignment import Alignment
 from sequences.json_input import Node
+from sequences.kinect import Matroska
 from sequences.kinect_calibration import colour_from_depth, colour_lens, depth_lens
 from sequences.lens import Lens
 
@@ -168,6 +170,30 @@ def test_broken_recordings_are_one_line(tmp_path: Path, capfd: pytest.CaptureFix
     said = capfd.readouterr().err
     assert str(path) in said
     assert said.count("\n") == 1
+
+
+def test_images_larger_than_their_track_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit is set so low that it need not take a huge image to show."""
+    av = pytest.importorskip("av")
+    container = av.open(str(tmp_path / "s.mkv"), "w", format="matroska")
+    track = container.add_stream("mpeg4", rate=5)
+    track.width, track.height, track.pix_fmt, track.metadata["title"] = 64, 48, "yuv420p", "COLOR"
+    images = []
+    for width, height in ((64, 48), (320, 240)):
+        coder = av.CodecContext.create("mpeg4", "w")
+        coder.width, coder.height, coder.pix_fmt, coder.time_base = width, height, "yuv420p", Fraction(1, 5)
+        image = av.VideoFrame.from_ndarray(np.zeros((height, width, 3), np.uint8), format="rgb24")
+        images += [*coder.encode(image), *coder.encode()]
+    for place, encoded in enumerate(images):
+        packet = av.Packet(bytes(encoded))
+        packet.stream, packet.pts, packet.dts, packet.is_keyframe = track, place, place, True
+        container.mux(packet)
+    container.close()
+    stamp = Matroska(tmp_path / "s.mkv").stamps("COLOR")[1][1]
+    assert Matroska(tmp_path / "s.mkv").picture("COLOR", stamp, "image 1").shape == (240, 320, 3)
+    monkeypatch.setattr("sequences.kinect.MAX_PIXELS", 64 * 48)
+    with pytest.raises(InputError, match=r"s\.mkv: is not a readable recording"):
+        Matroska(tmp_path / "s.mkv").picture("COLOR", stamp, "image 1")
 
 
 def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
