@@ -49,7 +49,7 @@ def paper_density(point_b, a_from_b, ranges_m, intrinsics, noise):
 def visibility(pose, sight, model):
     """Log-likelihood of one pose and number of explained points: every point in turn, as `kernels.visibility` says."""
     fx, fy, cx, cy, width, height = np.float64(sight.camera)
-    low, high = np.float64(sight.facing)
+    low, high, flat, steep = np.float64(sight.facing)
     cells, points = sight.cells.reshape(int(height), int(width), -1), np.float64(sight.points.T)
     blur, silhouette_px, dead_px, clearance_m, worst, bend, unmeasured, typical = map(np.float64, model[:-1])
     hidden = np.exp(np.float64(model.table[0]))
@@ -63,7 +63,7 @@ def visibility(pose, sight, model):
         row = int(np.floor(fy * position[1] / position[2] + cy + 0.5))
         inside = position[2] > 0 and 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]
         if not inside or cells[row, column, planes.KIND] == planes.MISSING:
-            total += unmeasured * faces
+            total += unmeasured * np.clip((facing - flat) / (steep - flat), 0, 1)
             continue
         cell = cells[row, column].astype(np.float64)
         if cell[planes.KIND] == planes.BACKGROUND:

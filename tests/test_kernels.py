@@ -1,11 +1,13 @@
 """Every kernel of the registration against its readable twin, on random inputs."""
 
+import os
+
 import naive
 import numpy as np
 import pytest
 
-from modeler import se3
-from modeler.kernels import matching, moves, paper, planes, ridges, visibility
+from modeler import kernels, se3
+from modeler.kernels import matching, mixture, moves, paper, patches, planes, ridges, visibility
 from modeler.kernels.sight import Sight, buffers
 from modeler.se3 import matrices, rows
 
@@ -90,7 +92,7 @@ def random_cells(rng):
 
 
 CAMERA = np.array([*INTRINSICS, SHAPE[1], SHAPE[0]], dtype=np.float32)
-FACING = np.array([0.1, 0.35], dtype=np.float32)
+FACING = np.array([0.1, 0.35, 0.3, 0.7], dtype=np.float32)
 HIDDEN = 0.3
 
 
@@ -256,3 +258,55 @@ def test_silhouette_distance_is_euclidean_within_the_chamfer_error(rng):
     got, want = planes.silhouette_distance(mask, 60.0), naive.silhouette_distance(mask)
     assert (np.abs(got - want) <= 0.09 * want + 1e-5).all()
     np.testing.assert_array_equal(planes.silhouette_distance(mask, 3.0), np.minimum(got, 3.0))
+
+
+def test_compiled_kernels_older_than_any_source_are_dropped(tmp_path):
+    """A kernel holds a copy of what it calls in other files, and those may have changed."""
+    cache = tmp_path / "__pycache__"
+    cache.mkdir()
+    for path, modified_s in (
+        (tmp_path / "a.py", 10),
+        (tmp_path / "b.py", 30),
+        (cache / "a.nbi", 20),
+        (cache / "b.nbi", 40),
+    ):
+        path.touch()
+        os.utime(path, (modified_s, modified_s))
+    kernels.drop_stale(tmp_path)
+    assert [path.name for path in cache.iterdir()] == ["b.nbi"]
+
+
+@pytest.mark.parametrize("crowd", [1, 3])
+def test_of_a_crowd_the_first_are_kept(rng, crowd):
+    centre_m, sigmas = np.array([0.0, 0.0, 0.8]), np.repeat([0.2, 0.01], 3)
+    poses = np.stack([random_pose(rng, 0.2) for _ in range(60)])
+    kept = mixture.uncrowded(rows(poses), sigmas, centre_m, crowd, 1000)
+    near = np.linalg.norm(se3.difference(poses[:, None], poses[None], centre_m) / sigmas, axis=2) <= 1.0
+    assert kept[0] == 0
+    assert (np.diff(kept) > 0).all()
+    for number in range(len(poses)):
+        before = kept[kept < number]
+        assert (number in kept) == (near[before, number].sum() < crowd)
+    np.testing.assert_array_equal(mixture.uncrowded(rows(poses), sigmas, centre_m, crowd, 5), kept[:5])
+
+
+def test_distances_are_in_standard_deviations(rng):
+    centre_m, poses = np.array([0.0, 0.0, 0.8]), np.stack([random_pose(rng, 0.2) for _ in range(5)])
+    spreads = np.linalg.cholesky(np.stack([np.cov(rng.normal(size=(6, 20))) for _ in range(5)]))
+    got = mixture.distances(rows(poses), spreads, centre_m)
+    for i, root in enumerate(spreads):
+        xi = se3.difference(poses[i], poses, centre_m)
+        np.testing.assert_allclose(got[i], np.linalg.norm(np.linalg.solve(root, xi.T), axis=0), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 200])
+def test_patches_are_halves_of_halves(rng, count):
+    points = rng.normal(size=(count, 3)) * [1.0, 3.0, 0.2]
+    numbers = patches.halved(points, 3)
+    sizes = np.bincount(numbers, minlength=8)
+    assert len(sizes) == 8
+    assert sizes.sum() == count
+    assert sizes.max() - sizes.min() <= 1
+    if count == 200:  # the first cut is across the longest side
+        low = numbers < 4
+        assert points[low, 1].max() <= points[~low, 1].min()

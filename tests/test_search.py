@@ -61,6 +61,21 @@ def test_a_turn_beyond_the_prior_shows(rng):
     assert VisibilityRegistrar().register(source, target, narrow, rng=rng).outcome is Outcome.AT_LIMIT
 
 
+def test_the_search_goes_on_along_the_ridge_of_a_roll(rng):
+    """From one good pose of a tube the whole of its roll is found, and what was found blunt is kept."""
+    source, target, truth = views("tube", source=1, target=0)
+    motion = GeneralPrior().between(source, target)
+    pair, search = VisibilityRegistrar().pair(source, target, rng), Search()
+    blunt = candidates([truth @ turned(0.1)], [0.1], [0.0], [True])
+    onward = search.onward(pair, motion, blunt, truth[None], rng)
+    rolled_deg = [rotation_error_deg(pose, truth) for pose in onward.poses[~onward.blunt]]
+    assert max(rolled_deg) > 20.0
+    assert onward.blunt.sum() == 1
+    sharp = onward.some(~onward.blunt)
+    assert sharp.scores[0] >= search.scores(pair, truth[None], search.blurs[-1] * pair.size_m)[0] - 1e-6
+    assert sharp.scores[-1] > sharp.scores[0] - search.negligible
+
+
 def test_candidates_that_reach_each_other_share_a_place():
     near, far = turned(0.02), turned(1.5)
     places = separate(candidates([np.eye(4), near, far], [0.01, 0.01, 0.01], [3, 2, 1]), np.zeros(3))

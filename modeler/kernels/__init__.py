@@ -1,6 +1,8 @@
 """Compiled functions: arrays in, arrays out; no package types, no hidden randomness."""
 
 import os
+from contextlib import suppress
+from pathlib import Path
 
 from numba.core import config
 
@@ -8,3 +10,18 @@ from numba.core import config
 config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore[reportAttributeAccessIssue]
 # Threads that spin at the end of each short loop hold up one another wherever anything else runs beside them.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
+def drop_stale(folder: Path) -> None:
+    """Delete the compiled kernels of a folder that are older than any source file there.
+
+    Numba keeps a kernel as long as its own file stays as it is, though it holds a copy of what it calls in others.
+    """
+    newest = max(path.stat().st_mtime for path in folder.glob("*.py"))
+    for index in (folder / "__pycache__").glob("*.nbi"):
+        with suppress(OSError):  # another process was quicker, or we may not
+            if index.stat().st_mtime < newest:
+                index.unlink()
+
+
+drop_stale(Path(__file__).parent)

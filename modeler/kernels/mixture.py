@@ -67,3 +67,33 @@ def distances(means, roots, centre):
                 square += z[k] * z[k]
             result[i, j] = math.sqrt(square)
     return result
+
+
+@numba.njit(cache=True)
+def uncrowded(poses, sigmas, centre, crowd, most):
+    """Return the numbers of the first poses, of each neighbourhood at most `crowd`, and at most so many in all.
+
+    Args:
+        poses: (n, 12), the best first.
+        sigmas: (6,) extent of a neighbourhood: ξ about the centre within one standard deviation.
+        centre: (3,) point in m.
+        crowd: at most so many lie in the neighbourhood of the next.
+        most: at most so many are returned.
+    """
+    kept, rotation = np.empty(min(len(poses), most), dtype=np.int64), np.empty((3, 3))
+    count = 0
+    for i in range(len(poses)):
+        near = 0
+        for number in range(count):
+            xi = difference(poses[kept[number]], poses[i], centre, rotation)
+            square = 0.0
+            for k in range(6):
+                square += (xi[k] / sigmas[k]) ** 2
+            if square <= 1.0:
+                near += 1
+        if near < crowd:
+            kept[count] = i
+            count += 1
+            if count == len(kept):
+                break
+    return kept[:count]

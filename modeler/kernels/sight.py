@@ -18,7 +18,8 @@ ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)  # a plain 0
 
 # Rows of the points handed in, and of what `carry` makes of them.
 VARIANCE_M2 = 6
-X, Y, Z, FACING_X, FACING_Y, FACING_Z, FACES = 0, 1, 2, 3, 4, 5, 6
+X, Y, Z, FACING_X, FACING_Y, FACING_Z, FACES, SHOWS = 0, 1, 2, 3, 4, 5, 6, 7
+CARRIED_ROWS = 8
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -33,7 +34,8 @@ class Sight(NamedTuple):
     camera: FloatArray
     """(6,) fx, fy, cx, cy, width and height in px of the other view."""
     facing: FloatArray
-    """(2,) cosines at which a point begins to face the other camera and fully does."""
+    """(4,) cosines at which a point begins to face the other camera and fully does; and at which the camera may be
+    relied on to measure it."""
 
 
 @numba.njit(cache=True)
@@ -53,7 +55,8 @@ def carry(pose, sight, carried, pixels):
     Args:
         pose: (12,) rows of the 3×4 matrix.
         sight: the points and the other camera.
-        carried: (7, n) out: position, normal, how much the point faces the camera (0..1).
+        carried: (8, n) out: position, normal, how much the point faces the camera (0..1), and how much it is to be
+            relied on that the camera measures it (0..1).
         pixels: (n,) out: number of the pixel it falls on, row by row; -1 outside the image or behind the camera.
     """
     p0, p1, p2, p3 = np.float32(pose[0]), np.float32(pose[1]), np.float32(pose[2]), np.float32(pose[3])
@@ -61,6 +64,7 @@ def carry(pose, sight, carried, pixels):
     p8, p9, p10, p11 = np.float32(pose[8]), np.float32(pose[9]), np.float32(pose[10]), np.float32(pose[11])
     points, (fx, fy, cx, cy, width, height) = sight.points, sight.camera
     low, per_range = sight.facing[0], ONE / (sight.facing[1] - sight.facing[0])
+    flat, per_turn = sight.facing[2], ONE / (sight.facing[3] - sight.facing[2])
     for j in range(points.shape[1]):
         a, b, c, d, e, f = points[0, j], points[1, j], points[2, j], points[3, j], points[4, j], points[5, j]
         x = p0 * a + p1 * b + p2 * c + p3
@@ -78,6 +82,7 @@ def carry(pose, sight, carried, pixels):
         carried[X, j], carried[Y, j], carried[Z, j] = x, y, z
         carried[FACING_X, j], carried[FACING_Y, j], carried[FACING_Z, j] = normal_x, normal_y, normal_z
         carried[FACES, j] = min(max((cosine - low) * per_range, ZERO), ONE)
+        carried[SHOWS, j] = min(max((cosine - flat) * per_turn, ZERO), ONE)
         pixels[j] = pixel if inside else np.int32(-1)
 
 
@@ -101,7 +106,7 @@ def look(pose, sight, carried, pixels, found):
 
 @numba.njit(cache=True)
 def buffers(sight):
-    """Return room for what `look` finds: carried (7, n), pixels (n,), cells (8, n)."""
+    """Return room for what `look` finds: carried (8, n), pixels (n,), cells (8, n)."""
     count = sight.points.shape[1]
-    carried, pixels = np.empty((7, count), dtype=np.float32), np.empty(count, dtype=np.int32)
+    carried, pixels = np.empty((CARRIED_ROWS, count), dtype=np.float32), np.empty(count, dtype=np.int32)
     return carried, pixels, np.empty((CELL_SIZE, count), dtype=np.float32)

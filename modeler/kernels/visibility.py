@@ -26,6 +26,7 @@ from modeler.kernels.sight import (
     FACING_Z,
     HALF,
     ONE,
+    SHOWS,
     VARIANCE_M2,
     VECTOR_MATHS,
     ZERO,
@@ -116,7 +117,7 @@ def score(points, carried, found, model):
 
     Args:
         points: (7, n), see `Sight`.
-        carried: (7, n) and
+        carried: (8, n) and
         found: (8, n), see `sight.look`.
         model: see `Model`.
     """
@@ -143,7 +144,7 @@ def score(points, carried, found, model):
         in_the_open = -min(HALF * beyond * beyond, worst) if in_the_way else ZERO
         gain = on_surface if kind == _OF_SURFACE else ZERO
         gain = in_the_open if kind == _OF_BACKGROUND else gain
-        gain = model.unmeasured * faces if kind == _OF_NOTHING else gain
+        gain = model.unmeasured * carried[SHOWS, j] if kind == _OF_NOTHING else gain
         total += gain
         explained += faces if (kind == _OF_SURFACE) & matches else ZERO
     return total, explained
@@ -154,9 +155,9 @@ def log_likelihoods(poses, forward, backward, forward_model, backward_model):
     """Return the log-likelihood of each pose, summed over the points of two views, each looked up in the other.
 
     A point that faces the other camera should lie on the surface measured there, but for a share that something
-    hides or the camera missed; one that faces away should lie behind it; none may lie where the camera saw
-    nothing. A point that matches as well as is typical and a hidden one both count 0 on average: turning it out of
-    sight neither pays nor costs.
+    hides or the camera missed (surface seen at a flat angle it often misses); one that faces away should lie behind
+    it; none may lie where the camera saw nothing. A point that matches as well as is typical and a hidden one both
+    count 0 on average: turning it out of sight neither pays nor costs.
 
     In single precision a point errs by less than 1e-4 nats, unless it falls within 1e-3 px of a pixel's border and
     may be looked up on the other side.

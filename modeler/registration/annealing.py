@@ -21,6 +21,8 @@ class Population:
 
     poses: Array
     """(n, 4, 4)."""
+    log_likelihoods: Array
+    """(n,) under the last level."""
     log_evidence: float
     """Log of the mean likelihood under the prior."""
     effective_samples: float
@@ -84,7 +86,7 @@ class AnnealedSampler:
                     if last and _distinct(poses) >= self.enough:
                         break
             before, previous = after, level
-        return Population(poses, evidence, _distinct(poses), worst_tail)
+        return Population(poses, before, evidence, _distinct(poses), worst_tail)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from modeler.kernels import visibility as kernel
 from modeler.kernels.sight import Sight
 from modeler.types import Array, RayImage
 
-FACING = np.array([0.1, 0.35], dtype=np.float32)  # cosines at which a point begins to face a camera and fully does
+FACING = np.array([0.1, 0.35, 0.35, 0.6], dtype=np.float32)  # see `Sight`
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,6 +41,16 @@ class Candidates:
         """
         return mixture.distances(se3.rows(self.poses), self.spreads, centre_m)
 
+    def beside(self, others: Candidates) -> Candidates:
+        """Return them and others, in this order."""
+        return Candidates(
+            np.concatenate([self.poses, others.poses]),
+            np.concatenate([self.scores, others.scores]),
+            np.concatenate([self.spreads, others.spreads]),
+            np.concatenate([self.blunt, others.blunt]),
+            self.beyond,
+        )
+
     def some(self, chosen: npt.NDArray[np.int64] | BoolArray) -> Candidates:
         """Return those chosen by number or by mask."""
         return Candidates(
@@ -63,7 +73,9 @@ class Search:
     looks_per_start: int = 15
     """Motions drawn from the prior for each that is led on: the best of them."""
     survivors: float = 0.25
-    """Share of them that is followed to the end."""
+    """Share of them that is followed to the end at most."""
+    crowd: int = 3
+    """At most so many of one basin are, so that a place next to a better one is not lost."""
     min_starts: int = 60
     """At least so many motions are led to matching surface."""
     blurs: tuple[float, ...] = (0.25, 0.12, 0.06, 0.03, 0.015)
@@ -107,7 +119,7 @@ class Search:
         look = plain - np.log(self.blurs[0]) * share * pair.points
         poses = poses[_best(look, starts)]
         poses = self._led(pair, poses, prior, self.blurs[1] * pair.size_m)
-        poses = poses[_best(self.scores(pair, poses, self.blurs[1] * pair.size_m), int(self.survivors * starts))]
+        poses = self._survivors(pair, poses, int(self.survivors * starts))
         blunt = self._ranked(pair, motion, poses, prior, self.blurs[1] * pair.size_m)
         for blur in self.blurs[2:]:
             poses = self._led(pair, poses, prior, blur * pair.size_m)
@@ -115,16 +127,28 @@ class Search:
         sharp = self._ranked(pair, motion, poses, prior, fine_m)
         if not len(sharp):
             sharp = self._ranked(pair, motion, motion.sample(starts, rng), prior, fine_m)
-        sharp = self._ranked(
-            pair, motion, np.concatenate([sharp.poses, self._walked(pair, sharp, prior)]), prior, fine_m
-        )
-        return Candidates(
-            np.concatenate([sharp.poses, blunt.poses]),
-            np.concatenate([sharp.scores, blunt.scores]),
-            np.concatenate([sharp.spreads, blunt.spreads]),
-            np.repeat([False, True], [len(sharp), len(blunt)]),
-            beyond=float(self.scores(pair, poses, fine_m).max() - sharp.scores[0]),
-        )
+        sharp = self._along(pair, motion, sharp, prior)
+        blunt = replace(blunt, blunt=np.ones(len(blunt), dtype=np.bool_))
+        return replace(sharp.beside(blunt), beyond=float(self.scores(pair, poses, fine_m).max() - sharp.scores[0]))
+
+    def onward(
+        self, pair: Pair, motion: AbstractMotion, found: Candidates, poses: Array, rng: np.random.Generator
+    ) -> Candidates:
+        """Return what was found, better poses (n, 4, 4) that are possible, and what lies along their ridges."""
+        prior, fine_m = _gaussian(motion.sample(500, rng), pair.centre_m), self.blurs[-1] * pair.size_m
+        sharp = self._ranked(pair, motion, np.concatenate([poses, found.poses[~found.blunt]]), prior, fine_m)
+        return self._along(pair, motion, sharp, prior).beside(found.some(found.blunt))
+
+    def _along(self, pair: Pair, motion: AbstractMotion, found: Candidates, prior: PoseGaussian) -> Candidates:
+        """Return candidates and what lies along their ridges, best first."""
+        poses = np.concatenate([found.poses, self._walked(pair, found, prior)])
+        return self._ranked(pair, motion, poses, prior, self.blurs[-1] * pair.size_m)
+
+    def _survivors(self, pair: Pair, poses: Array, most: int) -> Array:
+        """Return the best of poses (n, 4, 4), but of each basin no more than a few."""
+        ordered = poses[np.argsort(-self.scores(pair, poses, self.blurs[1] * pair.size_m), kind="stable")]
+        basin = self._basin(pair.size_m)
+        return ordered[mixture.uncrowded(se3.rows(ordered), basin, pair.centre_m, self.crowd, most)]
 
     def _walked(self, pair: Pair, found: Candidates, prior: PoseGaussian) -> Array:
         """Return poses (n, 4, 4) along the ridges through the best candidates.

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from modeler.registration.annealing import AnnealedSampler
+from modeler.registration.annealing import AnnealedSampler, Population
 from modeler.registration.lookup import Lookup
 from modeler.registration.mixture import MixtureMotion
 from modeler.registration.modes import Place, separate, weighed
@@ -49,6 +49,12 @@ class VisibilityRegistrar(AbstractRegistrar):
     """How much wider than the search's Gaussians the first samples lie."""
     blunt_share: float = 0.4
     """Share of them that looks farther, as far as surface leaves open when it is blurred."""
+    short_of: float = 3.0
+    """Where samples are so much better (nats) than all that the search had found, it goes on from them,"""
+    restarts: int = 20
+    """from so many of the best,"""
+    max_rounds: int = 3
+    """and samples are drawn at most so many times."""
     sampler: AnnealedSampler = field(default_factory=AnnealedSampler)
     """How each place is explored."""
     refiner: Refiner = field(default_factory=Refiner)
@@ -108,35 +114,48 @@ class VisibilityRegistrar(AbstractRegistrar):
             log_evidence=float(np.logaddexp.reduce([place.log_mass for _, place in places])),
         )
 
-    def _place(self, pair: Pair, motion: AbstractMotion, candidates: Candidates, rng: np.random.Generator) -> Place:
-        """Return samples of one place, sharpened by matching surface but where that would leave what is possible."""
-        fine_m = self.search.blurs[-1] * pair.size_m
-        noise_m = pair.surface_noise_m(candidates.poses[0], fine_m)
-        likelihood = partial(
-            pair.tempered,
-            blur_m=noise_m,
-            effective_points=self.effective_points,
-            typical=pair.typical_misfit(candidates.poses[0], noise_m),
-        )
-        plain = likelihood(candidates.poses)
-        volumes = np.log(np.diagonal(candidates.spreads, axis1=1, axis2=2)).sum(axis=1)
-        log_weights = np.where(candidates.blunt, candidates.scores, plain + volumes)
-        for kind, share in ((candidates.blunt, self.blunt_share), (~candidates.blunt, 1.0 - self.blunt_share)):
-            if kind.any():
-                log_weights[kind] += np.log(share) - np.logaddexp.reduce(log_weights[kind])
-        proposal = MixtureMotion(
-            motion, candidates.poses, self.widening * candidates.spreads, log_weights, pair.centre_m
-        )
-        population = self.sampler.run(proposal, [lambda _: likelihood], pair.centre_m, rng)
-        refined = self.refiner.refine(pair, population.poses, rng, fine_m=fine_m)
+    def _place(self, pair: Pair, motion: AbstractMotion, found: Candidates, rng: np.random.Generator) -> Place:
+        """Return samples of one place, sharpened by matching surface but where that would leave what is possible.
+
+        Matching surface alone does not lead to the top where free space has a say, at the ends of a tube. Where samples
+        come out far above what the search had found, it goes on from the best of them, and they are drawn anew.
+        """
+        population, rise = self._sampled(pair, motion, found, rng)
+        for _ in range(self.max_rounds - 1):
+            if population.log_likelihoods.max() - rise < self.short_of:
+                break
+            best = population.poses[np.argsort(-population.log_likelihoods)[: self.restarts]]
+            found = self.search.onward(pair, motion, found, best, rng)
+            population, rise = self._sampled(pair, motion, found, rng)
+        refined = self.refiner.refine(pair, population.poses, rng, fine_m=self.search.blurs[-1] * pair.size_m)
         inside = np.isfinite(motion.log_evidence(refined))
         return Place(
             np.where(inside[:, None, None], refined, population.poses),
             # Beside other places the points count as independently as the search has them.
-            population.log_evidence + float(candidates.scores[0] - plain[0]),
+            population.log_evidence + float(found.scores[0] - rise),
             population.effective_samples,
             population.pareto_k,
         )
+
+    def _sampled(
+        self, pair: Pair, motion: AbstractMotion, found: Candidates, rng: np.random.Generator
+    ) -> tuple[Population, float]:
+        """Return samples around candidates, and the likelihood of the best of these (nats)."""
+        noise_m = pair.surface_noise_m(found.poses[0], self.search.blurs[-1] * pair.size_m)
+        likelihood = partial(
+            pair.tempered,
+            blur_m=noise_m,
+            effective_points=self.effective_points,
+            typical=pair.typical_misfit(found.poses[0], noise_m),
+        )
+        plain = likelihood(found.poses)
+        volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
+        log_weights = np.where(found.blunt, found.scores, plain + volumes)
+        for kind, share in ((found.blunt, self.blunt_share), (~found.blunt, 1.0 - self.blunt_share)):
+            if kind.any():
+                log_weights[kind] += np.log(share) - np.logaddexp.reduce(log_weights[kind])
+        proposal = MixtureMotion(motion, found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
+        return self.sampler.run(proposal, [lambda _: likelihood], pair.centre_m, rng), float(plain[0])
 
     def pair(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> Pair:
         """Return the comparison of two views, at points drawn with `rng`."""
