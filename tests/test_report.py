@@ -183,7 +183,7 @@ def test_without_truth_recording_or_mesh_the_page_says_so(run: Path, tmp_path: P
 
 
 def test_the_command_writes_the_page_and_says_where(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    out = tmp_path / "page.html"
+    out = tmp_path / "pages" / "page.html"
     assert main(["report", str(run), "--out", str(out)]) == 0
     said = capsys.readouterr()
     assert said.out == ""

@@ -16,6 +16,8 @@ PART = ".part"  # ending of a file that is still being written
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file so that whoever looks at any moment, also after a kill, finds the old one or the new one whole.
 
+    A folder that is not there is made.
+
     Raises:
         InputError: where the file cannot be written.
     """
@@ -23,6 +25,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     part = path.with_name(f".{path.name}.{os.getpid()}{PART}")
     try:
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             part.write_bytes(data)
             os.replace(part, path)
         finally:
