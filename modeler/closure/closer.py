@@ -39,7 +39,7 @@ class Closer:
     """Once all frames are in, at most so many more views are tried for each of them; 0 = none."""
     max_span_deg: float = 55.0
     """Largest rotation in degrees to such a view: two steps of the usual 25°."""
-    min_span_gain_nats: float = 0.3
+    min_span_gain_nats: float = 0.1
     """Least information that it must promise: an edge over two steps of 25° does."""
     max_relocations: int = 4
     """At most so many earlier views are tried for a frame that the previous view does not place."""
