@@ -43,7 +43,7 @@ class Fuser:
     """A pixel carves only as deep as all its neighbours within so many px, so that silhouettes are not eaten away."""
     empty_weight: float = 0.3
     """Weight of a view that sees through a place, against 1 for a view that sees surface there head-on."""
-    min_support: float = 0.1
+    min_support: float = 0.03
     """Mesh that is seen less is removed. A view counts 1 head-on, less at flat angles, `edge_weight` at silhouettes."""
     closing: int = 3
     """Gaps narrower than about twice so many voxels are closed; what nobody saw beyond stays open."""
