@@ -1,5 +1,7 @@
 """Registration by what each view should see of the other's surface; the default method."""
 
+from __future__ import annotations
+
 import time
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -16,6 +18,18 @@ from modeler.registration.refinement import Refiner
 from modeler.registration.search import Candidates, Search
 from modeler.registration.surface import measured_share, spread_points
 from modeler.types import AbstractMotion, AbstractRegistrar, Mode, Outcome, PoseGaussian, Posterior, RayImage
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """Samples of one place, and the noise of matching surface with which they were weighed."""
+
+    population: Population
+    noise_m: float
+    typical: float
+    """What a good match loses to its misfit (nats)."""
+    rise: float
+    """By how much (nats) the best of them is better than what the search had found."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +103,11 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return the posterior that one search finds."""
         source, target = pair.backward.image, pair.forward.image
         candidates = search.candidates(pair, motion, rng)
-        places = weighed(
-            [self._place(pair, motion, found, rng) for found in separate(candidates, pair.centre_m)[: self.max_places]]
-        )
+        sampled = [
+            self._sampled_to_the_top(pair, motion, found, rng)
+            for found in separate(candidates, pair.centre_m)[: self.max_places]
+        ]
+        places = weighed([self._place(pair, motion, one, sampled, rng) for one in sampled])
         samples = np.concatenate([place.poses for _, place in places])
         weights = np.concatenate([np.full(len(place.poses), share / len(place.poses)) for share, place in places])
         modes = tuple(Mode(share, place.gaussian(pair.centre_m)) for share, place in places)
@@ -114,40 +130,29 @@ class VisibilityRegistrar(AbstractRegistrar):
             log_evidence=float(np.logaddexp.reduce([place.log_mass for _, place in places])),
         )
 
-    def _place(self, pair: Pair, motion: AbstractMotion, found: Candidates, rng: np.random.Generator) -> Place:
-        """Return samples of one place, sharpened by matching surface but where that would leave what is possible.
+    def _sampled_to_the_top(
+        self, pair: Pair, motion: AbstractMotion, found: Candidates, rng: np.random.Generator
+    ) -> _Sampled:
+        """Return samples of one place.
 
         Matching surface alone does not lead to the top where free space has a say, at the ends of a tube. Where samples
         come out far above what the search had found, it goes on from the best of them, and they are drawn anew.
         """
-        population, rise = self._sampled(pair, motion, found, rng)
+        sampled = self._sampled(pair, motion, found, rng)
         for _ in range(self.max_rounds - 1):
-            if population.log_likelihoods.max() - rise < self.short_of:
+            if sampled.rise < self.short_of:
                 break
-            best = population.poses[np.argsort(-population.log_likelihoods)[: self.restarts]]
+            order = np.argsort(-sampled.population.log_likelihoods)
+            best = sampled.population.poses[order[: self.restarts]]
             found = self.search.onward(pair, motion, found, best, rng)
-            population, rise = self._sampled(pair, motion, found, rng)
-        refined = self.refiner.refine(pair, population.poses, rng, fine_m=self.search.blurs[-1] * pair.size_m)
-        inside = np.isfinite(motion.log_evidence(refined))
-        return Place(
-            np.where(inside[:, None, None], refined, population.poses),
-            # Beside other places the points count as independently as the search has them.
-            population.log_evidence + float(found.scores[0] - rise),
-            population.effective_samples,
-            population.pareto_k,
-        )
+            sampled = self._sampled(pair, motion, found, rng)
+        return sampled
 
-    def _sampled(
-        self, pair: Pair, motion: AbstractMotion, found: Candidates, rng: np.random.Generator
-    ) -> tuple[Population, float]:
-        """Return samples around candidates, and the likelihood of the best of these (nats)."""
+    def _sampled(self, pair: Pair, motion: AbstractMotion, found: Candidates, rng: np.random.Generator) -> _Sampled:
+        """Return samples around candidates."""
         noise_m = pair.surface_noise_m(found.poses[0], self.search.blurs[-1] * pair.size_m)
-        likelihood = partial(
-            pair.tempered,
-            blur_m=noise_m,
-            effective_points=self.effective_points,
-            typical=pair.typical_misfit(found.poses[0], noise_m),
-        )
+        typical = pair.typical_misfit(found.poses[0], noise_m)
+        likelihood = partial(pair.tempered, blur_m=noise_m, effective_points=self.effective_points, typical=typical)
         plain = likelihood(found.poses)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
         log_weights = np.where(found.blunt, found.scores, plain + volumes)
@@ -155,7 +160,32 @@ class VisibilityRegistrar(AbstractRegistrar):
             if kind.any():
                 log_weights[kind] += np.log(share) - np.logaddexp.reduce(log_weights[kind])
         proposal = MixtureMotion(motion, found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
-        return self.sampler.run(proposal, [lambda _: likelihood], pair.centre_m, rng), float(plain[0])
+        population = self.sampler.run(proposal, [lambda _: likelihood], pair.centre_m, rng)
+        return _Sampled(population, noise_m, typical, float(population.log_likelihoods.max() - plain[0]))
+
+    def _place(
+        self, pair: Pair, motion: AbstractMotion, one: _Sampled, all_places: list[_Sampled], rng: np.random.Generator
+    ) -> Place:
+        """Return one of the places, sharpened by matching surface but where that would leave what is possible."""
+        population = one.population
+        refined = self.refiner.refine(pair, population.poses, rng, fine_m=self.search.blurs[-1] * pair.size_m)
+        inside = np.isfinite(motion.log_evidence(refined))
+        best = int(np.argmax(population.log_likelihoods))
+        # Each place was sampled under the noise that it shows itself, which would forgive it everything; beside each
+        # other all are held to the noise of the one that matches best.
+        strict = min(all_places, key=lambda place: place.noise_m)
+        beside = pair.tempered(
+            population.poses[best : best + 1],
+            strict.noise_m,
+            effective_points=self.effective_points,
+            typical=strict.typical,
+        )
+        return Place(
+            np.where(inside[:, None, None], refined, population.poses),
+            population.log_evidence + float(beside[0] - population.log_likelihoods[best]),
+            population.effective_samples,
+            population.pareto_k,
+        )
 
     def pair(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> Pair:
         """Return the comparison of two views, at points drawn with `rng`."""
