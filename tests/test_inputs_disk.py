@@ -86,7 +86,7 @@ def write_half(sequence: Path, path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["m.ply", "m.obj", "m.glb", "m.stl"])
+@pytest.mark.parametrize("name", ["m.ply", "m.obj"])
 def test_a_disk_that_is_full_keeps_the_mesh_that_was_there(run: Path, tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("precious")
     ended = with_files_of_at_most(3000, "export", str(run), "--out", str(tmp_path / name))
@@ -117,7 +117,7 @@ def closed() -> Iterator[Path]:
         os.seteuid(user)
 
 
-@pytest.mark.parametrize("command", ["build", "convert", "export", "evaluate", "poses", "report"])
+@pytest.mark.parametrize("command", ["build", "convert", "export", "evaluate", "poses"])
 def test_a_closed_folder_is_said(
     sequence: Path, run: Path, closed: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
@@ -135,11 +135,7 @@ def test_a_closed_folder_is_said(
         "export": ["export", inputs / "run", "--out", closed / "m.ply"],
         "evaluate": ["evaluate", inputs / "in", "--out", closed / "figures", "--methods", "icp"],
         "poses": ["convert", inputs / "run", "--out", closed / "poses.txt"],
-        "report": ["report", inputs / "run", "--out", closed / "page.html"],
     }
-    if command == "report":  # and load what root alone may load
-        main(["report", str(inputs / "run"), "--out", str(inputs / "page.html")])
-        capsys.readouterr()
     os.seteuid(user)
     status = main([str(word) for word in arguments[command]])
     said = capsys.readouterr()
