@@ -156,7 +156,12 @@ class Modeler:
             waiting = [(seen, view) for seen, view in state.overdue() if (seen.frame.index, view) not in tried]
 
     def _spanned(self, state: State) -> tuple[State, tuple[Edge, ...]]:
-        """Return the state with edges beyond those that placed the frames, each judged, and these."""
+        """Return the state with edges beyond those that placed the frames, each judged, and these.
+
+        Not where all steps share an axis: beside it the noise that a frame's edges have in common does not count yet.
+        """
+        if self.prior.shared_axis(list(state.views.values())) is not None:
+            return state, ()
         pairing = self._pairing()
         edges = [
             self.closer.spanning(_lasting(posterior), state.views, state.solution, state.graph.edges)
