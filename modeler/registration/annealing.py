@@ -35,7 +35,7 @@ class Population:
 class AnnealedSampler:
     """Sequential Monte Carlo: weight, resample, move; temperatures bridge the steps where weights would collapse."""
 
-    initial: int = 1000
+    initial: int = 1200
     """Samples drawn at first."""
     particles: int = 500
     """Samples kept from the first weighting on."""
@@ -45,8 +45,8 @@ class AnnealedSampler:
     """Samples of the result."""
     final_moves: int = 4
     """At most so many rounds of moves after the last weighting."""
-    enough: float = 600.0
-    """They end when the effective size of the result is this."""
+    enough: float = 520.0
+    """None are made, or no more, once the effective size of the result is this."""
     min_share: float = 0.4
     """Least effective share of the samples that a weighting may leave; with less, the step is cut."""
 
@@ -82,9 +82,9 @@ class AnnealedSampler:
                 poses, prior, before, after = poses[chosen], prior[chosen], before[chosen], after[chosen]
                 blend = _Blend(motion, previous, level, reached)
                 for _ in range(self.final_moves if last else self.moves):
-                    _move(poses, (prior, before, after), blend=blend, centre_m=centre_m, rng=rng)
                     if last and _distinct(poses) >= self.enough:
                         break
+                    _move(poses, (prior, before, after), blend=blend, centre_m=centre_m, rng=rng)
             before, previous = after, level
         return Population(poses, before, evidence, _distinct(poses), worst_tail)
 

@@ -102,9 +102,10 @@ def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: f
 
 def _steps(pair: Pair, poses: Array, noise_m: float, spread: Array, centre_m: Array) -> Array:
     """Return the Gauss-Newton steps (n, 6) of motions, held by the samples' spread where nothing else holds them."""
-    gradient, matrix = pair.normal_equations(poses, noise_m, stride=2)
+    _, first, number = np.unique(poses[:, 0, 3], return_index=True, return_inverse=True)  # some are copies of others
+    gradient, matrix = pair.normal_equations(poses[first], noise_m, stride=2)
     held = matrix + np.linalg.inv(spread @ spread.T)
-    return np.asarray(np.linalg.solve(held, gradient[:, :, None])[:, :, 0], dtype=np.float64)
+    return np.asarray(np.linalg.solve(held, gradient[:, :, None])[number, :, 0], dtype=np.float64)
 
 
 def _equations(pair: Pair, pose: Array, noise_m: float, centre_m: Array) -> tuple[Array, Array, Array, Array, Array]:
