@@ -48,9 +48,9 @@ def paper_density(point_b, a_from_b, ranges_m, intrinsics, noise):
 
 def visibility(pose, sight, model):
     """Log-likelihood of one pose and number of explained points: every point in turn, as `kernels.visibility` says."""
-    fx, fy, cx, cy, width, height = np.float64(sight.camera)
-    low, high, flat, steep = np.float64(sight.facing)
-    cells, points = sight.cells.reshape(int(height), int(width), -1), np.float64(sight.points.T)
+    fx, fy, cx, cy, width, height = sight.camera.astype(np.float64)
+    low, high, flat, steep = sight.facing.astype(np.float64)
+    cells, points = sight.cells.reshape(int(height), int(width), -1), sight.points.T.astype(np.float64)
     blur, silhouette_px, dead_px, clearance_m, worst, bend, unmeasured, typical = map(np.float64, model[:-1])
     hidden = np.exp(np.float64(model.table[0]))
     total, explained = 0.0, 0.0

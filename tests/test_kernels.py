@@ -139,7 +139,7 @@ def test_visibility_is_within_its_bound_of_its_twin(seed):
 def test_a_walk_along_a_ridge_rates_places_as_the_likelihood_does(seed):
     rng = np.random.default_rng(seed)
     sights, poses = (random_sight(rng, 40), random_sight(rng, 30)), np.stack([random_pose(rng, 0.3) for _ in range(5)])
-    ground = ridges.Ground(*sights, *sights, model(), model(), 0.5, 7.0, 0.3, -np.inf)
+    ground = ridges.Ground(sights[0], sights[1], sights[0], sights[1], model(), model(), 0.5, 7.0, 0.3, -np.inf)
     room = buffers(sights[0]), buffers(sights[1]), np.empty(12)
     got = [ridges.height(row, ground, *room) for row in rows(poses)]
     plain, explained = visibility.log_likelihoods(rows(poses), *sights, model(), model()).T
@@ -149,12 +149,12 @@ def test_a_walk_along_a_ridge_rates_places_as_the_likelihood_does(seed):
 def test_a_walk_keeps_its_strides_and_ends_at_the_floor(rng):
     """Where nothing matches nothing pulls a walker across: it goes straight on, as far as the ground is good."""
     sights = random_sight(rng), random_sight(rng)
-    empty = tuple(sight._replace(cells=np.zeros_like(sight.cells)) for sight in sights)
+    empty = [sight._replace(cells=np.zeros_like(sight.cells)) for sight in sights]
     start, spread = random_pose(rng, 0.1), np.diag([0.1, 0.1, 0.1, 0.01, 0.01, 0.01])
     axis, centre_m = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.8])
     pull = matching.Pull(rows(start), 1e-9 * np.eye(6), np.full(6, 1e-9), 0.2)
     for floor, steps in ((np.inf, 0), (-np.inf, 4)):
-        ground = ridges.Ground(*empty, *empty, model(), model(), 0.5, 0.0, 0.3, floor)
+        ground = ridges.Ground(empty[0], empty[1], empty[0], empty[1], model(), model(), 0.5, 0.0, 0.3, floor)
         visited, counts = ridges.walk(
             rows(start[None]), spread[None], axis[None], np.array([2.0]), ground, centre_m, 0.001, pull, 4
         )
@@ -174,7 +174,7 @@ def test_downhill_is_the_step_of_the_held_normal_equations(rng):
     for pose, gradient, matrix, there in zip(poses, gradients, matrices_, matrices(got), strict=True):
         away = se3.difference(matrices(pull.mean[None])[0], pose, centre_m)
         held = matrix + pull.precision + np.diag(pull.damping)
-        step = np.linalg.solve(held, gradient - pull.precision @ away)
+        step = np.asarray(np.linalg.solve(held, gradient - pull.precision @ away), dtype=np.float64)
         step *= min(1.0, 0.2 / np.linalg.norm(step[:3]))
         np.testing.assert_allclose(there, se3.moved(pose, step, centre_m), atol=1e-9)
 
