@@ -16,7 +16,9 @@ from modeler.registration.posterior import weighted_gaussian
 from modeler.types import AbstractMotion, Array, PoseGaussian
 
 VARIANCE = 0.02e-2  # the check of the design, in units of a tenth of a radian and of a metre
-SAMPLER = AnnealedSampler(initial=2000, particles=600, moves=6, final_particles=1000, final_moves=10)
+SAMPLER = AnnealedSampler(
+    initial=2000, particles=600, moves=6, final_particles=1000, final_moves=10, enough=np.inf
+)  # until nothing is left of where they started
 CENTRE = se3.translation(OBJECT_M)
 ABOUT = se3.adjoint(CENTRE)
 SPREAD = VARIANCE * ABOUT @ ABOUT.T  # the variance in all directions, about the object
