@@ -13,7 +13,8 @@ import tyro
 class Export:
     """Write the fused mesh of a run as PLY, OBJ, GLB or STL, in m, object frame.
 
-    The axes are those of the camera at the first frame: x right, y down, z forward. --watertight, --texture and
+    The axes are those of the camera at the first frame: x right, y down, z forward; a GLB's node turns them so that
+    y is up, as glTF has it. --watertight, --texture and
     --voxel-m make the mesh anew from the frames, so the sequence must be there.
     """
 

@@ -52,7 +52,8 @@ def write_mesh(model: ObjectModel, out: Path, texture: Texture | None = None) ->
     """Write a mesh; the ending of `out` selects the format.
 
     Coordinates stay as they are in every format: metres, in the object frame, x right, y down, z forward in the first
-    image. PLY, OBJ and GLB keep normals and colours, PLY alone what is known of the vertices; STL holds neither.
+    image. In glTF y is up, so that the node of a GLB turns the mesh half round x: viewers show it upright. PLY, OBJ
+    and GLB keep normals and colours, PLY alone what is known of the vertices; STL holds neither.
 
     Args:
         model: the mesh.
@@ -133,7 +134,9 @@ def _glb(model: ObjectModel, texture: Texture | None) -> bytes:
             baseColorTexture=Image.fromarray(texture.image), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
         )
         mesh.visual = TextureVisuals(uv=texture.uv, material=material)
-    data = gltf.export_glb(trimesh.Scene(mesh), include_normals=True)
+    scene = trimesh.Scene()
+    scene.add_geometry(mesh, transform=np.diag([1.0, -1.0, -1.0, 1.0]))  # glTF: y up, and the front towards +z
+    data = gltf.export_glb(scene, include_normals=True)
     assert isinstance(data, bytes)
     return data
 
