@@ -427,6 +427,18 @@ def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
     report = _spoilt(refuse, META, tmp_path)
     assert report["reasons"] == ["none of 1 loop closures was accepted; the last, frame 9 on frame 3: it lies"]
 
+    def see_little(step: Step) -> Step:
+        edges = [replace(edge, posterior=replace(edge.posterior, overlap=0.45)) for edge in step.edges_so_far]
+        return replace(step, edges_so_far=tuple(edges))
+
+    report = _spoilt(see_little, META, tmp_path)  # no edge of a loop stands alone
+    assert report["reasons"] == []
+    run, chain = RunFolder.open(tmp_path, overwrite=True), replace(META, closure_expected=False)
+    report = [run.write(see_little(step), chain) for step in _steps(closure=False)][-1]
+    assert [reason.partition(" share")[0] for reason in report["reasons"]] == [
+        f"frames {frame} and {frame - 2}" for frame in (5, 7, 9)
+    ]
+
     def leave_out(step: Step) -> Step:
         outliers = tuple(edge for edge in step.edges_so_far if edge.kind == "closure")
         return replace(step, solution=replace(step.solution, outliers=outliers))

@@ -123,7 +123,27 @@ def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> l
             reasons.append(f"none of {len(tried)} loop closures was accepted; the last, {pair}: {_reason(last, step)}")
         elif meta.closure_expected:
             reasons.append("the object never came back to an earlier view, so that no loop was closed")
+    reasons += [
+        f"frames {edge.source} and {edge.target} share little surface (overlap {edge.posterior.overlap:.2f}), and no "
+        "other edge confirms how they were joined"
+        for edge in _unconfirmed(_taking_part(step))
+        if edge.posterior.overlap < _LITTLE_OVERLAP
+    ]
     return reasons
+
+
+def _unconfirmed(edges: list[Edge]) -> list[Edge]:
+    """Return the edges without which the graph would fall apart."""
+    found = []
+    for edge in edges:
+        reached, on = {edge.source}, True
+        while on:
+            ends = [{other.source, other.target} for other in edges if other is not edge]
+            more = set().union(*(pair for pair in ends if pair & reached)) - reached
+            reached, on = reached | more, bool(more)
+        if edge.target not in reached:
+            found.append(edge)
+    return found
 
 
 def _taking_part(step: Step) -> list[Edge]:
@@ -134,6 +154,7 @@ def _reason(edge: Edge, step: Step) -> str:
     return _OUTLIER if edge in step.solution.outliers else edge.reason
 
 
+_LITTLE_OVERLAP = 0.5  # views farther apart are registered wrongly now and then, and surely so
 _OUTLIER = "the optimisation left it out: all other edges contradict it"
 
 
