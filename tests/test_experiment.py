@@ -6,8 +6,8 @@ import csv
 import io
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +24,14 @@ from modeler.types import (
     AbstractPrior,
     AbstractRegistrar,
     Array,
+    Edge,
     Frame,
     InputError,
     Outcome,
     PoseGaussian,
     Posterior,
     RayImage,
+    Solution,
 )
 from viz.figures import rotation_errors
 
@@ -113,6 +115,25 @@ def test_tries_every_pair_by_every_method_and_knows_how_many() -> None:
         ("bad", 1, 1, 0),
         ("good", 1, 2, 1),
     ]
+
+
+@dataclass(frozen=True)
+class Learning(GeneralPrior):
+    """Keeps count of the pairs that it could learn from."""
+
+    seen: list[int] = field(default_factory=list)
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> GeneralPrior:
+        assert not solution.trajectory  # pairs of a table have no sequence
+        self.seen.append(len(edges))
+        return self
+
+
+@pytest.mark.parametrize("learn", [False, True])
+def test_a_prior_learns_from_the_pairs_before_where_it_may(learn: bool) -> None:
+    prior = Learning()
+    assert len(list(experiment(prior=prior, learn=learn, methods={"good": Oracle()}).trials(Recording()))) == 5
+    assert prior.seen == ([0, 1, 2, 3, 4] if learn else [])
 
 
 def test_measures_errors_in_the_units_that_it_says() -> None:

@@ -33,6 +33,8 @@ class Evaluate:
     closed: bool = False
     """Take the sequence for a full turn: its last frame is followed by its first. What all its steps together
     leave, of how much they turn one by one, is told too: it judges a sequence without ground truth."""
+    learn: bool = False
+    """The prior learns from the pairs before, as in `build`: the axis and sense of a turntable that nobody tells."""
     points: Annotated[int | None, tyro.conf.arg(metavar="N"), tyro.conf.arg(help_behavior_hint="(default: all)")] = None
     """Keep so many of the object's surface points a view, drawn at random: very sparse clouds."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0

@@ -45,6 +45,7 @@ def evaluate(options: Evaluate) -> int:
         pairing=Pairing(_offsets(options.offsets), both_ways=options.both_ways, closed=options.closed),
         segmenter=compose.segmenter(options.where),
         points=options.points,
+        learn=options.learn,
         seed=compose.seed(options.seed),
     )
     with bar() as progress:

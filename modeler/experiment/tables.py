@@ -122,6 +122,7 @@ def results_json(experiment: Experiment, trials: Sequence[Trial], rows: Sequence
     """Return an experiment, its trials and their summaries as JSON; numbers that are not finite are null."""
     results = {
         "schema": 1,
+        "learn": experiment.learn,
         "seed": experiment.seed,
         "prior": repr(experiment.prior),
         "methods": {name: repr(method) for name, method in experiment.methods.items()},

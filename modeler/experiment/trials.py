@@ -13,7 +13,18 @@ from modeler.evaluation import nees, rotation_error_deg, translation_error_m, tr
 from modeler.experiment.pairing import Pairing
 from modeler.rays import Sensor
 from modeler.segmentation import Segmenter, telling
-from modeler.types import AbstractPrior, AbstractRegistrar, Array, Frame, InputError, Outcome, Posterior, RayImage
+from modeler.types import (
+    AbstractPrior,
+    AbstractRegistrar,
+    Array,
+    Edge,
+    Frame,
+    InputError,
+    Outcome,
+    Posterior,
+    RayImage,
+    Solution,
+)
 
 _SPARSE_STREAM = 1  # the random stream that thins frame k is [seed, k, this]; pairs draw from [seed, source, target]
 
@@ -103,6 +114,8 @@ class Experiment:
     """Object pixels of each frame whose depth is kept, drawn at random; None = all. The mask stays."""
     success_deg: float = 16.2
     """Rotation error below which a registration counts as right (Jian and Vemuri 2011)."""
+    learn: bool = False
+    """Whether the prior learns from the pairs before, as in a build: the axis of a turntable that nobody tells."""
     seed: int = 0
     """Each pair draws from a generator of its own, made from this and the two frame numbers, as in `register`."""
 
@@ -124,11 +137,12 @@ class Experiment:
         indices = self._frames(recorded)
         truth = recorded.truth()
         views = dict(self._views(recorded, indices))
+        known: dict[str, list[Edge]] = {name: [] for name in self.methods}
         for source, target, offset in self.pairing.pairs(indices):
             motion = None if truth is None else true_motion(truth, target, source)
             for name, method in self.methods.items():
                 blank = Trial(recorded.name, name, offset, source, target, outcome="", usable=False)
-                yield self._trial(method, views[source], views[target], blank=blank, truth=motion)
+                yield self._trial(method, views[source], views[target], blank=blank, truth=motion, known=known[name])
 
     def _frames(self, recorded: Recorded) -> tuple[int, ...]:
         truth = recorded.truth()
@@ -167,6 +181,7 @@ class Experiment:
         *,
         blank: Trial,
         truth: Array | None,
+        known: list[Edge],
     ) -> Trial:
         if truth is not None:
             blank = replace(blank, rotation_deg=rotation_error_deg(np.eye(4), truth))
@@ -178,11 +193,14 @@ class Experiment:
         assert isinstance(source, RayImage)
         assert isinstance(target, RayImage)
         try:
-            motion = self.prior.between(source, target)
+            prior = self.prior.learned(Solution(), known) if self.learn else self.prior
+            motion = prior.between(source, target)
         except InputError as error:
             return replace(blank, outcome=str(error))
         rng = np.random.default_rng([self.seed, source.index, target.index])
         posterior = method.register(source, target, motion, rng=rng)
+        if posterior.usable:
+            known.append(Edge(posterior, "odometry", accepted=True, reason="the method stands by it"))
         return _judged(blank, posterior, truth, source.centroid_m)
 
 
