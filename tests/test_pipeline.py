@@ -228,6 +228,8 @@ def test_at_the_end_views_two_steps_apart_are_registered_too_and_judged() -> Non
     none = run(registrar=Oracle(noise=1.0), closer=replace(closer, max_spans=0))[-1]
     assert len(none.edges_so_far) == len(last.edges_so_far) - len(spans)
     assert np.mean(_rotation_errors(last.solution)) < np.mean(_rotation_errors(none.solution))
+    hurried = list(modeler(registrar=Oracle(noise=1.0), closer=closer).run(FRAMES, Scene(), hurry=lambda: True))[-1]
+    assert len(hurried.edges_so_far) == len(none.edges_so_far)
     shared = run(registrar=Oracle(noise=1.0), closer=closer, prior=AnyPrior(axis=SharedAxis(1e-4, 1e-5)))[-1]
     assert len(shared.edges_so_far) == len(none.edges_so_far)  # their noise is not told apart from slip
 

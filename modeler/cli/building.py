@@ -69,7 +69,8 @@ def build(options: Build) -> int:
         report: Mapping[str, Any] = {}
         try:
             with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
-                for step in modeler.run(interrupt.until(frames.until(lambda: interrupt.asked)), scene):
+                coming = interrupt.until(frames.until(lambda: interrupt.asked))
+                for step in modeler.run(coming, scene, hurry=lambda: interrupt.asked):
                     seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
                     seconds["total"] = time.perf_counter() - began
                     meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)

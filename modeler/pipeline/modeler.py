@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -56,7 +56,9 @@ class Modeler:
     executor: Executor | None = None
     """Where the pairs of one frame are registered side by side; None: one after the other. Results are the same."""
 
-    def run(self, frames: Iterable[Frame], scene: Scene) -> Iterator[Step]:
+    def run(
+        self, frames: Iterable[Frame], scene: Scene, *, hurry: Callable[[], bool] = lambda: False
+    ) -> Iterator[Step]:
         """Yield what each frame brings. A frame that cannot be used is reported and left out.
 
         Before the last step, frames left out are tried once more, against views that followed them: one that then joins
@@ -65,6 +67,7 @@ class Modeler:
         Args:
             frames: in order of time; read one ahead, so that the last step is known as such.
             scene: what the segmenter learnt from the sequence.
+            hurry: asked after the last frame; where it says so, no edges are tried beyond those that placed the frames.
         """
         state = State()
         for frame, last in _with_last(frames):
@@ -74,7 +77,7 @@ class Modeler:
                 for later, found in self._caught_up(state):
                     state = self._fused(replace(later, growing=state.growing), last=False)
                     yield replace(found, model=state.model)
-                state, spans = self._spanned(state)
+                state, spans = (state, ()) if hurry() else self._spanned(state)
                 state = self._solved(state)
                 step = replace(step, posteriors=(*step.posteriors, *(edge.posterior for edge in spans)))
                 step = replace(step, edges=(*step.edges, *spans))
