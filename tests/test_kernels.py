@@ -310,3 +310,9 @@ def test_patches_are_halves_of_halves(rng, count):
     if count == 200:  # the first cut is across the longest side
         low = numbers < 4
         assert points[low, 1].max() <= points[~low, 1].min()
+
+
+def test_kernels_know_that_they_are_compiled():
+    rng = np.random.default_rng(0)
+    visibility.log_likelihoods(rows(np.eye(4)[None]), random_sight(rng), random_sight(rng), model(), model())
+    assert kernels.compiled()

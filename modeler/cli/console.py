@@ -7,6 +7,7 @@ from types import TracebackType
 from rich.console import Console as Terminal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from modeler import kernels
 from modeler.types import Step
 
 
@@ -36,6 +37,8 @@ class Console:
     def __enter__(self) -> Console:
         """Show the bar."""
         self._bar.start()
+        if self._bar.console.is_terminal and not kernels.compiled():
+            self._say("the first registration on this machine compiles for about half a minute")
         if self._address is not None:
             self._say(f"watch at {self._address}")
         return self
