@@ -10,6 +10,8 @@ from importlib import metadata
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from modeler.export.words import undetermined
 from modeler.types import Edge, Mode, RayImage, Solution, Step
@@ -123,27 +125,23 @@ def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> l
             reasons.append(f"none of {len(tried)} loop closures was accepted; the last, {pair}: {_reason(last, step)}")
         elif meta.closure_expected:
             reasons.append("the object never came back to an earlier view, so that no loop was closed")
+    edges = _taking_part(step)
     reasons += [
         f"frames {edge.source} and {edge.target} share little surface (overlap {edge.posterior.overlap:.2f}), and no "
         "other edge confirms how they were joined"
-        for edge in _unconfirmed(_taking_part(step))
-        if edge.posterior.overlap < _LITTLE_OVERLAP
+        for edge in edges
+        if edge.posterior.overlap < _LITTLE_OVERLAP and not _joined_without(edge, edges)
     ]
     return reasons
 
 
-def _unconfirmed(edges: list[Edge]) -> list[Edge]:
-    """Return the edges without which the graph would fall apart."""
-    found = []
-    for edge in edges:
-        reached, on = {edge.source}, True
-        while on:
-            ends = [{other.source, other.target} for other in edges if other is not edge]
-            more = set().union(*(pair for pair in ends if pair & reached)) - reached
-            reached, on = reached | more, bool(more)
-        if edge.target not in reached:
-            found.append(edge)
-    return found
+def _joined_without(edge: Edge, edges: list[Edge]) -> bool:
+    """Return whether the ends of an edge hang together by the others."""
+    numbers, ends = np.unique([(other.source, other.target) for other in edges], return_inverse=True)
+    ends = ends.reshape(-1, 2)[[other is not edge for other in edges]]
+    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(numbers), len(numbers)))
+    _, parts = connected_components(graph, directed=False)
+    return bool(np.ptp(parts[np.searchsorted(numbers, [edge.source, edge.target])]) == 0)
 
 
 def _taking_part(step: Step) -> list[Edge]:
