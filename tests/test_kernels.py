@@ -141,7 +141,7 @@ def test_a_walk_along_a_ridge_rates_places_as_the_likelihood_does(seed):
     sights, poses = (random_sight(rng, 40), random_sight(rng, 30)), np.stack([random_pose(rng, 0.3) for _ in range(5)])
     ground = ridges.Ground(sights[0], sights[1], sights[0], sights[1], model(), model(), 0.5, 7.0, 0.3, -np.inf)
     room = buffers(sights[0]), buffers(sights[1]), np.empty(12)
-    got = [ridges.height(row, ground, *room) for row in rows(poses)]
+    got = [ridges.height(row, ground, room) for row in rows(poses)]
     plain, explained = visibility.log_likelihoods(rows(poses), *sights, model(), model()).T
     np.testing.assert_allclose(got, 0.5 * plain - 7.0 * np.exp(-0.3 * explained), rtol=1e-6)
 

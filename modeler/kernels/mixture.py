@@ -1,4 +1,4 @@
-"""Mixtures of Gaussians on SE(3): their log density at many poses."""
+"""Gaussians on SE(3): the density of their mixtures, how far apart they lie, and which of them crowd."""
 
 import math
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from modeler.kernels.matching import equations, held_step, workroom
 from modeler.kernels.moves import turn
-from modeler.kernels.sight import Sight, buffers, invert, look
-from modeler.kernels.visibility import Model, score
+from modeler.kernels.sight import Sight, buffers
+from modeler.kernels.visibility import Model, compare
 
 
 class Ground(NamedTuple):
@@ -38,15 +38,11 @@ class Ground(NamedTuple):
 
 
 @numba.njit(cache=True)
-def height(pose, ground, there, back, inverse):
-    """Return how good a pose (12,) is (nats): the tempered likelihood; room for the search is handed in."""
-    look(pose, ground.all_forward, there[0], there[1], there[2])
-    total, explained = score(ground.all_forward.points, there[0], there[2], ground.forward_model)
-    invert(pose, inverse)
-    look(inverse, ground.all_backward, back[0], back[1], back[2])
-    more, further = score(ground.all_backward.points, back[0], back[2], ground.backward_model)
-    plain = ground.per_point * (np.float64(total) + np.float64(more))
-    return plain - ground.no_overlap * math.exp(-ground.per_explained * (np.float64(explained) + np.float64(further)))
+def height(pose, ground, room):
+    """Return how good a pose (12,) is (nats): the tempered likelihood; room as for `visibility.compare`."""
+    sights, models = (ground.all_forward, ground.all_backward), (ground.forward_model, ground.backward_model)
+    plain, explained = compare(pose, sights[0], sights[1], models[0], models[1], room)
+    return ground.per_point * plain - ground.no_overlap * math.exp(-ground.per_explained * explained)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -69,7 +65,7 @@ def walk(poses, spreads, axes, strides, ground, centre, surface_m, pull, max_str
     """
     visited, counts = np.empty((len(poses), max_strides, 12)), np.zeros(len(poses), dtype=np.int64)
     room, gradient, matrix = workroom(ground.forward, ground.backward), np.empty(6), np.empty((6, 6))
-    there, back, inverse = buffers(ground.all_forward), buffers(ground.all_backward), np.empty(12)
+    looked = buffers(ground.all_forward), buffers(ground.all_backward), np.empty(12)
     step, z, rotation = np.empty(6), np.empty(6), np.empty((3, 3))
     pose, moved = np.empty(12), np.empty(12)
     for i in range(len(poses)):
@@ -95,7 +91,7 @@ def walk(poses, spreads, axes, strides, ground, centre, surface_m, pull, max_str
                 spread_out(spreads[i], z, step)
                 turn(pose, step, centre, rotation, moved)
                 pose[:] = moved
-            if not height(pose, ground, there, back, inverse) > ground.floor:
+            if not height(pose, ground, looked) > ground.floor:
                 break
             visited[i, number] = pose
             counts[i] = number + 1

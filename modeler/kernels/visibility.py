@@ -52,7 +52,7 @@ MAX_SIGMAS = np.float32(3.0)
 
 # Nodes of the table of log((1 - hidden) exp(match) + hidden); below the first it is log(hidden) within 3e-6.
 TABLE_LOW, TABLE_HIGH, TABLE_STEPS = np.float32(-14.0), np.float32(4.0), 2304
-_PER_STEP = np.float32(TABLE_STEPS / 18.0)
+_PER_STEP = np.float32(TABLE_STEPS / (TABLE_HIGH - TABLE_LOW))
 
 _OF_SURFACE, _OF_BACKGROUND, _OF_NOTHING = np.float32(SURFACE), np.float32(BACKGROUND), np.float32(MISSING)
 
@@ -150,6 +150,21 @@ def score(points, carried, found, model):
     return total, explained
 
 
+@numba.njit(cache=True, error_model="numpy")
+def compare(pose, forward, backward, forward_model, backward_model, room):
+    """Return the log-likelihood of one pose (12,) and the number of explained points; see `log_likelihoods`.
+
+    Room is handed in: the `buffers` of either direction, and (12,).
+    """
+    there, back, inverse = room
+    look(pose, forward, there[0], there[1], there[2])
+    total, explained = score(forward.points, there[0], there[2], forward_model)
+    invert(pose, inverse)
+    look(inverse, backward, back[0], back[1], back[2])
+    more, further = score(backward.points, back[0], back[2], backward_model)
+    return np.float64(total) + np.float64(more), np.float64(explained) + np.float64(further)
+
+
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def log_likelihoods(poses, forward, backward, forward_model, backward_model):
     """Return the log-likelihood of each pose, summed over the points of two views, each looked up in the other.
@@ -175,15 +190,11 @@ def log_likelihoods(poses, forward, backward, forward_model, backward_model):
     block = 16  # poses that share one set of buffers
     result = np.empty((poses.shape[0], 2))
     for group in numba.prange((poses.shape[0] + block - 1) // block):
-        there, back, inverse = buffers(forward), buffers(backward), np.empty(12)
+        room = buffers(forward), buffers(backward), np.empty(12)
         for i in range(group * block, min((group + 1) * block, poses.shape[0])):
-            look(poses[i], forward, there[0], there[1], there[2])
-            total, explained = score(forward.points, there[0], there[2], forward_model)
-            invert(poses[i], inverse)
-            look(inverse, backward, back[0], back[1], back[2])
-            more, further = score(backward.points, back[0], back[2], backward_model)
-            result[i, LOG_LIKELIHOOD] = np.float64(total) + np.float64(more)
-            result[i, EXPLAINED] = np.float64(explained) + np.float64(further)
+            result[i, LOG_LIKELIHOOD], result[i, EXPLAINED] = compare(
+                poses[i], forward, backward, forward_model, backward_model, room
+            )
     return result
 
 
