@@ -29,6 +29,7 @@ from sequences.shapes import (
     Torus,
 )
 from sequences.surface import outer_surface
+from sequences.sweeps import ear_clipped
 from sequences.trajectory import Hand, Place, Places, RobotReadings, Tabletop, Turntable
 
 PI = np.pi
@@ -55,6 +56,13 @@ def volume_m3(mesh: Mesh) -> float:
     return float(np.sum(a * np.cross(b, c)) / 6.0)
 
 
+def assert_closed(mesh: Mesh) -> None:
+    edges = np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]], mesh.triangles[:, [2, 0]]])
+    there, back = {tuple(e) for e in edges.tolist()}, {tuple(e[::-1]) for e in edges.tolist()}
+    assert len(there) == len(edges)  # no edge is run through twice in one direction ...
+    assert there == back  # ... and each is in the other: closed, and oriented alike
+
+
 def area_m2(mesh: Mesh) -> float:
     a, b, c = np.moveaxis(mesh.corners(), 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
@@ -64,10 +72,7 @@ def area_m2(mesh: Mesh) -> float:
 def test_solids_are_closed_and_of_the_right_volume(name: str) -> None:
     shape, expected_m3 = SOLIDS[name]
     mesh = shape.mesh()
-    edges = np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]], mesh.triangles[:, [2, 0]]])
-    there, back = {tuple(e) for e in edges.tolist()}, {tuple(e[::-1]) for e in edges.tolist()}
-    assert len(there) == len(edges)  # no edge is run through twice in one direction ...
-    assert there == back  # ... and each is in the other: closed, and oriented alike
+    assert_closed(mesh)
     assert volume_m3(mesh) == pytest.approx(expected_m3, rel=0.02)  # facets lie inside; positive: outwards
     assert volume_m3(mesh) <= expected_m3 * (1 + 1e-9)
 
@@ -154,6 +159,27 @@ def test_a_robot_reads_its_hand_with_the_noise_it_says() -> None:
     read = RobotReadings(2.0, 0.005).camera_from_hand(poses, np.random.default_rng(0))
     spread = se3.log(se3.inverse(poses) @ read).std(axis=0)
     np.testing.assert_allclose(spread, np.repeat([np.radians(2.0), 0.005], 3), rtol=0.05)
+
+
+def lathes(shape: AnyShape) -> list[Lathe]:
+    if isinstance(shape, Compound):
+        return [lathe for part in shape.parts for lathe in lathes(part.shape)]
+    return [shape] if isinstance(shape, Lathe) else []
+
+
+@pytest.mark.parametrize("name", builtin_recipes())
+def test_builtin_recipes_are_well_formed_and_of_a_size_to_handle(name: str) -> None:
+    shape = load_recipe(name).object
+    mesh = shape.mesh()
+    assert 0.05 < np.ptp(mesh.vertices_m, axis=0).max() < 0.3
+    for number in np.unique(mesh.part):
+        part = mesh.only(mesh.part == number)
+        assert_closed(part)
+        assert volume_m3(part) > 0.0
+    for lathe in lathes(shape):
+        bottom, *_, top = lathe.profile_m
+        ends = [(0.0, height) for radius, height in (top, bottom) if radius > 0.0]
+        ear_clipped(np.array([*lathe.profile_m, *ends]))  # complains of a profile that crosses itself
 
 
 @pytest.mark.parametrize("name", builtin_recipes())

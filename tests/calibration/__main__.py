@@ -1,10 +1,11 @@
 """Render pairs, register them, and report how true the posteriors' covariances are: `make calibrate`.
 
 The shapes are split: methods may be tuned on one half; the other is there to be looked at once, at the end, and only
-where it is asked for (`--half held-out`). The table
-goes to stdout, progress to stderr, and calibration.json, calibration.csv and coverage.png into a folder. The status is
-1 where the negative control, whose covariance is known to be far too small, is not shown to be: then the study is
-broken.
+where it is asked for (`--half held-out`). The tables go to stdout, progress to stderr, and calibration.json,
+calibration.csv and coverage.png into a folder.
+
+The status is 1 where the negative control, whose covariance is known to be far too small, is not shown to be: then the
+study is broken.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from calibration.study import CONTROL, MEASURES, OURS, SPECIMENS, Study, Trial
+from calibration.specimens import FRAMES, SPECIMENS
+from calibration.study import CONTROL, MEASURES, OURS, Study, Trial
 from calibration.tables import degrees, results_csv, results_json, rows, text
 from modeler.export import write_atomically
 from modeler.types import InputError
@@ -29,7 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="calibration", description=__doc__)
     parser.add_argument("--half", choices=("tuning", "held-out", "both"), default="tuning", help="which shapes")
     parser.add_argument("--shapes", nargs="+", metavar="NAME", help="only these of them")
-    parser.add_argument("--frames", type=int, default=Study.frames, help="of each shape under each condition")
+    parser.add_argument(
+        "--frames", type=int, metavar="N", help="of each shape under each condition, one more than pairs"
+    )
     parser.add_argument("--seed", type=int, default=Study.seed, help="of poses, noise and registration")
     parser.add_argument("--out", type=Path, default=Path("runs/calibration"), help="folder of the results")
     options = parser.parse_args(arguments)
@@ -38,11 +42,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for specimen in SPECIMENS
         if options.half in ("both", specimen.half) and (not options.shapes or specimen.recipe in options.shapes)
     )
-    if not chosen or options.frames < 2 or options.seed < 0:
+    frames = FRAMES if options.frames is None else dict.fromkeys(FRAMES, int(options.frames))
+    if not chosen or min(frames.values()) < 2 or options.seed < 0:
         parser.error("no pair is left; check --shapes, --half, --frames (2 or more) and --seed (not negative)")
     try:
         options.out.mkdir(parents=True, exist_ok=True)
-        trials = run(Study(specimens=chosen, frames=options.frames, seed=options.seed), options.out)
+        trials = run(Study(specimens=chosen, frames=frames, seed=options.seed), options.out)
     except (InputError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

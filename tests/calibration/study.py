@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, final
+from typing import final
 
 import numpy as np
 
+from calibration.specimens import FRAMES, SPECIMENS, Half, Specimen, Symmetry
 from modeler import se3
 from modeler.evaluation import about, nees, rotation_error_deg, translation_error_m, true_motion
 from modeler.priors import GeneralPrior, TablePrior
@@ -19,9 +20,6 @@ from sequences.recipe import Recipe, load_recipe
 from sequences.renderer import RenderedSequence
 from sequences.trajectory import Tabletop, Turntable
 
-Half = Literal["tuning", "held-out"]
-Symmetry = Literal["asymmetric", "near-symmetric", "n-fold", "revolution"]
-
 OURS, CONTROL = "visibility", "icp"
 
 MEASURES: Mapping[str, slice] = {
@@ -31,49 +29,6 @@ MEASURES: Mapping[str, slice] = {
     **{axis: slice(k, k + 1) for k, axis in enumerate(("rx", "ry", "rz", "tx", "ty", "tz"))},
 }
 """What of ξ is judged: turns about, and shifts along, the axes of the source camera at the object's centroid."""
-
-
-@final
-@dataclass(frozen=True)
-class Specimen:
-    """One shape of the study."""
-
-    recipe: str
-    """Name of the built-in recipe."""
-    symmetry: Symmetry
-    """Its class; a near-symmetric shape is a body of revolution but for something small."""
-    half: Half
-    """Whether methods may be tuned on it."""
-
-
-SPECIMENS = (
-    Specimen("box", "n-fold", "tuning"),
-    Specimen("flashlight", "near-symmetric", "tuning"),
-    Specimen("tube", "revolution", "tuning"),
-    Specimen("mug", "near-symmetric", "tuning"),
-    Specimen("l_bracket", "asymmetric", "tuning"),
-    Specimen("dumbbell", "revolution", "tuning"),
-    Specimen("can", "revolution", "tuning"),
-    Specimen("two_fold", "n-fold", "tuning"),
-    Specimen("four_fold", "n-fold", "tuning"),
-    Specimen("wedge", "asymmetric", "tuning"),
-    Specimen("figurine", "asymmetric", "tuning"),
-    Specimen("bottle", "revolution", "tuning"),
-    Specimen("teapot", "near-symmetric", "tuning"),
-    Specimen("drill", "asymmetric", "held-out"),
-    Specimen("iron", "asymmetric", "held-out"),
-    Specimen("toy_car", "asymmetric", "held-out"),
-    Specimen("spray_can", "near-symmetric", "held-out"),
-    Specimen("saucepan", "near-symmetric", "held-out"),
-    Specimen("chamberstick", "near-symmetric", "held-out"),
-    Specimen("casserole", "n-fold", "held-out"),
-    Specimen("toy_brick", "n-fold", "held-out"),
-    Specimen("handwheel", "n-fold", "held-out"),
-    Specimen("stool", "n-fold", "held-out"),
-    Specimen("bowl", "revolution", "held-out"),
-    Specimen("goblet", "revolution", "held-out"),
-    Specimen("bowling_pin", "revolution", "held-out"),
-)
 
 
 @final
@@ -167,8 +122,8 @@ class Study:
     """The shapes."""
     conditions: tuple[Condition, ...] = CONDITIONS
     """How each is seen."""
-    frames: int = 5
-    """Frames of each shape under each condition: one more than pairs."""
+    frames: Mapping[Half, int] = field(default_factory=lambda: FRAMES)
+    """Frames of each shape under each condition, by half: one more than pairs."""
     seed: int = 0
     """Of poses, noise and registration."""
     priors: Mapping[str, AbstractPrior] = field(
@@ -183,14 +138,14 @@ class Study:
     @property
     def pairs(self) -> int:
         """Number of pairs rendered."""
-        return len(self.specimens) * len(self.conditions) * (self.frames - 1)
+        return len(self.conditions) * sum(self.frames[specimen.half] - 1 for specimen in self.specimens)
 
     def trials(self, specimen: Specimen) -> Iterator[Trial]:
         """Yield what every method makes of every pair of a shape with every prior."""
-        recipe = load_recipe(specimen.recipe)
+        recipe, frames = load_recipe(specimen.recipe), self.frames[specimen.half]
         for number, condition in enumerate(self.conditions):
             seed = int(np.random.SeedSequence([self.seed, recipe.seed, number]).generate_state(1)[0])
-            sequence = RenderedSequence(staged(recipe, condition, frames=self.frames, seed=seed))
+            sequence = RenderedSequence(staged(recipe, condition, frames=frames, seed=seed))
             views, truth = rendered_views(sequence), sequence.truth()
             for source, target in zip(sequence.indices[1:], sequence.indices[:-1], strict=True):
                 motion = true_motion(truth, target, source)

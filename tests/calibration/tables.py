@@ -157,9 +157,9 @@ def _number(value: float) -> str:
 def results_json(study: Study, trials: Sequence[Trial]) -> str:
     """Return the study and its tables as JSON; what does not exist is null."""
     results = {
-        "schema": 1,
+        "schema": 2,
         "seed": study.seed,
-        "frames": study.frames,
+        "frames": dict(study.frames),
         "pairs": study.pairs,
         "specimens": [asdict(specimen) for specimen in study.specimens],
         "conditions": [asdict(condition) for condition in study.conditions],

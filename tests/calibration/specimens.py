@@ -1,0 +1,50 @@
+"""The shapes of the study: which half each is in, and its symmetry."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal, final
+
+Half = Literal["tuning", "held-out"]
+Symmetry = Literal["asymmetric", "near-symmetric", "n-fold", "revolution"]
+
+
+@final
+@dataclass(frozen=True)
+class Specimen:
+    """One shape of the study."""
+
+    recipe: str
+    """Name of the built-in recipe."""
+    symmetry: Symmetry
+    """Its class; a near-symmetric shape is a body of revolution but for something small."""
+    half: Half
+    """Whether methods may be tuned on it."""
+
+
+FRAMES: Final[Mapping[Half, int]] = {"tuning": 3, "held-out": 5}
+"""Frames of each shape under each condition, one more than pairs: the half with fewer shapes has more of each."""
+
+_RECIPES: Final[Mapping[Half, Mapping[Symmetry, tuple[str, ...]]]] = {
+    "tuning": {
+        "asymmetric": ("l_bracket", "wedge", "figurine", "drill", "iron", "toy_car"),
+        "near-symmetric": ("flashlight", "mug", "teapot", "spray_can", "saucepan", "chamberstick"),
+        "n-fold": ("box", "two_fold", "four_fold", "casserole", "toy_brick", "handwheel", "stool"),
+        "revolution": ("tube", "dumbbell", "can", "bottle", "bowl", "goblet", "bowling_pin"),
+    },
+    "held-out": {
+        "asymmetric": ("watering_can", "stapler", "boot", "vise"),
+        "near-symmetric": ("jug", "pepper_mill", "oil_can"),
+        "n-fold": ("square_bottle", "toolbox", "lantern"),
+        "revolution": ("vase", "soup_plate", "funnel", "jar"),
+    },
+}
+
+SPECIMENS: Final = tuple(
+    Specimen(recipe, symmetry, half)
+    for half, classes in _RECIPES.items()
+    for symmetry, recipes in classes.items()
+    for recipe in recipes
+)
+"""All of them."""
