@@ -134,6 +134,37 @@ def test_noise_does_not_move_the_surface() -> None:
     assert 0.8 < np.median(np.abs(error_m)) / (0.67 * sequence.sensor()[1]) < 1.4
 
 
+def turned(name: str, angle_deg: float, **changes: object) -> RenderedSequence:
+    """Return a shape at one place: twice as it is, and once turned about the vertical."""
+    place, there = Place((0.01, 0.02, 0.0)), Place((0.01, 0.02, 0.0), (0.0, 0.0, angle_deg))
+    return RenderedSequence(replace(load_recipe(name), trajectory=Places((place, place, there)), **changes))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["can", "goblet", "bowl", "vase", "funnel", "soup_plate"])
+def test_a_shape_of_revolution_looks_the_same_however_it_is_turned(name: str) -> None:
+    exact, _, there = turned(name, 137.0, sensor=None)
+    assert exact.mask is not None
+    assert there.mask is not None
+    both = exact.mask & there.mask
+    assert np.sum(exact.mask != there.mask) < 0.01 * both.sum()  # facets
+    moved_m = np.abs(there.depth_m - exact.depth_m)[both]
+    assert np.median(moved_m) < 2e-5
+    assert np.mean(moved_m > 1e-3) < 0.01  # on edges
+
+    first, again, other = (frame.depth_m for frame in turned(name, 137.0))
+    noise_m, difference_m = (np.abs(depth_m - first)[both] for depth_m in (again, other))
+    assert np.mean(np.isnan(difference_m)) == pytest.approx(np.mean(np.isnan(noise_m)), abs=0.01)
+    for share in (0.5, 0.9):
+        assert np.nanquantile(difference_m, share) == pytest.approx(np.nanquantile(noise_m, share), rel=0.1)
+
+
+def test_a_box_does_not_look_the_same_when_it_is_turned() -> None:
+    first, again, other = turned("box", 137.0)
+    assert first.mask is not None
+    noise_m, difference_m = (np.abs(frame.depth_m - first.depth_m)[first.mask] for frame in (again, other))
+    assert np.nanmedian(difference_m) > 5.0 * np.nanmedian(noise_m)
+
+
 def same_frame(first: Frame, second: Frame) -> bool:
     pairs = ((first.depth_m, second.depth_m), (first.mask, second.mask), (first.colour, second.colour))
     return all(
