@@ -5,89 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from closing import ABOUT_OBJECT, COVARIANCE, REGULAR_DEG, Run, posterior_of, told, turned, view, witnessed
 
 from modeler import se3
 from modeler.closure import Closer
-from modeler.graph import PoseGraph, solve
-from modeler.types import Array, Camera, Edge, Frame, Outcome, PoseGaussian, Posterior, RayImage, Solution
-
-CENTROID_M = np.array([0.03, -0.02, 0.8])
-ABOUT_OBJECT = se3.translation(CENTROID_M)
-COVARIANCE = se3.adjoint(ABOUT_OBJECT) @ np.diag([0.003**2] * 3 + [0.001**2] * 3) @ se3.adjoint(ABOUT_OBJECT).T
-REGULAR_DEG = 25.0 * np.arange(14)  # the last frame at 325°
-
-
-def _view(index: int) -> RayImage:
-    camera = Camera(2, 2, 500.0, 500.0, 0.5, 0.5)
-    frame = Frame(index, float(index), np.full((2, 2), 0.8, dtype=np.float32), camera)
-    points = CENTROID_M + np.array([[0.05, 0.0, 0.0], [-0.05, 0.0, 0.0], [0.0, 0.05, 0.0], [0.0, -0.05, 0.0]])
-    return RayImage(frame, None, 0.001, 0.001, points, np.tile([0.0, 0.0, -1.0], (4, 1)), np.zeros((4, 2), np.int64))
-
-
-def _turned(angle_deg: float) -> Array:
-    """True object_from_camera of an object turned about a tilted axis through itself."""
-    axis = np.array([0.1, 0.99, -0.1])
-    xi = np.concatenate([np.radians(angle_deg) * axis / np.linalg.norm(axis), np.zeros(3)])
-    return se3.inverse(ABOUT_OBJECT @ se3.exp(xi) @ se3.inverse(ABOUT_OBJECT))
-
-
-def _posterior(source: int, target: int, pose: Array, outcome: Outcome = Outcome.CONVERGED) -> Posterior:
-    return Posterior(source, target, PoseGaussian(pose, COVARIANCE), outcome, overlap=0.8)
-
-
-class Run:
-    """The pipeline's loop, with a registration that knows the truth."""
-
-    def __init__(self, angles_deg: Sequence[float], numbers: Sequence[int] | None = None) -> None:
-        self.numbers = list(range(len(angles_deg))) if numbers is None else list(numbers)
-        self.truth = {k: _turned(angle) for k, angle in zip(self.numbers, angles_deg, strict=True)}
-        self.tried: dict[int, tuple[int, ...]] = {}
-        self.judged: dict[int, tuple[Edge, ...]] = {}
-        self.graph = PoseGraph(first=self.numbers[0])
-        self.views: dict[int, RayImage] = {}
-        self.solution = Solution()
-
-    def measured(self, target: int, source: int, rng: np.random.Generator, bias: Array) -> Posterior:
-        noise = rng.multivariate_normal(np.zeros(6), COVARIANCE) + se3.adjoint(ABOUT_OBJECT) @ bias
-        return _posterior(source, target, self.truth_between(target, source) @ se3.exp(noise))
-
-    def run(
-        self,
-        closer: Closer,
-        spoil: Callable[[Posterior], Posterior] = lambda posterior: posterior,
-        bias: Array | None = None,
-    ) -> None:
-        rng = np.random.default_rng(0)
-        bias_here = np.zeros(6) if bias is None else bias
-        for source in self.numbers:
-            posteriors: list[Posterior] = []
-            steps = self.numbers.index(source) - self.numbers.index(max(self.views)) if self.views else 1
-            if self.views:
-                posteriors = [spoil(self.measured(next(reversed(self.views)), source, rng, bias_here))]
-                judging = (self.views, self.solution, self.graph.edges)
-                while closer.base(posteriors, *judging, steps=steps)[0] is None:
-                    target = closer.relocation(posteriors, self.views, self.solution)
-                    if target is None:
-                        break
-                    posteriors.append(spoil(self.measured(target, source, rng, bias_here)))
-                base, _ = closer.base(posteriors, *judging, steps=steps)
-                if base is not None:
-                    targets = closer.closures(base, *judging, last=source == self.numbers[-1])
-                    tried = [posterior.target for posterior in posteriors]
-                    targets = [target for target in targets if target not in tried]
-                    posteriors += [spoil(self.measured(target, source, rng, bias_here)) for target in targets]
-            edges = closer.edges(posteriors, self.views, self.solution, self.graph.edges, steps=steps)
-            self.tried[source], self.judged[source] = tuple(p.target for p in posteriors), edges
-            self.graph = self.graph.plus(edges)
-            if not self.views or any(edge.accepted for edge in edges):
-                self.views[source] = _view(source)
-            self.solution = solve(self.graph, self.solution.trajectory)
-
-    def truth_between(self, target: int, source: int) -> Array:
-        return se3.inverse(self.truth[target]) @ self.truth[source]
-
-    def closures(self) -> list[Edge]:
-        return [edge for edges in self.judged.values() for edge in edges if edge.kind == "closure"]
+from modeler.types import Array, Outcome, PoseGaussian, Posterior, Solution
 
 
 def test_first_frame_has_nothing_to_be_registered_against() -> None:
@@ -182,7 +104,7 @@ def test_odometry_is_accepted_where_usable_and_refused_with_advice() -> None:
     closer = Closer()
     start = Solution({0: np.eye(4)})
     for outcome in Outcome:
-        (edge,) = closer.edges([_posterior(1, 0, np.eye(4), outcome)], {0: _view(0)}, start)
+        (edge,) = closer.edges([posterior_of(1, 0, np.eye(4), outcome)], {0: view(0)}, start)
         assert edge.kind == "odometry"
         assert edge.accepted == (outcome in (Outcome.CONVERGED, Outcome.AMBIGUOUS))
         assert edge.accepted or outcome.advice in edge.reason
@@ -192,8 +114,8 @@ def test_odometry_is_accepted_where_usable_and_refused_with_advice() -> None:
     "covariance", [np.zeros((6, 6)), np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-9]), np.full((6, 6), np.nan)]
 )
 def test_covariance_that_is_none_is_refused(covariance: Array) -> None:
-    posterior = replace(_posterior(1, 0, np.eye(4)), pose=PoseGaussian(np.eye(4), covariance))
-    (edge,) = Closer().edges([posterior], {0: _view(0)}, Solution({0: np.eye(4)}))
+    posterior = replace(posterior_of(1, 0, np.eye(4)), pose=PoseGaussian(np.eye(4), covariance))
+    (edge,) = Closer().edges([posterior], {0: view(0)}, Solution({0: np.eye(4)}))
     assert not edge.accepted
     assert "covariance" in edge.reason or "finite" in edge.reason
 
@@ -256,48 +178,22 @@ def test_closures_need_overlap_and_a_usable_outcome() -> None:
         assert not any(edge.accepted for edge in run.closures())
 
 
-def _witnessed(posterior: Posterior, nats: float) -> Posterior:
-    return replace(posterior, log_evidence=nats)
-
-
-def _told(source: int, *, scatter: float = 4.0, wrong: float = -90.0) -> Callable[[Posterior], Posterior]:
-    """Give evidence to registrations: as edges have it, and to those over more than one step from `source` far less."""
-
-    def told(posterior: Posterior) -> Posterior:
-        doubtful = posterior.source == source and posterior.source - posterior.target > 1
-        return _witnessed(posterior, wrong if doubtful else scatter * float(np.sin(3.0 * posterior.source)) - 20.0)
-
-    return told
-
-
 def test_closure_that_the_images_contradict_is_refused_though_it_agrees() -> None:
     run = Run(list(REGULAR_DEG))
-    run.run(Closer(), _told(13))
+    run.run(Closer(), told(13))
     (closure,) = [edge for edge in run.judged[13] if edge.target == 0]
     assert not closure.accepted
     assert closure.reason.startswith("the images contradict it: log evidence -90, of others -2")
     taken = Run(list(REGULAR_DEG))
-    taken.run(Closer(), _told(13, wrong=-45.0))
+    taken.run(Closer(), told(13, wrong=-45.0))
     assert all(edge.accepted for edge in taken.judged[13])
 
 
 def test_evidence_that_scatters_or_is_not_told_refuses_nothing() -> None:
-    for spoil in (_told(13, scatter=15.0), lambda posterior: _witnessed(posterior, np.nan)):
+    for spoil in (told(13, scatter=15.0), lambda posterior: witnessed(posterior, np.nan)):
         run = Run(list(REGULAR_DEG))
         run.run(Closer(), spoil)
         assert all(edge.accepted for edge in run.judged[13])
-
-
-def test_previous_view_is_not_believed_after_lost_frames_where_the_images_contradict_it() -> None:
-    run = Run(list(REGULAR_DEG[:9]))
-    run.run(Closer(), _told(-1))
-    truth, solution = run.measured(7, 8, np.random.default_rng(0), np.zeros(6)), run.solution
-    doubtful = _witnessed(replace(truth, source=12, target=8), -90.0)
-    judging = (run.views, solution, run.graph.edges)
-    assert Closer().base([doubtful], *judging, steps=1)[0] is doubtful
-    assert Closer().base([doubtful], *judging, steps=4)[0] is None
-    assert Closer().edges([doubtful], *judging, steps=4)[0].reason.startswith("the images contradict it")
-    assert Closer().base([_witnessed(doubtful, -30.0)], *judging, steps=4)[0] is not None
 
 
 def test_once_all_frames_are_in_each_is_tried_over_two_steps() -> None:
@@ -314,11 +210,11 @@ def test_once_all_frames_are_in_each_is_tried_over_two_steps() -> None:
         edge = Closer().spanning(true, run.views, run.solution, run.graph.edges)
         assert edge.accepted
         assert edge.kind == ("closure" if source - target > 3 else "odometry")
-        turned = replace(true, pose=PoseGaussian(true.pose.mean @ _turned(30.0), COVARIANCE))
-        edge = Closer().spanning(turned, run.views, run.solution, run.graph.edges)
+        wrong = replace(true, pose=PoseGaussian(true.pose.mean @ turned(30.0), COVARIANCE))
+        edge = Closer().spanning(wrong, run.views, run.solution, run.graph.edges)
         assert not edge.accepted
         assert edge.reason.startswith("contradicts the chain: ")
-        assert Closer().spanning(_witnessed(true, -1e9), run.views, run.solution, run.graph.edges).accepted
+        assert Closer().spanning(witnessed(true, -1e9), run.views, run.solution, run.graph.edges).accepted
 
 
 def test_of_small_steps_the_widest_that_tells_most_is_tried() -> None:
@@ -353,62 +249,3 @@ def test_wrong_closure_cannot_take_the_place_of_failed_odometry() -> None:
     assert not any(edge.accepted for edge in run.judged[13])
     assert 13 not in run.solution.trajectory
     assert all(edge.reason for edge in run.judged[13])
-
-
-@pytest.mark.parametrize("lost", [1, 16])
-def test_lost_frames_are_found_again_from_any_earlier_view(lost: int) -> None:
-    """The object comes back to a view of long ago; nothing connects it with the newest one."""
-    run = Run([*(20.0 * np.arange(9)), *[0.0] * lost, 42.0])
-    gone = range(9, 9 + lost)
-
-    def spoil(posterior: Posterior) -> Posterior:
-        apart_deg = np.degrees(se3.rotation_angle(posterior.pose.mean))
-        failed = posterior.source in gone or apart_deg > 50.0
-        return replace(posterior, outcome=Outcome.NO_OVERLAP) if failed else posterior
-
-    run.run(Closer(), spoil)
-    back = 9 + lost
-    assert not any(edge.accepted for frame in gone for edge in run.judged[frame])
-    assert len(run.tried[back]) <= 1 + Closer().max_relocations
-    if lost == 1:  # so far from where it was, so soon, is not believed
-        assert not any(edge.accepted for edge in run.judged[back])
-    else:
-        np.testing.assert_allclose(run.solution.trajectory[back], run.truth[back], atol=0.02)
-        assert sum(edge.accepted for edge in run.judged[back]) >= 2  # a witness
-
-
-def test_lost_frame_is_bridged_from_the_last_accepted_one() -> None:
-    run = Run(list(REGULAR_DEG))
-    run.run(Closer(), lambda p: replace(p, outcome=Outcome.TOO_FEW_POINTS) if p.source == 5 else p)
-    assert run.tried[6][0] == 4
-    assert 5 not in run.solution.trajectory
-    assert 0 in run.tried[13]
-
-
-def test_after_lost_frames_the_previous_view_is_believed_only_near_where_the_motion_led() -> None:
-    """A box looks the same from behind: after a gap its other side matches the last view."""
-    run = Run([*(23.0 * np.arange(7)), *[0.0] * 4, 253.0])
-
-    def spoil(posterior: Posterior) -> Posterior:
-        if posterior.source != 11:
-            return replace(posterior, outcome=Outcome.TOO_FEW_POINTS) if posterior.source > 6 else posterior
-        behind = ABOUT_OBJECT @ se3.exp(np.array([*np.radians([0.0, 180.0, 0.0]), 0, 0, 0])) @ se3.inverse(ABOUT_OBJECT)
-        return replace(posterior, pose=PoseGaussian(posterior.pose.mean @ behind, COVARIANCE))
-
-    run.run(Closer(), spoil)
-    assert run.tried[11][0] == 6
-    assert not any(edge.accepted for edge in run.judged[11])
-
-
-def test_a_view_seen_from_far_round_places_a_frame_only_with_a_witness() -> None:
-    run = Run([*(20.0 * np.arange(9)), *[0.0] * 6, 300.0, 320.0])
-
-    def spoil(posterior: Posterior) -> Posterior:
-        apart_deg = np.degrees(se3.rotation_angle(posterior.pose.mean))
-        failed = posterior.source in range(9, 15) or apart_deg > 65.0
-        return replace(posterior, outcome=Outcome.NO_OVERLAP) if failed else posterior
-
-    run.run(Closer(), spoil)
-    assert not any(edge.accepted for edge in run.judged[15])  # 60° from the first view, and no other in reach
-    assert any(edge.accepted for edge in run.judged[16])
-    np.testing.assert_allclose(run.solution.trajectory[16], run.truth[16], atol=0.02)

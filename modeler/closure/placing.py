@@ -1,0 +1,125 @@
+"""Which registration places a frame among the views, and what to register it against next where none does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from modeler import se3
+from modeler.closure.reckoning import continued
+from modeler.closure.trust import Trust
+from modeler.closure.verdict import Standard, flaw, modes, stands
+from modeler.closure.ways import ways
+from modeler.types import Edge, Posterior, RayImage, Solution
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Tells which of a frame's registrations places it.
+
+    The previous view's is believed frame by frame. After lost frames, and where another view has to take its place, an
+    object may be taken for another side of itself, which matches as well: such a registration is believed by itself
+    only near where the motion led, and farther from there if that of another view agrees.
+    """
+
+    views: Mapping[int, RayImage]
+    """The accepted views, in order of acceptance."""
+    solution: Solution
+    """The poses so far."""
+    known: Sequence[Edge]
+    """Every edge judged so far."""
+    asked: Standard
+    """Of registrations."""
+    trust: Trust
+    """In what the graph foretells."""
+    max_angle_deg: float
+    """How far in degrees from where the motion led a registration is believed by itself."""
+    steps: int = 1
+    """How many frames lie between the previous view and this frame, this one counted."""
+
+    def base(self, posteriors: Sequence[Posterior]) -> tuple[Posterior | None, str]:
+        """Return the posterior that places a frame, and why.
+
+        Args:
+            posteriors: registrations of the frame, the previous view first.
+        """
+        if not posteriors:
+            return None, ""
+        odometry = posteriors[0]
+        if self._goes_on(odometry) and (self.steps == 1 or self._off_deg(odometry) <= self.max_angle_deg):
+            return odometry, _joins(odometry)
+        standing = [posterior for posterior in posteriors[1:] if stands(posterior, self.asked)]
+        standing.sort(key=lambda posterior: -posterior.overlap)
+        for posterior in standing:
+            reason = f"joins in place of the failed previous view: overlap {posterior.overlap:.2f}"
+            off_deg = self._off_deg(posterior)
+            # Near the end of what views can be registered across, one alone may be cut off there.
+            turned_deg = float(np.degrees(se3.rotation_angle(posterior.pose.mean)))
+            if max(off_deg, turned_deg) <= self.max_angle_deg:
+                return posterior, f"{reason}, {off_deg:.0f}° from the motion going on"
+            for witness in self._witnesses(posterior, standing):
+                return posterior, f"{reason}, frame {witness.target} agrees"
+        for witness in self._witnesses(odometry, standing) if self._goes_on(odometry) else ():
+            return odometry, f"{_joins(odometry)}, frame {witness.target} agrees"
+        return None, ""
+
+    def next(self, posteriors: Sequence[Posterior]) -> int | None:
+        """Return the earlier view to register a lost frame against next; None where none is left.
+
+        A posterior that stands alone wants a witness: the view nearest to where it puts the frame. Otherwise the view
+        nearest to where the motion leads comes first, then those farthest from all views tried.
+
+        Args:
+            posteriors: what was tried for the frame, the previous view first.
+        """
+        tried = [posterior.target for posterior in posteriors]
+        left = [frame for frame in self._frames if frame not in tried]
+        if not left:
+            return None
+        poses = np.stack([self.solution.trajectory[frame] for frame in left])
+        for posterior in (posterior for posterior in posteriors if stands(posterior, self.asked)):
+            placed = self.solution.trajectory[posterior.target] @ posterior.pose.mean
+            angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ placed))
+            if angle_deg.min() <= self.max_angle_deg:
+                return left[int(np.argmin(angle_deg))]
+        if len(tried) == 1:
+            expected = continued(self.solution, self._frames, posteriors[0].source)
+            return left[int(np.argmin(se3.rotation_angle(se3.inverse(poses) @ expected)))]
+        apart = [se3.rotation_angle(se3.inverse(self.solution.trajectory[frame]) @ poses) for frame in tried]
+        return left[int(np.argmax(np.min(apart, axis=0)))]
+
+    @cached_property
+    def _frames(self) -> list[int]:
+        return [frame for frame in self.views if frame in self.solution.trajectory]
+
+    def _goes_on(self, odometry: Posterior) -> bool:
+        """Return whether the previous view's registration came to an end, and after lost frames matches like others."""
+        matches = self.steps == 1 or not odometry.log_evidence < self.asked.least_nats
+        return flaw(odometry) is None and matches
+
+    def _witnesses(self, posterior: Posterior, standing: Sequence[Posterior]) -> Iterator[Posterior]:
+        """Yield the registrations of other views that agree with one that is not too far from where the motion led."""
+        # A pace that changes at random from step to step goes astray with the root of their number.
+        if self._off_deg(posterior) > float(np.sqrt(self.steps)) * self.max_angle_deg:
+            return
+        reach = ways(self.known, posterior.target)
+        for witness in standing:
+            if witness is not posterior:
+                agreed = self.trust.agreement_by_way_of(posterior, witness, self.views, self.solution, reach)
+                if agreed.agrees:
+                    yield witness
+
+    def _off_deg(self, posterior: Posterior) -> float:
+        """Return the angle between where a registration puts a frame and where the motion going on would have."""
+        if len(self._frames) == 1:
+            return 0.0
+        expected = continued(self.solution, self._frames, posterior.source)
+        placed = self.solution.trajectory[posterior.target] @ modes(posterior)[0][1].mean
+        return float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ placed)))
+
+
+def _joins(odometry: Posterior) -> str:
+    return f"joins the previous view: {odometry.outcome.label}, overlap {odometry.overlap:.2f}"

@@ -1,0 +1,85 @@
+"""How far a registration may be from what the graph foretells: covariances hold less than all errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeler import se3
+from modeler.closure.reckoning import onwards
+from modeler.closure.verdict import Agreement, agreement, modes
+from modeler.closure.ways import Way
+from modeler.types import Array, PoseGaussian, Posterior, RayImage, Solution
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What is believed of stated covariances.
+
+    Pairwise covariances hold no systematic error, which adds up along a chain instead of averaging out, so that
+    registrations are compared with a wider one than they say.
+    """
+
+    sigma_scale: float = 2.0
+    """How many times the standard deviations of edges may understate their random errors."""
+    drift_deg: float = 0.15
+    """Systematic rotation error of an edge in degrees; along a chain it adds up."""
+    drift_m: float = 0.00025
+    """Systematic translation error of an edge in m, at the object; along a chain it adds up."""
+
+    def systematic(self, length: int, centroid_m: Array) -> Array:
+        """Return the covariance (6, 6) of the systematic error of a chain of `length` edges, seen from its end.
+
+        Args:
+            length: of the chain.
+            centroid_m: (3,) of the object in the camera at its end.
+        """
+        sigmas = length * np.repeat([np.radians(self.drift_deg), self.drift_m], 3)
+        camera_from_object = se3.adjoint(se3.translation(centroid_m))
+        return camera_from_object @ np.diag(sigmas**2) @ camera_from_object.T
+
+    def agreement(
+        self,
+        posterior: Posterior,
+        predictions: Sequence[tuple[float, PoseGaussian]],
+        *,
+        length: int,
+        centroid_m: Array,
+    ) -> Agreement:
+        """Return how well a registration agrees with what a chain of edges says of the same motion.
+
+        Args:
+            posterior: target_from_source as the images have it.
+            predictions: as the chain has it, with weights that sum to 1.
+            length: of the chain.
+            centroid_m: (3,) of the object in the source camera.
+        """
+        systematic = self.systematic(length, centroid_m)
+        return agreement(posterior, predictions, systematic=systematic, scale=self.sigma_scale, centroid_m=centroid_m)
+
+    def agreement_by_way_of(
+        self,
+        base: Posterior,
+        posterior: Posterior,
+        views: Mapping[int, RayImage],
+        solution: Solution,
+        reach: Mapping[int, Way],
+    ) -> Agreement:
+        """Return how well a registration of a frame agrees with the way through the graph and along another of it.
+
+        Args:
+            base: the other, by which the frame is placed.
+            posterior: target_from_source of the frame and some view.
+            views: the accepted views, in order of acceptance.
+            solution: the poses so far.
+            reach: ways from the view of `base`.
+        """
+        way = solution.relative_gaussian(posterior.target, base.target)
+        predictions = [(weight, onwards(way, pose)) for weight, pose in modes(base)]
+        centroid_m = se3.transform(se3.inverse(modes(base)[0][1].mean), views[base.target].centroid_m[None])[0]
+        surest = reach.get(posterior.target)
+        length = abs(list(views).index(base.target) - list(views).index(posterior.target))
+        length = length if surest is None else surest.edges
+        return self.agreement(posterior, predictions, length=1 + length, centroid_m=centroid_m)
