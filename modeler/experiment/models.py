@@ -47,11 +47,11 @@ class ModelScore:
     f_3mm: float
     """Their harmonic mean."""
     accurate_5mm: float
-    """As within 3 mm."""
+    """Share of the model within 5 mm of the true surface."""
     complete_5mm: float
-    """As within 3 mm."""
+    """Share of the true surface within 5 mm of the model."""
     f_5mm: float
-    """As within 3 mm."""
+    """Their harmonic mean."""
 
 
 @final
@@ -73,6 +73,21 @@ class Modelled:
     """Vertices (v, 3) in m and triangles (t, 3) of the true surface."""
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """One model to be compared with the truth."""
+
+    poses: Poses
+    """Of whose poses it is made."""
+    model: ObjectModel
+    """As it is made, in its object frame."""
+    model_from_object: Array
+    """(4, 4) lays it on the true model."""
+    model_from_camera: Mapping[int, Array]
+    """Its poses (4, 4), so laid, by frame number."""
+
+
 def model_scores(modelled: Modelled, fuser: Fuser, seed: int) -> list[ModelScore]:
     """Compare a run's model, and one that `fuser` makes of the same frames with their true poses, with the truth.
 
@@ -89,41 +104,51 @@ def model_scores(modelled: Modelled, fuser: Fuser, seed: int) -> list[ModelScore
         raise InputError(f"{modelled.name}: none of its frames has a true pose; is scene_gt.json of another sequence?")
     if not len(modelled.model.triangles):
         raise InputError(f"{modelled.name}: its model has no surface; build it from more frames")
+    surface = TrueSurface.of(*modelled.truth, np.random.default_rng([seed, 0]))
+    seen = surface.seen((modelled.views[frame].frame, modelled.camera_from_model[frame]) for frame in frames)
+    scores: list[ModelScore] = []
+    for candidate in _candidates(modelled, frames, fuser):
+        rng = np.random.default_rng([seed, 1])  # the same for both, so that their difference is that of the models
+        vertices_m = se3.transform(candidate.model_from_object, candidate.model.vertices_m)
+        errors = surface_errors(vertices_m, candidate.model.triangles, surface, rng)
+        scores += [
+            _score(modelled, candidate, "seen", errors.over(seen)),
+            _score(modelled, candidate, "whole", errors),
+        ]
+    return scores
+
+
+def _candidates(modelled: Modelled, frames: Sequence[int], fuser: Fuser) -> tuple[_Candidate, _Candidate]:
+    """Return the run's own model and the one of true poses."""
     true_poses = {frame: se3.inverse(modelled.camera_from_model[frame]) for frame in frames}
     model_from_object = laid(modelled.trajectory, modelled.camera_from_model)
     own_poses = {frame: model_from_object @ modelled.trajectory[frame] for frame in frames}
-    vertices_m, triangles = modelled.truth
-    surface = TrueSurface.of(vertices_m, triangles, np.random.default_rng([seed, 0]))
-    seen = surface.seen((modelled.views[frame].frame, modelled.camera_from_model[frame]) for frame in frames)
     reference = fuser.fuse({frame: modelled.views[frame] for frame in frames}, true_poses)
-    made: list[tuple[Poses, ObjectModel, Array, Mapping[int, Array]]] = [
-        ("run", modelled.model, model_from_object, own_poses),
-        ("true", reference, np.eye(4), true_poses),
-    ]
-    scores: list[ModelScore] = []
-    for poses, model, motion, trajectory in made:
-        rng = np.random.default_rng([seed, 1])
-        errors = surface_errors(se3.transform(motion, model.vertices_m), model.triangles, surface, rng)
-        regions: list[tuple[Over, SurfaceErrors]] = [("seen", errors.over(seen)), ("whole", errors)]
-        scores += [
-            ModelScore(
-                run=modelled.name,
-                poses=poses,
-                over=over,
-                frames=len(frames),
-                rotation_error_deg=max(rotation_error_deg(trajectory[k], true_poses[k]) for k in frames),
-                accuracy_mm=1e3 * part.accuracy_m,
-                completeness_mm=1e3 * part.completeness_m,
-                accurate_3mm=part.accurate(3e-3),
-                complete_3mm=part.complete(3e-3),
-                f_3mm=part.f_score(3e-3),
-                accurate_5mm=part.accurate(5e-3),
-                complete_5mm=part.complete(5e-3),
-                f_5mm=part.f_score(5e-3),
-            )
-            for over, part in regions
-        ]
-    return scores
+    return (
+        _Candidate("run", modelled.model, model_from_object, own_poses),
+        _Candidate("true", reference, np.eye(4), true_poses),
+    )
+
+
+def _score(modelled: Modelled, candidate: _Candidate, over: Over, errors: SurfaceErrors) -> ModelScore:
+    poses = candidate.model_from_camera
+    return ModelScore(
+        run=modelled.name,
+        poses=candidate.poses,
+        over=over,
+        frames=len(poses),
+        rotation_error_deg=max(
+            rotation_error_deg(poses[frame], se3.inverse(modelled.camera_from_model[frame])) for frame in poses
+        ),
+        accuracy_mm=1e3 * errors.accuracy_m,
+        completeness_mm=1e3 * errors.completeness_m,
+        accurate_3mm=errors.accurate(3e-3),
+        complete_3mm=errors.complete(3e-3),
+        f_3mm=errors.f_score(3e-3),
+        accurate_5mm=errors.accurate(5e-3),
+        complete_5mm=errors.complete(5e-3),
+        f_5mm=errors.f_score(5e-3),
+    )
 
 
 def models_json(scores: Sequence[ModelScore], seed: int) -> str:

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from modeler.experiment.tables import Summary, results_csv, results_json, summaries
-from modeler.experiment.trials import Experiment, Recorded, Trial
+from modeler.experiment.experiment import Experiment
+from modeler.experiment.recorded import Recorded
+from modeler.experiment.results import results_csv, results_json
+from modeler.experiment.summaries import Summary, summaries
+from modeler.experiment.trials import Trial
 from modeler.export import write_atomically
 from modeler.types import InputError
 
@@ -35,7 +38,7 @@ def evaluate(
     for recorded in sequences:
         if names.count(recorded.name) > 1:
             raise InputError(f"two sequences are called {recorded.name!r}; give each a name in its sequence.json.")
-        experiment.size(recorded)
+        experiment.size(recorded)  # refuses what cannot be judged, before hours are spent on the others
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

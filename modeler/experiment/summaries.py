@@ -1,20 +1,17 @@
-"""Trials as tables: one row a pair, one row a method."""
+"""Trials summed up: one row for each sequence, offset and method."""
 
 from __future__ import annotations
 
-import csv
 import functools
-import io
-import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, final
 
 import numpy as np
 
 from modeler.evaluation import coverage, rotation_error_deg
-from modeler.experiment.trials import Experiment, Trial
+from modeler.experiment.trials import Trial
 from modeler.types import Array
 
 
@@ -86,74 +83,35 @@ def summaries(trials: Iterable[Trial], success_deg: float, *, loops: bool = Fals
 
 
 def _summary(trials: Sequence[Trial], success_deg: float, loops: bool) -> Summary:
-    def known(values: Iterable[float]) -> Array:
-        return np.array([value for value in values if math.isfinite(value)])
-
-    rotation, squares = known(t.rotation_error_deg for t in trials), known(t.nees for t in trials)
+    rotation_deg, squares = _known(t.rotation_error_deg for t in trials), _known(t.nees for t in trials)
+    loop_deg, turned_deg = _once_round(trials) if loops else (math.nan, math.nan)
     return Summary(
         sequence=trials[0].sequence,
         method=trials[0].method,
         offset=trials[0].offset,
         pairs=len(trials),
         usable=sum(trial.usable for trial in trials),
-        successes=None if math.isnan(trials[0].rotation_deg) else int(np.sum(rotation < success_deg)),
-        rotation_error_deg=Quantiles.of(rotation),
-        translation_error_mm=Quantiles.of(known(t.translation_error_mm for t in trials)),
+        successes=None if math.isnan(trials[0].rotation_deg) else int(np.sum(rotation_deg < success_deg)),
+        rotation_error_deg=Quantiles.of(rotation_deg),
+        translation_error_mm=Quantiles.of(_known(t.translation_error_mm for t in trials)),
         nees=float(np.mean(squares)) if len(squares) else math.nan,
         median_nees=Quantiles.of(squares).median,
         inside_95=coverage(squares)[0.95],
-        seconds=Quantiles.of(known(t.seconds for t in trials)).median,
-        **(_round(trials) if loops else {}),
+        seconds=Quantiles.of(_known(t.seconds for t in trials)).median,
+        loop_deg=loop_deg,
+        turned_deg=turned_deg,
     )
 
 
-def _round(trials: Sequence[Trial]) -> dict[str, float]:
-    """Return how much all steps turn, together and one by one; nothing where one is missing."""
+def _known(values: Iterable[float]) -> Array:
+    """Return those of some numbers that exist."""
+    return np.array([value for value in values if math.isfinite(value)])
+
+
+def _once_round(trials: Sequence[Trial]) -> tuple[float, float]:
+    """Return by how many degrees all steps turn, together and one by one; NaN where a step is missing."""
     if not all(trial.target_from_source for trial in trials):
-        return {}
+        return math.nan, math.nan
     steps = [np.array(trial.target_from_source).reshape(4, 4) for trial in trials]
-    return {
-        "loop_deg": rotation_error_deg(functools.reduce(np.matmul, steps), np.eye(4)),
-        "turned_deg": sum(rotation_error_deg(step, np.eye(4)) for step in steps),
-    }
-
-
-def results_json(experiment: Experiment, trials: Sequence[Trial], rows: Sequence[Summary]) -> str:
-    """Return an experiment, its trials and their summaries as JSON; numbers that are not finite are null."""
-    results = {
-        "schema": 1,
-        "learn": experiment.learn,
-        "seed": experiment.seed,
-        "prior": repr(experiment.prior),
-        "methods": {name: repr(method) for name, method in experiment.methods.items()},
-        "pairing": asdict(experiment.pairing),
-        "points": experiment.points,
-        "pixels": experiment.pixels,
-        "success_deg": experiment.success_deg,
-        "summaries": [_finite(asdict(row)) for row in rows],
-        "trials": [_finite(asdict(trial)) for trial in trials],
-    }
-    return json.dumps(results, indent=1, allow_nan=False) + "\n"
-
-
-def results_csv(trials: Sequence[Trial]) -> str:
-    """Return the trials as CSV, a field a column but for the estimate; numbers that are not finite are empty."""
-    text = io.StringIO()
-    names = [f.name for f in fields(Trial) if f.name != "target_from_source"]
-    writer = csv.DictWriter(text, names, lineterminator="\n", extrasaction="ignore")
-    writer.writeheader()
-    writer.writerows(_finite(asdict(trial)) for trial in trials)
-    return text.getvalue()
-
-
-def _finite(record: Mapping[str, object]) -> dict[str, object]:
-    """Return a record whose numbers JSON can hold: None for what is not finite."""
-
-    def plain(value: object) -> object:
-        if isinstance(value, Quantiles):
-            return _finite(value._asdict())
-        if isinstance(value, tuple):
-            return [plain(entry) for entry in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return {name: plain(value) for name, value in record.items()}
+    left = functools.reduce(np.matmul, steps)
+    return rotation_error_deg(left, np.eye(4)), sum(rotation_error_deg(step, np.eye(4)) for step in steps)
