@@ -5,7 +5,7 @@ from __future__ import annotations
 import bz2
 import struct
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -23,7 +23,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from modeler.types import InputError
 from sequences.broken import told
 from sequences.folders import entries, inside
-from sequences.unpacking import check_file, from_bz2, from_lz4, from_zstd, of_size
+from sequences.unpacking import check_file, from_bz2, from_lz4, from_zstd, is_zstd, of_size
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -100,23 +100,19 @@ class Bag:
         return [connection for connection in self._reader.connections if str(connection.topic) == topic]
 
     def _message(self, connection: Connection, data: bytes) -> Any:
-        store, kind, data = _typestore(ros1=self.is_ros1), str(connection.msgtype), self._opened[1](data)
+        store, kind = _typestore(ros1=self.is_ros1), str(connection.msgtype)
         if not self.is_ros1:
-            return store.deserialize_cdr(data, kind)
+            # Recorders pack messages by themselves and need not say so; no message begins as packed ones do.
+            return store.deserialize_cdr(from_zstd(data) if is_zstd(data) else data, kind)
         return store.deserialize_ros1(_image_alone(data) if kind == "sensor_msgs/msg/Image" else data, kind)
 
     @property
     def _advice(self) -> str:
         return "reindex it (rosbag reindex), or record it anew" if self.is_ros1 else "record or copy it anew"
 
-    @property
-    def _reader(self) -> rosbag1.Reader | rosbag2.Reader:
-        return self._opened[0]
-
     @cached_property
-    def _opened(self) -> tuple[rosbag1.Reader | rosbag2.Reader, Callable[[bytes], bytes]]:
-        """Return the open reader, which is closed when this bag is forgotten, and what unpacks its messages."""
-        unpack: Callable[[bytes], bytes] = bytes
+    def _reader(self) -> rosbag1.Reader | rosbag2.Reader:
+        """Return the open reader, which is closed when this bag is forgotten."""
         with told(self.path, "bag", self._advice):
             if self.is_ros1:
                 reader = rosbag1.Reader(self.path)
@@ -126,9 +122,8 @@ class Bag:
                 reader = _ros2(self.path)
                 if reader.compression_mode == "message":  # which we unpack ourselves
                     reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
-                    unpack = from_zstd
             weakref.finalize(self, reader.close)
-            return reader, unpack
+            return reader
 
 
 def _image_alone(data: bytes) -> bytes:

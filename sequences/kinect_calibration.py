@@ -16,6 +16,8 @@ from sequences.lens import Lens, coefficients
 
 DEPTH, COLOUR = "CALIBRATION_CameraPurposeDepth", "CALIBRATION_CameraPurposePhotoVideo"
 Size = tuple[int, int]
+_MODELS = tuple(f"CALIBRATION_LensDistortionModel{name}" for name in ("BrownConrady", "Rational6KT"))
+"""Those that the maker's library takes; they differ by less than a tenth of a pixel, in a tangential term."""
 _DEPTH_MODES: dict[Size, tuple[Size, Size]] = {  # image: (binned sensor, corner of the image in it)
     (320, 288): ((512, 512), (96, 90)),
     (640, 576): ((1024, 1024), (192, 180)),
@@ -60,7 +62,11 @@ def colour_from_depth(calibration: Node) -> Array:
 
 
 def _lens(calibration: Node, purpose: str, size: Size, sensor: Size, corner: Size) -> Lens:
-    entry = _camera(calibration, purpose).need("Intrinsics").need("ModelParameters")
+    intrinsics = _camera(calibration, purpose).need("Intrinsics")
+    model = intrinsics.get("ModelType")
+    if model is not None and model.value not in _MODELS:
+        raise model.fault(f"one of {', '.join(_MODELS)}")
+    entry = intrinsics.need("ModelParameters")
     cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = (float(value) for value in entry.numbers(14))
     pixels = (
         fx * sensor[0],

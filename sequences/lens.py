@@ -10,7 +10,7 @@ from typing import TypeVar, final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types import Array, Camera
+from modeler.types import Array, Camera, InputError
 
 Pixel = TypeVar("Pixel", np.uint8, np.uint16, np.float32)
 
@@ -64,6 +64,29 @@ class Lens:
         columns, rows = np.rint(w * camera.fx + camera.cx), np.rint(h * camera.fy + camera.cy)
         inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
         return np.where(inside, rows, 0).astype(np.intp), np.where(inside, columns, 0).astype(np.intp), inside
+
+
+_NO_NAME = ("", "None")
+_BROWN = ("plumb_bob", "rational_polynomial", "Brown Conrady", "Modified Brown Conrady", "Inverse Brown Conrady")
+"""RealSense's library projects by one formula in all three models of that name, to 0.02 px."""
+
+
+def known(camera: Camera, bend: Sequence[float], model: str, where: str) -> Lens:
+    """Return the lens that a file describes.
+
+    Args:
+        camera: the camera.
+        bend: coefficients in the model's order.
+        model: what the file calls the model of distortion.
+        where: the file, for messages.
+
+    Raises:
+        InputError: where the lens bends lines and the model is not known.
+    """
+    found = Lens(camera, coefficients(bend))
+    if found.bends and model not in _NO_NAME + _BROWN:
+        raise InputError(f"{where}: its distortion model {model!r} is not known; record the rectified topic.")
+    return found
 
 
 def coefficients(values: Sequence[float]) -> tuple[float, ...]:

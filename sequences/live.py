@@ -21,6 +21,10 @@ FIRST = 10
 """So many frames are taken before anything is said of the sequence."""
 
 
+PATIENCE = 100
+"""So often may a camera give the same image."""
+
+
 class AbstractCamera(ABC):
     """A camera that is running."""
 
@@ -144,19 +148,26 @@ class LiveSequence(AbstractSequence):
         return f"{self.camera.unit_mm:g} mm (the camera)"
 
     def _coming(self) -> Iterator[Frame]:
-        number = self.seen[-1].index
+        last = self.seen[-1]
         while not self.stop():
-            number += 1
-            yield _frame(self.camera, number)
+            last = _next(self.camera, last.index + 1, last.time_s)
+            yield last
 
 
-def begin(camera: AbstractCamera, first: int = FIRST) -> LiveSequence:
+def begin(camera: AbstractCamera, first: int | None = None) -> LiveSequence:
     """Return what a camera sees from now on."""
-    return LiveSequence(camera, tuple(_frame(camera, number) for number in range(first)))
+    seen: list[Frame] = []
+    for number in range(FIRST if first is None else first):
+        seen.append(_next(camera, number, seen[-1].time_s if seen else None))
+    return LiveSequence(camera, tuple(seen))
 
 
-def _frame(camera: AbstractCamera, number: int) -> Frame:
-    time_s, raw, colour = camera.take()
-    lens = camera.lens
-    depth_m = lens.straight(metres(raw, camera.unit_mm), float("nan"))
-    return Frame(number, time_s, depth_m, lens.camera, None, None if colour is None else lens.straight(colour))
+def _next(camera: AbstractCamera, number: int, after_s: float | None) -> Frame:
+    """Return the first image that is not the one of `after_s` again, as it may come with another colour image."""
+    for _ in range(PATIENCE):
+        time_s, raw, colour = camera.take()
+        if time_s != after_s:
+            lens = camera.lens
+            depth_m = lens.straight(metres(raw, camera.unit_mm), float("nan"))
+            return Frame(number, time_s, depth_m, lens.camera, None, None if colour is None else lens.straight(colour))
+    raise InputError(f"{camera.name}: gives the same image again and again; plug it in anew.")

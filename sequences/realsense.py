@@ -44,6 +44,17 @@ def open_camera(serial: str, given: Given, context: Any = None) -> LiveSequence:
     return begin(camera)
 
 
+def _check_present(rs: Any, context: Any, serial: str) -> None:
+    """Refuse a camera that is not there, for which the library would wait long."""
+    devices = list(context.query_devices())
+    if not devices:
+        raise InputError(f"{SCHEME.removesuffix(':')}: no camera is plugged in; connect one to a USB 3 port.")
+    number = rs.camera_info.serial_number
+    present = [device.get_info(number) for device in devices if device.supports(number)]
+    if serial and serial not in present:
+        raise InputError(f"{SCHEME}{serial}: no such camera is plugged in; there is {', '.join(present) or 'another'}.")
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class RealsenseCamera(AbstractCamera):
@@ -76,13 +87,15 @@ class RealsenseCamera(AbstractCamera):
         where = f"{SCHEME}{serial}"
         try:
             context = rs.context() if context is None else context
-            if not len(context.query_devices()):
-                raise InputError(f"{where.removesuffix(':')}: no camera is plugged in; connect one to a USB 3 port.")
+            _check_present(rs, context, serial)
             pipeline, config = rs.pipeline(context), rs.config()
             if serial:
                 config.enable_device(serial)
             config.enable_stream(rs.stream.depth)
-            config.enable_stream(rs.stream.color, rs.format.rgb8)
+            # With two arguments, the library would take the format for the number of a stream.
+            config.enable_stream(rs.stream.color, rs.format.rgb8, 0)
+            if not config.can_resolve(rs.pipeline_wrapper(pipeline)):
+                config.disable_stream(rs.stream.color)  # some cameras have none
             profile = pipeline.start(config)
             device = profile.get_device()
             stream = profile.get_stream(rs.stream.depth).as_video_stream_profile()

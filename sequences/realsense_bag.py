@@ -1,6 +1,6 @@
-"""What RealSense's own recorder writes into bags besides images: units of depth, and where its cameras are.
+"""What RealSense's own recorder writes into bags besides images: units of depth, its cameras, and where they are.
 
-It has recorded bags of ROS 1, with messages, and since version 2.57 of ROS 2, with texts `key=value;key=value`.
+It has recorded bags of ROS 1, with messages, and since version 2.58 of ROS 2, with texts `key=value;key=value`.
 """
 
 from __future__ import annotations
@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 
 from modeler import se3
-from modeler.types import Array, InputError
+from modeler.types import Array, Camera, InputError
 from sequences import ros_frames
 from sequences.bag import Bag
+from sequences.given import sane
+from sequences.lens import Lens, known
 
+TEXT = "std_msgs/msg/String"
 _STREAM = r"(/device_\d+/sensor_\d+)/\w+"
 
 
@@ -29,6 +32,28 @@ def unit_mm(bag: Bag, topic: str) -> tuple[float, str] | None:
                 found = _number(str(message.data)) * 1000.0
                 if 1e-6 <= found <= 1e3:
                     return found, name
+    return None
+
+
+def lens(bag: Bag, topic: str) -> Lens | None:
+    """Return the camera of a topic where a text tells it, as versions 2.58 write it; None where none does.
+
+    Raises:
+        InputError: where the text tells no camera.
+    """
+    stream = re.match(_STREAM, topic)
+    name = None if stream is None else f"{stream[0]}/camera_info"
+    if name is None or bag.types.get(name) != TEXT:
+        return None
+    for _, message in bag.messages(name, most=1):
+        said = _said(message)
+        width, height, *pixels = (_number(said.get(key, "")) for key in ("width", "height", "fx", "fy", "ppx", "ppy"))
+        bend = _numbers(said.get("coeffs", ""), 5)
+        sound = sane((pixels[0], pixels[1], pixels[2], pixels[3])) and bool(np.isfinite(bend).all())
+        if not sound or not (1.0 <= width <= 1e5 and 1.0 <= height <= 1e5):
+            raise InputError(f"{bag.path}: {name}: tells no camera; record it anew, or convert with --intrinsics.")
+        camera = Camera(int(width), int(height), pixels[0], pixels[1], pixels[2], pixels[3])
+        return known(camera, bend.tolist(), said.get("model", ""), f"{bag.path}: {name}")
     return None
 
 
@@ -60,7 +85,7 @@ def _pose(message: Any, where: str) -> Array:
         found = ros_frames.pose(message)
         pose = np.full((4, 4), np.nan) if found is None else found
     else:
-        said = dict(part.split("=", 1) for part in str(getattr(message, "data", "")).split(";") if "=" in part)
+        said = _said(message)
         # Matrices of the camera's library stand column by column.
         pose = se3.translation(_numbers(said.get("translation", ""), 3))
         pose[:3, :3] = _numbers(said.get("rotation", ""), 9).reshape(3, 3).T
@@ -69,6 +94,11 @@ def _pose(message: Any, where: str) -> Array:
     if not sound or np.abs(pose[:3, 3]).max() > 10.0:
         raise InputError(f"{where}: is no rigid motion; record it anew.")
     return pose
+
+
+def _said(message: Any) -> dict[str, str]:
+    """Return what a text message `key=value;key=value` says."""
+    return dict(part.split("=", 1) for part in str(getattr(message, "data", "")).split(";") if "=" in part)
 
 
 def _numbers(text: str, count: int) -> Array:

@@ -10,13 +10,15 @@ import numpy.typing as npt
 from modeler.types import Camera, InputError
 from sequences.given import sane
 from sequences.images import MAX_PIXELS, Packed, read_colour, read_depth
-from sequences.lens import Lens, coefficients
+from sequences.lens import Lens, known
 
 IMAGE, PACKED, CAMERA = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 MILLIMETRES = ("16UC1", "mono16")
 METRES = ("32FC1",)
 COLOURS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4, "mono8": 1, "8UC1": 1}
 """Bytes a pixel; what OpenCV calls 8UC3 is BGR."""
+YUV = {"yuv422": (1, 0, 2), "UYVY": (1, 0, 2), "yuv422_yuy2": (0, 1, 3), "YUYV": (0, 1, 3)}
+"""Where Y, U and V stand in the four bytes of two pixels."""
 _PACKED_DEPTH_HEADER = 12  # bytes of image_transport's compressedDepth before the PNG
 
 
@@ -30,7 +32,7 @@ def is_depth(message: Any) -> bool:
 def is_colour(message: Any) -> bool:
     """Return whether an image message holds colour or grey that can be read."""
     if _is_raw(message):
-        return message.encoding in COLOURS
+        return message.encoding in COLOURS or message.encoding in YUV
     return not is_depth(message) and any(kind in message.format for kind in ("jpeg", "jpg", "png"))
 
 
@@ -69,6 +71,8 @@ def colour(message: Any, where: str) -> npt.NDArray[np.uint8]:
         raise InputError(f"{where}: is {_kind(message)} where images before it are colour; record it anew.")
     if not _is_raw(message):
         return read_colour(Packed(bytes(message.data), where))
+    if message.encoding in YUV:
+        return _from_yuv(_rows(message, 2, where), YUV[message.encoding])
     channels = COLOURS[message.encoding]
     pixels = _rows(message, channels, where).reshape(message.height, message.width, channels)
     if channels == 1:
@@ -86,13 +90,21 @@ def lens(message: Any, where: str, *, ros1: bool) -> Lens:
     matrix = np.asarray(message.K if ros1 else message.k, dtype=np.float64)
     bend = np.asarray(message.D if ros1 else message.d, dtype=np.float64)
     fx, _, cx, _, fy, cy = (float(value) for value in matrix[:6])
-    model = str(message.distortion_model)
     if not sane((fx, fy, cx, cy)) or not np.isfinite(bend).all():
         raise InputError(f"{where}: camera_info has no usable K; calibrate the camera, or convert with --intrinsics.")
-    known = Lens(Camera(int(message.width), int(message.height), fx, fy, cx, cy), coefficients(bend.tolist()))
-    if known.bends and model not in ("plumb_bob", "rational_polynomial", "Brown Conrady", "", "None"):
-        raise InputError(f"{where}: its distortion model {model!r} is not known; record the rectified topic.")
-    return known
+    camera = Camera(int(message.width), int(message.height), fx, fy, cx, cy)
+    return known(camera, bend.tolist(), str(message.distortion_model), where)
+
+
+def _from_yuv(rows: npt.NDArray[np.uint8], places: tuple[int, int, int]) -> npt.NDArray[np.uint8]:
+    """Return RGB (h, w, 3) of rows (h, 2 w) in which two pixels share U and V (ITU-R BT.601, as cameras send it)."""
+    height, width = rows.shape[0], rows.shape[1] // 4 * 2  # an odd last column has no partner to share with
+    pairs = rows[:, : 2 * width].reshape(height, width // 2, 4).astype(np.float32)
+    y = pairs[..., [places[0], places[0] + 2]].reshape(height, width)
+    u, v = (np.repeat(pairs[..., place] - 128.0, 2, axis=1) for place in places[1:])
+    light = 1.164 * (y - 16.0)
+    rgb = np.stack([light + 1.596 * v, light - 0.392 * u - 0.813 * v, light + 2.017 * u], axis=2)
+    return np.clip(np.rint(rgb), 0.0, 255.0).astype(np.uint8)
 
 
 def _kind(message: Any) -> str:

@@ -80,7 +80,7 @@ def _camera(bag: Bag, topic: str) -> Lens | None:
         for _, message in bag.messages(info, most=1):
             known = ros_images.lens(message, f"{bag.path}: {info}", ros1=bag.is_ros1)
             return Lens(known.camera, ()) if "rect" in bare.rsplit("/", 1)[1] else known
-    return None
+    return realsense_bag.lens(bag, topic)
 
 
 @final
@@ -113,7 +113,13 @@ def colour_source(
         if given.colour_topic not in found:
             raise InputError(f"{bag.path}: {given.colour_topic} holds no colour images; there are {_names(found)}.")
         return Colour(given.colour_topic, _beside(bag, first, given.colour_topic, depth)), []
-    aligned = [topic for topic in found if _same(_camera(bag, topic), depth[1])]
+    cameras, left = {}, []
+    for topic in found:
+        try:
+            cameras[topic] = _camera(bag, topic)
+        except InputError as error:  # depth is enough
+            left.append(f"colour of {topic} is left out: {str(error).removeprefix(f'{bag.path}: ')}")
+    aligned = [topic for topic, camera in cameras.items() if _same(camera, depth[1])]
     for better in (
         [topic for topic in aligned if "color" in topic or "rgb" in topic or "colour" in topic],
         [topic for topic in aligned if first[topic].__msgtype__ == ros_images.IMAGE],
@@ -121,11 +127,11 @@ def colour_source(
         aligned = better or aligned
     if aligned:
         return Colour(aligned[0], None), []
-    for topic in (name for name in found if "color" in name.lower() or "rgb" in name):
+    for topic in (name for name in cameras if "color" in name.lower() or "rgb" in name):
         alignment = _beside(bag, first, topic, depth)
         if alignment is not None:
             return Colour(topic, alignment), []
-    return None, [f"colour of {topic} is not aligned to depth and is left out" for topic in found[:3]]
+    return None, (left + [f"colour of {topic} is not aligned to depth and is left out" for topic in cameras])[:3]
 
 
 def _beside(bag: Bag, first: Mapping[str, Any], topic: str, depth: tuple[str, Lens]) -> Alignment | None:

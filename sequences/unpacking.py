@@ -59,6 +59,11 @@ def from_zstd(data: bytes, most: int = MAX_BYTES) -> bytes:
     return _whole(unpacked, ended=ended, most=most)
 
 
+def is_zstd(data: bytes) -> bool:
+    """Return whether something is packed by zstd."""
+    return bytes(data[: len(_ZSTD)]) == _ZSTD
+
+
 def of_size(unpack: Callable[[bytes, int], bytes]) -> Callable[[bytes, int], bytes]:
     """Return what unpacks to a size that is told beforehand, if it is one that may be."""
 
@@ -77,7 +82,7 @@ def check_file(path: Path) -> None:
         ValueError: where it would.
     """
     with path.open("rb") as file:
-        if file.read(len(_ZSTD)) != _ZSTD:
+        if not is_zstd(file.read(len(_ZSTD))):
             return
     left = max(MAX_BYTES, MAX_RATIO * path.stat().st_size)
     with zstd.open(path, "rb") as file:

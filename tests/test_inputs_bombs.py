@@ -131,7 +131,7 @@ def test_chunks_of_ros_1_are_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: rosbag1.Writer.CompressionFormat
 ) -> None:
     path = Recorder(compression=compression).write(tmp_path / "s.bag", small_frames(1))
-    for chunk in Bag(path)._opened[0].chunks.values():  # type: ignore[union-attr]
+    for chunk in Bag(path)._reader.chunks.values():  # type: ignore[union-attr]
         assert chunk.decompressor in (from_bz2, from_lz4)
 
 

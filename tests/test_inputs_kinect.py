@@ -10,6 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import FOLDER, scene, unpacked
+from recorded import kinect as recording
+from recorded.kinect import calibration
 
 from modeler import se3
 from modeler.cli import main
@@ -17,40 +20,13 @@ from modeler.types import Camera, InputError
 from sequences import Given, open_sequence
 from sequences.alignment import Alignment
 from sequences.json_input import Node
-from sequences.kinect import Matroska
+from sequences.kinect import KinectSequence, Matroska
 from sequences.kinect_calibration import colour_from_depth, colour_lens, depth_lens
 from sequences.lens import Lens
 
 WIDTH, HEIGHT = 320, 288  # NFOV_2X2BINNED
 COLOUR_SIZE = (1280, 720)
-# As the device tells them: shares of the sensor, from the corner of the first pixel.
-DEPTH_PARAMETERS = [0.51, 0.515, 0.4925, 0.4929, 0.55, -0.021, -0.0027, 0.89, 0.086, -0.0139, 0, 0, -7e-5, 2e-5]
-COLOUR_PARAMETERS = [0.5, 0.5066, 0.478, 0.6374, 0.33, -2.489, 1.4537, 0.2089, -2.3029, 1.3751, 0, 0, -1.3e-4, -1.6e-4]
-COLOUR_FROM_DEPTH = se3.exp(np.array([0.1, 0.002, -0.001, -0.032, -0.002, 0.004]))
-
-
-def calibration() -> dict:
-    def camera(purpose: str, parameters: list[float], pose: np.ndarray, size: tuple[int, int]) -> dict:
-        return {
-            "Intrinsics": {
-                "ModelParameterCount": 14,
-                "ModelParameters": parameters,
-                "ModelType": "CALIBRATION_LensDistortionModelBrownConrady",
-            },
-            "Purpose": purpose,
-            "Rt": {"Rotation": pose[:3, :3].ravel().tolist(), "Translation": pose[:3, 3].tolist()},
-            "SensorWidth": size[0],
-            "SensorHeight": size[1],
-        }
-
-    return {
-        "CalibrationInformation": {
-            "Cameras": [
-                camera("CALIBRATION_CameraPurposeDepth", DEPTH_PARAMETERS, np.eye(4), (1024, 1024)),
-                camera("CALIBRATION_CameraPurposePhotoVideo", COLOUR_PARAMETERS, COLOUR_FROM_DEPTH, (4096, 3072)),
-            ]
-        }
-    }
+COLOUR_FROM_DEPTH = colour_from_depth(Node(calibration(), Path("c.json")))
 
 
 def write_mkv(path: Path, count: int = 3, *, attached: dict | None = None, colour: bool = True) -> list[np.ndarray]:
@@ -123,6 +99,66 @@ def test_depth_comes_out_straight_and_colour_aligned(tmp_path: Path) -> None:
     assert (red[HEIGHT // 2][known] == should_be_red[known]).mean() > 0.97
 
 
+def test_a_recording_of_the_makers_library_is_read(tmp_path: Path) -> None:
+    path = unpacked("kinect.mkv", tmp_path)
+    pytest.importorskip("av")
+    sequence = open_sequence(path)
+    assert isinstance(sequence, KinectSequence)
+    assert sequence.indices == tuple(range(recording.COUNT))
+    assert sequence.alignment is not None
+    for number, frame in enumerate(sequence):
+        raw = scene.depth(number, *recording.DEPTH)
+        wanted = np.where(raw == 0, np.nan, raw * 0.001).astype(np.float32)
+        np.testing.assert_allclose(frame.depth_m, sequence.lens.straight(wanted, float("nan")), rtol=1e-6)
+        assert frame.time_s == pytest.approx(number * recording.STEP_US * 1e-6, abs=1e-6)
+        assert frame.colour is not None
+        coloured = np.argwhere(frame.colour.any(axis=2))
+        assert len(coloured) > 0.5 * raw.size
+        camera = frame.camera
+        for row, column in coloured[:: len(coloured) // 40]:
+            z = float(frame.depth_m[row, column])
+            there = se3.transform(
+                COLOUR_FROM_DEPTH,
+                np.array([[(column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z, z]]),
+            )[0]
+            lens = sequence.alignment.colour
+            w, h = lens.bent(np.array(there[0] / there[2]), np.array(there[1] / there[2]))
+            at = round(float(h) * lens.camera.fy + lens.camera.cy), round(float(w) * lens.camera.fx + lens.camera.cx)
+            if 0 <= at[0] < recording.COLOUR[1] and 0 <= at[1] < recording.COLOUR[0]:  # else it is lent
+                expected = scene.colour(number, *recording.COLOUR)[at].astype(int)
+                assert np.abs(frame.colour[row, column].astype(int) - expected).max() <= 12  # hidden pixels borrow
+
+
+def test_cameras_see_points_where_the_makers_library_does() -> None:
+    """It was asked by `recorded.kinect` for each mode of both cameras."""
+    said = json.loads((FOLDER / "kinect_pixels.json").read_text())
+    points_m = 0.001 * np.array(said["points_mm"], dtype=float)
+    node = Node(calibration(), Path("c.json"))
+    assert len(said["modes"]) == 24
+    for mode in said["modes"]:
+        lenses = depth_lens(node, tuple(mode["depth_size"]), None), colour_lens(node, tuple(mode["colour_size"]))
+        for name, lens, pose in zip(("depth", "colour"), lenses, (np.eye(4), COLOUR_FROM_DEPTH), strict=True):
+            there = se3.transform(pose, points_m)
+            w, h = lens.bent(there[:, 0] / there[:, 2], there[:, 1] / there[:, 2])
+            camera = lens.camera
+            ours = np.stack([w * camera.fx + camera.cx, h * camera.fy + camera.cy], axis=1)
+            np.testing.assert_allclose(ours, mode[name], atol=2e-3)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.7, 0.95])
+def test_what_is_left_of_a_recording_that_was_cut_off_is_read(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], share: float
+) -> None:
+    pytest.importorskip("av")
+    path = unpacked("kinect.mkv", tmp_path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    status, captured = main(["info", str(path)]), capfd.readouterr()
+    assert status in (0, 2)
+    assert (status == 0) == (share > 0.1)
+    assert captured.err.count("\n") == (status == 2)
+
+
 def test_a_mode_bins_and_crops_the_sensor() -> None:
     node = Node(calibration(), Path("c.json"))
     small, large = depth_lens(node, (320, 288), None).camera, depth_lens(node, (640, 576), None).camera
@@ -135,7 +171,6 @@ def test_a_mode_bins_and_crops_the_sensor() -> None:
     full, cropped = colour_lens(node, (4096, 3072)).camera, colour_lens(node, (1280, 720)).camera
     assert cropped.fx == pytest.approx(full.fx / 3.2)
     assert cropped.cy + 120.5 == pytest.approx((full.cy + 0.5) / 3.2)
-    np.testing.assert_allclose(colour_from_depth(node), COLOUR_FROM_DEPTH, atol=1e-12)
     with pytest.raises(InputError, match="of no mode of the Azure Kinect"):
         depth_lens(node, (600, 500), None)
 
@@ -150,10 +185,14 @@ def test_a_recording_without_colour_is_read_and_converted(tmp_path: Path) -> Non
     assert given.depth_unit == "0.5 mm (--depth-scale-mm)"
 
 
-@pytest.mark.parametrize("fault", ["truncated", "empty", "noise", "no calibration", "wrong calibration", "no lens"])
+@pytest.mark.parametrize(
+    "fault", ["truncated", "empty", "noise", "no calibration", "wrong calibration", "no lens", "fisheye"]
+)
 def test_broken_recordings_are_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str], fault: str) -> None:
     path = tmp_path / "s.mkv"
     tree = calibration()
+    if fault == "fisheye":
+        tree["CalibrationInformation"]["Cameras"][0]["Intrinsics"]["ModelType"] = "CALIBRATION_LensDistortionModelTheta"
     if fault == "no lens":
         tree["CalibrationInformation"]["Cameras"][0]["Intrinsics"]["ModelParameters"] = [0] * 14
     write_mkv(path, attached={"no": 1} if fault == "wrong calibration" else tree)

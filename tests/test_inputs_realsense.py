@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import re
 import sys
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from bags import Recorder
+from recorded import realsense as recording
+from recorded import scene, unpacked
 from recordings import raw_depth, small_frames
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
@@ -20,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from modeler.cli import main
 from modeler.types import Camera, Frame, InputError
 from sequences import Given, open_sequence, survey
-from sequences.lens import Lens
+from sequences.lens import Lens, known
 from sequences.live import AbstractCamera, begin
 from sequences.realsense import open_camera
 from sequences.ros import RosSequence
@@ -90,7 +91,7 @@ def test_bags_of_the_old_recorder_are_read(tmp_path: Path) -> None:
     assert_motion(sequence)
 
 
-# What the recorder that is installed writes; since 2.57 a bag of ROS 2.
+# What the recorders write themselves; since 2.58 a bag of ROS 2.
 
 
 @pytest.fixture
@@ -98,78 +99,83 @@ def rs() -> Any:
     return pytest.importorskip("pyrealsense2")
 
 
-@dataclass
-class Device:
-    """A camera that exists in software only."""
-
-    rs: Any
-    kept: list[np.ndarray] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        rs = self.rs
-        self.device = rs.software_device()
-        self.sensors = [self.device.add_sensor(name) for name in ("Depth", "Color")]
-        self.sensors[0].add_read_only_option(rs.option.depth_units, 0.00025)
-        self.profiles = []
-        kinds = (
-            (rs.stream.depth, rs.format.z16, 64, 48, 60.0, 2),
-            (rs.stream.color, rs.format.rgb8, 128, 96, 125.0, 3),
-        )
-        for uid, (kind, pixels, width, height, focal_px, size) in enumerate(kinds):
-            lens = rs.intrinsics()
-            lens.width, lens.height, lens.fx, lens.fy = width, height, focal_px, focal_px
-            lens.ppx, lens.ppy, lens.model, lens.coeffs = width / 2, height / 2, rs.distortion.brown_conrady, [0.0] * 5
-            stream = rs.video_stream()
-            stream.type, stream.index, stream.uid, stream.width, stream.height = kind, 0, uid, width, height
-            stream.fps, stream.bpp, stream.fmt, stream.intrinsics = 30, size, pixels, lens
-            self.profiles.append(self.sensors[uid].add_video_stream(stream))
-        motion = rs.extrinsics()
-        motion.rotation, motion.translation = TURN.T.ravel().tolist(), SHIFT_M.tolist()  # columns in turn
-        self.profiles[0].register_extrinsics_to(self.profiles[1], motion)
-        self.device.create_matcher(rs.matchers.default)
-
-    def see(self, number: int) -> None:
-        depth, colour = np.full((48, 64), 3000 + number, np.uint16), np.full((96, 128, 3), 50 + number, np.uint8)
-        for sensor, profile, pixels in zip(self.sensors, self.profiles, (depth, colour), strict=True):
-            image = self.rs.software_video_frame()
-            image.pixels, image.stride = pixels, pixels.strides[0]
-            image.bpp = pixels.strides[1]
-            image.timestamp, image.domain = 1000.0 * (1.0 + number / 30.0), self.rs.timestamp_domain.hardware_clock
-            image.frame_number, image.profile = number + 1, profile.as_video_stream_profile()
-            if pixels is depth:
-                image.depth_units = 0.00025
-            self.kept.append(pixels)
-            sensor.on_video_frame(image)
-
-
-def test_recordings_of_the_makers_recorder_are_read(rs: Any, tmp_path: Path) -> None:
-    version = tuple(int(part) for part in re.findall(r"\d+", rs.__version__)[:2])
-    path = tmp_path / ("s.db3" if version >= (2, 57) else "s.bag")
-    device = Device(rs)
-    recorder = rs.recorder(str(path), device.device)
-    sensors, queue = recorder.query_sensors(), rs.frame_queue(50, True)
-    for place in range(len(sensors)):
-        sensors[place].open(sensors[place].get_stream_profiles()[0])
-        sensors[place].start(queue)
-    for number in range(3):
-        device.see(number)
-        time.sleep(0.1)
-    time.sleep(0.3)
-    for place in range(len(sensors)):
-        sensors[place].stop()
-        sensors[place].close()
-    del recorder, sensors  # which writes the rest
+def assert_read(path: Path, count: int) -> None:
+    """Check that every number of a recording of `recorded.realsense` comes out as it went in."""
     sequence = open_sequence(path)
+    assert isinstance(sequence, RosSequence)
     assert "by RealSense" in sequence.layout
-    assert sequence.depth_unit.startswith("0.25 mm (/device_0/sensor_0/option/Depth")
-    assert len(sequence) == 3
+    assert sequence.depth_unit == "0.25 mm (/device_0/sensor_0/option/Depth_Units/value)"
+    assert sequence.notes == ()
+    assert len(sequence) == count
+    assert sequence.colour is not None
+    assert sequence.colour.alignment is not None
+    motion, lens = sequence.colour.alignment.colour_from_depth, sequence.colour.alignment.colour
+    np.testing.assert_allclose(motion[:3, :3], recording.TURN, atol=2e-6)
+    np.testing.assert_allclose(motion[:3, 3], recording.SHIFT_M, atol=1e-6)
+    np.testing.assert_allclose(lens.coefficients, recording.BEND, rtol=1e-5)
+    width, height, focal_px = recording.DEPTH
     for number, frame in enumerate(sequence):
-        np.testing.assert_allclose(frame.depth_m, (3000 + number) * 0.00025, rtol=1e-6)
+        raw = scene.depth(number, width, height)
+        np.testing.assert_allclose(frame.depth_m, np.where(raw == 0, np.nan, raw * recording.UNIT_M), rtol=1e-6)
         camera = frame.camera
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (60.0, 60.0, 32.0, 24.0)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (focal_px, focal_px, width / 2 - 0.5, height / 2)
         assert frame.colour is not None
-        assert set(np.unique(frame.colour)) == {0, 50 + number}
-    assert_motion(sequence)
+        at = np.argwhere(frame.colour[..., 2] > 0)
+        assert len(at) > 0.7 * raw.size
+        assert set(frame.colour[..., 2][at[:, 0], at[:, 1]]) == {100 + 10 * number}
+        for row, column in ((43, 14), (43, 48), (8, 48)):  # none of it hidden
+            z = raw[row, column] * recording.UNIT_M
+            point = np.array([(column - camera.cx) / focal_px * z, (row - camera.cy) / focal_px * z, z])
+            there = motion[:3, :3] @ point + motion[:3, 3]
+            w, h = lens.bent(np.array(there[0] / there[2]), np.array(there[1] / there[2]))
+            u, v = (recording.COLOUR[2] * np.array([w, h]) + [lens.camera.cx, lens.camera.cy]).round().astype(int)
+            expected = scene.colour(number, *recording.COLOUR[:2])[v, u]
+            np.testing.assert_array_equal(frame.colour[row, column], expected)
+
+
+RECORDED = (
+    "realsense-2.56.bag",  # ROS 1, lz4
+    "realsense-2.58.db3",  # ROS 2, each message packed by zstd, cameras as text
+    "realsense-2.59.db3",  # ROS 2, images packed as PNG
+)
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_recordings_of_the_makers_recorders_are_read(tmp_path: Path, name: str) -> None:
+    assert_read(unpacked(name, tmp_path), 3)
+
+
+def test_recordings_of_the_recorder_that_is_installed_are_read(rs: Any, tmp_path: Path) -> None:
+    version = tuple(int(part) for part in re.findall(r"\d+", rs.__version__)[:2])
+    path = tmp_path / ("s.db3" if version >= (2, 58) else "s.bag")
+    recording.record(rs, path, 3)
+    assert_read(path, 3)
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_a_recording_that_was_cut_off_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str) -> None:
+    path = unpacked(name, tmp_path)
+    content = path.read_bytes()
+    for share in (0.05, 0.5, 0.9):
+        path.write_bytes(content[: int(share * len(content))])
+        assert main(["info", str(path)]) == 2
+        said = capfd.readouterr().err
+        assert said.startswith(f"modeler: {path}: is not a readable bag")
+        assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("model", ["brown_conrady", "modified_brown_conrady", "inverse_brown_conrady"])
+def test_the_makers_library_sees_points_where_our_lens_does(rs: Any, model: str) -> None:
+    intrinsics = rs.intrinsics()
+    intrinsics.width, intrinsics.height, intrinsics.fx, intrinsics.fy = 640, 480, 385.0, 384.0
+    intrinsics.ppx, intrinsics.ppy, intrinsics.coeffs = 320.0, 240.0, list(recording.BEND)
+    intrinsics.model = getattr(rs.distortion, model)
+    camera = Camera(640, 480, 385.0, 384.0, 320.0, 240.0)
+    ours = known(camera, recording.BEND, model.replace("_", " ").title(), "here")
+    for x, y in itertools.product(np.linspace(-0.8, 0.8, 9), np.linspace(-0.6, 0.6, 7)):
+        w, h = ours.bent(np.array(x), np.array(y))
+        theirs = rs.rs2_project_point_to_pixel(intrinsics, [x, y, 1.0])
+        np.testing.assert_allclose([w * 385.0 + 320.0, h * 384.0 + 240.0], theirs, atol=0.02)
 
 
 # A camera that is running
@@ -181,6 +187,7 @@ class StandIn(AbstractCamera):
 
     frames: list[Frame]
     taken: list[int] = field(default_factory=list)
+    times_s: tuple[float, ...] = ()
 
     @property
     def name(self) -> str:
@@ -198,7 +205,7 @@ class StandIn(AbstractCamera):
         number = len(self.taken)
         self.taken.append(number)
         frame = self.frames[number % len(self.frames)]
-        return 0.1 * number, raw_depth(frame, 1.0), frame.colour
+        return self.times_s[number] if self.times_s else 0.1 * number, raw_depth(frame, 1.0), frame.colour
 
 
 def test_images_are_taken_when_they_are_asked_for() -> None:
@@ -222,10 +229,43 @@ def test_images_are_taken_when_they_are_asked_for() -> None:
         sequence.frame(7)
 
 
-def test_the_makers_library_is_driven_as_it_wants(rs: Any) -> None:
-    """All but starting: a camera in software cannot be started by a pipeline."""
-    with pytest.raises(InputError, match=r"realsense:(123)?: (no camera|cannot be started)"):
-        open_camera("123", Given(), rs.context())
+def test_an_image_that_comes_again_is_not_taken_for_a_new_one() -> None:
+    camera = StandIn(small_frames(3), times_s=(0.0, 0.0, 0.1, 0.1, 0.1, 0.2, 0.3, *[0.3] * 200))
+    sequence = begin(camera, first=2)
+    assert [frame.time_s for frame in itertools.islice(sequence, 4)] == [0.0, 0.1, 0.2, 0.3]
+    with pytest.raises(InputError, match="stand-in: gives the same image again and again"):
+        list(begin(camera, first=2))
+
+
+def test_a_camera_of_the_makers_library_is_read_while_it_runs(
+    rs: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is played back is to the library a camera like any other."""
+    version = tuple(int(part) for part in re.findall(r"\d+", rs.__version__)[:2])
+    path = tmp_path / ("s.db3" if version >= (2, 58) else "s.bag")
+    recording.record(rs, path, 14, pause_s=0.05)
+    context = rs.context()
+    with pytest.raises(InputError, match=r"realsense: no camera is plugged in"):
+        open_camera("123", Given(), context)
+    played = context.load_device(str(path))
+    with pytest.raises(InputError, match=r"realsense:123: no such camera is plugged in; there is 0123456789\."):
+        open_camera("123", Given(), context)
+    monkeypatch.setattr("sequences.realsense.PATIENCE_MS", 500)
+    monkeypatch.setattr("sequences.live.FIRST", 4)
+    sequence = open_camera("0123456789", Given(), context)
+    assert (sequence.name, sequence.depth_unit) == ("Software D455", "0.25 mm (the camera)")
+    frames: list[Frame] = []
+    with pytest.raises(InputError, match=r"Software D455: gives no image .*; plug it in anew"):
+        frames.extend(sequence)
+    for frame in frames:
+        raw = scene.depth(round(30.0 * (frame.time_s - 1.0)), *recording.DEPTH[:2])
+        np.testing.assert_allclose(frame.depth_m, np.where(raw == 0, np.nan, raw * recording.UNIT_M), rtol=1e-6)
+        assert frame.camera.fx == recording.DEPTH[2]
+        assert frame.colour is not None
+        assert np.count_nonzero(frame.colour[..., 2] >= 100) > 0.6 * raw.size
+    assert played.is_playback()
+    assert len(frames) >= 4
+    assert (np.diff([frame.time_s for frame in frames]) > 0.0).all()
 
 
 def test_without_the_library_it_says_what_to_install(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.cli import main
 from modeler.types import Camera, Frame, InputError
-from sequences import Given, open_sequence
+from sequences import Given, open_sequence, ros_images
 from sequences.lens import Lens
 from sequences.ros import RosSequence
 
@@ -299,3 +300,39 @@ class Cut(Recorder):
     def _image(self, types, header, encoding, pixels):
         message = super()._image(types, header, encoding, pixels)
         return dataclasses.replace(message, data=message.data[:-1000]) if encoding == "16UC1" else message
+
+
+@pytest.mark.parametrize(("encoding", "order"), [("yuv422", (1, 0, 3, 2)), ("YUYV", (0, 1, 2, 3))])
+def test_colour_that_shares_chroma_is_read(encoding: str, order: tuple[int, ...]) -> None:
+    """White, black, red and blue as the standard has them, two pixels each."""
+    colours = {(235, 128, 128): (255, 255, 255), (16, 128, 128): (0, 0, 0), (82, 90, 240): (255, 0, 0)}
+    colours[(41, 240, 110)] = (0, 0, 255)
+    y_u_y_v = np.array([[y, u, y, v] for y, u, v in colours], np.uint8)
+    data = np.tile(np.pad(y_u_y_v[:, order].ravel(), (0, 3)), 2)
+    message = SimpleNamespace(
+        __msgtype__=ros_images.IMAGE, encoding=encoding, height=2, width=8, step=19, is_bigendian=0, data=data
+    )
+    assert ros_images.is_colour(message)
+    assert not ros_images.is_depth(message)
+    picture = ros_images.colour(message, "here")
+    expected = np.repeat(np.array(list(colours.values())), 2, axis=0)
+    assert np.abs(picture.astype(int) - expected).max() <= 2
+
+
+@dataclasses.dataclass(frozen=True)
+class OddColour(Recorder):
+    """Has a colour camera of a kind that nobody knows."""
+
+    def _camera(self, types: Any, header: Any, frame: Frame, scale: float, *, ros1: bool) -> Any:
+        message = super()._camera(types, header, frame, scale, ros1=ros1)
+        return dataclasses.replace(message, distortion_model="odd" if header.frame_id == "colour_info" else "plumb_bob")
+
+
+def test_a_colour_camera_that_nobody_knows_costs_the_colour_alone(tmp_path: Path) -> None:
+    recorder = OddColour(distortion=(-0.1, 0.0, 0.0, 0.0, 0.0))
+    sequence = open_sequence(recorder.write(tmp_path / "s.bag", small_frames(2)))
+    assert sequence.frame(0).colour is None
+    assert sequence.notes == (
+        "colour of /camera/rgb/image_raw is left out: /camera/rgb/camera_info: its distortion model 'odd' is not "
+        "known; record the rectified topic.",
+    )

@@ -1,0 +1,18 @@
+"""Small recordings that the cameras' own libraries wrote, and the programs with which they did.
+
+`realsense.py` and `kinect.py` run by themselves, where NumPy and the library are; no camera is needed:
+
+    pip install numpy pyrealsense2==2.56.5.9235 && python realsense.py realsense-2.56.bag && xz realsense-2.56.bag
+    pip install numpy pillow pyk4a-bundle==1.5.0 && python kinect.py kinect.mkv kinect_pixels.json && xz kinect.mkv
+"""
+
+import lzma
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+
+
+def unpacked(name: str, folder: Path) -> Path:
+    """Put a recording into a folder."""
+    (folder / name).write_bytes(lzma.decompress((FOLDER / f"{name}.xz").read_bytes()))
+    return folder / name
