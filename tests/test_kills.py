@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,57 @@ def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(
     assert contents(folder) == contents(whole)
 
 
+def test_a_run_that_other_versions_began_is_registered_anew(
+    whole: Path,
+    tmp_path: Path,
+    asked: list[tuple[int, int]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder, drop, version = tmp_path / "run", Pairs.drop, metadata.version
+    with monkeypatch.context() as patch:
+        patch.setattr(Pairs, "drop", lambda pairs: None if pairs.folder.is_dir() else drop(pairs))
+        patch.setattr(metadata, "version", lambda name: "0.0.1" if name in ("modeler", "numpy") else version(name))
+        assert main(["build", BOX, "--out", str(folder), *QUICK]) == 0
+    assert len(list((folder / ".pairs").iterdir())) == len(pairs_of(whole))
+    asked.clear()
+    capsys.readouterr()
+    assert main(["build", BOX, "--out", str(folder), *QUICK, "--resume"]) == 0
+    assert "modeler: was begun with modeler 0.0.1, numpy 0.0.1: pairs are registered anew\n" in capsys.readouterr().err
+    assert set(asked) == pairs_of(whole)
+    assert contents(folder) == contents(whole)
+
+
+def test_what_is_said_to_be_saved_is_on_the_disk(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each file is brought to the disk before it takes its place, and the folder's list of names after that."""
+    done: list[tuple[str, str]] = []
+    fsync, swap = os.fsync, os.replace
+
+    def synced(number: int) -> None:
+        done.append(("synced", Path(os.readlink(f"/proc/self/fd/{number}")).name))
+        fsync(number)
+
+    def replaced(source: Path, target: Path) -> None:
+        done.append(("replaced", target.name))
+        swap(source, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", replaced)
+    assert main(["build", BOX, "--out", str(tmp_path / "run"), *QUICK]) == 0
+    monkeypatch.undo()
+    final = done[done.index(("replaced", "cloud.ply")) - 20 :]
+    order = [name for what, name in final if what == "replaced"][-6:]
+    assert order == ["trajectory.txt", "odometry.txt", "graph.g2o", "cloud.ply", "model.ply", "report.json"]
+    for name in order:
+        place = len(final) - 1 - final[::-1].index(("replaced", name))
+        assert any(what == "synced" and part.startswith(f".{name}.") for what, part in final[:place])
+        assert ("synced", "run") in final[place:]
+    assert ("synced", "recording.rrd") in final
+    kept = [name for what, name in done if what == "replaced" and name.endswith(".npz")]
+    assert len(kept) == len(pairs_of(whole))
+    assert {("synced", name) for name in kept} <= set(done)
+
+
 def test_ctrl_c_before_the_first_frame_ends_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Pressed(building.Interrupt):
         @property
@@ -198,7 +250,7 @@ def test_an_answer_is_to_one_question_only(tmp_path: Path, asked: list[tuple[int
     views = [Sensor().ray_image(frame, None) for frame in frames]
     nearer = Sensor().ray_image(replace(frames[0], depth_m=frames[0].depth_m - np.float32(0.001)), None)
     priors = [GeneralPrior(), GeneralPrior().grown(2)]
-    remembered = Remembered(IcpRegistrar(), Pairs(tmp_path))
+    remembered = Remembered(IcpRegistrar(), Pairs(tmp_path), {})
 
     def ask(target: RayImage, prior: int = 0, seed: int = 0) -> int:
         motion = priors[prior].between(views[1], target)

@@ -15,6 +15,8 @@ from modeler.cli.interrupt import Interrupt
 from modeler.cli.remembered import Remembered
 from modeler.cli.watching import watched
 from modeler.export import RunFolder, RunMeta, alone
+from modeler.pipeline import Modeler
+from modeler.segmentation import Scene
 from modeler.types import InputError
 from sequences import AbstractSequence, SensedSequence, frame_range, read_noise, survey
 from viz.ending import ends_whole
@@ -27,17 +29,9 @@ def build(options: Build) -> int:
     Raises:
         InputError: where the input or the folder cannot be used.
     """
-    if options.resume and options.overwrite:
-        raise InputError("--resume keeps what --overwrite deletes; give one of them")
-    if options.voxel_m is not None and not 0.0 < options.voxel_m < 1.0:
-        raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m between 0 and 1")
-    began = time.perf_counter()
-    path = options.sequence
-    whole = watched(path, options.idle_s) if options.watch else compose.open_sequence(path)
-    whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
-    frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
-    if not frames.live:
-        survey(frames, truth=False)  # what cannot be read is found before anything is made
+    began_s = time.perf_counter()
+    _check(options)
+    whole, frames = _opened(options)
     modeler = compose.modeler(whole, options.prior, options.method, options.where)
     modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=options.voxel_m))
     prior, remark = compose.told_prior(options.prior, whole)
@@ -53,41 +47,89 @@ def build(options: Build) -> int:
         return _told(RunFolder(options.out).report(), options)
     scene = compose.scene(modeler, whole)
     with alone(options.out):
+        before = RunFolder(options.out).changed_versions(meta) if options.resume else ()
         folder = RunFolder.open(options.out, overwrite=options.overwrite, resume=options.resume)
-        modeler = replace(modeler, registrar=Remembered(modeler.registrar, folder.pairs))
-        stream = open_stream(
-            frames.name,
-            save=folder.path / "recording.rrd",
-            spawn=options.view,
-            web=options.web,
-            connect=options.connect,
-            facts={"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings},
-        )
+        modeler = replace(modeler, registrar=Remembered(modeler.registrar, folder.pairs, meta.versions))
+        if before:
+            print(f"modeler: was begun with {', '.join(before)}: pairs are registered anew", file=sys.stderr)
         if remark:
             print(f"modeler: {remark}", file=sys.stderr)
-        seconds = {"scene": time.perf_counter() - began, "registration": 0.0, "total": 0.0}
-        report: Mapping[str, Any] = {}
-        try:
-            with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
-                coming = interrupt.until(frames.until(lambda: interrupt.asked))
-                for step in modeler.run(coming, scene, hurry=lambda: interrupt.asked):
-                    seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
-                    seconds["total"] = time.perf_counter() - began
-                    meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
-                    report = folder.write(step, meta)
-                    stream(step)
-                    console(step)
-        finally:
-            stream.close()
-        if not report:
-            raise KeyboardInterrupt  # before the first frame
+        report = _run(options, modeler, (frames, scene), folder, meta, began_s=began_s)
         folder.finish()
-    if not ends_whole(folder.path / "recording.rrd"):
-        print(
-            f"modeler: {folder.path / 'recording.rrd'}: is cut off (is the disk full?); the rest is whole",
-            file=sys.stderr,
-        )
+    recording = folder.path / "recording.rrd"
+    if not ends_whole(recording):
+        print(f"modeler: {recording}: is cut off (is the disk full?); the rest is whole", file=sys.stderr)
     return _told(report, options)
+
+
+def _check(options: Build) -> None:
+    """Refuse options that contradict each other or nobody can mean.
+
+    Raises:
+        InputError: where they do.
+    """
+    if options.resume and options.overwrite:
+        raise InputError("--resume keeps what --overwrite deletes; give one of them")
+    if options.voxel_m is not None and not 0.0 < options.voxel_m < 1.0:
+        raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m between 0 and 1")
+
+
+def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
+    """Return the sequence and what was selected of it; what cannot be read is found before anything is made.
+
+    Raises:
+        InputError: where something cannot be read.
+    """
+    path = options.sequence
+    whole = watched(path, options.idle_s) if options.watch else compose.open_sequence(path)
+    whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
+    frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
+    if not frames.live:
+        survey(frames, truth=False)
+    return whole, frames
+
+
+def _run(
+    options: Build,
+    modeler: Modeler,
+    seen: tuple[AbstractSequence, Scene],
+    folder: RunFolder,
+    meta: RunMeta,
+    *,
+    began_s: float,
+) -> Mapping[str, Any]:
+    """Show and write every step, and return the last report.
+
+    Raises:
+        InputError: where a frame cannot be read or a file cannot be written.
+        KeyboardInterrupt: where somebody asked for an end before the first frame.
+    """
+    frames, scene = seen
+    stream = open_stream(
+        frames.name,
+        save=folder.path / "recording.rrd",
+        spawn=options.view,
+        web=options.web,
+        connect=options.connect,
+        facts={"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings},
+    )
+    seconds = {"scene": time.perf_counter() - began_s, "registration": 0.0, "total": 0.0}
+    report: Mapping[str, Any] = {}
+    try:
+        with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
+            coming = interrupt.until(frames.until(lambda: interrupt.asked))
+            for step in modeler.run(coming, scene, hurry=lambda: interrupt.asked):
+                seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
+                seconds["total"] = time.perf_counter() - began_s
+                meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
+                report = folder.write(step, meta)
+                stream(step)
+                console(step)
+    finally:
+        stream.close()
+    if not report:
+        raise KeyboardInterrupt
+    return report
 
 
 def _comes_back(frames: AbstractSequence, reach_deg: float) -> bool:

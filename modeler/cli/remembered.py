@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import final
 
@@ -23,12 +24,14 @@ class Remembered(AbstractRegistrar):
     """Asked where memory ends."""
     pairs: Pairs
     """The memory."""
+    versions: Mapping[str, str]
+    """Of the packages: with others, answers may be others."""
 
     def register(
         self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior of target_from_source."""
-        question = _question(self.registrar, (source, target), motion, rng)
+        question = self._question((source, target), motion, rng)
         known = self.pairs.get(source.index, target.index, question)
         if known is not None:
             return known
@@ -36,22 +39,20 @@ class Remembered(AbstractRegistrar):
         self.pairs.keep(found, question)
         return found
 
+    def _question(self, views: tuple[RayImage, RayImage], motion: AbstractMotion, rng: np.random.Generator) -> str:
+        """Return a digest of all that an answer depends on.
 
-def _question(
-    registrar: AbstractRegistrar, views: tuple[RayImage, RayImage], motion: AbstractMotion, rng: np.random.Generator
-) -> str:
-    """Return a digest of all that an answer depends on.
-
-    A pair may be asked about more than once: with a prior that was grown, or that has learnt from frames in between.
-    """
-    digest = hashlib.blake2b(digest_size=12)
-    digest.update(f"{registrar!r} {rng.bit_generator.state} {motion.evidence}".encode())
-    for view in views:
-        frame = view.frame
-        digest.update(f"{frame.camera!r} {view.plane!r} {view.sigma_wh!r} {view.sigma_r_m!r}".encode())
-        for pixels in (frame.depth_m, frame.mask, frame.colour, view.points_m):
-            digest.update(b"none" if pixels is None else np.ascontiguousarray(pixels).tobytes())
-    drawn = motion.sample(_DRAWN, np.random.default_rng(0))
-    for numbers in (drawn, motion.log_density(drawn), motion.log_evidence(drawn)):
-        digest.update(np.ascontiguousarray(numbers).tobytes())
-    return digest.hexdigest()
+        A pair may be asked about more than once: with a prior that was grown, or has learnt from frames in between.
+        """
+        digest = hashlib.blake2b(digest_size=12)
+        asked = (self.registrar, sorted(self.versions.items()), rng.bit_generator.state, motion.evidence)
+        digest.update(" ".join(map(str, asked)).encode())
+        for view in views:
+            frame = view.frame
+            digest.update(f"{frame.camera!r} {view.plane!r} {view.sigma_wh!r} {view.sigma_r_m!r}".encode())
+            for pixels in (frame.depth_m, frame.mask, frame.colour, view.points_m):
+                digest.update(b"none" if pixels is None else np.ascontiguousarray(pixels).tobytes())
+        drawn = motion.sample(_DRAWN, np.random.default_rng(0))
+        for numbers in (drawn, motion.log_density(drawn), motion.log_evidence(drawn)):
+            digest.update(np.ascontiguousarray(numbers).tobytes())
+        return digest.hexdigest()

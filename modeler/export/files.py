@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,10 +15,15 @@ from modeler.types import InputError
 PART = ".part"  # ending of a file that is still being written
 
 
-def write_atomically(path: Path, content: str | bytes) -> None:
+def write_atomically(path: Path, content: str | bytes, *, lasting: bool = False) -> None:
     """Write a file so that whoever looks at any moment, also after a kill, finds the old one or the new one whole.
 
     A folder that is not there is made.
+
+    Args:
+        path: the file.
+        content: all of it.
+        lasting: wait until it is on the disk, so that the same holds after a power cut.
 
     Raises:
         InputError: where the file cannot be written.
@@ -27,11 +34,44 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             part.write_bytes(data)
+            if lasting:
+                settle(part)
             os.replace(part, path)
+            if lasting:
+                settle(path.parent)
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place with --out") from error
+
+
+def settle(*paths: Path) -> None:
+    """Wait until files, and the names in folders, are on the disk.
+
+    Raises:
+        OSError: where one cannot be brought there.
+    """
+    for path in paths:
+        opened = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some file systems have no such thing
+                raise
+        finally:
+            os.close(opened)
+
+
+def settle_soon(*paths: Path) -> threading.Thread:
+    """Do so without waiting; what is gone by then need not last."""
+
+    def settled() -> None:
+        with contextlib.suppress(OSError):
+            settle(*paths)
+
+    thread = threading.Thread(target=settled, daemon=True)
+    thread.start()
+    return thread
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from typing import final
 
 import numpy as np
 
-from modeler.export.files import write_atomically
+from modeler.export.files import settle_soon, write_atomically
 from modeler.types import InputError, Mode, Outcome, PoseGaussian, Posterior
 
 _NUMBERS = ("overlap", "effective_samples", "pareto_k", "log_evidence", "seconds")
@@ -50,7 +50,9 @@ class Pairs:
         np.savez(packed, allow_pickle=False, **_arrays(posterior))
         with contextlib.suppress(OSError, InputError):
             self.folder.mkdir(exist_ok=True)
-            write_atomically(self._path(posterior.source, posterior.target, question), packed.getvalue())
+            path = self._path(posterior.source, posterior.target, question)
+            write_atomically(path, packed.getvalue())
+            settle_soon(path, self.folder)  # waiting for the disk would take as long as registering
 
     def drop(self) -> None:
         """Forget everything, or, where the program is killed at it, nothing.

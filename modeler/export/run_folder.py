@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from modeler.export.files import PART, write_atomically
+from modeler.export.files import PART, settle, settle_soon, write_atomically
 from modeler.export.g2o import g2o_text
 from modeler.export.pairs import Pairs
 from modeler.export.ply import cloud_ply, mesh_ply
@@ -46,8 +46,9 @@ class RunFolder:
 
     Where that takes long, as of a thousand frames, some steps are passed over: it gets a tenth of the time at most.
     Each file is replaced in one go, the report after what it reports on: a run killed at any moment leaves no half
-    file. Until the run has ended each registration is kept as well. `RunFolder(path)` is for reading; `RunFolder.open`
-    makes one to write to.
+    file. After the last step all of it is on the disk; before, it is brought there in the background. Until the run
+    has ended each registration is kept as well. `RunFolder(path)` is for reading; `RunFolder.open` makes one to write
+    to.
     """
 
     path: Path
@@ -133,6 +134,20 @@ class RunFolder:
                 )
         return report.get("complete") is True and not self.pairs.folder.exists()
 
+    def changed_versions(self, meta: RunMeta) -> tuple[str, ...]:
+        """Return the packages, each with its version, with which a run was begun that is to be resumed with others.
+
+        Raises:
+            InputError: where its report cannot be read.
+        """
+        if not (self.path / _REPORT).exists():
+            return ()
+        before = self.report().get("versions")
+        before = before if isinstance(before, dict) else {}
+        return tuple(
+            f"{name} {before.get(name, '?')}" for name, now in meta.versions.items() if before.get(name) != now
+        )
+
     def write(self, step: Step, meta: RunMeta) -> dict[str, Any]:
         """Bring the folder up to date and return the report that stands there then.
 
@@ -145,28 +160,35 @@ class RunFolder:
         began_s = time.monotonic()
         report = report_of(step, list(self.frames.values()), meta)
         times_s = {frame: view.frame.time_s for frame, view in step.views.items()}
-        self._write("trajectory.txt", tum_text(step.solution.trajectory, times_s))
-        self._write("odometry.txt", tum_text(step.solution.odometry, times_s))
-        self._write("graph.g2o", g2o_text(step.edges_so_far, step.solution))
+        contents: dict[str, str | bytes] = {
+            "trajectory.txt": tum_text(step.solution.trajectory, times_s),
+            "odometry.txt": tum_text(step.solution.odometry, times_s),
+            "graph.g2o": g2o_text(step.edges_so_far, step.solution),
+        }
         if step.last and step.model is not None:
-            self._write("cloud.ply", cloud_ply(step.model))
-            self._write("model.ply", mesh_ply(step.model))
-        self._write(_REPORT, json.dumps(report, allow_nan=False) + "\n")
+            contents |= {"cloud.ply": cloud_ply(step.model), "model.ply": mesh_ply(step.model)}
+        contents[_REPORT] = json.dumps(report, allow_nan=False) + "\n"
+        for name, content in contents.items():
+            write_atomically(self.path / name, content, lasting=step.last)
+        if not step.last:
+            settle_soon(*(self.path / name for name in contents), self.path)
         self.newest.update(report)
         self.pace.took(time.monotonic() - began_s)
         return self.newest
 
     def finish(self) -> None:
-        """Forget the registrations, unless the run ended before its last frame and may be resumed.
+        """Bring the recording to the disk; forget the registrations, unless the run ended early and may be resumed.
 
         Raises:
-            InputError: where they cannot be removed.
+            InputError: where that cannot be.
         """
+        recording = self.path / _OURS[-1]
+        try:
+            settle(*(file for file in (recording,) if file.is_file()))
+        except OSError as error:
+            raise InputError(f"{recording}: cannot be written ({error.strerror}); choose another --out") from error
         if self.report()["complete"]:
             try:
                 self.pairs.drop()
             except OSError as error:
                 raise InputError(f"{self.pairs.folder}: cannot be removed ({error.strerror}); remove it") from error
-
-    def _write(self, name: str, content: str | bytes) -> None:
-        write_atomically(self.path / name, content)
