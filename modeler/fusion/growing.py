@@ -35,6 +35,8 @@ class _Place:
     low: Corner
     high: Corner
     """The box of that time, in voxels: what has grown since does not know of the view."""
+    corners_m: Array
+    """(8, 3) of a box in camera coordinates around what the view sees of the object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +72,7 @@ class Growing:
         voxel_m = self.voxel_m or self.how.preview_voxels * self.how.side_m(list(pairs.values()))
         after = self if self.voxel_m else replace(self, voxel_m=voxel_m)
         new = [frame for frame in pairs if frame not in self.places]
-        moved_m = {frame: _shift_m(pairs[frame], self.places[frame]) for frame in pairs if frame in self.places}
+        moved_m = _shifts_m(pairs, self.places)
         moved = sorted((frame for frame in moved_m if moved_m[frame] > 0.5 * voxel_m), key=lambda k: -moved_m[k])
         moved = moved[: self.how.preview_moves]
         gone = [frame for frame in self.places if frame not in pairs and frame in views]
@@ -83,7 +85,7 @@ class Growing:
         for frame in (*gone, *moved):
             after._tell(views[frame], places.pop(frame), -1.0)
         for frame in (*new, *moved):
-            places[frame] = _Place(pairs[frame][1], low, high)
+            places[frame] = _Place(pairs[frame][1], low, high, _corners_m(pairs[frame][0]))
             after._tell(pairs[frame][0], places[frame], 1.0)
         return replace(after, places=places)
 
@@ -191,10 +193,18 @@ def _images(view: RayImage) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float
     return index, np.where(measured, reach_m, 0.0).astype(np.float32), lens
 
 
-def _shift_m(pair: tuple[RayImage, Array], place: _Place) -> float:
-    """Return by how much, at most, a view's pose has moved what the view sees since it was added."""
-    view, pose = pair
-    low, high = view.points_m.min(axis=0), view.points_m.max(axis=0)
-    corners_m = np.array([[(low, high)[c >> axis & 1][axis] for axis in range(3)] for c in range(8)])
-    moved = se3.transform(pose, corners_m) - se3.transform(place.object_from_camera, corners_m)
-    return float(np.linalg.norm(moved, axis=1).max())
+def _shifts_m(pairs: Mapping[int, tuple[RayImage, Array]], places: Mapping[int, _Place]) -> dict[int, float]:
+    """Return by how much, at most, the pose of each view has moved what the view sees since it was added."""
+    frames = [frame for frame in pairs if frame in places]
+    if not frames:
+        return {}
+    moved = np.stack([pairs[frame][1] - places[frame].object_from_camera for frame in frames])
+    corners_m = np.stack([places[frame].corners_m for frame in frames])
+    shifts_m = corners_m @ np.swapaxes(moved[:, :3, :3], 1, 2) + moved[:, None, :3, 3]
+    return dict(zip(frames, np.linalg.norm(shifts_m, axis=2).max(axis=1).tolist(), strict=True))
+
+
+def _corners_m(view: RayImage) -> Array:
+    """Return the corners (8, 3) of a box in camera coordinates around what a view sees of the object."""
+    ends = np.stack([view.points_m.min(axis=0), view.points_m.max(axis=0)])
+    return ends[np.indices((2, 2, 2)).reshape(3, 8).T, np.arange(3)]

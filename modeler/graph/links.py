@@ -14,7 +14,8 @@ import gtsam
 import numpy as np
 
 from modeler import se3
-from modeler.types import Array, Edge, PoseGaussian
+from modeler.graph.belief import separate
+from modeler.types import Array, Edge, Mode, PoseGaussian
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,11 @@ class Link:
     def source(self) -> int:
         """Frame number of the source view."""
         return self.edge.source
+
+    @cached_property
+    def modes(self) -> tuple[Mode, ...]:
+        """Between which loops may decide: those of the posterior, unless they are as good as one."""
+        return self.edge.posterior.modes if separate(self.edge.posterior) else ()
 
     @cached_property
     def factor(self) -> gtsam.BetweenFactorPose3:

@@ -12,7 +12,7 @@ as welcome as any other. First order in the errors.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -40,6 +40,22 @@ class _Clique:
 
 
 @dataclass(frozen=True, eq=False)
+class _Leaf:
+    """A frame that hangs on another by one link alone, which tells nothing of the others. Known by identity."""
+
+    rows: Rows
+    """Of the link, where it stands in the solution."""
+    frame: int
+    other: int
+
+    @cached_property
+    def clique(self) -> _Clique:
+        """The frame given the other one, without its place among the cliques; the other may be the root."""
+        turned, upper = np.linalg.qr(self.rows[self.frame])
+        return _Clique((self.frame,), (self.other,), upper, turned.T @ self.rows[self.other], None)
+
+
+@dataclass(frozen=True, eq=False)
 class RelativeCovariance:
     """Covariances of target_from_source between solved frames. All work is done when asked."""
 
@@ -51,6 +67,27 @@ class RelativeCovariance:
     """All that take part."""
     others: Sequence[Rows] = ()
     """What else is known, as rows of errors in object coordinates; more variables than frames may take part."""
+    before: RelativeCovariance | None = None
+    """That of fewer frames, all worked out; the others are leaves."""
+    leaves: tuple[_Leaf, ...] = ()
+    """Frames beyond those before, each of which hangs on one that comes before it."""
+
+    def plus(self, trajectory: Mapping[int, Array], links: Sequence[Link]) -> RelativeCovariance | None:
+        """Return it with more frames; None where they do not hang on one link each, one after the other.
+
+        Args:
+            trajectory: as before, and object_from_camera (4, 4) of the new frames.
+            links: those by which they hang, in order.
+        """
+        leaves, known = list(self.leaves), set(self.trajectory)
+        for link, rows in zip(links, _rows(links, trajectory), strict=True):
+            if (link.source in known) == (link.target in known):
+                return None
+            frame, other = (link.target, link.source) if link.source in known else (link.source, link.target)
+            known.add(frame)
+            leaves.append(_Leaf(rows, frame, other))
+        before, links = self.before or self, (*self.links, *links)
+        return RelativeCovariance(trajectory, self.root, links, self.others, before, tuple(leaves))
 
     def __call__(self, target: int, source: int) -> Array:
         """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
@@ -82,26 +119,36 @@ class RelativeCovariance:
 
     @cached_property
     def _marginals(self) -> dict[int, Array]:
-        """All in one go from the root."""
-        spreads: dict[int, Array] = {self.root: np.zeros((6, 1))}  # L with LLᵀ the covariance, where still needed
-        roots: dict[int, dict[int, Array]] = {}
-        for number in range(len(self._cliques) - 1, -1, -1):  # parents before children
-            clique = self._cliques[number]
-            above = {} if clique.parent is None else roots[clique.parent]
-            outer = np.vstack([np.zeros((0, 1)) if not above else np.zeros((0, next(iter(above.values())).shape[1]))]
-                              + [above[frame] for frame in clique.outer])  # fmt: skip
-            own = solve_triangular(clique.upper, np.eye(len(clique.upper)), check_finite=False)
-            spread = np.block([[-own @ (clique.beside @ outer), own], [outer, np.zeros((len(outer), len(own)))]])
-            if spread.shape[1] > spread.shape[0]:
-                spread = np.asarray(np.linalg.qr(spread.T, mode="r"), dtype=np.float64).T
+        poses = np.stack(list(self.trajectory.values()))
+        local = se3.adjoint(se3.inverse(poses)) @ np.stack([self._spreads[frame] for frame in self.trajectory])
+        covariances = local @ np.swapaxes(local, 1, 2) + _GAUGE_SIGMA**2 * np.eye(6)
+        return dict(zip(self.trajectory, covariances, strict=True))
+
+    @cached_property
+    def _spreads(self) -> dict[int, Array]:
+        """L (6, 6) with LLᵀ the covariance of each pose in object coordinates: all in one go from the root."""
+        if self.before is not None:
+            found, known = dict(self.before._spreads), self.before._leaf_spreads
+            for leaf in self.leaves:
+                if leaf not in known:
+                    known[leaf] = _lower(_spread(leaf.clique, found[leaf.other])[:6])
+                found[leaf.frame] = known[leaf]
+            return found
+        found = {self.root: np.zeros((6, 6))}
+        spreads: list[dict[int, Array]] = []  # of all variables of a clique
+        for clique in self._cliques:  # parents before children
+            above = {} if clique.parent is None else spreads[clique.parent]
+            outer = np.vstack([above[frame] for frame in clique.outer]) if above else np.zeros((0, 0))
+            spread = _lower(_spread(clique, outer))
             blocks = spread.reshape(-1, 6, spread.shape[1])
-            roots[number] = dict(zip((*clique.inner, *clique.outer), blocks, strict=True))
-            spreads.update({frame: roots[number][frame] for frame in clique.inner if frame in self.trajectory})
-        result = {}
-        for frame, pose in self.trajectory.items():
-            local = se3.adjoint(se3.inverse(pose)) @ spreads[frame]
-            result[frame] = local @ local.T + _GAUGE_SIGMA**2 * np.eye(6)
-        return result
+            spreads.append(dict(zip((*clique.inner, *clique.outer), blocks, strict=True)))
+            found |= {frame: _lower(spreads[-1][frame]) for frame in clique.inner if frame in self.trajectory}
+        return found
+
+    @cached_property
+    def _leaf_spreads(self) -> dict[_Leaf, Array]:
+        """Those of leaves that hang here, as they are asked for."""
+        return {}
 
     @cached_property
     def log_determinant(self) -> float:
@@ -109,26 +156,31 @@ class RelativeCovariance:
         return float(sum(np.sum(np.log(np.abs(np.diag(clique.upper)))) for clique in self._cliques))
 
     def _way(self, frames: Sequence[int]) -> list[int]:
-        """Return the numbers of the cliques between variables and the last one, children first."""
+        """Return the numbers of the cliques between variables and the roots, children first."""
         numbers: set[int] = set()
         for frame in frames:
             number: int | None = self._homes[frame]
             while number is not None and number not in numbers:
                 numbers.add(number)
                 number = self._cliques[number].parent
-        return sorted(numbers)
+        return sorted(numbers, reverse=True)
 
     @cached_property
     def _homes(self) -> dict[int, int]:
-        return {frame: number for number, clique in enumerate(self._cliques) for frame in clique.inner}
+        if self.before is None:
+            return {frame: number for number, clique in enumerate(self._cliques) for frame in clique.inner}
+        first = len(self.before._cliques)
+        return self.before._homes | {leaf.frame: first + number for number, leaf in enumerate(self.leaves)}
 
     @cached_property
     def _cliques(self) -> list[_Clique]:
-        """The cliques of U, children before parents."""
+        """The cliques of U, parents before children."""
+        if self.before is not None:
+            return self.before._cliques + [self._hung(leaf) for leaf in self.leaves]
         if not self.links:
             return []
         factors = gtsam.GaussianFactorGraph()
-        for rows in (*self._rows(), *self.others):
+        for rows in (*_rows(self.links, self.trajectory), *self.others):
             factors.add(gaussian_factor({key: block for key, block in rows.items() if key != self.root}))
         tree = factors.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR)
         cliques: list[_Clique] = []
@@ -139,26 +191,45 @@ class RelativeCovariance:
             keys, size = tuple(conditional.keys()), len(upper) // 6
             waiting += [(clique[number], len(cliques)) for number in range(clique.nrChildren())]
             cliques.append(_Clique(keys[:size], keys[size:], upper, beside, parent))
-        last = len(cliques) - 1
-        return [
-            _Clique(c.inner, c.outer, c.upper, c.beside, None if c.parent is None else last - c.parent)
-            for c in reversed(cliques)
-        ]
+        return cliques
 
-    def _rows(self) -> Iterator[Rows]:
-        """Yield the rows of each link, where it stands in the solution."""
-        frames = {frame: number for number, frame in enumerate(self.trajectory)}
-        poses = np.stack(list(self.trajectory.values()))
-        targets, sources = (
-            poses[[frames[frame] for frame in ends]]
-            for ends in ([link.target for link in self.links], [link.source for link in self.links])
-        )
-        means = np.stack([link.pose.mean for link in self.links])
-        xi = se3.log(se3.inverse(means) @ se3.inverse(targets) @ sources)
-        roots = np.stack([link.root_information for link in self.links])
-        blocks = roots @ inverse_right_jacobian(xi) @ se3.adjoint(se3.inverse(sources))
-        for link, block in zip(self.links, blocks, strict=True):
-            yield {link.target: -block, link.source: block}
+    def _hung(self, leaf: _Leaf) -> _Clique:
+        """Return the clique of a leaf in its place."""
+        if leaf.other == self.root:
+            return replace(leaf.clique, outer=(), beside=np.zeros((6, 0)))
+        return replace(leaf.clique, parent=self._homes[leaf.other])
+
+
+def _rows(links: Sequence[Link], trajectory: Mapping[int, Array]) -> Iterator[Rows]:
+    """Yield the rows of each link, where it stands in a solution."""
+    if not links:
+        return
+    targets = np.stack([trajectory[link.target] for link in links])
+    sources = np.stack([trajectory[link.source] for link in links])
+    means = np.stack([link.pose.mean for link in links])
+    xi = se3.log(se3.inverse(means) @ se3.inverse(targets) @ sources)
+    roots = np.stack([link.root_information for link in links])
+    blocks = roots @ inverse_right_jacobian(xi) @ se3.adjoint(se3.inverse(sources))
+    for link, block in zip(links, blocks, strict=True):
+        yield {link.target: -block, link.source: block}
+
+
+def _spread(clique: _Clique, outer: Array) -> Array:
+    """Return L with LLᵀ the covariance of a clique's variables, from that of its outer ones."""
+    own = solve_triangular(clique.upper, np.eye(len(clique.upper)), check_finite=False)
+    size, (more, columns) = len(own), outer.shape
+    spread = np.zeros((size + more, columns + size))
+    spread[:size, :columns] = -own @ (clique.beside @ outer)
+    spread[:size, columns:] = own
+    spread[size:, :columns] = outer
+    return spread
+
+
+def _lower(spread: Array) -> Array:
+    """Return L with as many columns as rows at most and the same LLᵀ."""
+    if spread.shape[1] <= spread.shape[0]:
+        return spread
+    return np.asarray(np.linalg.qr(spread.T, mode="r"), dtype=np.float64).T
 
 
 def gaussian_factor(rows: Rows, right: Array | None = None) -> gtsam.JacobianFactor:

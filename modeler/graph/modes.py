@@ -23,7 +23,7 @@ from modeler import se3
 from modeler.graph.links import Link, chain, walk
 from modeler.graph.marginals import RelativeCovariance
 from modeler.graph.optimise import optimise
-from modeler.types import Array, Edge, PoseGaussian, Posterior
+from modeler.types import Array, Edge
 
 _BEAM = 4096  # hypotheses kept while loops are taken one by one: all of twelve edges with two modes
 _SOLVED = 8  # hypotheses solved whole
@@ -65,25 +65,6 @@ class _Loop:
         return tuple(piece.edge for piece in (*self.way, self.own) if piece.edge is not None)
 
 
-def belief(posterior: Posterior, weights: Array | None = None) -> PoseGaussian:
-    """Return a posterior as one Gaussian: at its heaviest mode, as wide as all of them make it.
-
-    The mean of several modes lies at none of them; a mode alone would be sure of what is not decided.
-
-    Args:
-        posterior: with its modes.
-        weights: (m,) of the modes, as far as loops have decided; None: the posterior's own.
-    """
-    modes = posterior.modes
-    if len(modes) < 2:
-        return posterior.pose
-    weights = np.array([mode.weight for mode in modes]) if weights is None else weights
-    mean = modes[int(np.argmax(weights))].pose.mean
-    offsets = se3.log(se3.inverse(mean) @ np.stack([mode.pose.mean for mode in modes]))
-    spread = np.stack([mode.pose.covariance for mode in modes]) + offsets[:, :, None] * offsets[:, None, :]
-    return PoseGaussian(mean, np.tensordot(weights / np.sum(weights), spread, 1))
-
-
 def decide(
     tree: Sequence[Link],
     loops: Sequence[Link],
@@ -103,7 +84,7 @@ def decide(
             them on whose way there are others that are not.
     """
     settled = {edge: weights for edge, weights in (before or {}).items() if weights.max() >= _DECIDED}
-    if not any(len(link.edge.posterior.modes) > 1 and link.edge not in settled for link in (*tree, *loops)):
+    if not any(link.modes and link.edge not in settled for link in (*tree, *loops)):
         return settled
     search = _Search.of(tree, loops, root, settled, threshold)
     best = search.best() if search.edges else None
@@ -162,7 +143,7 @@ class _Search:
                     source, link = above[source]
                     back.append((link, link.target == source))
             way = [*ahead, *reversed(back), (loop, True)]
-            if any(len(link.edge.posterior.modes) > 1 and link.edge not in settled for link, _ in way):
+            if any(link.modes and link.edge not in settled for link, _ in way):
                 *pieces, own = (_piece(link, settled, columns, forwards=forwards) for link, forwards in way)
                 found.append(_Loop(_joined(pieces), own))
         open_loops = sorted(found, key=lambda loop: len(loop.edges))
@@ -264,12 +245,11 @@ def _chosen(link: Link, modes: Mapping[Edge, int]) -> Link:
 def _piece(link: Link, settled: Mapping[Edge, Array], columns: dict[Edge, int], *, forwards: bool) -> _Piece:
     """Return a link as a stretch of a loop, along it or against it; an open edge is given a column."""
     edge, poses, column = link.edge, [link.pose], None
-    modes = edge.posterior.modes
-    if len(modes) > 1:
+    if link.modes:
         if edge in settled:
-            poses = [modes[int(np.argmax(settled[edge]))].pose]
+            poses = [link.modes[int(np.argmax(settled[edge]))].pose]
         else:
-            poses, column = [mode.pose for mode in modes], columns.setdefault(edge, len(columns))
+            poses, column = [mode.pose for mode in link.modes], columns.setdefault(edge, len(columns))
     poses = poses if forwards else [pose.inverse() for pose in poses]
     return _Piece(column, np.stack([pose.mean for pose in poses]), np.stack([pose.covariance for pose in poses]))
 

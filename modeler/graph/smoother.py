@@ -10,10 +10,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler.graph.axis import CommonAxis, Turned
+from modeler.graph.belief import belief
 from modeler.graph.incremental import Incremental
 from modeler.graph.links import Link, anchored, chain, split
 from modeler.graph.marginals import PoseCovariances, RelativeCovariance
-from modeler.graph.modes import belief, decide
+from modeler.graph.modes import decide
 from modeler.graph.optimise import agree, optimise, poses_of, values_of
 from modeler.graph.pose_graph import PoseGraph
 from modeler.graph.shared import SharedCovariance
@@ -112,13 +113,14 @@ class Smoother:
             inlier, turned = self._turned(self.axis, taken, closing, trajectory, state)
         trajectory = trajectory if turned is None else turned.poses
         chosen = _taking_part(closing, inlier)
-        relative_covariance = RelativeCovariance(
+        relative_covariance = self._hung(taken, trajectory) if grew and len(loops) == len(self.state.loops) else None
+        relative_covariance = relative_covariance or RelativeCovariance(
             trajectory, root, (*taken, *chosen), () if turned is None else turned.rows
         )
         if self.shared:
             relative_covariance = SharedCovariance(relative_covariance, (*taken, *chosen), self.shared)
-        several = [link for link in (*taken, *closing) if len(link.edge.posterior.modes) > 1]
-        own = {link.edge: [mode.weight for mode in link.edge.posterior.modes] for link in several}
+        several = [link for link in (*taken, *closing) if link.modes]
+        own = {link.edge: [mode.weight for mode in link.modes] for link in several}
         solution = Solution(
             trajectory=trajectory,
             covariances=PoseCovariances(trajectory, relative_covariance.marginals),
@@ -130,6 +132,13 @@ class Smoother:
             camera_from_axis=None if turned is None else turned.camera_from_axis,
         )
         return replace(self, graph=graph, solution=solution, state=state)
+
+    def _hung(self, tree: Sequence[Link], trajectory: Mapping[int, Array]) -> RelativeCovariance | None:
+        """Return the covariances where no loop is new: new frames hang on those before; None: they do not."""
+        before = self.solution.relative_covariance
+        if self.axis is not None or not isinstance(before, RelativeCovariance) or before.others:
+            return None
+        return before.plus(trajectory, tree[len(self.state.tree) :])
 
     def _closed(
         self, tree: Sequence[Link], loops: Sequence[Link], start: Mapping[int, Array], *, root: int, afresh: bool
