@@ -40,6 +40,24 @@ def test_last_frames_of_a_full_turn_close_on_the_first(name: str, angles_deg: Ar
         assert between_deg < 48.0, name
 
 
+@pytest.mark.parametrize("sigma_deg", [1.0, 20.0])
+def test_last_frame_is_tried_on_the_first_unless_the_graph_is_sure_that_it_is_elsewhere(sigma_deg: float) -> None:
+    """A mug whose handle is hidden for four steps: registrations see half of each turn, and say so or do not."""
+    spread = se3.adjoint(ABOUT_OBJECT)
+    unsure = COVARIANCE + spread @ np.diag([0.0, np.radians(sigma_deg) ** 2, 0.0, 0.0, 0.0, 0.0]) @ spread.T
+
+    def spoil(posterior: Posterior) -> Posterior:
+        if posterior.source not in (3, 4, 5, 6) or posterior.source - posterior.target != 1:
+            return posterior
+        half = se3.exp(0.5 * se3.log(posterior.pose.mean))
+        return replace(posterior, pose=PoseGaussian(half, unsure))
+
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(), spoil)
+    closed = [edge.accepted for edge in run.judged[13] if edge.target == 0]
+    assert closed == ([True] if sigma_deg > 10.0 else [])
+
+
 def test_previous_view_comes_first_and_recent_neighbours_are_no_closures() -> None:
     run = Run(list(REGULAR_DEG))
     run.run(Closer())

@@ -16,6 +16,7 @@ from modeler.closure.verdict import Standard, flaw, modes, standard
 from modeler.closure.ways import Way, ways
 from modeler.types import Edge, PoseGaussian, Posterior, RayImage, Solution
 
+_LEAST_CHANCE = 0.02  # that a view is in reach: one that comes back after a turn that nothing told tells very much
 _SPAN_POWER = 6.0  # an edge over 25° tells half as much as one over none, over 50° a fourteenth
 
 
@@ -29,7 +30,7 @@ class Closer:
     """
 
     max_angle_deg: float = 45.0
-    """Largest predicted rotation in degrees to an earlier view for it to be tried as a closure."""
+    """Largest rotation in degrees to an earlier view for it to be tried as a closure, as far as the graph can tell."""
     away_deg: float = 90.0
     """How far in degrees the object must have turned away from an earlier view before it counts as coming back."""
     max_closures: int = 2
@@ -75,10 +76,13 @@ class Closer:
         poses = np.stack([solution.trajectory[frame] for frame in frames])
         expected = solution.trajectory[base.target] @ modes(base)[0][1].mean
         angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ expected))
-        near = [number for number in np.flatnonzero(angle_deg <= self.max_angle_deg) if frames[number] != base.target]
-        outlook = Outlook(
-            solution, views, known, base.target, expected, self.trust.systematic(1, views[base.target].centroid_m)
-        )
+        own = self.trust.systematic(1, views[base.target].centroid_m)
+        outlook = Outlook(solution, views, known, base.target, expected, own, self.max_angle_deg)
+        near = [
+            number
+            for number, (frame, angle) in enumerate(zip(frames, angle_deg, strict=True))
+            if frame != base.target and outlook.within(frame, angle) >= _LEAST_CHANCE
+        ]
         chosen, spanned = [], False
         for prospect in outlook.prospects([frames[number] for number in near], angle_deg[near], self.min_gain_nats):
             if prospect.overlap >= self.min_overlap:
@@ -99,11 +103,14 @@ class Closer:
         poses = np.stack([solution.trajectory[frame] for frame in frames]) if frames else np.zeros((0, 4, 4))
         tried = {frozenset((edge.source, edge.target)) for edge in known}
         pairs: list[tuple[int, int]] = []
+        limit_deg = self.max_span_deg
         for number, source in enumerate(frames if self.max_spans else ()):
             angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses[:number]) @ poses[number]))
-            near = [k for k in np.flatnonzero(angle_deg <= self.max_span_deg) if {source, frames[k]} not in tried]
+            near = [k for k in np.flatnonzero(angle_deg <= limit_deg) if {source, frames[k]} not in tried]
             own = self.trust.systematic(1, views[source].centroid_m)
-            outlook = Outlook(solution, views, known, source, poses[number], own, hangs=False, power=_SPAN_POWER)
+            outlook = Outlook(
+                solution, views, known, source, poses[number], own, limit_deg, hangs=False, power=_SPAN_POWER
+            )
             found = outlook.prospects([frames[k] for k in near], angle_deg[near], self.min_span_gain_nats)
             telling = [(source, prospect.frame) for prospect in found if prospect.overlap >= self.min_overlap]
             pairs += telling[: self.max_spans]

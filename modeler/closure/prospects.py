@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.special import ndtr
 
 from modeler import se3
 from modeler.closure.ways import Way, ways
@@ -47,6 +48,8 @@ class Outlook:
     """object_from_camera (4, 4) of the new view."""
     systematic: Array
     """Covariance (6, 6) of an edge's systematic error, in the camera of the view that the new one hangs on."""
+    max_angle_deg: float
+    """Largest rotation in degrees across which views are registered."""
     hangs: bool = True
     """Whether the new view hangs on `previous` by an edge of its own; False: it is `previous`."""
     power: float = 2.0
@@ -57,6 +60,19 @@ class Outlook:
     def reach(self) -> Mapping[int, Way]:
         """The surest ways from the view that the new one hangs on."""
         return ways(self.edges, self.previous)
+
+    def within(self, frame: int, angle_deg: float) -> float:
+        """Return the chance that the turn to a view is no larger than views are registered across.
+
+        Args:
+            frame: number of the view.
+            angle_deg: predicted rotation to it, believed as surely as the surest way there says.
+        """
+        if frame not in self.reach:
+            return 0.0
+        one_edge_rad2 = _rotation_variance(self._one_edge) if self.hangs and self._one_edge is not None else 0.0
+        sigma_deg = np.degrees(np.sqrt(self.reach[frame].variance_rad2 + one_edge_rad2))
+        return float(ndtr((self.max_angle_deg - angle_deg) / max(sigma_deg, 1e-6)))
 
     def prospects(self, frames: Sequence[int], angle_deg: Array, least_nats: float) -> list[Prospect]:
         """Return the most promising of `frames`, whose predicted rotations to the new view are `angle_deg` (n,).
@@ -72,10 +88,9 @@ class Outlook:
             angle_deg: predicted rotation to each.
             least_nats: what tells less is left out.
         """
-        recent = [edge.posterior.pose.covariance for edge in self.edges[-_RECENT:] if edge.accepted]
-        if not recent:
+        one_edge = self._one_edge
+        if one_edge is None:
             return []
-        one_edge = np.mean(recent, axis=0) + self.systematic
         variance_rad2 = _rotation_variance(one_edge)
         own_rad2 = _rotation_variance(self.systematic)
         bounded = []
@@ -83,7 +98,7 @@ class Outlook:
             if frame in self.reach:
                 way = self.reach[frame]
                 ratio = self.hangs + (way.variance_rad2 + way.edges * own_rad2) / variance_rad2
-                bound_nats = 3.0 * _chance(angle) * np.log1p(self._tells(angle) * ratio)
+                bound_nats = 3.0 * self._chance(frame, angle) * np.log1p(self._tells(angle) * ratio)
                 bounded.append((float(bound_nats), frame, float(angle)))
         found = []
         for _, frame, angle in sorted((b for b in bounded if b[0] >= least_nats), reverse=True)[:_ASKED]:
@@ -91,14 +106,25 @@ class Outlook:
             known = self.solution.relative_covariance(frame, self.previous)
             known = known + self.hangs * one_edge + self.reach[frame].edges * self.systematic
             ratio = overlap * self._tells(angle) * np.linalg.solve(one_edge, known)
-            gain_nats = _chance(angle) * 0.5 * float(np.linalg.slogdet(np.eye(6) + ratio)[1])
+            gain_nats = self._chance(frame, angle) * 0.5 * float(np.linalg.slogdet(np.eye(6) + ratio)[1])
             if gain_nats >= least_nats:
                 found.append(Prospect(frame, angle, overlap, gain_nats))
         return sorted(found, key=lambda prospect: -prospect.gain_nats)
 
+    @cached_property
+    def _one_edge(self) -> Array | None:
+        """Covariance (6, 6) of an edge; None where there is none to go by."""
+        recent = [edge.posterior.pose.covariance for edge in self.edges[-_RECENT:] if edge.accepted]
+        return np.asarray(np.mean(recent, axis=0) + self.systematic) if recent else None
+
     def _tells(self, angle_deg: float) -> float:
         """Return how much an edge over an angle tells, against one over none."""
-        return float(np.cos(np.radians(min(angle_deg, 90.0))) ** self.power)
+        return float(np.cos(np.radians(min(angle_deg, self.max_angle_deg))) ** self.power)
+
+    def _chance(self, frame: int, angle_deg: float) -> float:
+        """Return the chance that an edge is found."""
+        shown_again = np.cos(0.5 * np.radians(min(angle_deg, self.max_angle_deg))) ** 2
+        return float(shown_again) * self.within(frame, angle_deg)
 
     def _overlap(self, frame: int) -> float:
         """Return the share of a view's surface that should face the new view's camera."""
@@ -112,8 +138,3 @@ class Outlook:
 
 def _rotation_variance(covariance: Array) -> float:
     return float(np.trace(covariance[:3, :3]))
-
-
-def _chance(angle_deg: float) -> float:
-    """Return how much of a sphere is shown again after a turn."""
-    return float(np.cos(np.radians(angle_deg) / 2.0) ** 2)
