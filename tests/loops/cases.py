@@ -31,6 +31,8 @@ class Case:
     """The prior to use."""
     gone: frozenset[int] = frozenset()
     """Frames from which the object is missing."""
+    closes: bool = True
+    """Whether a loop leads over all frames, so that closing it should mend what adds up along them."""
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames, without the object where it is gone."""
@@ -69,18 +71,26 @@ def turned(angles_deg: Sequence[float], *, shape: str, width: int = 640, seed: i
 
 
 def rendered(shape: str, seed: int) -> list[Case]:
-    """Return the rendered cases, in the order of the table."""
+    """Return the rendered cases, in the order of the table.
+
+    One registration bridges the gap of the first turn that has one, 45° wide. Nothing bridges that of the second, 92°
+    wide: the frames after it are lost until the object comes back to the first views, and then join backwards in time,
+    so that what hangs together are two arms from the first view, and no loop.
+    """
     there = np.arange(0.0, 136.0, 15.0)
 
-    def case(name: str, angles_deg: Sequence[float] | Array, gone: frozenset[int] = frozenset()) -> Case:
-        return Case(name, turned(list(angles_deg), shape=shape, seed=seed), gone=gone)
+    def case(
+        name: str, angles_deg: Sequence[float] | Array, gone: frozenset[int] = frozenset(), *, closes: bool = True
+    ) -> Case:
+        return Case(name, turned(list(angles_deg), shape=shape, seed=seed), gone=gone, closes=closes)
 
     return [
         case("full-turn", np.linspace(0.0, 360.0, 16)),
         case("turn-and-a-half", np.linspace(0.0, 540.0, 23)),
         case("two-turns", np.linspace(0.0, 720.0, 31)),
         case("back-and-forth", [*there, *there[-2::-1]]),
-        case("turn-with-gap", np.linspace(0.0, 390.0, 18), frozenset({7, 8, 9})),
+        case("turn-with-gap", np.linspace(0.0, 390.0, 27), frozenset({11, 12})),
+        case("turn-lost-and-found", np.linspace(0.0, 390.0, 18), frozenset({7, 8, 9}), closes=False),
         case("200-at-2deg", np.linspace(0.0, 398.0, 200)),
     ]
 

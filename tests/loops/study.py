@@ -30,7 +30,11 @@ _PAGE_BYTES = 4096
 
 @dataclass(frozen=True)
 class Result:
-    """What a case came to. Before = along the chain alone, after = with every accepted edge."""
+    """What a case came to.
+
+    Before = with the edges alone that placed the frames: the chain of neighbours in time, what bridges a gap, and where
+    nothing does, what found the frames after it again. After = with every accepted edge.
+    """
 
     name: str
     frames: int
@@ -97,19 +101,19 @@ def run(maker: Modeler, case: Case, told: Callable[[Step, float, float], None]) 
 
 
 def _figures(case: Case, step: Step, registrations: int, seconds: float, peak_mib: float) -> Result:
-    solution, truth = step.solution, case.truth()
+    solution, placed, truth = step.solution, _placed(step), case.truth()
     taking_part = [edge for edge in step.edges_so_far if edge.accepted and edge not in step.solution.outliers]
     loops = [edge for edge in taking_part if edge.kind == "closure"]
     errors: list[float | None] = [None] * 6
     if truth is not None and solution.trajectory and all(frame in truth for frame in solution.trajectory):
         centroid_m = step.views[min(solution.trajectory)].centroid_m
-        chain, whole = (trajectory_errors(t, truth, centroid_m) for t in (solution.odometry, solution.trajectory))
+        chain, whole = (trajectory_errors(s.trajectory, truth, centroid_m) for s in (placed, solution))
         errors = [
             chain.max_rotation_deg,
             whole.max_rotation_deg,
             1e3 * chain.max_translation_m,
             1e3 * whole.max_translation_m,
-            mean_nees(_chain(step), truth),
+            mean_nees(placed, truth),
             mean_nees(solution, truth),
         ]
     measured = {(edge.target, edge.source): edge.posterior.pose.mean for edge in loops}
@@ -127,15 +131,15 @@ def _figures(case: Case, step: Step, registrations: int, seconds: float, peak_mi
         after_mm=errors[3],
         nees_before=errors[4],
         nees_after=errors[5],
-        turned_deg=_turned_deg(solution),
-        residual_before_deg=_residual_deg(measured, solution.odometry),
+        turned_deg=_turned_deg(placed.trajectory),
+        residual_before_deg=_residual_deg(measured, placed.trajectory),
         residual_after_deg=_residual_deg(measured, solution.trajectory),
         seconds=seconds,
         peak_mib=peak_mib,
     )
 
 
-def _chain(step: Step) -> Solution:
+def _placed(step: Step) -> Solution:
     """Return the solution of the edges alone that placed the frames."""
     placed: dict[int, Edge] = {}
     for edge in step.edges_so_far:
@@ -155,9 +159,9 @@ def mean_nees(solution: Solution, truth: Mapping[int, Array]) -> float | None:
     return float(np.mean(values)) / 6.0 if values else None
 
 
-def _turned_deg(solution: Solution) -> float:
-    """Return the rotation summed over the chain, frame after frame."""
-    poses = [solution.odometry[frame] for frame in sorted(solution.odometry)]
+def _turned_deg(trajectory: Mapping[int, Array]) -> float:
+    """Return the rotation summed over the frames, one after the other."""
+    poses = [trajectory[frame] for frame in sorted(trajectory)]
     steps = [se3.inverse(one) @ other for one, other in itertools.pairwise(poses)]
     return float(np.degrees(sum(float(se3.rotation_angle(step)) for step in steps)))
 
