@@ -15,7 +15,7 @@ from sequences.folders import entries, frame_number, inside
 from sequences.given import Given
 from sequences.images import read_colour, read_depth, read_mask
 from sequences.json_input import read_tree
-from sequences.pictures import check_size, metres
+from sequences.pictures import check_alike, check_size, metres
 from sequences.recording import AbstractRecording
 
 
@@ -50,11 +50,13 @@ class BopSequence(AbstractRecording):
             raise self.absent(index)
         path = self._depth_paths[index]
         raw = read_depth(path)
-        check_size(path, raw.shape, self._size)
-        (fx, fy, cx, cy), scale_mm = self._intrinsics[index]
-        camera = Camera(raw.shape[1], raw.shape[0], fx, fy, cx, cy)
-        depth_m = metres(raw, scale_mm)
-        return Frame(index, self._times_s[index], depth_m, camera, self._mask(index), self._colour(index))
+        matrix, scale_mm = self._intrinsics[index]
+        alike = self._depth_paths[self._first_with[matrix]]
+        if alike != path:
+            check_alike(path, raw.shape, alike, "with the same cam_K; give each size its own in scene_camera.json")
+        camera = Camera(raw.shape[1], raw.shape[0], *matrix)
+        mask, colour = self._mask(index, raw.shape), self._colour(index, raw.shape)
+        return Frame(index, self._times_s[index], metres(raw, scale_mm), camera, mask, colour)
 
     def truth(self) -> dict[int, Array] | None:
         """Return the true camera_from_model (4, 4), in m, by frame number; None without `scene_gt.json`."""
@@ -139,23 +141,24 @@ class BopSequence(AbstractRecording):
         return times
 
     @cached_property
-    def _size(self) -> tuple[int, ...]:
-        return read_depth(self._depth_paths[self.indices[0]]).shape
+    def _first_with(self) -> dict[tuple[float, float, float, float], int]:
+        """The first frame with each intrinsics: all of them must have its size."""
+        return {self._intrinsics[index][0]: index for index in reversed(self.indices)}
 
-    def _mask(self, index: int) -> BoolArray | None:
+    def _mask(self, index: int, size: tuple[int, ...]) -> BoolArray | None:
         path = self.path / "mask_visib" / f"{self._depth_paths[index].stem}_000000.png"
         if not path.is_file():
             return None
         mask = read_mask(inside(path, self.path))
-        check_size(path, mask.shape, self._size)
+        check_size(path, mask.shape, size)
         return mask
 
-    def _colour(self, index: int) -> npt.NDArray[np.uint8] | None:
+    def _colour(self, index: int, size: tuple[int, ...]) -> npt.NDArray[np.uint8] | None:
         path = self._colour_paths.get(index)
         if path is None:
             return None
         colour = read_colour(path)
-        check_size(path, colour.shape[:2], self._size)
+        check_size(path, colour.shape[:2], size)
         return colour
 
 

@@ -46,6 +46,11 @@ def calibrate(sequence: AbstractSequence) -> Calibration:
     if len(indices) < 3:
         raise InputError(f"{sequence.name}: has {len(indices)} frames; record at least 3, better 10, of a still scene.")
     frames = [sequence.frame(index) for index in indices]
+    for frame in frames:
+        if frame.camera != frames[0].camera:
+            raise InputError(
+                f"{sequence.name}: frame {frame.index} has other intrinsics; a still scene needs one camera."
+            )
     depth_m = np.stack([frame.depth_m.astype(np.float64) for frame in frames])
     seen = np.isfinite(depth_m).mean(axis=0) > 0.5
     with warnings.catch_warnings():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import final
 
@@ -13,7 +12,7 @@ import numpy.typing as npt
 
 from modeler.types import Array, Camera, Frame, InputError
 from sequences.given import Intrinsics
-from sequences.images import read_colour, read_depth, read_mask
+from sequences.images import picture_size, read_colour, read_depth, read_mask
 from sequences.recording import AbstractRecording
 
 
@@ -71,13 +70,14 @@ class PictureSequence(AbstractRecording):
         if shot is None:
             raise self.absent(index)
         raw = read_depth(shot.depth)
-        check_size(shot.depth, raw.shape, self._size)
+        first = self.shots[self.indices[0]].depth
+        check_alike(shot.depth, raw.shape, first, "and one camera took them all; convert each size by itself")
         mask = None if shot.mask is None else read_mask(shot.mask)
         colour = None if shot.colour is None else read_colour(shot.colour)
         if shot.mask is not None and mask is not None:
-            check_size(shot.mask, mask.shape, self._size)
+            check_size(shot.mask, mask.shape, raw.shape)
         if shot.colour is not None and colour is not None:
-            check_size(shot.colour, colour.shape[:2], self._size)
+            check_size(shot.colour, colour.shape[:2], raw.shape)
         camera = Camera(raw.shape[1], raw.shape[0], *self.intrinsics)
         return Frame(index, shot.time_s, metres(raw, self.depth_scale_mm), camera, mask, colour)
 
@@ -100,24 +100,37 @@ class PictureSequence(AbstractRecording):
         """What the reader assumed, or left out."""
         return self.remarks
 
-    @cached_property
-    def _size(self) -> tuple[int, ...]:
-        return read_depth(self.shots[self.indices[0]].depth).shape
-
 
 def metres(raw: npt.NDArray[np.uint16], scale_mm: float) -> npt.NDArray[np.float32]:
     """Return depth (h, w) in m of raw units; 0 becomes NaN."""
     return np.where(raw == 0, np.float32(np.nan), (raw * (scale_mm / 1000.0)).astype(np.float32))
 
 
-def check_size(path: Path, found: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    """Refuse a picture of another size than the first depth image, each (h, w).
+def check_size(path: Path, found: tuple[int, ...], depth: tuple[int, ...]) -> None:
+    """Refuse a mask or colour of another size than its depth image, each (h, w).
 
     Raises:
         InputError: where it is.
     """
-    if found != expected:
+    if found != depth:
         raise InputError(
-            f"{path}: is {found[1]} x {found[0]} pixels where the first depth image is {expected[1]} x {expected[0]}; "
-            "all pictures of a sequence must have one size, colour and masks aligned to depth."
+            f"{path}: is {found[1]} x {found[0]} pixels where its depth image is {depth[1]} x {depth[0]}; "
+            "colour and masks must be aligned to depth."
         )
+
+
+def check_alike(path: Path, size: tuple[int, ...], alike: Path, said: str) -> None:
+    """Refuse a depth image of another size than one with the same intrinsics.
+
+    Args:
+        path: the depth image.
+        size: its (h, w).
+        alike: the other.
+        said: what says that the intrinsics are the same, and what to do.
+
+    Raises:
+        InputError: where it is.
+    """
+    width, height = picture_size(alike)
+    if size != (height, width):
+        raise InputError(f"{path}: is {size[1]} x {size[0]} pixels where {alike.name} is {width} x {height}, {said}.")

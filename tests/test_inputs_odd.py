@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fuzz.targets import tiny
-from recordings import small_frames
+from recordings import small_frames, small_truth
 
+from modeler import se3
 from modeler.cli import main
 from modeler.types import Camera, Frame
-from sequences import open_sequence, write_bop
+from sequences import bundled, open_sequence, write_bop
 
 QUICK = ("--prior", "table", "--method", "icp")
 
@@ -115,6 +116,56 @@ def test_an_object_that_fills_the_image_is_modelled_where_masks_say_so(frames: l
     status, report = built(close, tmp_path, "--prior", "general")
     assert status in (0, 3)
     assert report["frames"][0]["outcome"] == "accepted"
+
+
+def thinned(frame: Frame, step: int) -> Frame:
+    """Return every so many-th pixel of a frame."""
+    assert frame.mask is not None
+    assert frame.colour is not None
+    old, kept = frame.camera, (slice(None, None, step), slice(None, None, step))
+    camera = Camera(old.width // step, old.height // step, old.fx / step, old.fy / step, old.cx / step, old.cy / step)
+    return replace(frame, depth_m=frame.depth_m[kept], mask=frame.mask[kept], colour=frame.colour[kept], camera=camera)
+
+
+@pytest.fixture(scope="module")
+def mixed() -> list[Frame]:
+    whole = open_sequence(bundled("box"))
+    return [thinned(whole.frame(index), 4 if index % 2 else 2) for index in whole.indices[:4]]
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_frames_of_different_size_are_one_model(
+    mixed: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str], masked: bool
+) -> None:
+    """Some cameras send a part of the sensor, or merge pixels, on their own: each frame has its intrinsics."""
+    status, report = built(mixed if masked else [*map(unmasked, mixed)], tmp_path)
+    assert status == 0
+    assert [frame["outcome"] for frame in report["frames"]] == ["accepted"] * 4
+    truth = small_truth(4)
+    for pose in report["poses"]:
+        first_from_this = truth[0] @ se3.inverse(truth[pose["id"]])
+        off = se3.inverse(first_from_this) @ np.reshape(pose["object_from_camera"], (4, 4))
+        assert np.degrees(se3.rotation_angle(off)) < 2.0
+    capsys.readouterr()
+    assert main(["info", str(tmp_path / "in")]) == 0
+    assert "resolution    320 x 240, 160 x 120\n" in capsys.readouterr().out
+    assert main(["report", str(tmp_path / "run")]) == 0
+    assert main(["export", str(tmp_path / "run"), "--out", str(tmp_path / "m.obj"), "--texture"]) == 0
+
+
+def test_frames_of_different_size_need_different_intrinsics(
+    mixed: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_bop(tmp_path / "in", mixed, depth_scale_mm=1.0)
+    assert main(["calibrate-sensor", str(tmp_path / "in"), "--out", str(tmp_path / "noise.json")]) == 2
+    assert "frame 1 has other intrinsics; a still scene needs one camera" in capsys.readouterr().err
+    path = tmp_path / "in" / "scene_camera.json"
+    cameras = json.loads(path.read_text())
+    cameras["3"]["cam_K"] = cameras["2"]["cam_K"]
+    path.write_text(json.dumps(cameras))
+    assert main(["info", str(tmp_path / "in")]) == 2
+    said = capsys.readouterr().err
+    assert "000003.png: is 160 x 120 pixels where 000000.png is 320 x 240, with the same cam_K" in said
 
 
 def test_a_thousand_frames_are_read_and_converted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -36,6 +36,7 @@ def record(sequence: AbstractSequence, found: Survey) -> dict[str, object]:
         "frames": list(found.indices),
         "seconds": found.times_s[-1] - found.times_s[0],
         "resolution": [camera.width, camera.height],
+        "resolutions": [list(size) for size in _sizes(found.cameras)],
         "intrinsics": [[c.fx, c.fy, c.cx, c.cy] for c in found.cameras],
         "depth_unit": sequence.depth_unit,
         "depth_m": dict(zip(("1%", "50%", "99%"), found.range_m, strict=True)),
@@ -52,7 +53,7 @@ def record(sequence: AbstractSequence, found: Survey) -> dict[str, object]:
 
 def rows(sequence: AbstractSequence, found: Survey) -> list[tuple[str, str]]:
     """Return what was found as (what, in words)."""
-    total, camera = len(found.indices), found.cameras[0]
+    total = len(found.indices)
     low, middle, high = found.range_m
     sensor, motion = sequence.sensor(), sequence.motion
     timed = (
@@ -62,7 +63,7 @@ def rows(sequence: AbstractSequence, found: Survey) -> list[tuple[str, str]]:
         ("sequence", sequence.name),
         ("format", sequence.layout),
         ("frames", span(found.indices) + timed),
-        ("resolution", f"{camera.width} x {camera.height}"),
+        ("resolution", ", ".join(f"{width} x {height}" for width, height in _sizes(found.cameras)[:4])),
         ("intrinsics", _intrinsics(found.cameras)),
         ("depth unit", sequence.depth_unit),
         (
@@ -79,6 +80,11 @@ def rows(sequence: AbstractSequence, found: Survey) -> list[tuple[str, str]]:
         lines.append(("motion", ", ".join(f"{key} {value}" for key, value in motion.items())))
     lines += [("missing", what) for what in found.missing]
     return lines + [("note", note) for note in sequence.notes]
+
+
+def _sizes(cameras: tuple[Camera, ...]) -> list[tuple[int, int]]:
+    """Return (width, height) of the images, each once."""
+    return list(dict.fromkeys((camera.width, camera.height) for camera in cameras))
 
 
 def _intrinsics(cameras: tuple[Camera, ...]) -> str:
