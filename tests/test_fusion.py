@@ -308,6 +308,13 @@ def disagreement_m(views, trajectory):
     return float("nan") if found is None else found[0]
 
 
+def test_views_asked_in_batches_disagree_by_the_same(rng, monkeypatch):
+    trajectory, noisy = tabletop.trajectory(POSES), tabletop.views(BRICK, POSES, rng)
+    at_once = disagreement_m(noisy, trajectory)
+    monkeypatch.setattr("modeler.fusion.stack.AT_ONCE", 100 * len(POSES))
+    assert disagreement_m(noisy, trajectory) == at_once
+
+
 def test_views_disagree_by_their_noise_and_the_error_of_their_poses(rng):
     trajectory = tabletop.trajectory(POSES)
     exact, noisy = tabletop.views(BRICK, POSES), tabletop.views(BRICK, POSES, rng)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rings import edge, measured, spin, spun, turntable
 
-from modeler.graph import PoseGraph, Smoother, smoother, solve
+from modeler.graph import PoseGraph, Smoother, marginals, smoother, solve
 from modeler.types import Edge, Mode, PoseGaussian, Solution
 
 COUNT, PER_TURN = 40, 12
@@ -121,3 +121,61 @@ def test_other_root_or_other_edges_are_solved_afresh() -> None:
     for graph in (PoseGraph(tuple(edges), first=5), PoseGraph(tuple(edges[:40])), PoseGraph(tuple(edges[::-1]), 0)):
         _assert_same(growing.to(graph).solution, solve(graph, {}))
     assert dict(growing.to(PoseGraph()).solution.trajectory) == {}
+
+
+def _tail(count: int, rng: np.random.Generator) -> list[list[Edge]]:
+    """The edges of frames beyond those of `_arrivals`: each hangs on one that came before, some of them forked."""
+    truth = turntable(COUNT + count, PER_TURN)
+    hooks = [(k - 3 if k % 4 == 0 else k - 1, k) for k in range(COUNT, COUNT + count)]
+    return [[edge(t, k, measured(truth, t, k, rng))] for t, k in hooks]
+
+
+def test_frames_that_hang_on_one_edge_are_as_sure_as_in_the_batch() -> None:
+    growing = Smoother()
+    for edges in [*_arrivals(np.random.default_rng(9)), *_tail(9, np.random.default_rng(10))]:
+        growing = growing.plus(edges)
+    batch, rng = solve(growing.graph, {}), np.random.default_rng(11)
+    assert set(growing.solution.covariances) == set(batch.covariances) == set(range(COUNT + 9))
+    pairs = [*itertools.pairwise(range(COUNT - 2, COUNT + 9)), *rng.permuted([range(COUNT + 9)] * 2, axis=1).T]
+    for target, source in pairs:
+        if target != source:
+            found, wanted = (s.relative_covariance(target, source) for s in (growing.solution, batch))
+            np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4 * np.abs(wanted).max())
+    for frame, wanted in batch.covariances.items():
+        found = growing.solution.covariances[frame]
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4 * np.abs(wanted).max())
+
+
+def test_covariances_of_all_are_worked_out_again_only_where_a_loop_has_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def counted(links: Sequence[object], *args: object) -> object:
+        asked.append(len(links))
+        return rows(links, *args)  # pyright: ignore[reportArgumentType]
+
+    growing, rows = Smoother(), marginals._rows
+    for edges in _arrivals(np.random.default_rng(12)):
+        growing = growing.plus(edges)
+    assert growing.solution.covariances[1].shape == (6, 6)
+    monkeypatch.setattr(marginals, "_rows", counted)
+    for number, edges in enumerate(_tail(6, np.random.default_rng(13))):
+        growing = growing.plus(edges)
+        assert growing.solution.covariances[COUNT + number].shape == (6, 6)
+        assert growing.solution.relative_covariance(3, COUNT + number).shape == (6, 6)
+    assert asked == [1] * 6
+    closing = _arrivals(np.random.default_rng(14))[-1][1:]
+    growing = growing.plus(closing)
+    assert growing.solution.covariances[1].shape == (6, 6)
+    assert asked[6:] == [len(growing.graph.edges)]
+
+
+def test_what_hangs_on_one_solution_in_two_ways_is_not_mixed_up() -> None:
+    trunk = Smoother()
+    for edges in _arrivals(np.random.default_rng(15)):
+        trunk = trunk.plus(edges)
+    one, other = (_tail(1, np.random.default_rng(seed))[0] for seed in (16, 17))
+    vague = PoseGaussian(other[0].posterior.pose.mean, 100.0 * other[0].posterior.pose.covariance)
+    other = [edge(other[0].target, COUNT, vague)]
+    here, there = trunk.plus(one).solution, trunk.plus(other).solution
+    assert np.trace(there.covariances[COUNT]) > 3.0 * np.trace(here.covariances[COUNT])
+    np.testing.assert_array_equal(here.covariances[COUNT - 1], there.covariances[COUNT - 1])

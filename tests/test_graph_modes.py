@@ -10,7 +10,8 @@ import pytest
 from rings import covariance, edge, measured, nees, ring, rotation_error, spin, turntable
 
 from modeler import se3
-from modeler.graph import PoseGraph, Smoother, solve
+from modeler.graph import PoseGraph, Smoother, modes, solve
+from modeler.graph.belief import separate
 from modeler.types import Array, Edge, Mode, PoseGaussian
 
 COUNT = 12
@@ -194,3 +195,30 @@ def test_mode_of_almost_no_weight_changes_nothing() -> None:
     for frame in range(COUNT):
         np.testing.assert_allclose(solution.trajectory[frame], wanted.trajectory[frame], atol=1e-7)
         np.testing.assert_allclose(solution.covariances[frame], wanted.covariances[frame], atol=1e-9)
+
+
+def _rippled(of: Edge, sds: float) -> Edge:
+    """The edge as two modes of equal covariance, so many standard deviations apart."""
+    pose = of.posterior.pose
+    step = np.linalg.cholesky(pose.covariance) @ np.array([sds, 0.0, 0.0, 0.0, 0.0, 0.0])
+    parts = [PoseGaussian(pose.mean @ se3.exp(sign * 0.5 * step), pose.covariance) for sign in (1.0, -1.0)]
+    whole = PoseGaussian(pose.mean, pose.covariance + 0.25 * np.outer(step, step))
+    return edge(of.target, of.source, whole, of.kind, modes=[Mode(0.5, part) for part in parts])
+
+
+def test_modes_are_separate_where_there_is_a_dip_between_them() -> None:
+    graph, _ = ring(4, np.random.default_rng(0), [])
+    assert not separate(graph.edges[0].posterior)
+    assert not separate(_rippled(graph.edges[0], 1.9).posterior)
+    assert separate(_rippled(graph.edges[0], 2.1).posterior)
+
+
+def test_ripples_on_one_peak_are_one_gaussian_and_cost_loops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, _ = ring(COUNT, np.random.default_rng(1), [(0, COUNT - 1), (0, COUNT // 2)])
+    rippled = PoseGraph(tuple(_rippled(e, 0.5) if e.source % 3 == 0 else e for e in graph.edges))
+    monkeypatch.setattr(modes, "optimise", None)  # nothing is to be solved for the sake of modes
+    found, wanted = solve(rippled, {}), solve(_overall(rippled), {})
+    assert not found.mode_weights
+    for frame, pose in wanted.trajectory.items():
+        np.testing.assert_array_equal(found.trajectory[frame], pose)
+        np.testing.assert_array_equal(found.covariances[frame], wanted.covariances[frame])

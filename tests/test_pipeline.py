@@ -234,6 +234,24 @@ def test_at_the_end_views_two_steps_apart_are_registered_too_and_judged() -> Non
     assert len(shared.edges_so_far) == len(none.edges_so_far)  # their noise is not told apart from slip
 
 
+def test_the_end_tells_how_far_it_is_and_can_be_cut_short() -> None:
+    told: list[tuple[str, int, int]] = []
+    closer = Closer(max_span_deg=85.0, min_span_gain_nats=0.0, min_overlap=0.2)
+    building = modeler(registrar=Oracle(noise=1.0), closer=closer)
+    steps = list(building.run(FRAMES, Scene(), ending=lambda *stage: told.append(stage)))
+    pairs = [(done, total) for stage, done, total in told if stage == "registering more pairs"]
+    assert pairs == [(done, pairs[0][1]) for done in range(len(pairs))]
+    none = run(registrar=Oracle(noise=1.0), closer=replace(closer, max_spans=0))[-1]
+    assert pairs[-1][0] == pairs[-1][1] == len(steps[-1].edges_so_far) - len(none.edges_so_far)
+    assert [stage for stage, _, _ in told[:1] + told[-1:]] == ["choosing more pairs", "making the model"]
+    told.clear()
+    hurry = iter([False, *[True] * 9])
+    cut = list(building.run(FRAMES, Scene(), hurry=lambda: next(hurry), ending=lambda *stage: told.append(stage)))
+    assert len(cut[-1].edges_so_far) == len(steps[-1].edges_so_far) - pairs[-1][1] + 1
+    assert told[-1][0] == "making the model"
+    assert cut[-1].model is not None
+
+
 def test_covariances_account_for_the_noise_of_a_frame_in_all_its_edges() -> None:
     """The Oracle's edges err less around loops than they say, as if their images' noise cancelled there."""
     last = run(registrar=Oracle(noise=0.3))[-1]

@@ -86,6 +86,22 @@ def on_a_terminal(command: list[str]) -> str:
     return said.decode()
 
 
+ENDING = """
+from modeler.cli.console import Console
+with Console(3, None) as console:
+    console.ending("making the model", 0, 1)
+    for done in range(8):
+        console.ending("registering more pairs", done, 7)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
+def test_a_terminal_sees_what_is_done_after_the_last_frame() -> None:
+    said = on_a_terminal([sys.executable, "-c", ENDING])
+    assert "registering more pairs" in said
+    assert "7/7" in said
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
 def test_a_terminal_sees_how_far_it_is_and_how_long_it_takes() -> None:
     said = on_a_terminal(COMMAND)

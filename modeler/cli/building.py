@@ -118,7 +118,7 @@ def _run(
     try:
         with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
             coming = interrupt.until(frames.until(lambda: interrupt.asked))
-            for step in modeler.run(coming, scene, hurry=lambda: interrupt.asked):
+            for step in modeler.run(coming, scene, hurry=lambda: interrupt.asked, ending=console.ending):
                 seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
                 seconds["total"] = time.perf_counter() - began_s
                 meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)

@@ -31,6 +31,7 @@ class Console:
     def __init__(self, frames: int, address: str | None) -> None:
         self._bar = bar()
         self._task = self._bar.add_task("", total=frames)
+        self._frames, self._stage = frames, ""
         self._address = address
         self._placed: dict[int, bool] = {}  # a lost frame that later views place comes a second time
 
@@ -55,11 +56,18 @@ class Console:
         frame, accepted = step.frame.index, step.outcome == "accepted"
         again, self._placed[frame] = frame in self._placed, accepted
         description = f"{len(step.views)} joined, {loops} loops closed"
-        self._bar.update(self._task, completed=len(self._placed), description=description)
+        self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=description)
         if not accepted and not again:
             self._say(f"frame {frame} is left out: {step.outcome}")
         elif accepted and again:
             self._say(f"frame {frame} is placed after all")
+
+    def ending(self, stage: str, done: int, total: int) -> None:
+        """Tell of what is done after the last frame: `done` of `total`."""
+        if stage != self._stage:
+            self._stage = stage
+            self._bar.reset(self._task)
+        self._bar.update(self._task, completed=done, total=total, description=stage)
 
     def _say(self, text: str) -> None:
         self._bar.console.print(f"modeler: {text}", markup=False)

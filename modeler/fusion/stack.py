@@ -15,6 +15,8 @@ from modeler.kernels.surfels import surfels
 from modeler.types import Array, BoolArray, InputError, RayImage
 
 WITNESSES = 20000  # points asked for how well the views agree
+LOOKS = 10_000_000  # witnesses times views, at most
+AT_ONCE = 1_000_000  # of these, for the memory it takes
 GREY = 128  # colour of what no view with colour sees
 SMOOTHED = 0.5  # noise of a surface point, smoothed over its neighbours, against that of its pixel
 STEEPEST_RAD = 1.40  # a step between neighbouring pixels steeper than this (80°) is an edge, not a surface
@@ -208,55 +210,57 @@ def stack(
     Raises:
         InputError: where no view sees anything of the object in the box.
     """
-    cuts = [
-        _cut(
-            view,
-            _window(view, se3.inverse(pose), corners_m),
-            margin_px=margin_px,
-            min_cosine=min_cosine,
-            edge_weight=edge_weight,
-        )
-        for view, pose in pairs
-    ]
-    size = (len(cuts), *(max(cut.index.shape[axis] for cut in cuts) for axis in range(2)))
+    windows = [_window(view, se3.inverse(pose), corners_m) for view, pose in pairs]
+    size = (len(pairs), *(max(window[axis].stop - window[axis].start for window in windows) for axis in range(2)))
     index = np.full(size, -1, dtype=np.int32)
     free_m, beside_m = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.float32)
     colour = np.zeros((*size, 3), dtype=np.uint8)
-    colours, count = [], 0
-    for number, cut in enumerate(cuts):
+    lenses, told, counts = [], [], []
+    for number, ((view, pose), window) in enumerate(zip(pairs, windows, strict=True)):
+        cut = _cut(view, window, margin_px=margin_px, min_cosine=min_cosine, edge_weight=edge_weight)
         height, width = cut.index.shape
-        index[number, :height, :width] = np.where(cut.index >= 0, cut.index + count, -1)
+        index[number, :height, :width] = np.where(cut.index >= 0, cut.index + sum(counts), -1)
         free_m[number, :height, :width] = cut.free_m
         beside_m[number, :height, :width] = cut.beside_m
         if cut.colour is not None:
             colour[number, :height, :width] = cut.colour
-        colours.append(_sampled(cut.colour, cut.pixels))
-        count += len(cut.points_m)
-    if count == 0:
+        lenses.append(cut.lens)
+        told.append(_told(cut, view, pose, covariances))  # its images need not be kept
+        counts.append(len(cut.points_m))
+    if sum(counts) == 0:
         raise InputError("nothing to fuse: the object is seen at flat angles only; check the masks and the trajectory")
-    points_m = np.concatenate([se3.transform(pose, cut.points_m) for cut, (_, pose) in zip(cuts, pairs, strict=True)])
+    points_m, normals, depth_m, weights, noise, colours = (np.concatenate(some) for some in zip(*told, strict=True))
     # The noise of a triangulating camera grows with z².
-    depth_m = np.concatenate([cut.points_m[:, 2] for cut in cuts])
-    weights = np.concatenate([cut.weights for cut in cuts]) * (np.median(depth_m) / depth_m) ** 4
-    noise = np.concatenate(
-        [_pose_variances(cut, view, covariances) for cut, (view, _) in zip(cuts, pairs, strict=True)]
-    )
+    weights = weights * (np.median(depth_m) / depth_m) ** 4
     trust = 1.0 / (1.0 + weights * noise)
-    weights = weights * trust / np.median(trust)
     return Stack(
         index=index,
         free_m=free_m,
         beside_m=beside_m,
         colour=colour,
-        coloured=np.array([cut.colour is not None for cut in cuts]),
+        coloured=np.array([view.frame.colour is not None for view, _ in pairs]),
         poses=np.stack([se3.inverse(pose)[:3] for _, pose in pairs]),
-        lenses=np.stack([cut.lens for cut in cuts]),
+        lenses=np.stack(lenses),
         planes=np.stack([_plane(view, pose) for view, pose in pairs]),
         points_m=points_m,
-        normals=np.concatenate([cut.normals @ pose[:3, :3].T for cut, (_, pose) in zip(cuts, pairs, strict=True)]),
-        weights=weights,
-        colours=np.concatenate(colours),
-        views=np.repeat(np.arange(len(cuts)), [len(cut.points_m) for cut in cuts]),
+        normals=normals,
+        weights=weights * trust / np.median(trust),
+        colours=colours,
+        views=np.repeat(np.arange(len(pairs)), counts),
+    )
+
+
+def _told(
+    cut: _Cut, view: RayImage, object_from_camera: Array, covariances: Mapping[int, Array] | None
+) -> tuple[Array, Array, Array, Array, Array, npt.NDArray[np.uint8]]:
+    """Return points and normals (n, 3) in the object frame, their depths, weights and pose variances (n,), and RGB."""
+    return (
+        se3.transform(object_from_camera, cut.points_m),
+        cut.normals @ object_from_camera[:3, :3].T,
+        cut.points_m[:, 2].copy(),
+        cut.weights,
+        _pose_variances(cut, view, covariances),
+        _sampled(cut.colour, cut.pixels),
     )
 
 
@@ -272,13 +276,15 @@ def spread(views: Stack, limit_m: float) -> tuple[float, float] | None:
     Returns:
         The standard deviation between two views, and that of one view of weight 1.
     """
-    chosen = np.arange(0, len(views.points_m), max(1, len(views.points_m) // WITNESSES))
-    distance_m, rivals = fusion.disagreements(
-        chosen, views.views[chosen], limit_m, views.index, views.poses, views.lenses, views.points_m, views.normals
-    )
-    found = rivals >= 0
-    if not found.any():
-        return None
-    mine, theirs = views.weights[chosen[np.nonzero(found)[0]]], views.weights[rivals[found]]
-    off_m = np.abs(distance_m[found])
-    return 1.4826 * float(np.median(off_m)), 1.4826 * float(np.median(off_m / np.sqrt(1.0 / mine + 1.0 / theirs)))
+    witnesses = min(WITNESSES, -(-LOOKS // len(views.index)))
+    chosen = np.arange(0, len(views.points_m), max(1, len(views.points_m) // witnesses))
+    lookup = views.index, views.poses, views.lenses, views.points_m, views.normals
+    told = []
+    for some in np.array_split(chosen, -(-len(chosen) * len(views.index) // AT_ONCE)):
+        distance_m, rivals = fusion.disagreements(some, views.views[some], limit_m, *lookup)
+        found = rivals >= 0
+        mine, theirs = views.weights[some[np.nonzero(found)[0]]], views.weights[rivals[found]]
+        off_m = np.abs(distance_m[found])
+        told.append((off_m, off_m / np.sqrt(1.0 / mine + 1.0 / theirs)))
+    off_m, share_m = (np.concatenate(some) for some in zip(*told, strict=True))
+    return (1.4826 * float(np.median(off_m)), 1.4826 * float(np.median(share_m))) if len(off_m) else None

@@ -57,7 +57,12 @@ class Modeler:
     """Where the pairs of one frame are registered side by side; None: one after the other. Results are the same."""
 
     def run(
-        self, frames: Iterable[Frame], scene: Scene, *, hurry: Callable[[], bool] = lambda: False
+        self,
+        frames: Iterable[Frame],
+        scene: Scene,
+        *,
+        hurry: Callable[[], bool] = lambda: False,
+        ending: Callable[[str, int, int], None] = lambda stage, done, total: None,
     ) -> Iterator[Step]:
         """Yield what each frame brings. A frame that cannot be used is reported and left out.
 
@@ -67,7 +72,9 @@ class Modeler:
         Args:
             frames: in order of time; read one ahead, so that the last step is known as such.
             scene: what the segmenter learnt from the sequence.
-            hurry: asked after the last frame; where it says so, no edges are tried beyond those that placed the frames.
+            hurry: asked after the last frame; once it says so, no more edges are tried beyond those that placed the
+                frames.
+            ending: told after the last frame what is being done, and how much of how much is done.
         """
         state = State()
         for frame, last in _with_last(frames):
@@ -77,8 +84,9 @@ class Modeler:
                 for later, found in self._caught_up(state):
                     state = self._fused(replace(later, growing=state.growing), last=False)
                     yield replace(found, model=state.model)
-                state, spans = (state, ()) if hurry() else self._spanned(state)
+                state, spans = (state, ()) if hurry() else self._spanned(state, hurry, ending)
                 state = self._solved(state)
+                ending("making the model", 0, 1)
                 step = replace(step, posteriors=(*step.posteriors, *(edge.posterior for edge in spans)))
                 step = replace(step, edges=(*step.edges, *spans))
                 step = replace(step, solution=state.solution, edges_so_far=state.graph.edges, views=state.views)
@@ -126,7 +134,7 @@ class Modeler:
             posteriors = pairing.placed(state, seen.view, previous, last=last, again=again)
         lasting = [_lasting(posterior) for posterior in posteriors]
         steps = state.steps(seen.frame.index, previous)
-        edges = self.closer.edges(lasting, state.views, state.solution, state.graph.edges, steps=steps)
+        edges = self.closer.edges(lasting, state.past, steps=steps)
         edges = pairing.explained(edges)
         outcome = _outcome(seen, edges, first=not state.views)
         state = state.joined(seen, edges, accepted=outcome == ACCEPTED)
@@ -158,20 +166,27 @@ class Modeler:
                 yield state, step
             waiting = [(seen, view) for seen, view in state.overdue() if (seen.frame.index, view) not in tried]
 
-    def _spanned(self, state: State) -> tuple[State, tuple[Edge, ...]]:
+    def _spanned(
+        self, state: State, hurry: Callable[[], bool], ending: Callable[[str, int, int], None]
+    ) -> tuple[State, tuple[Edge, ...]]:
         """Return the state with edges beyond those that placed the frames, each judged, and these.
 
         Not where all steps share an axis: beside it the noise that a frame's edges have in common does not count yet.
         """
         if self.prior.shared_axis(list(state.views.values())) is not None:
             return state, ()
-        pairing = self._pairing()
-        edges = [
-            self.closer.spanning(_lasting(posterior), state.views, state.solution, state.graph.edges)
-            for posterior in pairing.spanning(state)
-        ]
-        edges = pairing.explained(edges)
-        return state.spanned(edges), edges
+        ending("choosing more pairs", 0, 1)
+        pairing, edges, stage = self._pairing(), [], "registering more pairs"
+        pairs = self.closer.spans(state.views, state.solution, state.graph.edges)
+        ending(stage, 0, len(pairs))
+        for posterior in pairing.spanning(state, pairs):
+            known = state.graph.edges
+            edges.append(self.closer.spanning(_lasting(posterior), state.views, state.solution, known))
+            ending(stage, len(edges), len(pairs))
+            if hurry():
+                break
+        explained = pairing.explained(edges)
+        return state.spanned(explained), explained
 
     def _solved(self, state: State) -> State:
         """Return the state solved with what edges have in common.

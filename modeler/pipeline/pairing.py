@@ -47,23 +47,22 @@ class Pairing:
         prior, known = self.prior.learned(state.solution, state.graph.edges), state.graph.edges
         odometry = self._pair(state, view, previous, prior.grown(steps) if steps > 1 else prior)
         posteriors = (odometry,)
-        base, _ = self.closer.base(posteriors, state.views, state.solution, known, steps=steps)
+        base, _ = self.closer.base(posteriors, state.past, steps=steps)
         if base is None:
             posteriors = self._relocalised(state, view, odometry, prior, again=again)
-            base, _ = self.closer.base(posteriors, state.views, state.solution, known, steps=steps)
+            base, _ = self.closer.base(posteriors, state.past, steps=steps)
         if base is None:
             return posteriors
         tried = {previous, *(posterior.target for posterior in posteriors)}
         tried |= {edge.target for edge in known if edge.source == view.index}
-        targets = self.closer.closures(base, state.views, state.solution, known, last=last)
+        targets = self.closer.closures(base, state.past, last=last)
         targets = [target for target in targets if target not in tried]
         foreseen = [ForeseenPrior(prior, self.closer.foreseen(base, target, state.solution)) for target in targets]
         return (*posteriors, *self._pairs(state, [(view, target) for target in targets], foreseen))
 
-    def spanning(self, state: State) -> Iterator[Posterior]:
-        """Yield posteriors of pairs of views of the graph that were not registered with each other yet."""
+    def spanning(self, state: State, pairs: Sequence[tuple[int, int]]) -> Iterator[Posterior]:
+        """Yield posteriors of pairs (source, target) of views of the graph that were not registered yet."""
         prior = self.prior.learned(state.solution, state.graph.edges).grown(_ROOM)
-        pairs = self.closer.spans(state.views, state.solution, state.graph.edges)
         foreseen = [ForeseenPrior(prior, state.solution.relative_gaussian(t, s)) for s, t in pairs]
         yield from self._pairs(state, [(state.views[source], target) for source, target in pairs], foreseen)
 
@@ -85,9 +84,9 @@ class Pairing:
         if steps == 1 and odometry.outcome in _BEYOND:  # the motion may be larger than the prior allows for one step
             wider = self._pair(state, view, odometry.target, grown)
             odometry = replace(wider, seconds=odometry.seconds + wider.seconds)
-        posteriors, known = (odometry,), state.graph.edges
-        while not again and self.closer.base(posteriors, state.views, state.solution, known, steps=steps)[0] is None:
-            target = self.closer.relocation(posteriors, state.views, state.solution, known)
+        posteriors = (odometry,)
+        while not again and self.closer.base(posteriors, state.past, steps=steps)[0] is None:
+            target = self.closer.relocation(posteriors, state.past)
             if target is None:
                 break
             posteriors = (*posteriors, self._pair(state, view, target, grown))
