@@ -27,10 +27,9 @@ from scipy.spatial.transform import Rotation
 from turning_box import CENTRE_M, COVARIANCE, HALF_M, object_from_camera, steps
 
 from modeler import se3
-from modeler.types import Array, Edge, Mode, Outcome, PoseGaussian, Segmentation, Solution, Step
+from modeler.types import Array, Mode, Outcome, PoseGaussian, Segmentation, Solution, Step
 from viz import (
     blueprint,
-    chain,
     clouds,
     entities,
     ghosts,
@@ -304,21 +303,6 @@ def test_where_nothing_was_measured_no_point_is_judged(run: list[Step]) -> None:
     verdicts = visibility.projection(source, blind, np.eye(4)).verdicts
     assert len(verdicts) > 100
     assert (verdicts == visibility.NO_SAY).all()
-
-
-def test_the_chain_adds_up_what_its_edges_err(run: list[Step]) -> None:
-    step, rng = run[-1], np.random.default_rng(1)
-    got = chain.poses(step.edges_so_far, 0)
-    assert set(got) == set(step.solution.odometry)
-    edges = [edge for edge in step.edges_so_far if edge.kind == "odometry" and edge.accepted]
-    ends = np.tile(np.eye(4), (20_000, 1, 1))
-    for edge in edges:
-        pose = edge.posterior.pose
-        ends = ends @ pose.mean @ se3.exp(rng.multivariate_normal(np.zeros(6), 0.04 * pose.covariance, len(ends)))
-    xi = se3.log(se3.inverse(step.solution.odometry[edges[-1].source]) @ ends)
-    wanted = np.cov(xi.T) / 0.04
-    np.testing.assert_allclose(got[edges[-1].source].covariance, wanted, atol=0.05 * np.abs(wanted).max())
-    np.testing.assert_allclose(got[edges[-1].source].mean, step.solution.odometry[edges[-1].source], atol=1e-12)
 
 
 def test_ghosts_stay_with_their_mode_and_spread_about_it(run: list[Step]) -> None:
@@ -763,20 +747,3 @@ def test_the_notebook_runs_and_embeds_the_viewer(monkeypatch: pytest.MonkeyPatch
     assert frame.src.startswith("http://127.0.0.1:")
     assert len(names["step"].views) == 3
     assert names["stream"].viewers[0].process.poll() is not None
-
-
-def test_the_chain_goes_by_odometry_and_over_closures_only_where_that_ends(run: list[Step]) -> None:
-    odometry = run[1].edges[0]
-
-    def edge(source: int, target: int, kind: str) -> Edge:
-        return replace(odometry, posterior=replace(odometry.posterior, source=source, target=target), kind=kind)
-
-    edges = [edge(2, 0, "closure"), edge(1, 0, "odometry"), edge(2, 1, "odometry"), edge(4, 2, "closure")]
-    edges += [edge(5, 4, "odometry"), edge(9, 8, "odometry"), replace(edge(6, 5, "odometry"), accepted=False)]
-    poses = chain.poses(edges, 0)
-    assert set(poses) == {0, 1, 2, 4, 5}
-    step = odometry.posterior.pose.mean
-    for frame, count in ((1, 1), (2, 2), (4, 3), (5, 4)):
-        np.testing.assert_allclose(poses[frame].mean, np.linalg.matrix_power(step, count), atol=1e-9)
-    back = chain.poses([edge(0, 1, "odometry")], 0)[1]
-    np.testing.assert_allclose(back.mean, se3.inverse(step), atol=1e-12)

@@ -11,8 +11,9 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
+from modeler.graph import PoseGraph, dead_reckoning
 from modeler.types import Array, Edge, Step
-from viz import chain, clouds, entities, poses
+from viz import clouds, entities, poses
 from viz.drawings import CLEAR, Drawing
 
 _LARGEST_3_SIGMA: Final = 0.3  # half axis of the largest ellipsoid of a chain, as a share of the object's distance
@@ -36,10 +37,10 @@ def drawing(step: Step) -> Drawing:
     factor = magnification(step.edges_so_far, poses.distance_m(step))
     shown = poses.shown(step)
     after = {frame: step.solution.covariances[frame] for frame in shown if frame in step.solution.covariances}
-    # The chain is walked outwards from its root.
-    before = chain.poses(step.edges_so_far, next(iter(step.solution.odometry))) if step.solution.odometry else {}
     yield from _of_poses(step, _AFTER, step.solution.trajectory, after, factor)
-    chained = {k: before[k].covariance for k in shown if k in before and k in step.solution.odometry}
+    root = next(iter(step.solution.odometry), None)  # the chain is walked outwards from it
+    chain = dead_reckoning(PoseGraph(step.edges_so_far, root))
+    chained = {k: chain[k].covariance for k in shown if k in chain and k in step.solution.odometry}
     yield from _of_poses(step, _BEFORE, step.solution.odometry, chained, factor)
     yield from _of_edges(step)
 

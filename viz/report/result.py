@@ -10,8 +10,8 @@ from typing import Any
 
 from modeler import se3
 from modeler.export import RunFolder, edges_of, poses_of
+from modeler.graph import PoseGraph, dead_reckoning
 from modeler.types import Array, Edge, InputError, PoseGaussian
-from viz import chain
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,8 @@ class Result:
 
     @cached_property
     def chain(self) -> dict[int, PoseGaussian]:
-        """object_from_camera of the pairwise chain alone, by frame number."""
-        reached = chain.poses(self.edges, self.first)
+        """object_from_camera of the pairwise chain alone, by frame number: `odometry.txt` with covariances."""
+        reached = dead_reckoning(PoseGraph(tuple(self.edges), self.first))
         return {frame: reached[frame] for frame in self.poses if frame in reached}
 
     @property

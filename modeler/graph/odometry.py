@@ -1,0 +1,31 @@
+"""Where the poses were, and how sure, before any loop was closed: along a chain errors only add up."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from modeler import se3
+from modeler.graph.belief import belief
+from modeler.graph.links import Link, split, walk
+from modeler.graph.pose_graph import PoseGraph
+from modeler.types import PoseGaussian
+
+_GAUGE_SIGMA = 1e-9  # rad and m: the first pose is where it is by definition
+
+
+def dead_reckoning(graph: PoseGraph) -> dict[int, PoseGaussian]:
+    """Return object_from_camera by frame number along the edges that first connect each frame with the root.
+
+    These are the poses that solutions have as `odometry`. Covariances are of first order.
+    """
+    root = graph.root
+    if root is None:
+        return {}
+    tree, _ = split((Link(edge, belief(edge.posterior)) for edge in graph.accepted), root)
+    poses = {root: PoseGaussian(np.eye(4), _GAUGE_SIGMA**2 * np.eye(6))}
+    for frame, neighbour, link in walk(tree, root):
+        before = poses[frame]
+        motion = link.pose if link.target == frame else link.pose.inverse()
+        covariance = se3.composed_covariance(before.covariance, motion.mean, motion.covariance)
+        poses[neighbour] = PoseGaussian(before.mean @ motion.mean, covariance)
+    return poses
