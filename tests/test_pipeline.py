@@ -222,7 +222,7 @@ def test_at_the_end_views_two_steps_apart_are_registered_too_and_judged() -> Non
     spans = [edge for edge in last.edges if (edge.source - edge.target) % 9 in (2, 7)]
     assert sorted(edge.source for edge in spans) == list(range(2, 9))
     assert all(
-        edge.accepted and edge.kind == ("odometry" if edge.source - edge.target == 2 else "closure") for edge in spans
+        edge.accepted and edge.kind == ("span" if edge.source - edge.target == 2 else "closure") for edge in spans
     )
     assert len(registrar.asked) == len(set(registrar.asked)) == len(last.edges_so_far)
     none = run(registrar=Oracle(noise=1.0), closer=replace(closer, max_spans=0))[-1]

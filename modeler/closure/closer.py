@@ -8,14 +8,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from modeler import se3
+from modeler.closure.past import Past
 from modeler.closure.placing import Placing
 from modeler.closure.prospects import Outlook
 from modeler.closure.reckoning import came_back, onwards
 from modeler.closure.trust import Trust
-from modeler.closure.verdict import Standard, flaw, modes, standard
+from modeler.closure.verdict import Agreement, Standard, flaw, modes, standard
 from modeler.closure.ways import Way, ways
-from modeler.types import Edge, PoseGaussian, Posterior, RayImage, Solution
+from modeler.types import Edge, EdgeKind, PoseGaussian, Posterior, Solution
 
+_NOWHERE = "neither the previous view nor another one places the frame with certainty"
 _LEAST_CHANCE = 0.02  # that a view is in reach: one that comes back after a turn that nothing told tells very much
 _SPAN_POWER = 6.0  # an edge over 25° tells half as much as one over none, over 50° a fourteenth
 
@@ -55,9 +57,7 @@ class Closer:
     def closures(
         self,
         base: Posterior,
-        views: Mapping[int, RayImage],
-        solution: Solution,
-        known: Sequence[Edge],
+        past: Past,
         *,
         last: bool = False,
     ) -> tuple[int, ...]:
@@ -65,19 +65,16 @@ class Closer:
 
         Args:
             base: the registration that places the frame.
-            views: the accepted views, in order of acceptance.
-            solution: the poses so far.
-            known: every edge judged so far.
+            past: what is known so far.
             last: whether this is the last frame: it is tried against the first wherever that is in reach.
         """
-        frames = [frame for frame in views if frame in solution.trajectory]
+        frames = past.frames
         if self.max_closures == 0 or len(frames) < 2:
             return ()
-        poses = np.stack([solution.trajectory[frame] for frame in frames])
-        expected = solution.trajectory[base.target] @ modes(base)[0][1].mean
-        angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ expected))
-        own = self.trust.systematic(1, views[base.target].centroid_m)
-        outlook = Outlook(solution, views, known, base.target, expected, own, self.max_angle_deg)
+        expected = past.solution.trajectory[base.target] @ modes(base)[0][1].mean
+        angle_deg = np.degrees(se3.rotation_angle(se3.inverse(past.poses(frames)) @ expected))
+        own = self.trust.systematic(1, past.views[base.target].centroid_m)
+        outlook = Outlook(past, base.target, expected, own, self.max_angle_deg)
         near = [
             number
             for number, (frame, angle) in enumerate(zip(frames, angle_deg, strict=True))
@@ -86,31 +83,27 @@ class Closer:
         chosen, spanned = [], False
         for prospect in outlook.prospects([frames[number] for number in near], angle_deg[near], self.min_gain_nats):
             if prospect.overlap >= self.min_overlap:
-                back = self._back(prospect.frame, base.source, outlook.reach, solution)
+                back = self._back(prospect.frame, base.source, outlook.reach, past.solution)
                 if back or not spanned:  # one large step over many small ones is enough
                     chosen.append(prospect.frame)
                 spanned = spanned or not back
         first = frames[0]
-        if first in chosen or (last and 0 in near and self._back(first, base.source, outlook.reach, solution)):
+        if first in chosen or (last and 0 in near and self._back(first, base.source, outlook.reach, past.solution)):
             chosen = [first, *(frame for frame in chosen if frame != first)]  # to close on the first is best
         return tuple(chosen[: self.max_closures])
 
-    def spans(
-        self, views: Mapping[int, RayImage], solution: Solution, known: Sequence[Edge]
-    ) -> tuple[tuple[int, int], ...]:
+    def spans(self, past: Past) -> tuple[tuple[int, int], ...]:
         """Return pairs (source, target) of views to register once all are in: for each view those that tell most."""
-        frames = sorted(frame for frame in views if frame in solution.trajectory)
-        poses = np.stack([solution.trajectory[frame] for frame in frames]) if frames else np.zeros((0, 4, 4))
-        tried = {frozenset((edge.source, edge.target)) for edge in known}
+        frames = sorted(past.frames)
+        poses = past.poses(frames)
+        tried = {frozenset((edge.source, edge.target)) for edge in past.edges}
         pairs: list[tuple[int, int]] = []
         limit_deg = self.max_span_deg
         for number, source in enumerate(frames if self.max_spans else ()):
             angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses[:number]) @ poses[number]))
             near = [k for k in np.flatnonzero(angle_deg <= limit_deg) if {source, frames[k]} not in tried]
-            own = self.trust.systematic(1, views[source].centroid_m)
-            outlook = Outlook(
-                solution, views, known, source, poses[number], own, limit_deg, hangs=False, power=_SPAN_POWER
-            )
+            own = self.trust.systematic(1, past.views[source].centroid_m)
+            outlook = Outlook(past, source, poses[number], own, limit_deg, hangs=False, power=_SPAN_POWER)
             found = outlook.prospects([frames[k] for k in near], angle_deg[near], self.min_span_gain_nats)
             telling = [(source, prospect.frame) for prospect in found if prospect.overlap >= self.min_overlap]
             pairs += telling[: self.max_spans]
@@ -120,106 +113,78 @@ class Closer:
         """Return target_from_source of the frame that a registration places and a view, as all edges tell it."""
         return onwards(solution.relative_gaussian(target, base.target), modes(base)[0][1])
 
-    def relocation(
-        self,
-        posteriors: Sequence[Posterior],
-        views: Mapping[int, RayImage],
-        solution: Solution,
-        known: Sequence[Edge] = (),
-    ) -> int | None:
+    def relocation(self, posteriors: Sequence[Posterior], past: Past) -> int | None:
         """Return the earlier view to register a lost frame against next; None: it is given up. See `Placing.next`.
 
         Args:
             posteriors: what was tried for the frame, the previous view first.
-            views: the accepted views, in order of acceptance.
-            solution: the poses so far.
-            known: every edge judged so far.
+            past: what is known so far.
         """
         if len(posteriors) > self.max_relocations:
             return None
-        return self._placing(views, solution, known).next(posteriors)
+        return self._placing(past).next(posteriors)
 
-    def base(
-        self,
-        posteriors: Sequence[Posterior],
-        views: Mapping[int, RayImage],
-        solution: Solution,
-        known: Sequence[Edge] = (),
-        *,
-        steps: int = 1,
-    ) -> tuple[Posterior | None, str]:
+    def base(self, posteriors: Sequence[Posterior], past: Past, *, steps: int = 1) -> tuple[Posterior | None, str]:
         """Return the posterior that places a frame, and why: the previous view's, or else another's. See `Placing`.
 
         Args:
             posteriors: registrations of the frame, the previous view first.
-            views: the accepted views, in order of acceptance.
-            solution: the poses so far.
-            known: every edge judged so far.
+            past: what is known so far.
             steps: how many frames lie between the previous view and this frame, this one counted.
         """
-        return self._placing(views, solution, known, steps=steps).base(posteriors)
+        return self._placing(past, steps=steps).base(posteriors)
 
-    def edges(
-        self,
-        posteriors: Sequence[Posterior],
-        views: Mapping[int, RayImage],
-        solution: Solution,
-        known: Sequence[Edge] = (),
-        *,
-        steps: int = 1,
-    ) -> tuple[Edge, ...]:
+    def edges(self, posteriors: Sequence[Posterior], past: Past, *, steps: int = 1) -> tuple[Edge, ...]:
         """Return one judged edge per posterior, in their order. The frame joins the graph if any is accepted.
 
-        Edges to views that the object had turned away from are closures, the others odometry.
+        Edges to views that the object had turned away from are closures; of the others the one that places the frame,
+        or was to, is odometry, and the rest are spans.
 
         Args:
             posteriors: registrations of one new frame, against the previous view first.
-            views: the accepted views, in order of acceptance.
-            solution: the poses so far.
-            known: every edge judged so far.
+            past: what is known so far.
             steps: how many frames lie between the previous view and this frame, this one counted.
         """
-        base, base_reason = self.base(posteriors, views, solution, known, steps=steps)
-        reach = ways(known, base.target) if base is not None and len(posteriors) > 1 else {}
-        edges, asked = [], self._asked(known)
+        base, base_reason = self.base(posteriors, past, steps=steps)
+        reach = ways(past.edges, past.solution, base.target) if base is not None and len(posteriors) > 1 else {}
+        edges, asked = [], self._asked(past)
         for number, posterior in enumerate(posteriors):
-            back = number > 0 and self._back(posterior.target, posterior.source, reach, solution)
+            back = number > 0 and self._back(posterior.target, posterior.source, reach, past.solution)
+            places = number == 0 or base is None or posterior is base
+            kind: EdgeKind = "closure" if back else "odometry" if places else "span"
             if posterior is base:
-                accepted, reason = True, base_reason
+                edge = Edge(posterior, kind, accepted=True, reason=base_reason)
             elif (found := flaw(posterior, asked if number or steps > 1 else None)) is not None:
-                accepted, reason = False, found
+                edge = Edge(posterior, kind, accepted=False, reason=found)
             elif base is None:
-                accepted, reason = False, "neither the previous view nor another one places the frame with certainty"
+                edge = Edge(posterior, kind, accepted=False, reason=_NOWHERE)
             else:
-                agreed = self.trust.agreement_by_way_of(base, posterior, views, solution, reach)
-                agreeing = "closes the loop" if back else "spans several steps"
-                verdict = agreeing if agreed.agrees else "contradicts the chain"
-                accepted, reason = agreed.agrees, f"{verdict}: {agreed.words}"
-            edges.append(Edge(posterior, "closure" if back else "odometry", accepted, reason))
+                edge = _judged(posterior, kind, self.trust.agreement_by_way_of(base, posterior, past, reach))
+            edges.append(edge)
         return tuple(edges)
 
-    def spanning(
-        self, posterior: Posterior, views: Mapping[int, RayImage], solution: Solution, known: Sequence[Edge]
-    ) -> Edge:
+    def spanning(self, posterior: Posterior, past: Past) -> Edge:
         """Return the judged edge between two views of the graph, from a registration that it does not hold yet."""
-        reach, centroid_m = ways(known, posterior.source), views[posterior.source].centroid_m
-        kind = "closure" if self._back(posterior.target, posterior.source, reach, solution) else "odometry"
-        if (found := flaw(posterior, self._asked(known))) is not None:
+        reach = ways(past.edges, past.solution, posterior.source)
+        kind = "closure" if self._back(posterior.target, posterior.source, reach, past.solution) else "span"
+        if (found := flaw(posterior, self._asked(past))) is not None:
             return Edge(posterior, kind, accepted=False, reason=found)
-        foretold = [(1.0, solution.relative_gaussian(posterior.target, posterior.source))]
-        length = reach[posterior.target].edges
-        agreed = self.trust.agreement(posterior, foretold, length=length, centroid_m=centroid_m)
-        agreeing = "closes the loop" if kind == "closure" else "spans several steps"
-        verdict = agreeing if agreed.agrees else "contradicts the chain"
-        return Edge(posterior, kind, agreed.agrees, f"{verdict}: {agreed.words}")
+        foretold = [(1.0, past.solution.relative_gaussian(posterior.target, posterior.source))]
+        length, centroid_m = reach[posterior.target].edges, past.views[posterior.source].centroid_m
+        return _judged(posterior, kind, self.trust.agreement(posterior, foretold, length=length, centroid_m=centroid_m))
 
     def _back(self, target: int, source: int, reach: Mapping[int, Way], solution: Solution) -> bool:
         return came_back(target, source, reach, solution, away_deg=self.away_deg)
 
-    def _placing(
-        self, views: Mapping[int, RayImage], solution: Solution, known: Sequence[Edge], *, steps: int = 1
-    ) -> Placing:
-        return Placing(views, solution, known, self._asked(known), self.trust, self.max_angle_deg, steps)
+    def _placing(self, past: Past, *, steps: int = 1) -> Placing:
+        return Placing(past, self._asked(past), self.trust, self.max_angle_deg, steps)
 
-    def _asked(self, known: Sequence[Edge]) -> Standard:
-        return standard(known, min_overlap=self.min_overlap, drop_nats=self.max_evidence_drop_nats)
+    def _asked(self, past: Past) -> Standard:
+        return standard(past.edges, past.solution, min_overlap=self.min_overlap, drop_nats=self.max_evidence_drop_nats)
+
+
+def _judged(posterior: Posterior, kind: EdgeKind, agreed: Agreement) -> Edge:
+    """Return an edge that is accepted where it agrees with the others."""
+    agreeing = "closes the loop" if kind == "closure" else "spans several steps"
+    verdict = agreeing if agreed.agrees else "contradicts the chain"
+    return Edge(posterior, kind, agreed.agrees, f"{verdict}: {agreed.words}")

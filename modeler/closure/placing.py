@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from modeler import se3
+from modeler.closure.past import Past
 from modeler.closure.reckoning import continued
 from modeler.closure.trust import Trust
 from modeler.closure.verdict import Standard, flaw, modes, stands
 from modeler.closure.ways import ways
-from modeler.types import Edge, Posterior, RayImage, Solution
+from modeler.types import Posterior
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Placing:
     """Tells which of a frame's registrations places it.
 
@@ -25,12 +26,8 @@ class Placing:
     only near where the motion led, and farther from there if that of another view agrees.
     """
 
-    views: Mapping[int, RayImage]
-    """The accepted views, in order of acceptance."""
-    solution: Solution
-    """The poses so far."""
-    known: Sequence[Edge]
-    """Every edge judged so far."""
+    past: Past
+    """What is known so far."""
     asked: Standard
     """Of registrations."""
     trust: Trust
@@ -79,21 +76,21 @@ class Placing:
         left = [frame for frame in self._frames if frame not in tried]
         if not left:
             return None
-        poses = np.stack([self.solution.trajectory[frame] for frame in left])
+        poses = self.past.poses(left)
         for posterior in (posterior for posterior in posteriors if stands(posterior, self.asked)):
-            placed = self.solution.trajectory[posterior.target] @ posterior.pose.mean
+            placed = self.past.solution.trajectory[posterior.target] @ posterior.pose.mean
             angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ placed))
             if angle_deg.min() <= self.max_angle_deg:
                 return left[int(np.argmin(angle_deg))]
         if len(tried) == 1:
-            expected = continued(self.solution, self._frames, posteriors[0].source)
+            expected = continued(self.past.solution, self._frames, posteriors[0].source)
             return left[int(np.argmin(se3.rotation_angle(se3.inverse(poses) @ expected)))]
-        apart = [se3.rotation_angle(se3.inverse(self.solution.trajectory[frame]) @ poses) for frame in tried]
+        apart = [se3.rotation_angle(se3.inverse(pose) @ poses) for pose in self.past.poses(tried)]
         return left[int(np.argmax(np.min(apart, axis=0)))]
 
     @cached_property
     def _frames(self) -> list[int]:
-        return [frame for frame in self.views if frame in self.solution.trajectory]
+        return self.past.frames
 
     def _goes_on(self, odometry: Posterior) -> bool:
         """Return whether the previous view's registration came to an end, and after lost frames matches like others."""
@@ -105,10 +102,10 @@ class Placing:
         # A pace that changes at random from step to step goes astray with the root of their number.
         if self._off_deg(posterior) > float(np.sqrt(self.steps)) * self.max_angle_deg:
             return
-        reach = ways(self.known, posterior.target)
+        reach = ways(self.past.edges, self.past.solution, posterior.target)
         for witness in standing:
             if witness is not posterior:
-                agreed = self.trust.agreement_by_way_of(posterior, witness, self.views, self.solution, reach)
+                agreed = self.trust.agreement_by_way_of(posterior, witness, self.past, reach)
                 if agreed.agrees:
                     yield witness
 
@@ -116,8 +113,8 @@ class Placing:
         """Return the angle between where a registration puts a frame and where the motion going on would have."""
         if len(self._frames) == 1:
             return 0.0
-        expected = continued(self.solution, self._frames, posterior.source)
-        placed = self.solution.trajectory[posterior.target] @ modes(posterior)[0][1].mean
+        expected = continued(self.past.solution, self._frames, posterior.source)
+        placed = self.past.solution.trajectory[posterior.target] @ modes(posterior)[0][1].mean
         return float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ placed)))
 
 

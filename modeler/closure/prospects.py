@@ -10,8 +10,9 @@ import numpy as np
 from scipy.special import ndtr
 
 from modeler import se3
+from modeler.closure.past import Past
 from modeler.closure.ways import Way, ways
-from modeler.types import Array, Edge, RayImage, Solution
+from modeler.types import Array
 
 _ASKED = 6  # views whose motion's covariance is worked out: the most promising by a bound that costs little
 _RECENT = 20  # edges judged last that tell how sure the next may be
@@ -32,16 +33,12 @@ class Prospect:
     """Information that the edge is expected to add to what is known of the motion between the two."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Outlook:
     """What is expected of a new view's place among the earlier ones."""
 
-    solution: Solution
-    """The poses so far."""
-    views: Mapping[int, RayImage]
-    """The accepted views."""
-    edges: Sequence[Edge]
-    """Every edge judged so far."""
+    past: Past
+    """What is known so far."""
     previous: int
     """The view that the new one hangs on; or the new view itself, where it is in the graph already."""
     expected: Array
@@ -59,7 +56,7 @@ class Outlook:
     @cached_property
     def reach(self) -> Mapping[int, Way]:
         """The surest ways from the view that the new one hangs on."""
-        return ways(self.edges, self.previous)
+        return ways(self.past.edges, self.past.solution, self.previous)
 
     def within(self, frame: int, angle_deg: float) -> float:
         """Return the chance that the turn to a view is no larger than views are registered across.
@@ -97,14 +94,14 @@ class Outlook:
         for frame, angle in zip(frames, angle_deg, strict=True):
             if frame in self.reach:
                 way = self.reach[frame]
-                ratio = self.hangs + (way.variance_rad2 + way.edges * own_rad2) / variance_rad2
+                ratio = float(self.hangs) + (way.variance_rad2 + way.edges * own_rad2) / variance_rad2
                 bound_nats = 3.0 * self._chance(frame, angle) * np.log1p(self._tells(angle) * ratio)
                 bounded.append((float(bound_nats), frame, float(angle)))
         found = []
         for _, frame, angle in sorted((b for b in bounded if b[0] >= least_nats), reverse=True)[:_ASKED]:
             overlap = self._overlap(frame)
-            known = self.solution.relative_covariance(frame, self.previous)
-            known = known + self.hangs * one_edge + self.reach[frame].edges * self.systematic
+            known = self.past.solution.relative_covariance(frame, self.previous)
+            known = known + float(self.hangs) * one_edge + self.reach[frame].edges * self.systematic
             ratio = overlap * self._tells(angle) * np.linalg.solve(one_edge, known)
             gain_nats = self._chance(frame, angle) * 0.5 * float(np.linalg.slogdet(np.eye(6) + ratio)[1])
             if gain_nats >= least_nats:
@@ -114,7 +111,8 @@ class Outlook:
     @cached_property
     def _one_edge(self) -> Array | None:
         """Covariance (6, 6) of an edge; None where there is none to go by."""
-        recent = [edge.posterior.pose.covariance for edge in self.edges[-_RECENT:] if edge.accepted]
+        edges = [edge for edge in self.past.edges[-_RECENT:] if self.past.solution.takes_part(edge)]
+        recent = [self.past.solution.pose_of(edge).covariance for edge in edges]
         return np.asarray(np.mean(recent, axis=0) + self.systematic) if recent else None
 
     def _tells(self, angle_deg: float) -> float:
@@ -128,9 +126,9 @@ class Outlook:
 
     def _overlap(self, frame: int) -> float:
         """Return the share of a view's surface that should face the new view's camera."""
-        view = self.views[frame]
+        view = self.past.views[frame]
         chosen = np.linspace(0, len(view.points_m) - 1, min(_WITNESSES, len(view.points_m))).astype(int)
-        camera_from_frame = se3.inverse(self.expected) @ self.solution.trajectory[frame]
+        camera_from_frame = se3.inverse(self.expected) @ self.past.solution.trajectory[frame]
         points_m = se3.transform(camera_from_frame, view.points_m[chosen])
         normals = view.normals[chosen] @ camera_from_frame[:3, :3].T
         return float(np.mean(np.sum(points_m * normals, axis=1) < 0.0))

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
+from modeler.closure.past import Past
 from modeler.closure.reckoning import onwards
 from modeler.closure.verdict import Agreement, agreement, modes
 from modeler.closure.ways import Way
-from modeler.types import Array, PoseGaussian, Posterior, RayImage, Solution
+from modeler.types import Array, PoseGaussian, Posterior
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,7 @@ class Trust:
         self,
         base: Posterior,
         posterior: Posterior,
-        views: Mapping[int, RayImage],
-        solution: Solution,
+        past: Past,
         reach: Mapping[int, Way],
     ) -> Agreement:
         """Return how well a registration of a frame agrees with the way through the graph and along another of it.
@@ -72,14 +72,13 @@ class Trust:
         Args:
             base: the other, by which the frame is placed.
             posterior: target_from_source of the frame and some view.
-            views: the accepted views, in order of acceptance.
-            solution: the poses so far.
+            past: what is known so far.
             reach: ways from the view of `base`.
         """
-        way = solution.relative_gaussian(posterior.target, base.target)
+        way = past.solution.relative_gaussian(posterior.target, base.target)
         predictions = [(weight, onwards(way, pose)) for weight, pose in modes(base)]
-        centroid_m = se3.transform(se3.inverse(modes(base)[0][1].mean), views[base.target].centroid_m[None])[0]
+        centroid_m = se3.transform(se3.inverse(modes(base)[0][1].mean), past.views[base.target].centroid_m[None])[0]
         surest = reach.get(posterior.target)
-        length = abs(list(views).index(base.target) - list(views).index(posterior.target))
-        length = length if surest is None else surest.edges
+        order = list(past.views)
+        length = abs(order.index(base.target) - order.index(posterior.target)) if surest is None else surest.edges
         return self.agreement(posterior, predictions, length=1 + length, centroid_m=centroid_m)

@@ -9,7 +9,7 @@ from itertools import islice, product
 import numpy as np
 
 from modeler import se3
-from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior
+from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Solution
 
 RADIUS = 4.7390  # √χ²₆(0.999): Mahalanobis distance that 1 of 1000 true closures exceeds
 _RECENT, _FEWEST = 30, 5  # edges whose evidence tells what is usual
@@ -28,7 +28,7 @@ class Standard:
     """Below it the images speak against any surface in common, and rather for none."""
 
 
-def standard(edges: Sequence[Edge], *, min_overlap: float, drop_nats: float) -> Standard:
+def standard(edges: Sequence[Edge], solution: Solution, *, min_overlap: float, drop_nats: float) -> Standard:
     """Return what the edges of a run so far, between neighbours, ask of further ones.
 
     How well two views of one object match depends on its shape and on the sensor, so that evidence tells little by
@@ -36,11 +36,12 @@ def standard(edges: Sequence[Edge], *, min_overlap: float, drop_nats: float) -> 
 
     Args:
         edges: every edge judged so far.
+        solution: the poses so far.
         min_overlap: smallest overlap (0..1).
         drop_nats: how far evidence may lie below the median; or eight times their scatter, if that is more.
     """
-    accepted = (edge for edge in reversed(edges) if edge.accepted and edge.kind == "odometry")
-    nats = [edge.posterior.log_evidence for edge in islice(accepted, _RECENT)]
+    joining = (edge for edge in reversed(edges) if edge.kind == "odometry" and solution.takes_part(edge))
+    nats = [edge.posterior.log_evidence for edge in islice(joining, _RECENT)]
     told = np.array([evidence for evidence in nats if np.isfinite(evidence)])
     if len(told) < _FEWEST:
         return Standard(min_overlap)

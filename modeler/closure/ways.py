@@ -6,7 +6,7 @@ import heapq
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from modeler.types import Edge
+from modeler.types import Edge, Solution
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,18 @@ class Way:
     """The frame before the last on the way; the start itself at the start."""
 
 
-def ways(edges: Iterable[Edge], start: int) -> Mapping[int, Way]:
-    """Return the surest way from a frame to every other that accepted edges connect with it (Dijkstra 1959)."""
+def ways(edges: Iterable[Edge], solution: Solution, start: int) -> Mapping[int, Way]:
+    """Return the surest way from a frame to every other that hangs together with it (Dijkstra 1959).
+
+    Args:
+        edges: as they were judged; those that take part lead on.
+        solution: the poses so far.
+        start: number of the frame.
+    """
     neighbours: dict[int, list[tuple[int, float]]] = {}
     for edge in edges:
-        if edge.accepted:
-            covariance = edge.posterior.pose.covariance
+        if solution.takes_part(edge):
+            covariance = solution.pose_of(edge).covariance
             variance_rad2 = float(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
             neighbours.setdefault(edge.source, []).append((edge.target, variance_rad2))
             neighbours.setdefault(edge.target, []).append((edge.source, variance_rad2))

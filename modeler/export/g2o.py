@@ -29,8 +29,8 @@ def g2o_text(edges: Sequence[Edge], solution: Solution) -> str:
     ]
     for edge in edges:
         solved = edge.target in solution.trajectory and edge.source in solution.trajectory
-        if edge.accepted and solved and edge not in solution.outliers:
-            pose = solution.edge_poses.get((edge.source, edge.target), edge.posterior.pose)
+        if solved and solution.takes_part(edge):
+            pose = solution.pose_of(edge)
             numbers = " ".join(repr(float(value)) for value in _upper_triangle(pose.covariance))
             lines.append(f"EDGE_SE3:QUAT {edge.target} {edge.source} {pose_text(pose.mean)} {numbers}")
     return "".join(f"{line}\n" for line in lines)

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from modeler.types import Array, Edge, InputError, Mode, ObjectModel, Outcome, PoseGaussian, Posterior
+from modeler.types import Array, Edge, EdgeKind, InputError, Mode, ObjectModel, Outcome, PoseGaussian, Posterior
 
 
 def edges_of(report: Mapping[str, Any]) -> tuple[Edge, ...]:
     """Return the edges in a report, in order, as they were judged; their posteriors are without samples."""
     return tuple(
-        Edge(_posterior(record), record["kind"], record["accepted"], record.get("reason", ""))
+        Edge(_posterior(record), _kind(record), record["accepted"], record.get("reason", ""))
         for record in report["edges"]
     )
 
@@ -64,6 +64,11 @@ def read_model(path: Path) -> ObjectModel:
         vertex_views=np.asarray(columns["views"], dtype=np.int64).ravel() if "views" in names else None,
         vertex_sigmas_m=None if sigmas_m is None else np.where(sigmas_m < 0.0, np.inf, sigmas_m),
     )
+
+
+def _kind(edge: Mapping[str, Any]) -> EdgeKind:
+    """Return what an edge is for; reports count spans as odometry, and say so beside."""
+    return "span" if edge.get("span") else edge["kind"]
 
 
 def _posterior(edge: Mapping[str, Any]) -> Posterior:

@@ -81,7 +81,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         frames: what became of every frame so far.
         meta: everything else.
     """
-    solution, views = step.solution, dict(step.views)
+    solution, views, covariances = step.solution, dict(step.views), dict(step.solution.covariances.items())
     if step.view is not None:  # also where the frame was left out
         views[step.frame.index] = step.view
     reasons = _shortcomings(step, frames, meta)
@@ -98,13 +98,13 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "trustworthy": not reasons,
         "reasons": reasons,
         "frames": [vars(frame) for frame in frames],
-        "edges": [edge_record(edge, solution, views.get(edge.source)) for edge in step.edges_so_far],
-        "poses": [
-            {"id": frame, "object_from_camera": pose, "covariance": solution.covariances[frame]}
-            for frame, pose in sorted(solution.trajectory.items())
-        ],
     }
-    return _json(report)
+    poses = [
+        {"id": frame, "object_from_camera": pose, "covariance": covariances[frame]}
+        for frame, pose in sorted(solution.trajectory.items())
+    ]
+    edges = [edge_record(edge, solution, views.get(edge.source)) for edge in step.edges_so_far]
+    return {**_json(report), "edges": edges, "poses": _json(poses)}
 
 
 def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> list[str]:
@@ -145,7 +145,7 @@ def _joined_without(edge: Edge, edges: list[Edge]) -> bool:
 
 
 def _taking_part(step: Step) -> list[Edge]:
-    return [edge for edge in step.edges_so_far if edge.accepted and edge not in step.solution.outliers]
+    return [edge for edge in step.edges_so_far if step.solution.takes_part(edge)]
 
 
 def _reason(edge: Edge, step: Step) -> str:
@@ -170,8 +170,9 @@ def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) ->
     record = {
         "source": posterior.source,
         "target": posterior.target,
-        "kind": edge.kind,
-        "accepted": edge.accepted and not outlier,
+        "kind": "closure" if edge.kind == "closure" else "odometry",
+        "span": edge.kind == "span",  # of the odometry, those that only join frames which others placed
+        "accepted": solution.takes_part(edge),
         "outcome": posterior.outcome.label,
         "reason": _OUTLIER if outlier else edge.reason,
         "target_from_source": posterior.pose.mean,

@@ -15,7 +15,9 @@ import numpy as np
 
 from modeler import se3
 from modeler.graph.belief import separate
-from modeler.types import Array, Edge, Mode, PoseGaussian
+from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian
+
+_FIRST: tuple[EdgeKind, ...] = ("odometry", "span", "closure")  # what connects frames, if it can
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +79,7 @@ def split(links: Iterable[Link], root: int) -> tuple[list[Link], list[Link]]:
     tree: list[Link] = []
     loops: list[Link] = []
     group: dict[int, set[int]] = {}
-    for link in sorted(links, key=lambda link: link.edge.kind != "odometry"):  # stable: by arrival within a kind
+    for link in sorted(links, key=lambda link: _FIRST.index(link.edge.kind)):  # stable: by arrival within a kind
         target, source = (group.setdefault(frame, {frame}) for frame in (link.target, link.source))
         if source is target:
             loops.append(link)

@@ -96,9 +96,9 @@ def shared_noise(graph: PoseGraph, solution: Solution) -> float:
     for edge in graph.accepted:
         if edge.target not in solution.trajectory or edge.source not in solution.trajectory:
             continue
-        if any(edge is outlier for outlier in solution.outliers):
+        if not solution.takes_part(edge):
             continue
-        pose = solution.edge_poses.get((edge.source, edge.target), edge.posterior.pose)
+        pose = solution.pose_of(edge)
         xi = se3.log(se3.inverse(pose.mean) @ solution.relative(edge.target, edge.source))
         distance += float(xi @ np.linalg.solve(pose.covariance, xi))
         count += 1

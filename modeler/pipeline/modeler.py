@@ -177,11 +177,10 @@ class Modeler:
             return state, ()
         ending("choosing more pairs", 0, 1)
         pairing, edges, stage = self._pairing(), [], "registering more pairs"
-        pairs = self.closer.spans(state.views, state.solution, state.graph.edges)
+        pairs = self.closer.spans(state.past)
         ending(stage, 0, len(pairs))
         for posterior in pairing.spanning(state, pairs):
-            known = state.graph.edges
-            edges.append(self.closer.spanning(_lasting(posterior), state.views, state.solution, known))
+            edges.append(self.closer.spanning(_lasting(posterior), state.past))
             ending(stage, len(edges), len(pairs))
             if hurry():
                 break

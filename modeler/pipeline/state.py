@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from modeler.closure import Past
 from modeler.fusion import Growing
 from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.types import Edge, Frame, ObjectModel, RayImage, Segmentation, Solution
@@ -48,6 +49,11 @@ class State:
     def solution(self) -> Solution:
         """The poses so far."""
         return self.smoother.solution
+
+    @property
+    def past(self) -> Past:
+        """What closures are chosen and judged by."""
+        return Past(self.views, self.solution, self.graph.edges)
 
     @property
     def latest(self) -> int | None:

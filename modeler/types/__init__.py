@@ -20,6 +20,7 @@ from modeler.types.posteriors import Posterior as Posterior
 from modeler.types.priors import AbstractPrior as AbstractPrior
 from modeler.types.priors import SharedAxis as SharedAxis
 from modeler.types.solution import Edge as Edge
+from modeler.types.solution import EdgeKind as EdgeKind
 from modeler.types.solution import Solution as Solution
 from modeler.types.views import Camera as Camera
 from modeler.types.views import Frame as Frame

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 from modeler import se3
 from modeler.types.arrays import Array
 from modeler.types.posteriors import PoseGaussian, Posterior
+
+EdgeKind = Literal["odometry", "closure", "span"]
+"""What an edge is for: to place a frame, to close a loop with a view that the object had turned away from, or to span
+several steps between frames that others placed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,8 +21,8 @@ class Edge:
 
     posterior: Posterior
     """The registration behind the edge."""
-    kind: str
-    """"odometry" or "closure"."""
+    kind: EdgeKind
+    """What the edge is for."""
     accepted: bool
     """Whether the edge takes part in the optimisation."""
     reason: str
@@ -59,6 +64,14 @@ class Solution:
     """Weights (m,) that all edges together leave to the modes of an edge with several, by (source, target)."""
     camera_from_axis: Array | None = None
     """(4, 4), the third direction that about which all steps turn; None where that was not asked, or does not fit."""
+
+    def takes_part(self, edge: Edge) -> bool:
+        """Return whether an edge was accepted and the optimisation did not leave it out since."""
+        return edge.accepted and edge not in self.outliers
+
+    def pose_of(self, edge: Edge) -> PoseGaussian:
+        """Return target_from_source of an edge as it took part: of several modes, as all edges together have it."""
+        return self.edge_poses.get((edge.source, edge.target), edge.posterior.pose)
 
     def relative_gaussian(self, target: int, source: int) -> PoseGaussian:
         """Return target_from_source between two different solved frames, with its uncertainty."""
