@@ -52,7 +52,10 @@ def moved(pose: Array, xi: Array, about_m: Array) -> Array:
 
     C is the shift to the point: about an object's centre rotation and translation have least to do with each other.
     """
-    return pose @ translation(about_m) @ exp(xi) @ translation(-np.asarray(about_m))
+    shape = np.broadcast_shapes(np.shape(pose)[:-2], np.shape(xi)[:-1])
+    poses = np.broadcast_to(np.asarray(pose, dtype=np.float64), (*shape, 4, 4)).reshape(-1, 4, 4)
+    steps = np.broadcast_to(np.asarray(xi, dtype=np.float64), (*shape, 6)).reshape(-1, 6)
+    return moves.turned(poses, steps, np.asarray(about_m, dtype=np.float64)).reshape(*shape, 4, 4)
 
 
 def difference(first: Array, second: Array, about_m: Array) -> Array:
@@ -115,14 +118,9 @@ def mean(
     """
     weights = np.asarray(weights, dtype=np.float64) / np.sum(weights)
     point_m = np.zeros(3) if about_m is None else np.asarray(about_m, dtype=np.float64)
-    flat = rows(poses)
-    centre = poses[int(np.argmax(weights))] if start is None else start
-    for _ in range(iterations):
-        step, _ = moves.moments(flat, weights, rows(centre), point_m)
-        centre = moved(centre, step, point_m)
-        if np.linalg.norm(step) < 1e-10:
-            break
-    return centre, moves.moments(flat, weights, rows(centre), point_m)[1]
+    begin = poses[int(np.argmax(weights))] if start is None else start
+    centre, covariance = moves.mean(rows(poses), weights, rows(begin), point_m, iterations, 1e-11)
+    return matrices(centre[None])[0], covariance
 
 
 def rows(poses: Array) -> Array:

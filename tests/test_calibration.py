@@ -17,7 +17,7 @@ from modeler import se3
 from modeler.evaluation import rotation_error_deg, sample_surface, true_motion
 from modeler.priors import TablePrior
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
-from modeler.registration.annealing import AnnealedSampler
+from modeler.registration.importance import AdaptiveSampler
 from modeler.types import Outcome, PoseGaussian, Posterior
 from sequences.recipe import builtin_recipes, load_recipe
 from sequences.renderer import RenderedSequence
@@ -146,7 +146,7 @@ def test_only_answers_that_are_given_are_judged() -> None:
 
 
 def test_a_study_runs_and_repeats_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    quick = AnnealedSampler(initial=1000, particles=300, moves=1, final_particles=300, final_moves=2)
+    quick = AdaptiveSampler(enough=200.0, kept=300)
     box = Specimen("box", "n-fold", "tuning")
     small = Study(
         specimens=(box,),

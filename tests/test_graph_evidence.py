@@ -11,14 +11,12 @@ from rings import OBJECT_M, edge, nees
 
 from modeler import se3
 from modeler.graph import PoseGraph, solve
-from modeler.registration.annealing import AnnealedSampler
+from modeler.registration.importance import AdaptiveSampler
 from modeler.registration.posterior import weighted_gaussian
 from modeler.types import AbstractMotion, Array, PoseGaussian
 
 VARIANCE = 0.02e-2  # the check of the design, in units of a tenth of a radian and of a metre
-SAMPLER = AnnealedSampler(
-    initial=2000, particles=600, moves=6, final_particles=1000, final_moves=10, enough=np.inf
-)  # until nothing is left of where they started
+SAMPLER = AdaptiveSampler(enough=1000.0, kept=2000)
 CENTRE = se3.translation(OBJECT_M)
 ABOUT = se3.adjoint(CENTRE)
 SPREAD = VARIANCE * ABOUT @ ABOUT.T  # the variance in all directions, about the object
@@ -52,8 +50,8 @@ def _off(pose: Array, rng: np.random.Generator) -> Array:
 
 def _registered(motion: AbstractMotion, images: Array, rng: np.random.Generator) -> PoseGaussian:
     """The posterior of images that alone would say `images`, with VARIANCE, sampled from `motion` on."""
-    found = SAMPLER.run(motion, [lambda _: lambda poses: _log_gaussian(poses, images)], OBJECT_M, rng)
-    return weighted_gaussian(found.poses, np.ones(len(found.poses)), OBJECT_M)
+    found = SAMPLER.run(motion, lambda poses: _log_gaussian(poses, images), OBJECT_M, rng)
+    return weighted_gaussian(found.poses, found.weights, OBJECT_M)
 
 
 def _share(covariance: Array) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from modeler import kernels, se3
-from modeler.kernels import matching, mixture, moves, paper, patches, planes, ridges, visibility
+from modeler.kernels import matching, mixture, paper, patches, planes, ridges, visibility
 from modeler.kernels.sight import Sight, buffers
 from modeler.se3 import matrices, rows
 
@@ -208,18 +208,6 @@ def test_verdicts_follow_from_where_a_point_lies():
     sight = Sight(points, cells.reshape(-1, planes.CELL_SIZE), CAMERA, FACING)
     verdicts = visibility.classify(rows(np.eye(4)), sight, model(0.001))
     assert verdicts.tolist() == [want for *_, want in cases]
-
-
-@pytest.mark.parametrize("angle_rad", [1e-9, 1e-3, 0.5, 1.8])
-def test_proposals_are_steps_along_differences(rng, angle_rad):
-    first, second, moving = (np.stack([random_pose(rng, angle_rad) for _ in range(200)]) for _ in range(3))
-    scales, jitter = rng.uniform(0.1, 1.0, 200), rng.normal(0, 1e-3, (200, 6))
-    centre_m = np.array([0.05, -0.02, 0.8])
-    there, back = se3.translation(centre_m), se3.translation(-centre_m)
-    step = scales[:, None] * se3.log(back @ se3.inverse(first) @ second @ there) + jitter
-    want = moving @ there @ se3.exp(step) @ back
-    got = moves.propose(rows(moving), rows(first), rows(second), scales, jitter, centre_m)
-    np.testing.assert_allclose(matrices(got), want, atol=1e-9)
 
 
 def test_local_planes_are_least_squares_in_inverse_depth(rng):

@@ -70,7 +70,9 @@ def test_matches_are_near_and_face_alike(rng):
 def test_what_the_surface_determines_is_sharpened(rng):
     pair, truth, centre_m = bundled_pair("box")
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
-    mean, turn_rad, shift_m = sigmas_about(Refiner().refine(pair, poses, rng, fine_m=0.001), centre_m)
+    mean, turn_rad, shift_m = sigmas_about(
+        Refiner().refine(pair, poses, np.ones(len(poses)), rng, fine_m=0.001), centre_m
+    )
     _, turn_before_rad, shift_before_m = sigmas_about(poses, centre_m)
     assert turn_rad < 0.5 * turn_before_rad
     assert shift_m < shift_before_m
@@ -88,7 +90,7 @@ def test_the_roll_of_a_tube_is_not(rng):
     roll = np.concatenate([axis, shift])
     poses = scattered(truth, centre_m, np.repeat([0.003, 0.0003], 3), rng)
     poses = se3.moved(poses, rng.normal(size=(len(poses), 1)) * 0.2 * roll, centre_m)
-    refined = Refiner().refine(pair, poses, rng, fine_m=0.001)
+    refined = Refiner().refine(pair, poses, np.ones(len(poses)), rng, fine_m=0.001)
     xi = se3.difference(truth, refined, centre_m)
     assert np.std(xi[:, :3] @ axis) > 0.12
 
@@ -96,7 +98,7 @@ def test_the_roll_of_a_tube_is_not(rng):
 def test_too_few_matches_leave_the_samples_alone(rng):
     pair, truth, centre_m = bundled_pair("box")
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
-    refined = Refiner(min_patches=10_000).refine(pair, poses, rng, fine_m=0.001)
+    refined = Refiner(min_patches=10_000).refine(pair, poses, np.ones(len(poses)), rng, fine_m=0.001)
     np.testing.assert_allclose(refined, poses, atol=1e-9)
 
 
@@ -104,6 +106,10 @@ def test_too_few_matches_leave_the_samples_alone(rng):
 def test_caution_widens(fields, rng):
     pair, truth, centre_m = bundled_pair("box")
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
-    plain = sigmas_about(Refiner().refine(pair, poses, np.random.default_rng(1), fine_m=0.001), centre_m)
-    other = sigmas_about(Refiner(**fields).refine(pair, poses, np.random.default_rng(1), fine_m=0.001), centre_m)
+    plain = sigmas_about(
+        Refiner().refine(pair, poses, np.ones(len(poses)), np.random.default_rng(1), fine_m=0.001), centre_m
+    )
+    other = sigmas_about(
+        Refiner(**fields).refine(pair, poses, np.ones(len(poses)), np.random.default_rng(1), fine_m=0.001), centre_m
+    )
     assert (other[1] > plain[1]) == (fields["caution"] > 2.0)

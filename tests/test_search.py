@@ -1,5 +1,7 @@
 """Where the posterior may have its mass: the search, its separate places, and the mixture that samples start from."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior
 from modeler.priors.general import GeneralMotion
 from modeler.rays import Sensor
-from modeler.registration.mixture import MixtureMotion
+from modeler.registration.mixture import Gaussians, MixtureMotion
 from modeler.registration.modes import Place, separate, weighed
 from modeler.registration.search import Candidates, Search
 from modeler.registration.visibility import VisibilityRegistrar
@@ -97,8 +99,9 @@ def test_a_blunt_candidate_joins_what_it_covers_and_is_no_place_itself():
 def test_places_are_weighed_and_those_of_no_weight_dropped(rng):
     here = turned(0.0) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
     there = turned(1.5) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
-    one = weighed([Place(here, 0.0, 200.0, 0.1), Place(there, -20.0, 200.0, 0.1)])
-    two = weighed([Place(here, 0.0, 200.0, 0.1), Place(there, np.log(3.0), 200.0, 0.1)])
+    even = np.full(200, 1.0 / 200)
+    one = weighed([Place(here, even, 0.0, 200.0, 0.1), Place(there, even, -20.0, 200.0, 0.1)])
+    two = weighed([Place(here, even, 0.0, 200.0, 0.1), Place(there, even, np.log(3.0), 200.0, 0.1)])
     assert [share for share, _ in one] == [1.0]
     np.testing.assert_allclose([share for share, _ in two], [0.75, 0.25])
     assert rotation_error_deg(two[0][1].gaussian(np.zeros(3)).mean, turned(1.5)) < 1.0
@@ -111,13 +114,13 @@ def mixture(rng):
     means = se3.exp(rng.normal(size=(3, 6)) * np.repeat([0.3, 0.02], 3))
     spreads = np.linalg.cholesky(np.stack([np.cov(rng.normal(size=(6, 20))) for _ in range(3)]))
     spreads *= np.repeat([0.1, 0.005], 3)[:, None]
-    return MixtureMotion(known, means, spreads, np.log([0.5, 0.3, 0.2]), centre_m)
+    return MixtureMotion(known, Gaussians(means, spreads, np.log([0.5, 0.3, 0.2]), centre_m))
 
 
 def test_a_mixture_has_the_density_of_its_samples(rng):
     """∫ q over a broad known density, by importance: 1; and the mean of log q agrees with the entropy of samples."""
     motion = mixture(rng)
-    broad = MixtureMotion(motion.known, motion.means, 2.0 * motion.spreads, motion.log_weights, motion.centre_m)
+    broad = replace(motion.gaussians, spreads=2.0 * motion.gaussians.spreads)
     samples = broad.sample(40_000, rng)
     ratio = np.exp(motion.log_density(samples) - broad.log_density(samples))
     assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std() / np.sqrt(len(ratio))
@@ -125,8 +128,9 @@ def test_a_mixture_has_the_density_of_its_samples(rng):
 
 def test_a_narrow_component_has_the_gaussian_density(rng):
     motion = mixture(rng)
-    narrow = MixtureMotion(motion.known, motion.means[:1], 0.01 * motion.spreads[:1], np.zeros(1), motion.centre_m)
-    centre = se3.translation(motion.centre_m)
+    several = motion.gaussians
+    narrow = Gaussians(several.means[:1], 0.01 * several.spreads[:1], np.zeros(1), several.centre_m)
+    centre = se3.translation(several.centre_m)
     xi = (narrow.spreads[0] @ rng.normal(size=(6, 50))).T
     poses = narrow.means[0] @ centre @ se3.exp(xi) @ se3.inverse(centre)
     covariance = narrow.spreads[0] @ narrow.spreads[0].T

@@ -7,6 +7,8 @@ import numpy as np
 
 from modeler.kernels.moves import difference
 
+_NEGLIGIBLE = 40.0  # nats below the best Gaussian
+
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def log_densities(poses, means, roots, log_weights, centre):
@@ -16,30 +18,32 @@ def log_densities(poses, means, roots, log_weights, centre):
         poses: (n, 12) upper three rows of their matrices.
         means: (k, 12) of the components, likewise.
         roots: (k, 6, 6) upper triangular R with RᵀR the precision of ξ = log(mean⁻¹ pose) about the centre.
-        log_weights: (k,) whose exponentials sum to 1.
+        log_weights: (k,) of any sum of exponentials.
         centre: (3,) point in m.
     """
+    log_tops = log_weights - 3.0 * math.log(2.0 * math.pi)
+    for k in range(len(means)):
+        for u in range(6):
+            log_tops[k] += math.log(roots[k, u, u])
     result = np.empty(poses.shape[0])
-    half_dimensions = 3.0 * math.log(2.0 * math.pi)
     for i in numba.prange(poses.shape[0]):
         total, top, r = 0.0, -np.inf, np.empty((3, 3))
         for k in range(means.shape[0]):
             xi = difference(means[k], poses[i], centre, r)
-            density = log_weights[k] - half_dimensions
+            density = log_tops[k]
             for u in range(6):
                 z = 0.0
                 for v in range(u, 6):
                     z += roots[k, u, v] * xi[v]
-                density += math.log(roots[k, u, u]) - 0.5 * z * z
-            # ξ runs wider than the uniform measure: by (2 - 2 cos a) / a² for rotation, and as much for translation.
-            square = xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2]
-            if square > 1e-6:
-                density -= 2.0 * math.log((2.0 - 2.0 * math.cos(math.sqrt(square))) / square)
+                density -= 0.5 * z * z
+            if density < top - _NEGLIGIBLE:
+                continue
+            narrower = (0.5 * xi[6]) ** 4
             if density > top:
-                total = total * math.exp(top - density) + 1.0
+                total = total * math.exp(top - density) + narrower
                 top = density
             else:
-                total += math.exp(density - top)
+                total += narrower * math.exp(density - top)
         result[i] = top + math.log(total)
     return result
 

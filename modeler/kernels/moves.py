@@ -17,7 +17,10 @@ def cross(ax, ay, az, bx, by, bz):
 
 @numba.njit(cache=True)
 def rotation_vector(r):
-    """Return the rotation vector (3 numbers, rad) of a rotation matrix (3, 3), by its quaternion (Shepperd 1978)."""
+    """Return the rotation vector (3 numbers, rad) of a rotation matrix (3, 3), by its quaternion (Shepperd 1978).
+
+    And the cosine of half the angle a, and a / sin(a / 2).
+    """
     trace = r[0, 0] + r[1, 1] + r[2, 2]
     if trace > 0.0:
         real = 0.5 * math.sqrt(1.0 + trace)
@@ -40,22 +43,24 @@ def rotation_vector(r):
         x, y, z = imaginary[0], imaginary[1], imaginary[2]
     length = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 * math.atan2(length, real) / length if length > 1e-12 else 2.0
-    return scale * x, scale * y, scale * z
+    return scale * x, scale * y, scale * z, real, scale
 
 
 @numba.njit(cache=True)
 def logarithm(r, tx, ty, tz):
-    """Return ξ (6 numbers: rad, m) of a motion given by its rotation (3, 3) and translation."""
-    wx, wy, wz = rotation_vector(r)
+    """Return ξ (6 numbers: rad, m) of a motion given by its rotation (3, 3) and translation, and a / sin(a / 2).
+
+    a is the angle of the rotation: ξ runs wider there than the uniform measure of motions, by ((a / 2) / sin(a / 2))⁴.
+    """
+    wx, wy, wz, cosine, scale = rotation_vector(r)
     square = wx * wx + wy * wy + wz * wz
     if square < 1e-8:
         last = 1.0 / 12.0 + square / 720.0
     else:
-        angle = math.sqrt(square)
-        last = (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / square
+        last = (1.0 - 0.5 * scale * cosine) / square
     ax, ay, az = cross(wx, wy, wz, tx, ty, tz)
     bx, by, bz = cross(wx, wy, wz, ax, ay, az)
-    return wx, wy, wz, tx - 0.5 * ax + last * bx, ty - 0.5 * ay + last * by, tz - 0.5 * az + last * bz
+    return wx, wy, wz, tx - 0.5 * ax + last * bx, ty - 0.5 * ay + last * by, tz - 0.5 * az + last * bz, scale
 
 
 @numba.njit(cache=True)
@@ -84,7 +89,7 @@ def exponential(wx, wy, wz, ux, uy, uz, r):
 
 @numba.njit(cache=True)
 def difference(first, second, centre, r):
-    """Return ξ (6 numbers: rad, m) of log(C⁻¹ first⁻¹ second C) for poses (12,), C the shift to `centre` (3,).
+    """Return ξ = log(C⁻¹ first⁻¹ second C) for poses (12,), C the shift to `centre` (3,), as `logarithm` does.
 
     Room for a rotation, `r` (3, 3), is handed in.
     """
@@ -119,23 +124,16 @@ def turn(pose, xi, centre, r, moved):
 
 
 @numba.njit(cache=True)
-def propose(moving, first, second, scales, jitter, centre):
-    """Return moving · C · exp(scale · log(C⁻¹ first⁻¹ second C) + jitter) · C⁻¹, C the shift to `centre`.
-
-    Args:
-        moving: (m, 12) poses to be moved.
-        first: (m, 12) and
-        second: (m, 12) poses whose difference is the direction of each step.
-        scales: (m,) lengths of the steps in units of the differences.
-        jitter: (m, 6) tangents added to the steps.
-        centre: (3,) point of the source, in m, about which steps turn.
-    """
-    moved, xi, r = np.empty((len(moving), 12)), np.empty(6), np.empty((3, 3))
-    for i in range(len(moving)):
-        way = difference(first[i], second[i], centre, r)
-        for k in range(6):
-            xi[k] = scales[i] * way[k] + jitter[i, k]
-        turn(moving[i], xi, centre, r, moved[i])
+def turned(poses, xi, centre):
+    """Return pose · C · exp(ξ) · C⁻¹ (n, 4, 4) of poses (n, 4, 4) and tangents ξ (n, 6); see `turn`."""
+    moved, row, full, r = np.zeros((len(poses), 4, 4)), np.empty(12), np.empty(12), np.empty((3, 3))
+    for i in range(len(poses)):
+        for k in range(12):
+            row[k] = poses[i, k // 4, k % 4]
+        turn(row, xi[i], centre, r, full)
+        for k in range(12):
+            moved[i, k // 4, k % 4] = full[k]
+        moved[i, 3, 3] = 1.0
     return moved
 
 
@@ -163,23 +161,36 @@ def logarithms(poses):
 
 
 @numba.njit(cache=True)
-def moments(poses, weights, pose, about):
-    """Return Σ w ξ (6,) and Σ w ξ ξᵀ (6, 6) of ξ = log(C⁻¹ pose⁻¹ other C), C the shift to `about` (3,).
+def mean(poses, weights, start, about, iterations, tolerance):
+    """Return the intrinsic mean (12,) of weighted poses, and the covariance (6, 6) of ξ = log(C⁻¹ mean⁻¹ pose C).
 
     Args:
-        poses: (n, 12) the others.
-        weights: (n,).
-        pose: (12,) from which they are seen.
-        about: (3,) point in m.
+        poses: (n, 12).
+        weights: (n,), their sum 1.
+        start: (12,) where the fixed-point iteration begins.
+        about: (3,) point in m, C the shift to it.
+        iterations: at most so many steps.
+        tolerance: a shorter step (rad, m) is the last.
     """
-    first, second, r = np.zeros(6), np.zeros((6, 6)), np.empty((3, 3))
-    for i in range(len(poses)):
-        xi = difference(pose, poses[i], about, r)
+    centre, moved, r = start.copy(), np.empty(12), np.empty((3, 3))
+    first, second = np.empty(6), np.empty((6, 6))
+    for turn_number in range(iterations + 1):
+        first[:], second[:] = 0.0, 0.0
+        for i in range(len(poses)):
+            xi = difference(centre, poses[i], about, r)
+            for k in range(6):
+                part = weights[i] * xi[k]
+                first[k] += part
+                for m in range(k + 1):
+                    second[k, m] += part * xi[m]
+        length = 0.0
         for k in range(6):
-            first[k] += weights[i] * xi[k]
-            for m in range(k + 1):
-                second[k, m] += weights[i] * xi[k] * xi[m]
+            length += first[k] * first[k]
+        if turn_number == iterations or math.sqrt(length) < tolerance:
+            break
+        turn(centre, first, about, r, moved)
+        centre[:] = moved
     for k in range(6):
         for m in range(k):
             second[m, k] = second[k, m]
-    return first, second
+    return centre, second

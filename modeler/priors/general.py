@@ -64,7 +64,7 @@ class GeneralMotion(AbstractMotion):
 
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of motions (n, 4, 4); -inf outside."""
-        trace = target_from_source[:, :3, :3].reshape(-1, 9) @ self.middle.ravel()  # of the rotation from the middle
+        trace = np.einsum("nij,ij->n", target_from_source[:, :3, :3], self.middle)  # of the rotation from the middle
         offset_m = centroid_offset(target_from_source, self.source_centroid_m, self.target_centroid_m)
         inside = (trace >= 1.0 + 2.0 * np.cos(self.max_rotation_rad) - 1e-9) & (
             np.sum(offset_m**2, axis=1) <= self.max_offset_m**2

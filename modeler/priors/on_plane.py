@@ -47,12 +47,14 @@ class OnPlane:
 
     def coordinates(self, target_from_source: Array) -> tuple[Array, Array, Array]:
         """Return turns (n,) in rad, shifts (n, 2) in m of motions (n, 4, 4), and the log density (n,) of the rest."""
-        axes = self.axes
-        rotation = axes @ target_from_source[:, :3, :3] @ axes.T
-        tilt_rad = np.arctan2(np.hypot(rotation[:, 0, 2], rotation[:, 1, 2]), rotation[:, 2, 2])
+        rotation, normal = target_from_source[:, :3, :3], self.normal
+        tilted = np.einsum("nij,j->ni", rotation, normal)
+        upright = np.einsum("ni,i->n", tilted, normal)
+        tilt_rad = np.arctan2(np.linalg.norm(np.cross(tilted, normal), axis=1), upright)
         # What is left of the rotation once the tilt is undone turns about the normal.
-        turn_rad = np.arctan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1])
-        offset_m = centroid_offset(target_from_source, self.source_centroid_m, self.target_centroid_m) @ axes.T
+        twist = np.einsum("nij,ij->n", rotation, se3.hat(normal))
+        turn_rad = np.arctan2(twist, np.einsum("nii->n", rotation) - upright)
+        offset_m = centroid_offset(target_from_source, self.source_centroid_m, self.target_centroid_m) @ self.axes.T
         out_of_plane = (
             -0.5 * (tilt_rad / self.sigma_tilt_rad) ** 2
             - 0.5 * ((offset_m[:, 2] - self._lift_m) / self.sigma_lift_m) ** 2

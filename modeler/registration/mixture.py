@@ -1,8 +1,8 @@
-"""Where to sample: Gaussians around the candidates of a search, over what is known of the motion."""
+"""Gaussians on SE(3): to draw from, and to weigh what was drawn."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,11 +14,9 @@ from modeler.types import AbstractMotion, Array
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureMotion(AbstractMotion):
-    """A mixture of Gaussians on SE(3) that only proposes: what is known of the motion is another's."""
+class Gaussians:
+    """Weighted Gaussians of ξ, each about a pose of its own."""
 
-    known: AbstractMotion
-    """The independent knowledge."""
     means: Array
     """(k, 4, 4) target_from_source."""
     spreads: Array
@@ -27,28 +25,36 @@ class MixtureMotion(AbstractMotion):
     """(k,) of any sum of exponentials."""
     centre_m: Array
     """(3,) point of the source."""
-    evidence: bool = False
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw motions (count, 4, 4)."""
-        chosen = rng.choice(len(self.means), count, p=np.exp(self._log_shares))
+        """Draw motions (count, 4, 4), each Gaussian by its share of the weight."""
+        chosen = rng.choice(len(self.means), count, p=np.exp(self.log_weights - self.log_weight))
         xi = (self.spreads[chosen] @ rng.normal(size=(count, 6, 1)))[:, :, 0]
         return se3.moved(self.means[chosen], xi, self.centre_m)
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of motions (n, 4, 4)."""
+        """Return the log (n,) of the weighted sum of densities at motions (n, 4, 4)."""
         return mixture.log_densities(
-            rows(target_from_source), rows(self.means), self._roots, self._log_shares, self.centre_m
+            rows(target_from_source), rows(self.means), self._roots, self.log_weights, self.centre_m
         )
 
-    def log_evidence(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of what is independently known of motions (n, 4, 4)."""
-        return self.known.log_evidence(target_from_source)
+    def times(self, factor: float) -> Gaussians:
+        """Return the same with so many times the weight."""
+        return replace(self, log_weights=self.log_weights + np.log(factor))
+
+    def beside(self, other: Gaussians) -> Gaussians:
+        """Return them and others about the same centre."""
+        return Gaussians(
+            np.concatenate([self.means, other.means]),
+            np.concatenate([self.spreads, other.spreads]),
+            np.concatenate([self.log_weights, other.log_weights]),
+            self.centre_m,
+        )
 
     @cached_property
-    def _log_shares(self) -> Array:
-        top = self.log_weights.max()
-        return self.log_weights - top - np.log(np.sum(np.exp(self.log_weights - top)))
+    def log_weight(self) -> float:
+        """Log of the sum of the weights."""
+        return float(np.logaddexp.reduce(self.log_weights))
 
     @cached_property
     def _roots(self) -> Array:
@@ -56,3 +62,26 @@ class MixtureMotion(AbstractMotion):
         flipped = (self.spreads @ self.spreads.transpose(0, 2, 1))[:, ::-1, ::-1]
         upper = np.linalg.cholesky(flipped)[:, ::-1, ::-1]
         return np.ascontiguousarray(np.triu(np.linalg.inv(upper)), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureMotion(AbstractMotion):
+    """Gaussians that only propose: what is known of the motion is another's."""
+
+    known: AbstractMotion
+    """The independent knowledge."""
+    gaussians: Gaussians
+    """Where to draw."""
+    evidence: bool = False
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw motions (count, 4, 4)."""
+        return self.gaussians.sample(count, rng)
+
+    def log_density(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of motions (n, 4, 4)."""
+        return self.gaussians.log_density(target_from_source) - self.gaussians.log_weight
+
+    def log_evidence(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of what is independently known of motions (n, 4, 4)."""
+        return self.known.log_evidence(target_from_source)

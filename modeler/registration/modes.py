@@ -17,7 +17,9 @@ class Place:
     """Samples of one place, and how much of the mass is there."""
 
     poses: Array
-    """(n, 4, 4) equally weighted."""
+    """(n, 4, 4)."""
+    weights: Array
+    """(n,), their sum 1."""
     log_mass: float
     """Log of the prior mass times likelihood, up to a constant that all places share."""
     effective_samples: float
@@ -27,7 +29,7 @@ class Place:
 
     def gaussian(self, centre_m: Array) -> PoseGaussian:
         """Return the mean and covariance of the samples, taken about a point (3,) of the source."""
-        return weighted_gaussian(self.poses, np.ones(len(self.poses)), centre_m)
+        return weighted_gaussian(self.poses, self.weights, centre_m)
 
 
 def separate(found: Candidates, centre_m: Array, *, apart: float = 3.5) -> list[Candidates]:

@@ -8,8 +8,8 @@ import numpy as np
 
 from modeler import se3
 from modeler.kernels import paper as kernel
-from modeler.registration.annealing import effective_samples, pareto_tail
 from modeler.registration.free_space import Draws, FreeSpace, Measured
+from modeler.registration.importance import effective_samples, pareto_tail
 from modeler.registration.posterior import failed, intrinsics, weighted_gaussian
 from modeler.se3 import matrices, rows
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, Posterior, RayImage

@@ -24,7 +24,9 @@ def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaus
     return PoseGaussian(mean, 0.5 * (covariance + covariance.T))
 
 
-def share_at_limit(motion: AbstractMotion, poses: Array, centre_m: Array, rng: np.random.Generator) -> float:
+def share_at_limit(
+    motion: AbstractMotion, poses: Array, weights: Array, centre_m: Array, rng: np.random.Generator
+) -> float:
     """Return the share of motions (n, 4, 4) that a small step, about 1° and 1 mm, takes out of the prior's support.
 
     A posterior that leans on the end of its prior is cut off there, and what it would have found beyond is not known.
@@ -32,7 +34,7 @@ def share_at_limit(motion: AbstractMotion, poses: Array, centre_m: Array, rng: n
     """
     nudges = rng.normal(size=(len(poses), 6)) * np.repeat([np.radians(1.0), 0.001], 3)
     nudged = se3.moved(poses, nudges, centre_m)
-    return float(np.mean(~np.isfinite(motion.log_density(nudged))))
+    return float(weights @ ~np.isfinite(motion.log_density(nudged)))
 
 
 def failed(source: RayImage, target: RayImage, outcome: Outcome) -> Posterior:

@@ -33,7 +33,7 @@ class Refiner:
     caution: float = 2.0
     """By so many standard errors the sensitivity is lowered, so that noise does not pass for knowledge."""
 
-    def refine(self, pair: Pair, poses: Array, rng: np.random.Generator, *, fine_m: float) -> Array:
+    def refine(self, pair: Pair, poses: Array, weights: Array, rng: np.random.Generator, *, fine_m: float) -> Array:
         """Return the refined samples (n, 4, 4): those of posterior × matching surface, if both were Gaussian.
 
         Each sample takes its own Gauss-Newton step, as far as the surface is surer than the samples' spread, and a
@@ -43,11 +43,12 @@ class Refiner:
         Args:
             pair: the two views.
             poses: (n, 4, 4) samples of target_from_source.
+            weights: (n,) of the samples, of any sum.
             rng: source of all randomness.
             fine_m: least blur in m at which surfaces are told apart.
         """
         centre_m = pair.centre_m
-        mean, covariance = se3.mean(poses, np.ones(len(poses)), about_m=centre_m)
+        mean, covariance = se3.mean(poses, weights, about_m=centre_m)
         covariance = covariance + np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
         spread = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
         mode, noise_m = _mode(pair, mean, spread, centre_m, fine_m=fine_m)
@@ -102,10 +103,9 @@ def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: f
 
 def _steps(pair: Pair, poses: Array, noise_m: float, spread: Array, centre_m: Array) -> Array:
     """Return the Gauss-Newton steps (n, 6) of motions, held by the samples' spread where nothing else holds them."""
-    _, first, number = np.unique(poses[:, 0, 3], return_index=True, return_inverse=True)  # some are copies of others
-    gradient, matrix = pair.normal_equations(poses[first], noise_m, stride=2)
+    gradient, matrix = pair.normal_equations(poses, noise_m, stride=2)
     held = matrix + np.linalg.inv(spread @ spread.T)
-    return np.asarray(np.linalg.solve(held, gradient[:, :, None])[number, :, 0], dtype=np.float64)
+    return np.asarray(np.linalg.solve(held, gradient[:, :, None])[:, :, 0], dtype=np.float64)
 
 
 def _equations(pair: Pair, pose: Array, noise_m: float, centre_m: Array) -> tuple[Array, Array, Array, Array, Array]:

@@ -8,9 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from modeler.registration.annealing import AnnealedSampler, Population
+from modeler.registration.importance import AdaptiveSampler, Population
 from modeler.registration.lookup import Lookup
-from modeler.registration.mixture import MixtureMotion
+from modeler.registration.mixture import Gaussians, MixtureMotion
 from modeler.registration.modes import Place, separate, weighed
 from modeler.registration.pair import Pair
 from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
@@ -69,7 +69,7 @@ class VisibilityRegistrar(AbstractRegistrar):
     """from so many of the best,"""
     max_rounds: int = 3
     """and samples are drawn at most so many times."""
-    sampler: AnnealedSampler = field(default_factory=AnnealedSampler)
+    sampler: AdaptiveSampler = field(default_factory=AdaptiveSampler)
     """How each place is explored."""
     refiner: Refiner = field(default_factory=Refiner)
     """How samples are sharpened by the surface that matches."""
@@ -107,15 +107,18 @@ class VisibilityRegistrar(AbstractRegistrar):
             self._sampled_to_the_top(pair, motion, found, rng)
             for found in separate(candidates, pair.centre_m)[: self.max_places]
         ]
-        places = weighed([self._place(pair, motion, one, sampled, rng) for one in sampled])
+        strict = min(sampled, key=lambda one: one.noise_m)
+        places = weighed([self._place(pair, motion, one, strict, rng) for one in sampled])
         samples = np.concatenate([place.poses for _, place in places])
-        weights = np.concatenate([np.full(len(place.poses), share / len(place.poses)) for share, place in places])
+        weights = np.concatenate([share * place.weights for share, place in places])
         modes = tuple(Mode(share, place.gaussian(pair.centre_m)) for share, place in places)
         pose = modes[0].pose if len(modes) == 1 else weighted_gaussian(samples, weights, pair.centre_m)
         overlap = pair.overlap(modes[0].pose.mean)
         effective = 1.0 / sum(share**2 / place.effective_samples for share, place in places)
         beyond = candidates.beyond > self.max_beyond
-        at_limit = 1.0 if beyond else share_at_limit(motion, places[0][1].poses, pair.centre_m, rng)
+        at_limit = (
+            1.0 if beyond else share_at_limit(motion, places[0][1].poses, places[0][1].weights, pair.centre_m, rng)
+        )
         return Posterior(
             source=source.index,
             target=target.index,
@@ -142,7 +145,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         for _ in range(self.max_rounds - 1):
             if sampled.rise < self.short_of:
                 break
-            order = np.argsort(-sampled.population.log_likelihoods)
+            order = np.argsort(-sampled.population.log_likelihoods, kind="stable")
             best = sampled.population.poses[order[: self.restarts]]
             found = self.search.onward(pair, motion, found, best, rng)
             sampled = self._sampled(pair, motion, found, rng)
@@ -159,21 +162,24 @@ class VisibilityRegistrar(AbstractRegistrar):
         for kind, share in ((found.blunt, self.blunt_share), (~found.blunt, 1.0 - self.blunt_share)):
             if kind.any():
                 log_weights[kind] += np.log(share) - np.logaddexp.reduce(log_weights[kind])
-        proposal = MixtureMotion(motion, found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
-        population = self.sampler.run(proposal, [lambda _: likelihood], pair.centre_m, rng)
+        gaussians = Gaussians(found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
+        population = self.sampler.run(MixtureMotion(motion, gaussians), likelihood, pair.centre_m, rng)
         return _Sampled(population, noise_m, typical, float(population.log_likelihoods.max() - plain[0]))
 
     def _place(
-        self, pair: Pair, motion: AbstractMotion, one: _Sampled, all_places: list[_Sampled], rng: np.random.Generator
+        self, pair: Pair, motion: AbstractMotion, one: _Sampled, strict: _Sampled, rng: np.random.Generator
     ) -> Place:
-        """Return one of the places, sharpened by matching surface but where that would leave what is possible."""
+        """Return one of the places, sharpened by matching surface but where that would leave what is possible.
+
+        Each place was sampled under the noise that it shows itself, which would forgive it everything; beside each
+        other all are held to the noise of the one that matches best.
+        """
         population = one.population
-        refined = self.refiner.refine(pair, population.poses, rng, fine_m=self.search.blurs[-1] * pair.size_m)
+        refined = self.refiner.refine(
+            pair, population.poses, population.weights, rng, fine_m=self.search.blurs[-1] * pair.size_m
+        )
         inside = np.isfinite(motion.log_evidence(refined))
         best = int(np.argmax(population.log_likelihoods))
-        # Each place was sampled under the noise that it shows itself, which would forgive it everything; beside each
-        # other all are held to the noise of the one that matches best.
-        strict = min(all_places, key=lambda place: place.noise_m)
         beside = pair.tempered(
             population.poses[best : best + 1],
             strict.noise_m,
@@ -182,6 +188,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         )
         return Place(
             np.where(inside[:, None, None], refined, population.poses),
+            population.weights,
             population.log_evidence + float(beside[0] - population.log_likelihoods[best]),
             population.effective_samples,
             population.pareto_k,
@@ -189,7 +196,7 @@ class VisibilityRegistrar(AbstractRegistrar):
 
     def pair(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> Pair:
         """Return the comparison of two views, at points drawn with `rng`."""
-        size_m = float(np.mean([np.sqrt(np.sum(np.var(view.points_m, axis=0))) for view in (source, target)]))
+        size_m = 0.5 * (source.size_m + target.size_m)
         return Pair(
             self._lookup(source, target, size_m, rng),
             self._lookup(target, source, size_m, rng),

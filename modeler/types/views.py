@@ -117,4 +117,9 @@ class RayImage:
     @cached_property
     def centroid_m(self) -> Array:
         """Mean (3,) of the surface points; the origin where there are none."""
-        return self.points_m.mean(axis=0) if len(self.points_m) else np.zeros(3)
+        return np.array([axis_m.mean() for axis_m in self.points_m.T]) if len(self.points_m) else np.zeros(3)
+
+    @cached_property
+    def size_m(self) -> float:
+        """Root mean square distance in m of the surface points from their centroid; 0 where there are none."""
+        return float(np.sqrt(np.sum((self.points_m - self.centroid_m) ** 2) / max(len(self.points_m), 1)))

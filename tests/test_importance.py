@@ -1,0 +1,144 @@
+"""The sampler that learns where to draw: its samples stand for the posterior, whatever it drew from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from modeler import se3
+from modeler.registration.importance import AdaptiveSampler, effective_samples, pareto_tail, thinned
+from modeler.registration.mixture import Gaussians
+from modeler.types import AbstractMotion, Array
+
+CENTRE_M = np.array([0.05, -0.02, 0.7])
+ABOUT = se3.exp(np.array([0.2, -0.1, 0.3, 0.01, 0.02, -0.03]))
+SIGMAS = np.array([0.05, 0.02, 0.08, 0.004, 0.01, 0.002])
+
+
+@dataclass(frozen=True, eq=False)
+class Around(AbstractMotion):
+    """A Gaussian of ξ about a motion, the only thing known."""
+
+    sigmas: Array
+    evidence: bool = True
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        return gaussian(ABOUT, self.sigmas).sample(count, rng)
+
+    def log_density(self, target_from_source: Array) -> Array:
+        return gaussian(ABOUT, self.sigmas).log_density(target_from_source)
+
+
+def gaussian(mean: Array, sigmas: Array) -> Gaussians:
+    return Gaussians(mean[None], np.diag(sigmas)[None], np.zeros(1), CENTRE_M)
+
+
+def away(xi: Array) -> Array:
+    return se3.moved(ABOUT, xi, CENTRE_M)
+
+
+@pytest.mark.parametrize("narrower", [1.0, 0.3, 0.05])
+def test_samples_are_those_of_prior_times_likelihood(narrower: float) -> None:
+    """However little of the prior the likelihood leaves: mean, covariance and evidence are the product's."""
+    shift = narrower * SIGMAS * np.array([1.0, -1.0, 0.5, 0.5, -1.0, 1.0])
+    images = gaussian(away(shift), narrower * SIGMAS)
+    found = AdaptiveSampler(enough=4000.0, kept=8000).run(
+        Around(SIGMAS), images.log_density, CENTRE_M, np.random.default_rng(1)
+    )
+    assert found.weights.sum() == pytest.approx(1.0)
+    assert found.effective_samples > 3500.0
+    mean, covariance = se3.mean(found.poses, found.weights, about_m=CENTRE_M)
+    precision = 1.0 + narrower**-2.0
+    off = se3.difference(ABOUT, mean, CENTRE_M) - shift * narrower**-2.0 / precision
+    product = SIGMAS / np.sqrt(precision)
+    np.testing.assert_allclose(off / product, 0.0, atol=0.08)
+    np.testing.assert_allclose(covariance / np.outer(product, product), np.eye(6), atol=0.12)
+    both = np.hypot(SIGMAS, narrower * SIGMAS)
+    evidence = -0.5 * np.sum((shift / both) ** 2) - np.sum(np.log(both)) - 3.0 * np.log(2.0 * np.pi)
+    assert found.log_evidence == pytest.approx(evidence, abs=0.05)
+    assert found.pareto_k < 0.5
+
+
+def test_two_heaps_and_a_bent_ridge_keep_their_shares() -> None:
+    """What one Gaussian cannot draw well, several do; and the weights are right with either."""
+    apart = np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
+    heaps = gaussian(away(apart), 0.8 * SIGMAS).times(3.0).beside(gaussian(away(-apart), 0.8 * SIGMAS))
+    wide = Around(np.array([0.3, 0.03, 0.1, 0.006, 0.015, 0.003]))
+
+    def bent(poses: Array) -> Array:
+        xi = se3.difference(ABOUT, poses, CENTRE_M)
+        return -0.5 * ((xi[:, 4] - 0.2 * xi[:, 0] ** 2) / 0.003) ** 2 - 0.5 * np.sum((xi[:, 1:3] / 0.02) ** 2, axis=1)
+
+    shares, slopes = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        one = AdaptiveSampler(kept=3000, enough=1500.0).run(wide, heaps.log_density, CENTRE_M, rng)
+        shares.append(one.weights[se3.difference(ABOUT, one.poses, CENTRE_M)[:, 0] > 0.0].sum())
+        other = AdaptiveSampler(kept=3000, enough=1500.0).run(wide, bent, CENTRE_M, rng)
+        xi = se3.difference(ABOUT, other.poses, CENTRE_M)
+        slopes.append(other.weights @ (xi[:, 4] * xi[:, 0] ** 2) / (other.weights @ xi[:, 0] ** 4))
+        assert min(one.effective_samples, other.effective_samples) > 500.0
+    assert np.mean(shares) == pytest.approx(0.75, abs=0.02)
+    assert np.mean(slopes) == pytest.approx(0.2, abs=0.02)
+
+
+def test_a_proposal_that_is_off_costs_samples_and_not_truth() -> None:
+    """What only proposes is divided out: the result is the likelihood's own Gaussian."""
+    images = gaussian(away(3.0 * SIGMAS), SIGMAS)
+    found = AdaptiveSampler(enough=2000.0, kept=4000).run(
+        Around(SIGMAS, evidence=False), images.log_density, CENTRE_M, np.random.default_rng(3)
+    )
+    mean, covariance = se3.mean(found.poses, found.weights, about_m=CENTRE_M)
+    np.testing.assert_allclose(se3.difference(ABOUT, mean, CENTRE_M) / SIGMAS, 3.0, atol=0.1)
+    np.testing.assert_allclose(np.diag(covariance) / SIGMAS**2, 1.0, atol=0.15)
+
+
+def test_it_draws_no_more_than_it_may_and_says_what_that_is_worth() -> None:
+    narrow = gaussian(away(4.0 * SIGMAS), 0.01 * SIGMAS)
+    found = AdaptiveSampler(initial=200, max_draws=400).run(Around(SIGMAS), narrow.log_density, CENTRE_M, np.random.default_rng(0))
+    assert len(found.poses) <= 400
+    assert found.effective_samples < 100.0
+
+
+def test_a_likelihood_is_asked_only_where_a_pose_is_possible_and_nothing_possible_is_no_evidence() -> None:
+    class Nowhere(Around):
+        def log_evidence(self, target_from_source: Array) -> Array:
+            return np.full(len(target_from_source), -np.inf)
+
+    def never(poses: Array) -> Array:
+        raise AssertionError(f"asked of {len(poses)} impossible poses")
+
+    found = AdaptiveSampler(max_draws=600).run(
+        Nowhere(SIGMAS, evidence=False), never, CENTRE_M, np.random.default_rng(0)
+    )
+    assert found.log_evidence == -np.inf
+    assert np.all(np.isfinite(found.weights))
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0, 4.0])
+def test_thinned_samples_weigh_what_they_did_on_average(spread: float) -> None:
+    rng = np.random.default_rng(0)
+    weights = np.exp(spread * rng.normal(size=300))
+    weights /= weights.sum()
+    total, kept = np.zeros(300), np.zeros(0)
+    for _ in range(2000):
+        chosen, kept = thinned(weights, 60, rng)
+        assert len(chosen) == len(np.unique(chosen)) <= 60
+        assert kept.sum() == pytest.approx(1.0)
+        total[chosen] += kept
+    np.testing.assert_allclose(total / 2000, weights, atol=4.0 * np.sqrt(weights.max() / 60 / 2000))
+    assert 1.0 / np.sum(kept**2) > 0.9 * min(60.0, effective_samples(np.log(weights)))
+
+
+def test_thinning_leaves_the_few_as_they_are() -> None:
+    chosen, kept = thinned(np.array([0.5, 0.0, 0.3, 0.2]), 3, np.random.default_rng(0))
+    assert chosen.tolist() == [0, 2, 3]
+    assert kept.tolist() == [0.5, 0.3, 0.2]
+
+
+def test_the_tail_of_weights_that_fall_steeply_is_told_without_a_warning() -> None:
+    log_weights = -np.random.default_rng(0).exponential(400.0, size=2000)
+    assert np.isfinite(pareto_tail(log_weights)) or pareto_tail(log_weights) == -np.inf
+    assert pareto_tail(3.0 * np.random.default_rng(1).exponential(1.0, size=4000)) > 0.7
