@@ -179,3 +179,23 @@ def test_what_hangs_on_one_solution_in_two_ways_is_not_mixed_up() -> None:
     here, there = trunk.plus(one).solution, trunk.plus(other).solution
     assert np.trace(there.covariances[COUNT]) > 3.0 * np.trace(here.covariances[COUNT])
     np.testing.assert_array_equal(here.covariances[COUNT - 1], there.covariances[COUNT - 1])
+
+
+def test_a_pose_that_is_asked_alone_is_worked_out_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    growing = Smoother()
+    for edges in _arrivals(np.random.default_rng(18)):
+        growing = growing.plus(edges)
+    wanted = dict(solve(growing.graph, {}).covariances.items())
+    with monkeypatch.context() as patch:
+        patch.setattr(marginals, "_spread", None)  # without which not all can be worked out
+        covariances = growing.solution.covariances
+        assert COUNT - 1 in covariances
+        assert COUNT not in covariances
+        for _ in range(2):
+            found = covariances[COUNT - 1]
+            np.testing.assert_allclose(found, wanted[COUNT - 1], rtol=1e-4, atol=1e-4 * np.abs(found).max())
+    for frame, found in covariances.items():
+        np.testing.assert_allclose(found, wanted[frame], rtol=1e-4, atol=1e-4 * np.abs(found).max())
+    np.testing.assert_array_equal(covariances[3], dict(covariances.items())[3])
+    with pytest.raises(KeyError):
+        covariances[COUNT]

@@ -200,7 +200,7 @@ def test_mode_of_almost_no_weight_changes_nothing() -> None:
 def _rippled(of: Edge, sds: float) -> Edge:
     """The edge as two modes of equal covariance, so many standard deviations apart."""
     pose = of.posterior.pose
-    step = np.linalg.cholesky(pose.covariance) @ np.array([sds, 0.0, 0.0, 0.0, 0.0, 0.0])
+    step = np.asarray(np.linalg.cholesky(pose.covariance) @ np.array([sds, 0.0, 0.0, 0.0, 0.0, 0.0]), np.float64)
     parts = [PoseGaussian(pose.mean @ se3.exp(sign * 0.5 * step), pose.covariance) for sign in (1.0, -1.0)]
     whole = PoseGaussian(pose.mean, pose.covariance + 0.25 * np.outer(step, step))
     return edge(of.target, of.source, whole, of.kind, modes=[Mode(0.5, part) for part in parts])

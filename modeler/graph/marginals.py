@@ -11,7 +11,7 @@ as welcome as any other. First order in the errors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, ItemsView, Iterator, Mapping, Sequence, ValuesView
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -245,16 +245,29 @@ def gaussian_factor(rows: Rows, right: Array | None = None) -> gtsam.JacobianFac
 
 @dataclass(frozen=True, eq=False)
 class PoseCovariances(Mapping[int, Array]):
-    """Covariances (6, 6) of object_from_camera by frame number, worked out when asked."""
+    """Covariances (6, 6) of object_from_camera by frame number, worked out when asked.
+
+    The first one that is asked for is worked out alone; whoever asks for a second one is taken to want them all.
+    """
 
     trajectory: Mapping[int, Array]
     """object_from_camera (4, 4) by frame number."""
+    alone: Callable[[int], Array]
+    """Answers for one."""
     marginals: Callable[[], Mapping[int, Array]]
     """Answers for all."""
 
     def __getitem__(self, frame: int) -> Array:
         """Return the covariance of one pose."""
-        return self.marginals()[frame]
+        if frame not in self.trajectory:
+            raise KeyError(frame)
+        if not self._first:
+            self._first[frame] = self.alone(frame)
+        return self._first[frame] if frame in self._first else self.marginals()[frame]
+
+    def __contains__(self, frame: object) -> bool:
+        """Return whether a frame was solved."""
+        return frame in self.trajectory
 
     def __iter__(self) -> Iterator[int]:
         """Yield the solved frames."""
@@ -263,3 +276,15 @@ class PoseCovariances(Mapping[int, Array]):
     def __len__(self) -> int:
         """Return the number of solved frames."""
         return len(self.trajectory)
+
+    def items(self) -> ItemsView[int, Array]:
+        """Return all, the same numbers whatever was asked before."""
+        return self.marginals().items()
+
+    def values(self) -> ValuesView[Array]:
+        """Return all, the same numbers whatever was asked before."""
+        return self.marginals().values()
+
+    @cached_property
+    def _first(self) -> dict[int, Array]:
+        return {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import operator
 from collections.abc import Iterable, Mapping, Sequence
@@ -123,7 +124,9 @@ class Smoother:
         own = {link.edge: [mode.weight for mode in link.modes] for link in several}
         solution = Solution(
             trajectory=trajectory,
-            covariances=PoseCovariances(trajectory, relative_covariance.marginals),
+            covariances=PoseCovariances(
+                trajectory, functools.partial(relative_covariance, root), relative_covariance.marginals
+            ),
             odometry=odometry,
             outliers=tuple(loop.edge for loop, good in zip(closing, inlier, strict=True) if not good),
             relative_covariance=relative_covariance,
