@@ -97,7 +97,9 @@ def test_a_proposal_that_is_off_costs_samples_and_not_truth() -> None:
 
 def test_it_draws_no_more_than_it_may_and_says_what_that_is_worth() -> None:
     narrow = gaussian(away(4.0 * SIGMAS), 0.01 * SIGMAS)
-    found = AdaptiveSampler(initial=200, max_draws=400).run(Around(SIGMAS), narrow.log_density, CENTRE_M, np.random.default_rng(0))
+    found = AdaptiveSampler(initial=200, max_draws=400).run(
+        Around(SIGMAS), narrow.log_density, CENTRE_M, np.random.default_rng(0)
+    )
     assert len(found.poses) <= 400
     assert found.effective_samples < 100.0
 
