@@ -142,6 +142,30 @@ def test_exports_made_anew_from_the_frames(
     assert mesh.volume == pytest.approx(5.1e-4, rel=0.08)  # of the parts, less where they overlap
 
 
+def test_sequences_of_a_joined_run_may_have_moved(
+    runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = runs[2].parent
+    moved = [(folder / name).rename(tmp_path / name) for name in ("upright", "lying")]
+    out, options = tmp_path / "m.ply", [word for path in moved for word in ("--sequence", str(path))]
+    try:
+        command = ["export", str(runs[2]), "--out", str(out), "--voxel-m", "0.005"]
+        assert main([*command, *options]) == 0
+        out.unlink()
+        for wrong, words in (
+            ([], "say where it is with --sequence"),
+            (options[:2], "--sequence is given too few times"),
+            ([*options, *options[:2]], "--sequence is given 3 times"),
+            (options[2:] + options[:2], "shows something else than the one"),
+        ):
+            assert main([*command, *wrong]) == 2
+            assert words in capfd.readouterr().err
+        assert not out.exists()
+    finally:
+        for path in moved:
+            path.rename(folder / path.name)
+
+
 def test_a_textured_export_shows_the_colours(runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path) -> None:
     out = tmp_path / "figure.glb"
     assert main(["export", str(runs[0]), "--out", str(out), "--texture", "--triangles", "1500"]) == 0

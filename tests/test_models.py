@@ -124,6 +124,41 @@ def test_evaluate_tells_how_good_the_model_of_a_run_is(
         assert [float(row["f_3mm"]) for row in csv.DictReader(file)] == [row["f_3mm"] for row in results["models"]]
 
 
+def test_another_sequence_is_not_taken_for_that_of_the_run(
+    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence, run = _without(built, tmp_path)
+    moved = sequence.rename(tmp_path / "moved")
+    page = ("report", run, "--out", tmp_path / "page.html")
+    status, _, _ = _told(capsys, *page, "--sequence", moved)
+    assert status == 0
+    assert "Errors against ground truth" in (tmp_path / "page.html").read_text()
+    for command in (page, ("export", run, "--out", tmp_path / "m.ply", "--voxel-m", "0.005")):
+        status, out, err = _told(capsys, *command, "--sequence", bundled("tube"))
+        assert (status, out, err.count("\n")) == (2, "", 1)
+        assert f"tube: frame 0 shows something else than the one that {run} was made from" in err
+        status, _, err = _told(capsys, *command, "--sequence", moved, "--sequence", moved)
+        assert (status, err.count("\n")) == (2, 1)
+        assert "--sequence is given 2 times where" in err
+    assert not (tmp_path / "m.ply").exists()
+    assert _told(capsys, "report", "--sequence", moved, run)[0] == 0
+    (tmp_path / "page.html").unlink()
+    assert _told(capsys, *page)[0] == 0  # without its sequence
+    assert "The true motion is not known here" in (tmp_path / "page.html").read_text()
+
+
+def test_a_joined_run_is_judged_where_its_parts_know_one_surface(
+    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    joined = tmp_path / "joined"
+    assert _told(capsys, "join", built, built, "--out", joined, "--pairs", "2")[0] in (0, 3)
+    status, out, err = _told(capsys, "evaluate", joined, "--out", tmp_path / "scores")
+    assert (status, err) == (0, "")
+    assert [line.split()[3] for line in out.splitlines()[1:]] == ["6"] * 4
+    found = json.loads((tmp_path / "scores" / "models.json").read_bytes())["models"]
+    assert {row["poses"]: row["f_5mm"] > 0.8 for row in found if row["over"] == "seen"} == {"run": True, "true": True}
+
+
 def test_sequences_and_runs_are_not_mixed(built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = _told(capsys, "evaluate", BOX, built, "--out", tmp_path / "none")
     assert (status, out, err.count("\n")) == (2, "", 1)

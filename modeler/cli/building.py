@@ -145,7 +145,8 @@ def _told(report: Mapping[str, Any], options: Build) -> int:
     accepted = sum(frame["outcome"] == "accepted" for frame in report["frames"])
     loop = "loop closed" if report["closed"] else "no loop closed"
     took = f"{report['seconds']['total']:.0f} s"
-    print(f"modeler: {accepted} of {len(report['frames'])} frames, {loop}, {took}: {options.out}", file=sys.stderr)
+    frames = "1 frame" if len(report["frames"]) == 1 else f"{len(report['frames'])} frames"
+    print(f"modeler: {accepted} of {frames}, {loop}, {took}: {options.out}", file=sys.stderr)
     if report["reasons"]:
         first, *others = report["reasons"]
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""

@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
+from modeler.cli.parts import Part
 from modeler.cli.reopened import reopened
 from modeler.experiment import Modelled, ModelScore, model_scores, models_csv, models_json
 from modeler.export import mesh_of, read_model, write_atomically
 from modeler.fusion import Fuser
-from modeler.types import InputError
+from modeler.types import Array, InputError
 from sequences import true_mesh
+from sequences.mesh import Mesh
+
+_SAME_M = 1e-5  # to which files of one surface agree
 
 
 def is_run(path: Path) -> bool:
@@ -32,12 +38,7 @@ def evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> list[ModelSco
     scores = []
     for path in runs:
         run = reopened(path)
-        if run.recorded is None:
-            raise InputError(f"{path}: is joined from two runs; evaluate those, each against its own truth")
-        truth = run.recorded.truth()
-        if truth is None:
-            raise InputError(f"{run.recorded.name}: has no ground truth to compare with; add scene_gt.json.")
-        mesh = true_mesh(run.recorded)
+        truth, mesh = _truth(path, run.parts)
         modelled = Modelled(
             name=str(path),
             model=read_model(mesh_of(path)),
@@ -54,6 +55,30 @@ def evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> list[ModelSco
     write_atomically(out / "models.json", models_json(scores, seed))
     write_atomically(out / "models.csv", models_csv(scores))
     return scores
+
+
+def _truth(run: Path, parts: Sequence[Part]) -> tuple[dict[int, Array], Mesh]:
+    """Return the true camera_from_model (4, 4) by frame number, and the true surface.
+
+    Raises:
+        InputError: where a part of the run does not know them, or parts that were joined know different surfaces.
+    """
+    poses: dict[int, Array] = {}
+    meshes: list[Mesh] = []
+    for part in parts:
+        truth = part.truth()
+        if truth is None:
+            raise InputError(f"{part.sequence.name}: has no ground truth to compare with; add scene_gt.json.")
+        poses |= truth
+        meshes.append(true_mesh(part.sequence))
+    first = meshes[0].vertices_m
+    for part, mesh in zip(parts, meshes, strict=True):
+        if mesh.vertices_m.shape != first.shape or np.abs(mesh.vertices_m - first).max() > _SAME_M:
+            raise InputError(
+                f"{run}: {parts[0].sequence.name} and {part.sequence.name}, of which it is joined, have different true "
+                "surfaces; evaluate the runs it joins"
+            )
+    return poses, meshes[0]
 
 
 def models_table(scores: Sequence[ModelScore]) -> list[tuple[str, ...]]:

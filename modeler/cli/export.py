@@ -34,8 +34,12 @@ class Export:
     """Colour vertices by the number of views that saw them or by their standard deviation; made-up surface is pink."""
     voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M", help_behavior_hint="(default: as the data)")] = None
     """Side of a voxel: detail of the mesh."""
-    sequence: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: as in RUN)")] = None
-    """Where the sequence is now, if it has moved."""
+    sequence: Annotated[
+        tuple[Path, ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="SEQUENCE", help_behavior_hint="(default: as in RUN)"),
+    ] = ()
+    """Where the sequence is now, if it has moved; of a joined run, once for each of its parts, in order."""
 
     def run(self) -> int:
         """Write the mesh."""

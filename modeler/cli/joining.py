@@ -12,7 +12,8 @@ import numpy as np
 
 from modeler import se3
 from modeler.cli.join import Join
-from modeler.cli.reopened import Reopened, renumbered, reopened
+from modeler.cli.parts import renumbered
+from modeler.cli.reopened import Reopened, reopened
 from modeler.export import RunFolder, RunMeta
 from modeler.export.report import FrameRecord
 from modeler.fusion import Fuser, Match, Matcher, own_covariances

@@ -28,30 +28,43 @@ class Report:
     )
     """Page to write."""
     sequence: Annotated[
-        Path | None, tyro.conf.arg(metavar="SEQUENCE", help_behavior_hint="(default: as the run says)")
-    ] = None
-    """Where the sequence is now."""
+        tuple[Path, ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="SEQUENCE", help_behavior_hint="(default: as in RUN)"),
+    ] = ()
+    """Where the sequence is now, if it has moved; of a joined run, once for each of its parts, in order."""
 
     def run(self) -> int:
         """Write the page."""
-        from modeler.cli.compose import open_sequence
         from modeler.export import RunFolder
+        from modeler.types import InputError
         from viz.report import write_page
 
         out = self.run_folder / "report.html" if self.out is None else self.out
-        report = RunFolder(self.run_folder).report()
-        truth = _truth(Path(report["sequence"])) if self.sequence is None else open_sequence(self.sequence).truth()
+        RunFolder(self.run_folder).report()  # without which there is nothing to tell
+        try:
+            truth = _truth(self.run_folder, self.sequence)
+        except InputError:
+            if self.sequence:
+                raise
+            truth = None
         write_page(self.run_folder, out, truth)
         print(f"modeler: open {out} in a browser", file=sys.stderr)
         return 0
 
 
-def _truth(path: Path) -> Mapping[int, Array] | None:
-    """Return the true camera_from_model by frame number; None where there is none, or no sequence any more."""
-    from modeler.cli.compose import open_sequence
-    from modeler.types import InputError
+def _truth(run: Path, sequences: tuple[Path, ...]) -> Mapping[int, Array] | None:
+    """Return the true camera_from_model by frame number; None where nothing tells it.
 
-    try:
-        return open_sequence(path).truth()
-    except InputError:
-        return None
+    Raises:
+        InputError: where a sequence is not to be found, or is another than the run was made from.
+    """
+    from modeler.cli.parts import parts_of
+
+    poses: dict[int, Array] = {}
+    for part in parts_of(run, sequences):
+        truth = part.truth()
+        if truth is not None:
+            part.check()
+            poses |= truth
+    return poses or None

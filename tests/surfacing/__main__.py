@@ -73,10 +73,9 @@ def _sequence(shape: str, distance_m: float, out: Path) -> Path:
 def _rows(name: str, folder: Path) -> list[dict[str, object]]:
     """Return what each method makes of a run's frames, with true poses and the run's own."""
     run = reopened(folder)
-    assert run.recorded is not None
-    truth = run.recorded.truth()
+    truth = run.parts[0].truth()
     assert truth is not None
-    mesh = true_mesh(run.recorded)
+    mesh = true_mesh(run.parts[0].sequence)
     surface = TrueSurface.of(mesh.vertices_m, mesh.triangles, np.random.default_rng([0, 0]))
     seen = surface.seen((view.frame, truth[frame]) for frame, view in run.views.items())
     model_from_object = laid(run.solution.trajectory, truth)
