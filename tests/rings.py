@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.graph import PoseGraph
-from modeler.types import Array, Edge, Mode, Outcome, PoseGaussian, Posterior
+from modeler.types import Array, Edge, EdgeKind, Mode, Outcome, PoseGaussian, Posterior
 
 OBJECT_M = np.array([0.05, 0.02, 0.8])
 
@@ -16,7 +16,7 @@ def edge(
     target: int,
     source: int,
     pose: PoseGaussian,
-    kind: str = "odometry",
+    kind: EdgeKind = "odometry",
     *,
     accepted: bool = True,
     modes: Sequence[Mode] = (),

@@ -41,6 +41,7 @@ from modeler.types import (
     Array,
     Camera,
     Edge,
+    EdgeKind,
     Frame,
     InputError,
     ObjectModel,
@@ -74,7 +75,7 @@ def _loaded(path: Path) -> Any:
     return loaded
 
 
-def _edge(target: int, source: int, rng: np.random.Generator, kind: str = "odometry", **changes: Any) -> Edge:
+def _edge(target: int, source: int, rng: np.random.Generator, kind: EdgeKind = "odometry", **changes: Any) -> Edge:
     step = np.array([0.02, 0.4 * (source - target), 0.01, -0.3 * (source - target), 0.0, 0.05])
     factor = rng.normal(size=(6, 6)) * 0.003 + 0.004 * np.eye(6)
     pose = PoseGaussian(se3.exp(step + 0.005 * rng.normal(size=6)), factor @ factor.T)

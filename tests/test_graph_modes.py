@@ -12,7 +12,7 @@ from rings import covariance, edge, measured, nees, ring, rotation_error, spin, 
 from modeler import se3
 from modeler.graph import PoseGraph, Smoother, modes, solve
 from modeler.graph.belief import separate
-from modeler.types import Array, Edge, Mode, PoseGaussian
+from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian
 
 COUNT = 12
 WRONG_RAD = (np.pi / 2, -np.pi / 2, np.pi)
@@ -24,7 +24,7 @@ def _spun(pose: PoseGaussian, angle_rad: float) -> PoseGaussian:
 
 
 def _ambiguous(truth: Mapping[int, Array], target: int, source: int, *, rng: np.random.Generator, weights: list[float],
-               kind: str = "odometry") -> Edge:  # fmt: skip
+               kind: EdgeKind = "odometry") -> Edge:  # fmt: skip
     """An edge whose true mode has the first of the weights; they need not be in order."""
     true = measured(truth, target, source, rng)
     modes = [Mode(weights[0], true)]

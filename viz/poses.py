@@ -44,7 +44,7 @@ def drawing(step: Step) -> Drawing:
 
 def takes_part(edge: Edge, step: Step) -> bool:
     """Return whether an edge was accepted and not left out by the optimisation since."""
-    return edge.accepted and not any(edge is outlier for outlier in step.solution.outliers)
+    return step.solution.takes_part(edge)
 
 
 def shown(step: Step) -> list[int]:

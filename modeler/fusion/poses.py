@@ -21,9 +21,9 @@ def own_covariances(solution: Solution, edges: Iterable[Edge]) -> Mapping[int, A
     """
     information: dict[int, Array] = {}
     for edge in edges:
-        if not edge.accepted or edge in solution.outliers:
+        if not solution.takes_part(edge):
             continue
-        pose = solution.edge_poses.get((edge.source, edge.target), edge.posterior.pose)
+        pose = solution.pose_of(edge)
         ends = ((edge.source, pose.covariance), (edge.target, pose.inverse().covariance))
         for frame, covariance in ends:
             if frame in solution.trajectory:

@@ -85,7 +85,7 @@ class TurntablePrior(AbstractPrior):
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> TurntablePrior:
         """Return the prior that knows the axis and the sense of turning which the accepted pairs have in common."""
-        accepted = [edge for edge in edges if edge.accepted]
+        accepted = [edge for edge in edges if solution.takes_part(edge)]
         learnt = common_axis([edge.posterior for edge in accepted], np.radians(self.wobble_deg), self.wobble_m)
         prior = replace(self, learnt=learnt, newest=max(solution.trajectory, default=None))
         if self.step_sign == "known":
