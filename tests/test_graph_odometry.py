@@ -27,7 +27,7 @@ def _graph(rng: np.random.Generator) -> PoseGraph:
     true = measured(truth, 3, 4, rng)
     modes = Mode(0.6, PoseGaussian(true.mean @ spin([0.0, 1.5, 0.0]), true.covariance)), Mode(0.4, true)
     edges[3] = edge(3, 4, PoseGaussian(true.mean @ spin([0.0, 0.9, 0.0]), covariance(rng, 0.7)), modes=modes)
-    spans = [edge(k, k + 2, measured(truth, k, k + 2, rng)) for k in range(COUNT - 2)]
+    spans = [edge(k, k + 2, measured(truth, k, k + 2, rng), "span") for k in range(COUNT - 2)]
     closures = [edge(0, 7, measured(truth, 0, 7, rng), "closure"), edge(1, 6, measured(truth, 1, 6, rng), "closure")]
     lie = spun(edge(2, 7, measured(truth, 2, 7, rng), "closure"), [0.0, 1.0, 0.0])
     refused = edge(0, 5, measured(truth, 0, 5, rng), accepted=False)

@@ -46,7 +46,6 @@ Recording = dict[str, dict[int, dict[str, Any]]]
 COUNT, LOST = 6, 3
 PAIR_CLOUDS = (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER)
 GHOSTS = (entities.GHOSTS, entities.GHOST_MEANS, entities.GHOST_TIPS)
-SEEN = (entities.VISIBILITY_AGREES, entities.VISIBILITY_HIDDEN)
 CAPTIONS = (
     entities.MAGNIFICATION,
     entities.BEFORE_MAGNIFICATION,
@@ -121,7 +120,7 @@ def test_every_promised_entity_is_recorded(recording: Recording) -> None:
     promised = {
         "blob": [entities.COLOUR, entities.DEPTH],
         "buffer": [entities.MASK, entities.VISIBILITY_AREAS],
-        "positions": [*PAIR_CLOUDS, entities.PAIR_DRAWS, entities.CLOUD, *GHOSTS, *SEEN],
+        "positions": [*PAIR_CLOUDS, entities.PAIR_DRAWS, entities.CLOUD, *GHOSTS, entities.VISIBILITY_AGREES],
         "vertex_positions": [entities.MESH],
         "strips": [entities.CAMERAS, entities.CURRENT, entities.CHAIN, entities.BEFORE_CAMERAS, *EDGES],
         "vectors": [entities.AXES, entities.PAIR_AXES],
@@ -295,11 +294,32 @@ def test_points_hang_in_front_only_where_the_motion_is_wrong(run: list[Step]) ->
     assert len(beyond.pixels) == 0
 
 
+def test_points_are_drawn_by_what_is_said_of_them(run: list[Step]) -> None:
+    step = run[1]
+    (posterior,) = step.posteriors
+
+    def drawn_at(offset_m: list[float]) -> dict[str, Any]:
+        mean = se3.translation(np.array(offset_m)) @ posterior.pose.mean
+        moved = replace(posterior, pose=replace(posterior.pose, mean=mean))
+        return dict(visibility.drawing(replace(step, posteriors=(moved,))))
+
+    for path, offset_m in (
+        (entities.VISIBILITY_AGREES, [0.0, 0.0, 0.0]),
+        (entities.VISIBILITY_HIDDEN, [0.0, 0.0, 0.05]),
+        (entities.VISIBILITY_VIOLATIONS, [0.0, 0.0, -0.05]),
+    ):
+        points = drawn_at(offset_m)[path]
+        assert isinstance(points, rr.Points2D)
+        assert points.positions is not None
+        assert len(points.positions.as_arrow_array()) > 100
+
+
 def test_where_nothing_was_measured_no_point_is_judged(run: list[Step]) -> None:
     source, target = run[1].view, run[0].view
     assert source is not None
     assert target is not None
-    blind = replace(target, frame=replace(target.frame, depth_m=np.full_like(target.frame.depth_m, np.nan)))
+    nowhere = np.zeros_like(target.layers["cells"])  # cells of the kind MISSING
+    blind = replace(target, layers=dict(target.layers) | {"cells": nowhere})
     verdicts = visibility.projection(source, blind, np.eye(4)).verdicts
     assert len(verdicts) > 100
     assert (verdicts == visibility.NO_SAY).all()
@@ -673,7 +693,7 @@ def test_a_recording_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 
 
 def test_viewing_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(viewer.InputError, match=r"no recording\.rrd"):
+    with pytest.raises(viewer.InputError, match=r"no recording\.rrd .*build --out"):
         viewer.view(tmp_path)
 
 

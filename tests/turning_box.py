@@ -9,11 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from modeler import se3
+from modeler.rays import Sensor
 from modeler.types import (
     Array,
     BoolArray,
     Camera,
     Edge,
+    EdgeKind,
     Frame,
     ObjectModel,
     Outcome,
@@ -81,9 +83,10 @@ def _registrations(
     if not views:
         return [], []
     previous, first = max(views), min(views)
-    wanted = [(previous, "odometry", not lost)]
+    wanted: list[tuple[int, EdgeKind, bool]] = [(previous, "odometry", not lost)]
     if closing and not lost:
-        wanted += [(first, "closure", True), (sorted(views)[len(views) // 2], "closure", False)]
+        middle = sorted(views)[len(views) // 2]
+        wanted.extend(((first, "closure", True), (middle, "closure", False)))
     posteriors, edges = [], []
     for target, kind, accepted in wanted:
         truth = se3.inverse(object_from_camera(target)) @ object_from_camera(index)
@@ -123,16 +126,13 @@ def _view(index: int, width: int, rng: np.random.Generator, *, colour: bool) -> 
     depth = np.where(hit, near.max(axis=1), background)
     depth = depth + 0.001 * rng.standard_normal(len(depth))
     sign = -np.sign(np.take_along_axis(directions, axis[:, None], axis=1)[:, 0])
-    normals = (np.eye(3)[axis] * sign[:, None]) @ camera_from_box[:3, :3].T
     checks = 0.75 + 0.25 * (np.floor((origin + depth[:, None] * directions) / 0.025).sum(axis=1) % 2)
     rgb = np.where(hit[:, None], FACE_RGB[2 * axis + (sign > 0)] * checks[:, None], 90).astype(np.uint8)
     mask = hit.reshape(height, width)
     depth_m = depth.reshape(height, width).astype(np.float32)
     depth_m[: height // 20] = np.nan
     frame = Frame(index, float(index), depth_m, camera, colour=rgb.reshape(height, width, 3) if colour else None)
-    view = RayImage(
-        replace(frame, mask=mask), None, 0.002, 0.002, rays[hit] * depth[hit, None], normals[hit], np.argwhere(mask)
-    )
+    view = Sensor().ray_image(replace(frame, mask=mask))
     return frame, mask, view
 
 

@@ -108,9 +108,9 @@ centre within 1 and 3 sd as yellow ellipsoids; other modes in other colours, wit
 
 **Model.** Pink surface is made up: nobody saw it, and it closes the mesh.
 
-**Graph.** A pyramid is the camera as the object saw it, the newest orange. Edges: odometry white, closure green,
-rejected red, each with an ellipsoid of the shift it allows within 1 sd. Yellow: position of a camera within 1 sd
-(solid) and 3 sd (wire); discs at the tips of its axes: rotation within 1 sd. All magnified as written below.
+**Graph.** A pyramid is the camera as the object saw it, the newest orange. Edges: odometry and spans white, closure
+green, rejected red, each with an ellipsoid of the shift it allows within 1 sd. Yellow: position of a camera within
+1 sd (solid) and 3 sd (wire); discs at the tips of its axes: rotation within 1 sd. All magnified as written below.
 
 **Readings.** White odometry, green closure, yellow the newest pose after optimisation. Sd along the worst axis;
 translation is that of the object's centre.

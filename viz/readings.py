@@ -101,7 +101,7 @@ def now_words(step: Step) -> str:
     rejected = len(step.edges_so_far) - len(kinds)
     points = 0 if step.model is None else len(step.model.points_m)
     lines.append(
-        f"\nSo far: views {len(step.views)}, odometry edges {kinds.count('odometry')}, "
+        f"\nSo far: views {len(step.views)}, odometry edges {kinds.count('odometry')}, spans {kinds.count('span')}, "
         f"loop closures {kinds.count('closure')}, pairs rejected {rejected}; the model has {points:,} points"
         + (f" and {len(step.model.triangles):,} triangles." if step.model is not None and step.last else ".")
     )

@@ -115,7 +115,6 @@ def _of_edges(step: Step) -> Drawing:
     rotations = np.array([trajectory[edge.source][:3, :3] for edge in edges])
     blocks = np.array([edge.posterior.pose.covariance[3:, 3:] for edge in edges])
     half_axes, quaternions = ellipsoids(rotations @ blocks @ np.swapaxes(rotations, 1, 2))
-    rgb = {"odometry": entities.UNCERTAINTY_RGB, "closure": entities.CLOSURE_RGB}
     factor = rounded_down(_LARGEST_EDGE_SIGMA * poses.distance_m(step) / max(float(half_axes.max()), 1e-9))
     factor = min(max(factor, 0.1), 1000.0)
     yield (
@@ -124,12 +123,16 @@ def _of_edges(step: Step) -> Drawing:
             centers=ends.mean(axis=1),
             half_sizes=factor * half_axes,
             quaternions=quaternions,
-            colors=np.array([rgb[edge.kind] for edge in edges], dtype=np.uint8),
+            colors=np.array([_edge_rgb(edge) for edge in edges], dtype=np.uint8),
             fill_mode=rr.components.FillMode.Solid,
         ),
     )
     words = f"edges: 1 sd, {scale_words(factor)}"
     yield entities.EDGES_MAGNIFICATION, clouds.caption(poses.below_ring_m(step), words, entities.UNCERTAINTY_RGB)
+
+
+def _edge_rgb(edge: Edge) -> entities.Rgb:
+    return entities.CLOSURE_RGB if edge.kind == "closure" else entities.UNCERTAINTY_RGB
 
 
 def magnification(edges: Sequence[Edge], distance_m: float) -> float:

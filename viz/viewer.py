@@ -94,7 +94,7 @@ def view(run: Path, *, web: bool = False) -> Viewer:
     """
     recording = run / "recording.rrd"
     if not recording.is_file():
-        raise InputError(f"{run}: no recording.rrd in this folder; make one with: modeler build SEQUENCE --out {run}")
+        raise InputError(f"{run}: no recording.rrd here; give the folder that `modeler build --out` made")
     return start_web([recording]) if web else start_window([recording])
 
 

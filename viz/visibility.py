@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
-from scipy import ndimage
 
 from modeler import se3
-from modeler.types import Array, BoolArray, RayImage, Step
+from modeler.kernels import visibility as kernel
+from modeler.rays import Sensor
+from modeler.registration import VisibilityRegistrar
+from modeler.types import Array, RayImage, Step
 from viz import clouds, entities, images
 from viz.drawings import CLEAR, Drawing
 
 MISSING, BACKGROUND, OBJECT = 0, 1, 2
 """Areas of a picture: nothing was measured, something other than the object was, the object was."""
 AGREES, HIDDEN, VIOLATION, NO_SAY = 0, 1, 2, 3
-"""Verdicts on a point: on the measured surface, behind it, in front of it, where nothing was measured."""
+"""Verdicts on a point: on the measured surface, behind it, in front of it, where nothing is to be told."""
 
 _POINTS: Final = 1_200
-_SIGMAS: Final = 4.0  # closer to the surface than this a point agrees with it
-_DEAD: Final = 1.25  # width of the rim of the silhouette, in lateral sds, where pixels are mixed and judge nothing
+_VERDICT: Final = np.zeros(6, dtype=np.int8)  # by that of the likelihood
+_VERDICT[[kernel.MATCHED, kernel.UNKNOWN]] = AGREES, NO_SAY
+_VERDICT[[kernel.HIDDEN, kernel.BEHIND]] = HIDDEN
+_VERDICT[[kernel.IN_FRONT, kernel.IN_EMPTY_SPACE]] = VIOLATION
 _PATHS: Final = {
     AGREES: (entities.VISIBILITY_AGREES, entities.AGREES_RGB, 1.25),
     HIDDEN: (entities.VISIBILITY_HIDDEN, entities.HIDDEN_RGB, 1.0),
@@ -94,56 +97,24 @@ def areas(view: RayImage) -> npt.NDArray[np.uint8]:
 def projection(source: RayImage, target: RayImage, target_from_source: Array) -> Projection:
     """Return where points of the source land in the target's image, and whether they may be there.
 
-    A point may hide behind what a pixel measured, but not hang in front of it; a pixel without a measurement has no
-    say (paper, eq. pbd: the erf). Distances are along the normal of the measured surface, in sds of its noise.
+    The verdicts are those of `visibility`, from which an edge's overlap is counted, whatever method found the motion.
     """
-    stride = math.ceil(max(len(source.points_m), 1) / _POINTS)
-    points_m = se3.transform(target_from_source, source.points_m[::stride])
-    normals = source.normals[::stride] @ target_from_source[:3, :3].T
+    if min(len(source.points_m), len(target.points_m)) == 0:
+        return Projection(np.zeros((0, 2)), np.zeros(0, dtype=np.int8))
+    registrar, rng = VisibilityRegistrar(points=_POINTS), np.random.default_rng(0)
+    looked_up = registrar.pair(_ready(source), _ready(target), rng).forward
+    points_m = se3.transform(target_from_source, looked_up.points[:, :3])
+    verdicts = _VERDICT[looked_up.verdicts(se3.rows(target_from_source))]
     camera = target.frame.camera
     ahead = points_m[:, 2] > 1e-6
-    points_m, normals = points_m[ahead], normals[ahead]
+    points_m, verdicts = points_m[ahead], verdicts[ahead]
     scale = np.array([camera.fx, camera.fy])
     pixels = scale * points_m[:, :2] / points_m[:, 2:] + np.array([camera.cx, camera.cy])
-    columns, rows = np.rint(pixels).astype(np.int64).T
+    columns, rows = np.rint(pixels).T
     inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
-    points_m, normals, pixels = points_m[inside], normals[inside], pixels[inside]
-    return Projection(pixels, _verdicts(points_m, normals, (rows[inside], columns[inside]), target))
+    return Projection(pixels[inside], verdicts[inside])
 
 
-def _verdicts(
-    points_m: Array, normals: Array, at: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]], target: RayImage
-) -> npt.NDArray[np.int8]:
-    """Return the verdicts on points (n, 3) with normals (n, 3) at pixels (rows, columns) of the target."""
-    depth_m = target.frame.depth_m[at]
-    mask = target.frame.mask
-    measured = np.isfinite(depth_m) & (depth_m > 0)
-    facing = np.sum(normals * points_m, axis=1) < 0
-    tolerance_m = _SIGMAS * math.sqrt(2.0) * target.sigma_r_m
-    in_front_m = np.where(measured, depth_m, np.inf) - points_m[:, 2]
-    number_at = np.full(target.frame.depth_m.shape, -1, dtype=np.int64)
-    number_at[tuple(target.pixels.T)] = np.arange(len(target.pixels))
-    number = number_at[at]
-    planar = number >= 0
-    on = number[planar]
-    in_front_m[planar] = np.sum(target.normals[on] * (points_m[planar] - target.points_m[on]), axis=1)
-    verdicts = np.full(len(points_m), HIDDEN, dtype=np.int8)
-    verdicts[facing & (np.abs(in_front_m) <= tolerance_m)] = AGREES
-    verdicts[in_front_m > tolerance_m] = VIOLATION
-    if mask is not None:
-        # Object pixels without a local plane, and the rim around the silhouette, are mixed and judge nothing.
-        rim_px = 2 * math.ceil(_DEAD * max(target.sigma_wh * target.frame.camera.fx, 1.0)) + 1
-        near = _dilated(mask, rim_px)[at]
-        verdicts[(verdicts == VIOLATION) & ~planar & near] = NO_SAY
-    verdicts[~measured] = NO_SAY
-    return verdicts
-
-
-def _dilated(mask: BoolArray, size_px: int) -> BoolArray:
-    """Return the mask (h, w) grown to squares of `size_px` about its pixels."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    grown = np.zeros_like(mask)
-    if len(rows):
-        box = tuple(slice(max(int(ends[0]) - size_px, 0), int(ends[-1]) + size_px + 1) for ends in (rows, columns))
-        grown[box] = ndimage.maximum_filter(mask[box], size=size_px)
-    return grown
+def _ready(view: RayImage) -> RayImage:
+    """Return a view with the images that the likelihood looks up; steps hold earlier views without them."""
+    return view if view.layers else Sensor(view.sigma_wh, view.sigma_r_m).ray_image(view.frame, view.plane)
