@@ -11,6 +11,7 @@ from pathlib import Path
 
 import bags
 import numpy as np
+import recorded
 import recordings
 import test_inputs_clouds as clouds
 import test_inputs_kinect as kinect
@@ -110,6 +111,11 @@ def _kinect(folder: Path) -> Path:
     return folder / "s.mkv"
 
 
+def _recorded(name: str) -> Callable[[Path], Path]:
+    """Return what puts a recording of a camera's own library into a folder."""
+    return lambda folder: recorded.unpacked(name, folder)
+
+
 def _noise(folder: Path) -> Path:
     noise = {"lateral_px": 0.5, "focal_px": 500.0, "floor_m": 1e-4, "growth": [1e-6, 1e-7, 0.0]}
     (folder / "s.json").write_text(json.dumps({"noise": noise}))
@@ -145,10 +151,6 @@ TARGETS: dict[str, Target] = {
     "ply": Target(_cloud("ply binary"), ("s.ply",), read_all),
     "noise": Target(_noise, ("s.json",), read_noise),
 }
-
-
-if importlib.util.find_spec("av") is not None:
-    TARGETS["mkv"] = Target(_kinect, ("s.mkv",), read_all, 0.5)
 
 
 def _packed(mode: bags.rosbag2.CompressionMode) -> Callable[[Path], Path]:
@@ -219,7 +221,13 @@ TARGETS |= {
     "robot": Target(_robot, ("robot.txt",), trajectory),
     "recipe": Target(_recipe, ("s.json",), load_recipe),
     "run": Target(_run, ("report.json",), _poses),
+    "realsense 2.56": Target(_recorded("realsense-2.56.bag"), ("*.bag",), read_all, 0.5),
+    "realsense 2.58": Target(_recorded("realsense-2.58.db3"), ("*.db3",), read_all),
+    "realsense 2.59": Target(_recorded("realsense-2.59.db3"), ("*.db3",), read_all),
 }
+if importlib.util.find_spec("av") is not None:
+    TARGETS["mkv"] = Target(_kinect, ("s.mkv",), read_all, 0.5)
+    TARGETS["k4arecord"] = Target(_recorded("kinect.mkv"), ("kinect.mkv",), read_all, 0.3)
 
 
 def fresh(target: Target, folder: Path) -> tuple[Path, list[Path]]:
