@@ -13,7 +13,7 @@ import rerun as rr
 
 from modeler import se3
 from modeler.types import Array, Mode, Posterior, RayImage, Step
-from viz import clouds, entities, spread, uncertainty
+from viz import certainty, clouds, entities, spread, uncertainty
 from viz.drawings import CLEAR, Drawing
 
 _GHOSTS: Final = 20
@@ -99,8 +99,8 @@ def _factor(modes: Sequence[Mode], view: RayImage) -> float:
     widest_rad, widest_m = 0.0, 0.0
     for mode in modes:
         covariance = about_centre(mode.pose.covariance, view.centroid_m)
-        widest_rad = max(widest_rad, _sd(covariance[:3, :3]))
-        widest_m = max(widest_m, math.hypot(radius_m * _sd(covariance[:3, :3]), _sd(covariance[3:, 3:])))
+        turn_rad, shift_m = (certainty.worst_axis_sd(block) for block in (covariance[:3, :3], covariance[3:, 3:]))
+        widest_rad, widest_m = max(widest_rad, turn_rad), max(widest_m, math.hypot(radius_m * turn_rad, shift_m))
     if not widest_m > 0.0:
         return 1.0
     wanted = min(_SHOWN_SD * radius_m / widest_m, _MOST_RAD / max(widest_rad, 1e-9))
@@ -111,10 +111,6 @@ def about_centre(covariance: Array, centre_m: Array) -> Array:
     """Return the covariance (6, 6) of a motion's ξ about a point (3,) of the source instead of its camera."""
     to_centre = se3.adjoint(se3.translation(-centre_m))
     return to_centre @ covariance @ to_centre.T
-
-
-def _sd(covariance: Array) -> float:
-    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
 
 
 def _means(view: RayImage, modes: Sequence[Mode], colours: npt.NDArray[np.int64]) -> rr.Points3D:
