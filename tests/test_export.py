@@ -451,6 +451,25 @@ def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
     assert "contradict" in report["reasons"][0]
 
 
+def test_report_doubts_a_model_some_of_whose_frames_may_be_turned(tmp_path: Path) -> None:
+    """A mug whose handle is hidden for some frames: the loop closes, and yet nothing tells how far it turned there."""
+
+    def vague(*frames: int) -> Callable[[Step], Step]:
+        def change(step: Step) -> Step:
+            spread = np.diag([0.0, np.radians(9.0) ** 2, 0.0, 0.0, 0.0, 0.0])
+            sure = step.solution.covariances
+            covariances = {frame: sure[frame] + spread * (frame in frames) for frame in step.solution.trajectory}
+            return replace(step, solution=replace(step.solution, covariances=covariances))
+
+        return change
+
+    assert _spoilt(vague(), META, tmp_path)["reasons"] == []
+    one, some = (_spoilt(vague(*frames), META, tmp_path) for frames in ((7,), (5, 7, 9)))
+    assert (one["closed"], one["trustworthy"]) == (True, False)
+    assert one["reasons"] == ["frame 7 may be turned by 9° (one standard deviation)"]
+    assert some["reasons"][0].endswith("(one standard deviation), 2 more by over 5°")
+
+
 def test_report_in_the_middle_of_a_run_says_so(tmp_path: Path) -> None:
     run = RunFolder.open(tmp_path)
     report = [run.write(step, META) for step in _steps()[:2]][-1]

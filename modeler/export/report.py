@@ -132,7 +132,21 @@ def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> l
         for edge in edges
         if edge.posterior.overlap < _LITTLE_OVERLAP and not _joined_without(edge, edges)
     ]
-    return reasons
+    return reasons + _unsure(step.solution)
+
+
+def _unsure(solution: Solution) -> list[str]:
+    """Return in words which frames nobody knows how to turn: where the graph is not sure of it, nor is the model."""
+    sigmas_deg = {
+        frame: float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])))
+        for frame, covariance in solution.covariances.items()
+    }
+    worst = max(sigmas_deg, key=lambda frame: sigmas_deg[frame], default=None)
+    if worst is None or sigmas_deg[worst] <= _UNSURE_DEG:
+        return []
+    count = sum(sigma_deg > _UNSURE_DEG for sigma_deg in sigmas_deg.values())
+    others = f", {count - 1} more by over {_UNSURE_DEG:.0f}°" if count > 1 else ""
+    return [f"frame {worst} may be turned by {sigmas_deg[worst]:.0f}° (one standard deviation){others}"]
 
 
 def _joined_without(edge: Edge, edges: list[Edge]) -> bool:
@@ -153,6 +167,7 @@ def _reason(edge: Edge, step: Step) -> str:
 
 
 _LITTLE_OVERLAP = 0.5  # views farther apart are registered wrongly now and then, and surely so
+_UNSURE_DEG = 5.0  # standard deviation of a frame's turn beyond which the model shows a surface several times
 _OUTLIER = "the optimisation left it out: all other edges contradict it"
 
 
