@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import logsumexp
 
 from modeler import se3
 from modeler.priors.about_axis import Axis
@@ -15,11 +16,11 @@ _LEAST_PAIRS, _MOST_PAIRS = 3, 60  # the latest of many say enough
 _LEAST_TURN_RAD = np.radians(5.0)
 _STUDENT = 5.0  # degrees of freedom of the weights: few, so that motions that do not fit count little
 _ITERATIONS = 30
-_DECISIVE = np.log(1000.0)  # odds at which the sense of turning is taken for known
-_DOUBT = 0.1  # least chance that a pair is all wrong: one mode may have been missed
+_DECISIVE = np.log(500.0)  # odds at which the sense of turning is taken for known: three sure pairs tell 9³
+_MOST_TOLD = np.log(9.0)  # by one pair: it may be all wrong, for one mode may have been missed
 
 
-def common_axis(posteriors: Sequence[Posterior], wobble_rad: float, wobble_m: float) -> Axis | None:
+def common_axis(motions: Sequence[PoseGaussian], wobble_rad: float, wobble_m: float) -> Axis | None:
     """Return the axis that motions have in common; None where fewer than three turn far enough to show one.
 
     Each motion is exp(θ S) about the unit twist S = (d, -d × p) of the axis through p along d, its own angle θ free,
@@ -28,11 +29,11 @@ def common_axis(posteriors: Sequence[Posterior], wobble_rad: float, wobble_m: fl
     covariances say, the axis is the less sure for it.
 
     Args:
-        posteriors: of motions before one and the same camera.
+        motions: target_from_source, all before one and the same camera.
         wobble_rad: standard deviation of each motion's rotation that is no turn about the axis.
         wobble_m: standard deviation of its shift that no turn makes, at the axis' point.
     """
-    turning = [p.pose for p in posteriors if np.linalg.norm(se3.log(p.pose.mean)[:3]) >= _LEAST_TURN_RAD]
+    turning = [motion for motion in motions if np.linalg.norm(se3.log(motion.mean)[:3]) >= _LEAST_TURN_RAD]
     turning = turning[-_MOST_PAIRS:]
     if len(turning) < _LEAST_PAIRS:
         return None
@@ -84,21 +85,36 @@ def _gap(pose: PoseGaussian, direction: Array, point_m: Array, wobble: Array) ->
     )
 
 
-def turn_sense(posteriors: Sequence[Posterior], up: Array) -> float:
+def turn_sense(posteriors: Sequence[Posterior], up: Array, step_rad: float, sigma_step_rad: float) -> int:
     """Return +1 where from frame to frame the object turns right-handed about `up`, -1 the other way, 0 not yet known.
+
+    How sure a pair can be is bounded, so that it takes three of one mind. Turns by about half a circle tell nothing.
 
     Args:
         posteriors: of motions before one and the same camera.
-        up: (3,) the side to which the axis points.
+        up: (3,) unit, the side to which the axis points.
+        step_rad: turn from one frame number to the next, of either sign.
+        sigma_step_rad: standard deviation of one step.
     """
     odds = 0.0
     for posterior in posteriors:
-        poses = posterior.samples if len(posterior.samples) else posterior.pose.mean[None]
-        weights = posterior.weights if len(posterior.samples) else np.ones(1)
-        forth = (se3.log(poses)[:, :3] @ up) * (posterior.target - posterior.source) > 0.0
-        share = float(np.sum(weights * forth) / np.sum(weights))
-        odds += float(np.log(max(share, _DOUBT) / max(1.0 - share, _DOUBT)))
-    return float(np.sign(odds)) if abs(odds) > _DECISIVE else 0.0
+        steps = posterior.target - posterior.source
+        turn_rad, variance = steps * step_rad, abs(steps) * sigma_step_rad**2
+        forth, back = (_log_likelihood(posterior, up, turn, variance) for turn in (turn_rad, -turn_rad))
+        odds += float(np.clip(forth - back, -_MOST_TOLD, _MOST_TOLD))
+    return int(np.sign(odds)) if abs(odds) > _DECISIVE else 0
+
+
+def _log_likelihood(posterior: Posterior, up: Array, turn_rad: float, variance: float) -> float:
+    """Return the log likelihood, up to a constant, of a turn about `up` that is known with a variance in rad²."""
+    parts = [(mode.weight, mode.pose) for mode in posterior.modes] or [(1.0, posterior.pose)]
+    told, shares = [], []
+    for weight, pose in parts:
+        off_rad = np.remainder(se3.log(pose.mean)[:3] @ up - turn_rad + np.pi, 2.0 * np.pi) - np.pi
+        whole = variance + up @ pose.covariance[:3, :3] @ up
+        told.append(-0.5 * off_rad**2 / whole)
+        shares.append(weight / np.sqrt(whole))
+    return float(logsumexp(told, b=shares))
 
 
 def _begin(motions: Sequence[PoseGaussian]) -> tuple[Array, Array]:

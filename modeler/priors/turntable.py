@@ -61,6 +61,9 @@ class TurntablePrior(AbstractPrior):
     """Whether views that show no table are refused: the product of table and step."""
     learnt: Axis | None = None
     """The axis that the pairs so far have in common, which tells where to look."""
+    sense: int = 0
+    """Which way round the pairs so far turn, right-handed about the axis +1, where `step_sign` does not tell and they
+    do: it tells where to look."""
     newest: int | None = None
     """The last frame of a sequence that is being built, from which on steps are evidence; None: no sequence."""
 
@@ -70,9 +73,11 @@ class TurntablePrior(AbstractPrior):
         Raises:
             InputError: where a table is needed and neither view shows one.
         """
-        motion = self._motion(source, target, self._axis(source, target))
-        if self.learnt is not None:
-            motion = guided(motion, [self._motion(source, target, self.learnt)])
+        axis = self._axis(source, target)
+        motion = self._motion(source, target, axis)
+        if self.learnt is not None or self.sense:
+            told = replace(self, step_sign="known", step_deg=self.sense * abs(self.step_deg)) if self.sense else self
+            motion = guided(motion, [told._motion(source, target, self.learnt or axis)])
         if self.newest is None or target.index == self.newest:
             return motion
         # The steps that lead to an earlier view count in the edges between; here they only tell where to look.
@@ -84,15 +89,16 @@ class TurntablePrior(AbstractPrior):
         return replace(self, max_shift_m=grown_limits(step_deg, self.max_shift_m, steps)[1])
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> TurntablePrior:
-        """Return the prior that knows the axis and the sense of turning which the accepted pairs have in common."""
-        accepted = [edge for edge in edges if solution.takes_part(edge)]
-        learnt = common_axis([edge.posterior for edge in accepted], np.radians(self.wobble_deg), self.wobble_m)
-        prior = replace(self, learnt=learnt, newest=max(solution.trajectory, default=None))
-        if self.step_sign == "known":
-            return prior
-        up = np.array(_UP if self.axis_direction is None else self.axis_direction)
-        sense = turn_sense([edge.posterior for edge in accepted], up)
-        return prior if sense == 0.0 else replace(prior, step_sign="known", step_deg=sense * abs(self.step_deg))
+        """Return the prior that knows the axis and the sense of turning which the pairs so far have in common."""
+        telling = [edge for edge in edges if solution.takes_part(edge)]
+        motions = [solution.pose_of(edge) for edge in telling]
+        learnt = common_axis(motions, float(np.radians(self.wobble_deg)), self.wobble_m)
+        sense = 0
+        if self.step_sign == "unknown":
+            up = np.array(_UP if self.axis_direction is None else self.axis_direction)
+            step_rad, sigma_rad = np.radians([abs(self.step_deg), self.step_sigma_deg])
+            sense = turn_sense([edge.posterior for edge in telling], up / np.linalg.norm(up), step_rad, sigma_rad)
+        return replace(self, learnt=learnt, sense=sense, newest=max(solution.trajectory, default=None))
 
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
         """Return the axis that all steps share, as far as the edge of each does not hold it; None where it is given.
