@@ -290,6 +290,37 @@ def test_the_object_goes_with_the_hand(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(shift_m.std(axis=0), 0.008, rtol=0.08)
 
 
+def seen_before(index: int) -> RayImage:
+    """A view of a surface 7 cm before the point about which the hand turns it, on the camera's side."""
+    near_m = AXIS_POINT_M + np.array([0.0, 0.0, -0.07]) + np.random.default_rng(index).normal(0.0, 0.003, (300, 3))
+    return view(index, near_m, None)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_a_hand_that_turned_far_leaves_room_for_what_is_seen(steps: int) -> None:
+    """What is seen lies before the middle of the object, so that a true motion parts the centroids of two views."""
+    upright = np.array([0.0, 1.0, 0.0])
+    poses = np.array([turned(k * STEP, upright) for k in range(6)])
+    prior = HeldPrior(0.5 * np.arange(6.0), poses, newest=9)
+    source, target = (seen_before(k) for k in (steps, 0))
+    true = poses[0] @ se3.inverse(poses[steps])
+    apart_m = np.linalg.norm(se3.transform(true, source.centroid_m[None])[0] - target.centroid_m)
+    assert (apart_m > prior.max_offset_m) == (steps > 1)
+    assert np.isfinite(prior.between(source, target).log_evidence(true[None]))
+
+
+def test_a_hand_whose_prior_grows_leaves_more_room() -> None:
+    taught = replace(held(HERE), newest=9)
+    for prior in (taught, taught.grown(2.0)):
+        motion = prior.between(SOURCE, TARGET)
+        assert isinstance(motion, Guided)
+        samples = motion.known.sample(2000, np.random.default_rng(RNG))
+        offset_m = samples[:, :3, :3] @ SOURCE.centroid_m + samples[:, :3, 3] - TARGET.centroid_m
+        assert np.linalg.norm(offset_m, axis=1).max() == pytest.approx(prior.max_offset_m, rel=0.02)
+    assert taught.grown(2.0).max_offset_m > 1.8 * taught.max_offset_m
+    assert taught.grown(1.0).max_offset_m == taught.max_offset_m
+
+
 def test_a_missing_pose_is_interpolated_and_less_sure() -> None:
     times_s, poses = hand(HERE)
     sparse = HeldPrior(np.delete(times_s, 2), np.delete(poses, 2, axis=0))

@@ -7,6 +7,7 @@ import numpy as np
 from modeler import se3
 from modeler.types import AbstractMotion, AbstractPrior, Array, EvenSpread, RayImage
 
+_SMALL_DEG = 30.0  # up to this turn limits of the centroids' offset are what they say
 _WIDEST_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of what was seen of it
 
 
@@ -85,6 +86,12 @@ def grown_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -> 
     rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, _WIDEST_DEG))
     chord = np.sin(np.radians(rotation_deg) / 2.0) / np.sin(np.radians(max_rotation_deg) / 2.0)
     return rotation_deg, float(max(chord, 1.0)) * max_offset_m
+
+
+def turned_offset_m(max_offset_m: float, turn_rad: float) -> float:
+    """Return the limit of the centroids' offset in m for a turn of any size: up to 30 degrees what it says itself."""
+    share = max(abs(np.remainder(turn_rad + np.pi, 2.0 * np.pi) - np.pi) / np.radians(_SMALL_DEG), 1.0)
+    return grown_limits(_SMALL_DEG, max_offset_m, float(share))[1]
 
 
 def directions(count: int, rng: np.random.Generator) -> Array:

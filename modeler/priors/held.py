@@ -9,10 +9,11 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors.bumps import Bumps
-from modeler.priors.general import GeneralPrior
+from modeler.priors.general import GeneralPrior, grown_limits, turned_offset_m
 from modeler.priors.proposal import guided
 from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, Frame, InputError, RayImage, Solution
 
+_STEP_DEG = 25.0  # such as the limit of the offset is meant for
 _ROOM_DEG = 5.0  # about what four standard deviations of the hand's errors allow
 _SAME_TIME_S = 1e-3  # poses and frames that are no farther apart in time belong together
 
@@ -36,7 +37,8 @@ class HeldPrior(AbstractPrior):
     max_gap_s: float = 1.0
     """Poses farther apart in time than this are not interpolated."""
     max_offset_m: float = 0.04
-    """Largest distance between the centroids where the hand only tells where to look (returns to earlier views)."""
+    """Largest distance between the centroids where the hand only tells where to look (returns to earlier views); for
+    turns beyond 30 degrees it grows with them."""
     name: str = "the hand's trajectory"
     """What the poses were read from, for messages."""
     newest: int | None = None
@@ -61,8 +63,13 @@ class HeldPrior(AbstractPrior):
             return moved
         # What the hand did up to an earlier view counts in the edges between; here it only tells where to look.
         reach_deg = min(float(np.degrees(4.0 * sigma_rad)) + _ROOM_DEG, 180.0)
-        limits = GeneralPrior(reach_deg, self.max_offset_m).between(source, target)
+        offset_m = turned_offset_m(self.max_offset_m, float(se3.rotation_angle(motion)))
+        limits = GeneralPrior(reach_deg, offset_m).between(source, target)
         return guided(replace(limits, middle=motion[:3, :3]), [moved])
+
+    def grown(self, steps: float) -> HeldPrior:
+        """Return the prior with room for the offset of several steps; their motion is the hand's."""
+        return replace(self, max_offset_m=grown_limits(_STEP_DEG, self.max_offset_m, steps)[1])
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> HeldPrior:
         """Return the prior that knows which frame came last."""

@@ -11,7 +11,7 @@ import numpy as np
 from modeler.priors.about_axis import AboutAxis, Axis
 from modeler.priors.axis_turn import AxisTurn
 from modeler.priors.common_axis import common_axis, turn_sense
-from modeler.priors.general import GeneralPrior, grown_limits
+from modeler.priors.general import GeneralPrior, grown_limits, turned_offset_m
 from modeler.priors.on_plane import no_plane, support
 from modeler.priors.proposal import guided
 from modeler.priors.table import TablePrior
@@ -19,7 +19,6 @@ from modeler.types import AbstractMotion, AbstractPrior, Edge, RayImage, SharedA
 
 _UP = (0.0, -1.0, 0.0)  # against gravity for a camera held upright: y points down
 _BROAD_DEG, _GIVEN_DEG = 30.0, 1.0
-_SHIFT_DEG = 30.0  # up to this turn the shift's limit is what it says
 _LEAST = 1e-5  # rad or m: densities stay finite where somebody is wholly sure
 _VAGUE_DEG = 20.0  # a direction known no better counts for nothing beside what steps show, in however many edges it is
 _ROOM_DEG = 5.0  # about what four standard deviations of the steps allow
@@ -151,8 +150,7 @@ class TurntablePrior(AbstractPrior):
 
     def _shift_m(self, steps: int) -> float:
         """Return the largest shift for so many steps: the centroid of what is seen lies before the axis, and turns."""
-        turn_deg = abs(_on_circle(steps * self.step_deg))
-        return grown_limits(_SHIFT_DEG, self.max_shift_m, max(turn_deg / _SHIFT_DEG, 1.0))[1]
+        return turned_offset_m(self.max_shift_m, float(np.radians(steps * self.step_deg)))
 
     def _limits(self, source: RayImage, target: RayImage) -> AbstractMotion:
         """Return motions as far as the steps may reach, on the table where one is seen; all turns within are alike."""
