@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -46,8 +46,10 @@ class Placing:
         if not posteriors:
             return None, ""
         odometry = posteriors[0]
-        if self._goes_on(odometry) and (self.steps == 1 or self._off_deg(odometry) <= self.max_angle_deg):
-            return odometry, _joins(odometry)
+        follows, joins = self._follows(odometry), f"joins the previous view: {odometry.outcome.label}"
+        joins = f"{joins}, overlap {odometry.overlap:.2f}"
+        if follows and (self.steps == 1 or self._off_deg(odometry) <= self.max_angle_deg):
+            return odometry, joins
         standing = [posterior for posterior in posteriors[1:] if stands(posterior, self.asked)]
         standing.sort(key=lambda posterior: -posterior.overlap)
         for posterior in standing:
@@ -57,10 +59,10 @@ class Placing:
             turned_deg = float(np.degrees(se3.rotation_angle(posterior.pose.mean)))
             if max(off_deg, turned_deg) <= self.max_angle_deg:
                 return posterior, f"{reason}, {off_deg:.0f}° from the motion going on"
-            for witness in self._witnesses(posterior, standing):
+            if (witness := self._witness(posterior, standing)) is not None:
                 return posterior, f"{reason}, frame {witness.target} agrees"
-        for witness in self._witnesses(odometry, standing) if self._goes_on(odometry) else ():
-            return odometry, f"{_joins(odometry)}, frame {witness.target} agrees"
+        if follows and (witness := self._witness(odometry, standing)) is not None:
+            return odometry, f"{joins}, frame {witness.target} agrees"
         return None, ""
 
     def next(self, posteriors: Sequence[Posterior]) -> int | None:
@@ -92,22 +94,22 @@ class Placing:
     def _frames(self) -> list[int]:
         return self.past.frames
 
-    def _goes_on(self, odometry: Posterior) -> bool:
+    def _follows(self, odometry: Posterior) -> bool:
         """Return whether the previous view's registration came to an end, and after lost frames matches like others."""
         matches = self.steps == 1 or not odometry.log_evidence < self.asked.least_nats
         return flaw(odometry) is None and matches
 
-    def _witnesses(self, posterior: Posterior, standing: Sequence[Posterior]) -> Iterator[Posterior]:
-        """Yield the registrations of other views that agree with one that is not too far from where the motion led."""
+    def _witness(self, posterior: Posterior, standing: Sequence[Posterior]) -> Posterior | None:
+        """Return a registration of another view that agrees with one not too far from where the motion led."""
         # A pace that changes at random from step to step goes astray with the root of their number.
         if self._off_deg(posterior) > float(np.sqrt(self.steps)) * self.max_angle_deg:
-            return
+            return None
         reach = ways(self.past.edges, self.past.solution, posterior.target)
-        for witness in standing:
-            if witness is not posterior:
-                agreed = self.trust.agreement_by_way_of(posterior, witness, self.past, reach)
-                if agreed.agrees:
-                    yield witness
+        others = (other for other in standing if other is not posterior)
+        agreeing = (
+            other for other in others if self.trust.agreement_by_way_of(posterior, other, self.past, reach).agrees
+        )
+        return next(agreeing, None)
 
     def _off_deg(self, posterior: Posterior) -> float:
         """Return the angle between where a registration puts a frame and where the motion going on would have."""
@@ -116,7 +118,3 @@ class Placing:
         expected = continued(self.past.solution, self._frames, posterior.source)
         placed = self.past.solution.trajectory[posterior.target] @ modes(posterior)[0][1].mean
         return float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ placed)))
-
-
-def _joins(odometry: Posterior) -> str:
-    return f"joins the previous view: {odometry.outcome.label}, overlap {odometry.overlap:.2f}"
