@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Array, Camera, Frame, InputError
-from sequences.broken import told
-from sequences.colour_depth import told_numbers
-from sequences.folders import pictures
+from sequences.files.broken import told
+from sequences.files.folders import pictures
+from sequences.files.images import MAX_PIXELS
 from sequences.given import Given, Intrinsics, sane
-from sequences.images import MAX_PIXELS
+from sequences.pictures.colour_depth import told_numbers
 from sequences.recording import AbstractRecording
 
 SUFFIXES = (".pcd", ".ply")

@@ -10,7 +10,7 @@ import numpy as np
 
 from modeler.types import Array, Camera, InputError
 from sequences.depth_sensor import DepthSensor
-from sequences.json_input import read_tree
+from sequences.files.json_input import read_tree
 from sequences.shapes import AnyShape
 from sequences.structure import build
 from sequences.trajectory import AnyTrajectory, Tabletop

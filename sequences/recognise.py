@@ -6,12 +6,12 @@ from pathlib import Path
 
 from modeler.types import InputError
 from sequences.base import AbstractSequence
-from sequences.bop import BopSequence
-from sequences.colour_depth import COLOUR_FOLDERS, open_colour_depth
-from sequences.folders import entries
+from sequences.bop.sequence import BopSequence
+from sequences.files.folders import entries
 from sequences.given import Given
-from sequences.realsense import SCHEME, open_camera
-from sequences.tum import open_tum
+from sequences.live.realsense import SCHEME, open_camera
+from sequences.pictures.colour_depth import COLOUR_FOLDERS, open_colour_depth
+from sequences.pictures.tum import open_tum
 
 FORMATS = (
     "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder, organised clouds, a ROS bag, a RealSense recording, "
@@ -46,13 +46,13 @@ def _open(path: Path, given: Given) -> AbstractSequence:
     if not path.exists():
         raise InputError(f"{path}: no such folder or file; give {FORMATS}.")
     if path.suffix.lower() in BAGS or (path / "metadata.yaml").exists():
-        from sequences.ros import open_ros
+        from sequences.ros.sequence import open_ros
 
         return open_ros(path, given)
     if (path / "report.json").is_file():
         raise InputError(f"{path}: is the folder of a run; give the sequence it was made from, or convert its poses.")
     if path.is_file() and path.suffix.lower() == ".mkv":
-        from sequences.kinect import open_kinect
+        from sequences.kinect.sequence import open_kinect
 
         return open_kinect(path, given)
     if (path.is_file() and path.suffix.lower() in CLOUDS) or _holds_clouds(path):

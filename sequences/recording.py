@@ -9,8 +9,8 @@ from pathlib import Path
 
 from modeler.types import InputError
 from sequences.base import AbstractSequence, span
-from sequences.folders import inside
-from sequences.json_input import Node, read_tree
+from sequences.files.folders import inside
+from sequences.files.json_input import Node, read_tree
 
 
 @dataclass(frozen=True)

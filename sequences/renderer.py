@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.types import Array, Camera, Frame, InputError
 from sequences.base import AbstractSequence, span
-from sequences.bop_writer import write_bop
+from sequences.bop.writer import write_bop
 from sequences.depth_sensor import EXACT, DepthSensor, Exposure
 from sequences.mesh import Mesh, ply_bytes
 from sequences.raycast import Caster, Hits

@@ -8,7 +8,7 @@ from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 
 from modeler.types import InputError
-from sequences.json_input import Node
+from sequences.files.json_input import Node
 
 
 def build(annotation: object, node: Node) -> typing.Any:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from modeler.types import InputError
 from sequences.base import AbstractSequence
-from sequences.bop import BopSequence
-from sequences.json_input import read_tree
+from sequences.bop.sequence import BopSequence
+from sequences.files.json_input import read_tree
 from sequences.mesh import Mesh, read_mesh
 
 _MM = 1e-3

@@ -19,9 +19,9 @@ from modeler.cli import main
 from modeler.types import Camera, InputError
 from sequences import Given, open_sequence
 from sequences.alignment import Alignment
-from sequences.json_input import Node
-from sequences.kinect import KinectSequence, Matroska
-from sequences.kinect_calibration import colour_from_depth, colour_lens, depth_lens
+from sequences.files.json_input import Node
+from sequences.kinect.calibration import colour_from_depth, colour_lens, depth_lens
+from sequences.kinect.sequence import KinectSequence, Matroska
 from sequences.lens import Lens
 
 WIDTH, HEIGHT = 320, 288  # NFOV_2X2BINNED
@@ -230,7 +230,7 @@ def test_images_larger_than_their_track_are_bounded(tmp_path: Path, monkeypatch:
     container.close()
     stamp = Matroska(tmp_path / "s.mkv").stamps("COLOR")[1][1]
     assert Matroska(tmp_path / "s.mkv").picture("COLOR", stamp, "image 1").shape == (240, 320, 3)
-    monkeypatch.setattr("sequences.kinect.MAX_PIXELS", 64 * 48)
+    monkeypatch.setattr("sequences.kinect.sequence.MAX_PIXELS", 64 * 48)
     with pytest.raises(InputError, match=r"s\.mkv: is not a readable recording"):
         Matroska(tmp_path / "s.mkv").picture("COLOR", stamp, "image 1")
 

@@ -22,9 +22,9 @@ from modeler.cli import main
 from modeler.types import Camera, Frame, InputError
 from sequences import Given, open_sequence, survey
 from sequences.lens import Lens, known
-from sequences.live import AbstractCamera, begin
-from sequences.realsense import open_camera
-from sequences.ros import RosSequence
+from sequences.live.realsense import open_camera
+from sequences.live.sequence import AbstractCamera, begin
+from sequences.ros.sequence import RosSequence
 
 TURN = Rotation.from_rotvec([0.1, 0.3, -0.2]).as_matrix()
 SHIFT_M = np.array([0.015, 0.001, 0.002])
@@ -250,8 +250,8 @@ def test_a_camera_of_the_makers_library_is_read_while_it_runs(
     played = context.load_device(str(path))
     with pytest.raises(InputError, match=r"realsense:123: no such camera is plugged in; there is 0123456789\."):
         open_camera("123", Given(), context)
-    monkeypatch.setattr("sequences.realsense.PATIENCE_MS", 500)
-    monkeypatch.setattr("sequences.live.FIRST", 4)
+    monkeypatch.setattr("sequences.live.realsense.PATIENCE_MS", 500)
+    monkeypatch.setattr("sequences.live.sequence.FIRST", 4)
     sequence = open_camera("0123456789", Given(), context)
     assert (sequence.name, sequence.depth_unit) == ("Software D455", "0.25 mm (the camera)")
     frames: list[Frame] = []

@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.cli import main
 from modeler.types import Camera, Frame, InputError
-from sequences import Given, open_sequence, ros_images
+from sequences import Given, open_sequence
 from sequences.lens import Lens
-from sequences.ros import RosSequence
+from sequences.ros import images as ros_images
+from sequences.ros.sequence import RosSequence
 
 SUFFIXES = (".bag", ".mcap", ".db3", "")
 

@@ -12,10 +12,10 @@ import pytest
 from modeler.cli import main
 from modeler.types import Frame, InputError
 from sequences import NoiseModel, SensedSequence, bundled, open_sequence, read_noise, write_bop
-from sequences.calibrate import Calibration, calibrate
 from sequences.depth_noise import gaussian_field
-from sequences.noise_lateral import borders, pooled_px
-from sequences.noise_model import noise_text, object_distance_m
+from sequences.noise.across import borders, pooled_px
+from sequences.noise.calibrate import Calibration, calibrate
+from sequences.noise.model import noise_text, object_distance_m
 from sequences.recipe import load_recipe
 from sequences.renderer import RenderedSequence
 from sequences.trajectory import Tabletop

@@ -9,8 +9,8 @@ from modeler.cli.calibrate_sensor import CalibrateSensor
 from modeler.cli.reading import reading
 from modeler.export.files import write_atomically
 from sequences import open_sequence
-from sequences.calibrate import Calibration, calibrate
-from sequences.noise_model import noise_text, object_distance_m
+from sequences.noise.calibrate import Calibration, calibrate
+from sequences.noise.model import noise_text, object_distance_m
 
 
 def calibrate_sensor(options: CalibrateSensor) -> int:

@@ -16,7 +16,7 @@ from modeler.export.files import write_atomically
 from modeler.export.tum import tum_text
 from modeler.types import InputError
 from sequences import AbstractSequence, SensedSequence, frame_range, open_sequence, read_noise, survey, write_bop
-from sequences.bop_entries import pose_entry
+from sequences.bop.entries import pose_entry
 
 UNITS_MM = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 10.0)
 """Depth is written in the finest of these in which it fits into 16 bits."""

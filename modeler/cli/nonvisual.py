@@ -23,7 +23,7 @@ from modeler.priors import (
 )
 from modeler.types import AbstractPrior, InputError
 from sequences import AbstractSequence
-from sequences.tum import trajectory
+from sequences.pictures.tum import trajectory
 
 _GIVEN = {
     "general": ("max_rotation_deg", "max_offset_m"),

@@ -9,11 +9,11 @@ from typing import final
 import numpy as np
 
 from modeler.types import InputError
-from sequences import noise_range
 from sequences.base import AbstractSequence
-from sequences.noise_lateral import Border, borders, pooled_px
-from sequences.noise_model import NoiseModel
-from sequences.noise_range import Class
+from sequences.noise import along
+from sequences.noise.across import Border, borders, pooled_px
+from sequences.noise.along import Class
+from sequences.noise.model import NoiseModel
 
 MOST_FRAMES = 40
 """More frames of a still scene add little."""
@@ -56,7 +56,7 @@ def calibrate(sequence: AbstractSequence) -> Calibration:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # pixels without any measurement
         middle_m = np.where(seen, np.nanmedian(depth_m, axis=0), np.nan)
-    moving = noise_range.moving_share(depth_m, middle_m)
+    moving = along.moving_share(depth_m, middle_m)
     if moving > MAX_MOVING:
         raise InputError(
             f"{sequence.name}: {moving:.0%} of the image moves; record a scene in which camera and things stand still."
@@ -68,10 +68,10 @@ def calibrate(sequence: AbstractSequence) -> Calibration:
             f"{sequence.name}: shows no border of a near thing before a far one; put a box in front of the background."
         )
     camera = frames[0].camera
-    classes = noise_range.classes(depth_m, middle_m, camera, lateral_px)
+    classes = along.classes(depth_m, middle_m, camera, lateral_px)
     if not classes:
         raise InputError(f"{sequence.name}: shows no smooth surface; put flat things at several distances and angles.")
-    floor_m, growth = noise_range.fitted(classes)
+    floor_m, growth = along.fitted(classes)
     # A border that never wavers still lies somewhere within its pixel.
     lateral_px = max(lateral_px, float(np.sqrt(1.0 / 12.0)))
     model = NoiseModel(lateral_px, 0.5 * (camera.fx + camera.fy), floor_m, growth)

@@ -11,13 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Array, Frame, InputError
-from sequences import ros_images
-from sequences import ros_topics as topics
-from sequences.bag import Bag, Stamp
 from sequences.given import Given
 from sequences.lens import Lens
+from sequences.pictures.tum import MAX_APART_S, nearest
 from sequences.recording import AbstractRecording
-from sequences.tum import MAX_APART_S, nearest
+from sequences.ros import images, topics
+from sequences.ros.bag import Bag, Stamp
 
 
 @final
@@ -53,7 +52,7 @@ class RosSequence(AbstractRecording):
             raise self.absent(index)
         time_s, depth_stamp, colour_stamp = self.shots[index]
         where = f"{self.path}: {self.depth_topic}, image {index}"
-        depth_m = ros_images.depth_m(self.bag.message(self.depth_topic, depth_stamp), self.unit_mm, where)
+        depth_m = images.depth_m(self.bag.message(self.depth_topic, depth_stamp), self.unit_mm, where)
         self._check_size(where, depth_m.shape, self.lens)
         camera = self.lens.camera
         depth_m = self.lens.straight(depth_m, float("nan"))
@@ -86,7 +85,7 @@ class RosSequence(AbstractRecording):
         if stamp is None or self.colour is None:
             return None
         where = f"{self.path}: {self.colour.topic}, for image {index}"
-        picture = ros_images.colour(self.bag.message(self.colour.topic, stamp), where)
+        picture = images.colour(self.bag.message(self.colour.topic, stamp), where)
         alignment = self.colour.alignment
         self._check_size(where, picture.shape[:2], self.lens if alignment is None else alignment.colour)
         return self.lens.straight(picture) if alignment is None else alignment.aligned(depth_m, picture)

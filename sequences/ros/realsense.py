@@ -12,10 +12,10 @@ import numpy as np
 
 from modeler import se3
 from modeler.types import Array, Camera, InputError
-from sequences import ros_frames
-from sequences.bag import Bag
 from sequences.given import sane
 from sequences.lens import Lens, known
+from sequences.ros import frames
+from sequences.ros.bag import Bag
 
 TEXT = "std_msgs/msg/String"
 _STREAM = r"(/device_\d+/sensor_\d+)/\w+"
@@ -82,7 +82,7 @@ def _from_reference(bag: Bag, topic: str) -> Array | None:
 
 def _pose(message: Any, where: str) -> Array:
     if message.__msgtype__ == "geometry_msgs/msg/Transform":
-        found = ros_frames.pose(message)
+        found = frames.pose(message)
         pose = np.full((4, 4), np.nan) if found is None else found
     else:
         said = _said(message)

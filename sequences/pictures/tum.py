@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.types import Array, InputError
-from sequences.folders import first_folder, inside, pictures
+from sequences.files.folders import first_folder, inside, pictures
+from sequences.files.images import picture_size
+from sequences.files.intrinsics import find_intrinsics
+from sequences.files.json_input import read_text
 from sequences.given import Given
-from sequences.images import picture_size
-from sequences.intrinsics_files import find_intrinsics
-from sequences.json_input import read_text
-from sequences.pictures import PictureSequence, Shot
+from sequences.pictures.sequence import PictureSequence, Shot
 
 UNIT_MM = 0.2
 """The benchmark stores 5000 units per metre."""

@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation, correlate
 from scipy.optimize import nnls
 
 from modeler.types import Array, BoolArray, Camera
-from sequences.noise_model import slope_terms
+from sequences.noise.model import slope_terms
 
 HALF = 3
 """Surfaces are compared with a quadric over so many pixels to either side."""

@@ -4,7 +4,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.types import Array
-from sequences.json_input import Node
+from sequences.files.json_input import Node
 
 
 def intrinsics(node: Node) -> tuple[float, float, float, float]:

@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from modeler.types import Array, Frame, InputError
 from sequences.base import AbstractSequence, span
+from sequences.files.images import metres
 from sequences.lens import Lens
-from sequences.pictures import metres
 
 FIRST = 10
 """So many frames are taken before anything is said of the sequence."""

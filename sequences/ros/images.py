@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Camera, InputError
+from sequences.files.images import MAX_PIXELS, Packed, read_colour, read_depth
 from sequences.given import sane
-from sequences.images import MAX_PIXELS, Packed, read_colour, read_depth
 from sequences.lens import Lens, known
 
 IMAGE, PACKED, CAMERA = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"

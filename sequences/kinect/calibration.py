@@ -10,8 +10,8 @@ import numpy as np
 
 from modeler import se3
 from modeler.types import Array, Camera, InputError
+from sequences.files.json_input import Node
 from sequences.given import Intrinsics, sane
-from sequences.json_input import Node
 from sequences.lens import Lens, coefficients
 
 DEPTH, COLOUR = "CALIBRATION_CameraPurposeDepth", "CALIBRATION_CameraPurposePhotoVideo"

@@ -21,9 +21,9 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from modeler.types import InputError
-from sequences.broken import told
-from sequences.folders import entries, inside
-from sequences.unpacking import check_file, from_bz2, from_lz4, from_zstd, is_zstd, of_size
+from sequences.files.broken import told
+from sequences.files.folders import entries, inside
+from sequences.ros.unpacking import check_file, from_bz2, from_lz4, from_zstd, is_zstd, of_size
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

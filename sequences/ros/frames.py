@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.types import Array
-from sequences.bag import Bag
+from sequences.ros.bag import Bag
 
 STATIC = "tf2_msgs/msg/TFMessage"
 FARTHEST_M = 1e4

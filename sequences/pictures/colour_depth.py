@@ -10,11 +10,11 @@ import numpy as np
 
 from modeler import se3
 from modeler.types import Array, InputError
-from sequences.folders import entries, first_folder, frame_number, inside, pictures
+from sequences.files.folders import entries, first_folder, frame_number, inside, pictures
+from sequences.files.intrinsics import find_intrinsics
+from sequences.files.json_input import read_text
 from sequences.given import Given
-from sequences.intrinsics_files import find_intrinsics
-from sequences.json_input import read_text
-from sequences.pictures import PictureSequence, Shot
+from sequences.pictures.sequence import PictureSequence, Shot
 
 COLOUR_FOLDERS = ("color", "rgb", "colour", "image")
 MASK_FOLDERS = ("masks", "mask")

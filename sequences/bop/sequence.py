@@ -10,12 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Array, BoolArray, Camera, Frame, InputError
-from sequences.bop_entries import camera_from_model, depth_scale_mm, intrinsics
-from sequences.folders import entries, frame_number, inside
+from sequences.bop.entries import camera_from_model, depth_scale_mm, intrinsics
+from sequences.files.folders import entries, frame_number, inside
+from sequences.files.images import check_alike, check_size, metres, read_colour, read_depth, read_mask
+from sequences.files.json_input import read_tree
 from sequences.given import Given
-from sequences.images import read_colour, read_depth, read_mask
-from sequences.json_input import read_tree
-from sequences.pictures import check_alike, check_size, metres
 from sequences.recording import AbstractRecording
 
 

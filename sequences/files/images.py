@@ -148,3 +148,38 @@ def write_picture(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uin
         picture.save(path, quality=85, optimize=True)
     else:
         picture.save(path, compress_level=9, optimize=True)
+
+
+def metres(raw: npt.NDArray[np.uint16], scale_mm: float) -> npt.NDArray[np.float32]:
+    """Return depth (h, w) in m of raw units; 0 becomes NaN."""
+    return np.where(raw == 0, np.float32(np.nan), (raw * (scale_mm / 1000.0)).astype(np.float32))
+
+
+def check_size(path: Path, found: tuple[int, ...], depth: tuple[int, ...]) -> None:
+    """Refuse a mask or colour of another size than its depth image, each (h, w).
+
+    Raises:
+        InputError: where it is.
+    """
+    if found != depth:
+        raise InputError(
+            f"{path}: is {found[1]} x {found[0]} pixels where its depth image is {depth[1]} x {depth[0]}; "
+            "colour and masks must be aligned to depth."
+        )
+
+
+def check_alike(path: Path, size: tuple[int, ...], alike: Path, said: str) -> None:
+    """Refuse a depth image of another size than one with the same intrinsics.
+
+    Args:
+        path: the depth image.
+        size: its (h, w).
+        alike: the other.
+        said: what says that the intrinsics are the same, and what to do.
+
+    Raises:
+        InputError: where it is.
+    """
+    width, height = picture_size(alike)
+    if size != (height, width):
+        raise InputError(f"{path}: is {size[1]} x {size[0]} pixels where {alike.name} is {width} x {height}, {said}.")

@@ -9,7 +9,7 @@ from typing import final
 
 from modeler.types import Frame
 from sequences.base import AbstractDerived
-from sequences.noise_model import NoiseModel, object_distance_m
+from sequences.noise.model import NoiseModel, object_distance_m
 
 
 @final

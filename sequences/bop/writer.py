@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Array, Frame, InputError
-from sequences.bop_entries import camera_entry, pose_entry
-from sequences.images import write_picture
+from sequences.bop.entries import camera_entry, pose_entry
+from sequences.files.images import write_picture
 
 
 def write_bop(

@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
-import numpy as np
-import numpy.typing as npt
-
-from modeler.types import Array, Camera, Frame, InputError
+from modeler.types import Array, Camera, Frame
+from sequences.files.images import check_alike, check_size, metres, read_colour, read_depth, read_mask
 from sequences.given import Intrinsics
-from sequences.images import picture_size, read_colour, read_depth, read_mask
 from sequences.recording import AbstractRecording
 
 
@@ -99,38 +96,3 @@ class PictureSequence(AbstractRecording):
     def notes(self) -> tuple[str, ...]:
         """What the reader assumed, or left out."""
         return self.remarks
-
-
-def metres(raw: npt.NDArray[np.uint16], scale_mm: float) -> npt.NDArray[np.float32]:
-    """Return depth (h, w) in m of raw units; 0 becomes NaN."""
-    return np.where(raw == 0, np.float32(np.nan), (raw * (scale_mm / 1000.0)).astype(np.float32))
-
-
-def check_size(path: Path, found: tuple[int, ...], depth: tuple[int, ...]) -> None:
-    """Refuse a mask or colour of another size than its depth image, each (h, w).
-
-    Raises:
-        InputError: where it is.
-    """
-    if found != depth:
-        raise InputError(
-            f"{path}: is {found[1]} x {found[0]} pixels where its depth image is {depth[1]} x {depth[0]}; "
-            "colour and masks must be aligned to depth."
-        )
-
-
-def check_alike(path: Path, size: tuple[int, ...], alike: Path, said: str) -> None:
-    """Refuse a depth image of another size than one with the same intrinsics.
-
-    Args:
-        path: the depth image.
-        size: its (h, w).
-        alike: the other.
-        said: what says that the intrinsics are the same, and what to do.
-
-    Raises:
-        InputError: where it is.
-    """
-    width, height = picture_size(alike)
-    if size != (height, width):
-        raise InputError(f"{path}: is {size[1]} x {size[0]} pixels where {alike.name} is {width} x {height}, {said}.")

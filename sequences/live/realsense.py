@@ -13,7 +13,7 @@ import numpy.typing as npt
 from modeler.types import Camera, InputError
 from sequences.given import Given
 from sequences.lens import Lens, coefficients
-from sequences.live import AbstractCamera, LiveSequence, begin
+from sequences.live.sequence import AbstractCamera, LiveSequence, begin
 
 SCHEME = "realsense:"
 """What a path begins with that means a camera; its serial number may follow."""

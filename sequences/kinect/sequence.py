@@ -16,15 +16,14 @@ import numpy.typing as npt
 
 from modeler.types import Array, Frame, InputError
 from sequences.alignment import Alignment
-from sequences.broken import told
+from sequences.files.broken import told
+from sequences.files.images import MAX_PIXELS, Packed, metres, read_colour
+from sequences.files.json_input import Node
 from sequences.given import Given
-from sequences.images import MAX_PIXELS, Packed, read_colour
-from sequences.json_input import Node
-from sequences.kinect_calibration import colour_from_depth, colour_lens, depth_lens
+from sequences.kinect.calibration import colour_from_depth, colour_lens, depth_lens
 from sequences.lens import Lens
-from sequences.pictures import metres
+from sequences.pictures.tum import MAX_APART_S, nearest
 from sequences.recording import AbstractRecording
-from sequences.tum import MAX_APART_S, nearest
 
 ADVICE = "pip install 'modeler[kinect]'"
 _AGAIN = "record or copy it anew"

@@ -10,16 +10,16 @@ from typing import Any, final
 import numpy as np
 
 from modeler.types import Camera, InputError
-from sequences import realsense_bag, ros_frames, ros_images
 from sequences.alignment import Alignment
-from sequences.bag import Bag
 from sequences.given import Given
 from sequences.lens import Lens
+from sequences.ros import frames, images, realsense
+from sequences.ros.bag import Bag
 
 
 def first_images(bag: Bag) -> dict[str, Any]:
     """Return the first message of each topic of images."""
-    kinds = (ros_images.IMAGE, ros_images.PACKED)
+    kinds = (images.IMAGE, images.PACKED)
     found = {}
     for topic in sorted(topic for topic, kind in bag.types.items() if kind in kinds):
         for _, message in bag.messages(topic, most=1):
@@ -33,7 +33,7 @@ def depth_topic(bag: Bag, first: Mapping[str, Any], given: Given) -> str:
     Raises:
         InputError: where there is none or nothing tells which.
     """
-    found = [topic for topic, message in first.items() if ros_images.is_depth(message)]
+    found = [topic for topic, message in first.items() if images.is_depth(message)]
     if given.depth_topic is not None:
         if given.depth_topic not in found:
             raise InputError(f"{bag.path}: {given.depth_topic} holds no depth images; {_listed(found)}.")
@@ -58,9 +58,9 @@ def depth_lens(bag: Bag, topic: str, image: Any, given: Given) -> Lens:
         InputError: where nothing tells it.
     """
     if given.intrinsics is not None:
-        if image.__msgtype__ == ros_images.IMAGE:
+        if image.__msgtype__ == images.IMAGE:
             return Lens(Camera(int(image.width), int(image.height), *given.intrinsics), ())
-        height, width = ros_images.depth_m(image, 1.0, f"{bag.path}: {topic}").shape
+        height, width = images.depth_m(image, 1.0, f"{bag.path}: {topic}").shape
         return Lens(Camera(width, height, *given.intrinsics), ())
     known = _camera(bag, topic)
     if known is None:
@@ -72,15 +72,15 @@ def depth_lens(bag: Bag, topic: str, image: Any, given: Given) -> Lens:
 
 def _camera(bag: Bag, topic: str) -> Lens | None:
     """Return what the first camera_info message beside a topic of images says; None where there is none."""
-    infos = [other for other, kind in bag.types.items() if kind == ros_images.CAMERA]
+    infos = [other for other, kind in bag.types.items() if kind == images.CAMERA]
     bare = re.sub(r"/(compressedDepth|compressed|theora)$", "", topic)
     parent = bare.rsplit("/", 1)[0]
     wanted = (f"{parent}/camera_info", f"{parent.rsplit('/', 1)[0]}/info/camera_info", f"{bare}/camera_info")
     for info in (name for name in wanted if name in infos):
         for _, message in bag.messages(info, most=1):
-            known = ros_images.lens(message, f"{bag.path}: {info}", ros1=bag.is_ros1)
+            known = images.lens(message, f"{bag.path}: {info}", ros1=bag.is_ros1)
             return Lens(known.camera, ()) if "rect" in bare.rsplit("/", 1)[1] else known
-    return realsense_bag.lens(bag, topic)
+    return realsense.lens(bag, topic)
 
 
 @final
@@ -108,7 +108,7 @@ def colour_source(
     Raises:
         InputError: where the topic asked for holds none.
     """
-    found = [topic for topic, message in first.items() if ros_images.is_colour(message)]
+    found = [topic for topic, message in first.items() if images.is_colour(message)]
     if given.colour_topic is not None:
         if given.colour_topic not in found:
             raise InputError(f"{bag.path}: {given.colour_topic} holds no colour images; there are {_names(found)}.")
@@ -122,7 +122,7 @@ def colour_source(
     aligned = [topic for topic, camera in cameras.items() if _same(camera, depth[1])]
     for better in (
         [topic for topic in aligned if "color" in topic or "rgb" in topic or "colour" in topic],
-        [topic for topic in aligned if first[topic].__msgtype__ == ros_images.IMAGE],
+        [topic for topic in aligned if first[topic].__msgtype__ == images.IMAGE],
     ):
         aligned = better or aligned
     if aligned:
@@ -136,9 +136,9 @@ def colour_source(
 
 def _beside(bag: Bag, first: Mapping[str, Any], topic: str, depth: tuple[str, Lens]) -> Alignment | None:
     """Return where the camera of a colour topic is; None where nothing tells it."""
-    camera, motion = _camera(bag, topic), realsense_bag.colour_from_depth(bag, topic, depth[0])
+    camera, motion = _camera(bag, topic), realsense.colour_from_depth(bag, topic, depth[0])
     if motion is None:
-        motion = ros_frames.fixed(bag, first[topic].header.frame_id, first[depth[0]].header.frame_id)
+        motion = frames.fixed(bag, first[topic].header.frame_id, first[depth[0]].header.frame_id)
     return None if camera is None or motion is None else Alignment(depth[1].camera, camera, motion)
 
 
@@ -155,9 +155,9 @@ def unit(bag: Bag, topic: str, image: Any, given: Given) -> tuple[float, str]:
     """Return the millimetres in one unit of 16-bit depth, and the unit in words."""
     if given.depth_scale_mm is not None:
         return given.depth_scale_mm, f"{given.depth_scale_mm:g} mm (--depth-scale-mm)"
-    if image.__msgtype__ == ros_images.IMAGE and image.encoding in ros_images.METRES:
+    if image.__msgtype__ == images.IMAGE and image.encoding in images.METRES:
         return 1000.0, "m (32FC1)"
-    found = realsense_bag.unit_mm(bag, topic)
+    found = realsense.unit_mm(bag, topic)
     if found is not None:
         return found[0], f"{found[0]:g} mm ({found[1]})"
     return 1.0, "1 mm (16UC1)"

@@ -11,7 +11,7 @@ from typing import final
 import numpy as np
 
 from modeler.types import Array, Frame
-from sequences.json_input import Node, read_tree
+from sequences.files.json_input import Node, read_tree
 
 MAX_ANGLE_RAD = np.radians(85.0)
 

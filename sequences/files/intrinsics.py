@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from modeler.types import Array, InputError
-from sequences.folders import inside
+from sequences.files.folders import inside
+from sequences.files.json_input import Node, read_text, read_tree
 from sequences.given import Given, Intrinsics, sane
-from sequences.json_input import Node, read_text, read_tree
 
 NAMES = (
     "cam_K.txt",

@@ -1,0 +1,1 @@
+"""What readers read of files, and how they say what is wrong with them."""
