@@ -13,7 +13,7 @@ import sys
 import time
 import urllib.request
 from collections import defaultdict
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ from viz import (
     viewer,
     visibility,
 )
-from viz.stream import RerunStream, open_stream
+from viz.stream import RerunStream, graph_due, open_stream
 
 Recording = dict[str, dict[int, dict[str, Any]]]
 COUNT, LOST = 6, 3
@@ -650,6 +650,43 @@ def test_a_viewer_that_freezes_does_not_stop_the_run(
         stream(step)
     stream.close()
     assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
+
+
+@dataclass
+class SlowDisk:
+    """A recording that takes its time to write its file."""
+
+    file: Path
+
+    def flush(self, timeout_sec: float) -> None:
+        raise RuntimeError("not everything was sent in time")
+
+    def disconnect(self) -> None:
+        for _ in range(10):
+            with self.file.open("ab") as file:
+                file.write(b"more")
+            time.sleep(0.05)
+        self.file.write_bytes(b"whole")
+
+
+@pytest.mark.parametrize("watched", [False, True])
+def test_a_recording_is_waited_for_as_long_as_it_grows(
+    watched: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("viz.stream._PATIENCE_S", 0.2)
+    recording: Any = SlowDisk(tmp_path / "r.rrd")
+    RerunStream(recording, (), 0.0, recording.file, watched=watched).close()
+    assert recording.file.read_bytes() == b"whole"
+
+
+def test_the_whole_graph_is_drawn_a_number_of_times_that_hardly_grows(run: list[Step]) -> None:
+    view = run[0].views[0]
+    steps = [replace(run[1], views=dict.fromkeys(range(count), view)) for count in range(1, 1001)]
+    due = [count for count, step in enumerate(steps, 1) if graph_due(step)]
+    assert due[:99] == list(range(1, 100))  # every frame of a short run
+    assert len(due) < 300
+    assert max(np.diff(due[98:]) / due[99:]) <= 1 / 50  # never far behind
+    assert graph_due(replace(steps[-2], last=True))
 
 
 def closed_port() -> int:

@@ -99,8 +99,8 @@ AXIS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((230, 70, 70), (80, 200, 80), (90, 130,
 LEGEND_TEXT: Final = """\
 **Image column.** The frame as the camera saw it, all but the object dimmed; its depth; and, lowest, what the last view
 saw (blue: object, grey: background, black: no measurement) with the new view's points in it: orange they agree with the
-surface measured there, brown they are hidden behind it, **pink they hang in front of what was measured**, which no true
-motion makes them do.
+surface measured there, brown they are hidden behind it, **pink they hang in front of what was measured**, as few do
+under the true motion.
 
 **Pair column.** New view orange, the view it is aligned to teal, in the latter's camera frame. Lowest, the posterior
 spread by the factor written there: the object at its mean, ghosts of it at samples, the ends of its axes as dots, its

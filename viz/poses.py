@@ -23,23 +23,27 @@ _CAPTION: Final = 1.0  # of captions below the object, as a share of the distanc
 
 
 def drawing(step: Step) -> Drawing:
-    """Yield the cameras and the edges between them, in the object frame."""
+    """Yield all cameras and the edges between them, in the object frame."""
     trajectory = step.solution.trajectory
     poses = np.array([trajectory[k] for k in shown(step)]).reshape(-1, 4, 4)
     size_m = camera_size_m(step)
     yield entities.CAMERAS, _frusta(poses, step.frame.camera, size_m, (entities.CAMERA_RGB, 1.0))
     yield entities.AXES, _axes(poses, size_m)
-    current = trajectory.get(step.frame.index)
-    if current is None:
-        yield entities.CURRENT, CLEAR
-    else:
-        style = (entities.CURRENT_RGB, 3.0)
-        yield entities.CURRENT, _frusta(current[None], step.frame.camera, 1.3 * size_m, style)
     chain = [step.solution.odometry[k][:3, 3] for k in sorted(step.solution.odometry)]
     yield entities.CHAIN, _lines([chain] if len(chain) > 1 else [], entities.CHAIN_RGB, 1.0)
     before = np.array([step.solution.odometry[k] for k in shown(step) if k in step.solution.odometry]).reshape(-1, 4, 4)
     yield entities.BEFORE_CAMERAS, _frusta(before, step.frame.camera, size_m, (entities.CHAIN_RGB, 1.0))
     yield from _edges(step)
+
+
+def newest_drawing(step: Step) -> Drawing:
+    """Yield the camera of the step's frame."""
+    current = step.solution.trajectory.get(step.frame.index)
+    if current is None:
+        yield entities.CURRENT, CLEAR
+    else:
+        style = (entities.CURRENT_RGB, 3.0)
+        yield entities.CURRENT, _frusta(current[None], step.frame.camera, 1.3 * camera_size_m(step), style)
 
 
 def takes_part(edge: Edge, step: Step) -> bool:

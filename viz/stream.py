@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _PATIENCE_S: Final = 5.0  # with a viewer, at the end, until it has taken what it was sent
+_GRAPH_DRAWN: Final = 50  # times at most while the number of views doubles: drawing it takes time for each of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,10 @@ class RerunStream:
     """The viewers opened for this run."""
     started_s: float
     """When the stream was opened, by `time.monotonic`."""
+    file: Path | None = None
+    """What it is recorded to."""
+    watched: bool = False
+    """Whether it is also sent to a viewer, which may be slow or freeze."""
 
     @property
     def address(self) -> str | None:
@@ -57,8 +62,8 @@ class RerunStream:
             ghosts.drawing(step),
             visibility.drawing(step),
             clouds.model_drawing(step),
-            poses.drawing(step),
-            uncertainty.drawing(step),
+            poses.newest_drawing(step),
+            *((poses.drawing(step), uncertainty.drawing(step)) if graph_due(step) else ()),
             readings.drawing(step),
             readings.words(step),
         ):
@@ -66,20 +71,40 @@ class RerunStream:
 
     def close(self) -> None:
         """Complete the recording. A window stays open with what it was sent; a page in the browser ends."""
-        try:
-            self.recording.flush(timeout_sec=_PATIENCE_S)
-        except RuntimeError as error:
-            _log.info("the viewer did not receive everything: %s", error)
+        if self.watched:
+            try:
+                self.recording.flush(timeout_sec=_PATIENCE_S)
+            except RuntimeError as error:
+                _log.info("the viewer did not receive everything: %s", error)
         # Disconnecting completes the file, but first takes leave of the viewers, and for ever of one that is frozen.
         leave = threading.Thread(target=self.recording.disconnect, daemon=True)
         leave.start()
-        leave.join(_PATIENCE_S)
+        self._wait(leave)
         for own in self.viewers:
             if own.process.poll() is not None:
                 _log.warning("the viewer was closed before the run had ended; the recording holds what it missed")
             elif leave.is_alive() or not own.lasting:
                 own.stop()
-        leave.join(_PATIENCE_S)
+        self._wait(leave)
+
+    def _wait(self, leave: threading.Thread) -> None:
+        """Wait until the recording is complete; where a viewer may have frozen, no longer than the file grows."""
+        if not self.watched:
+            leave.join()
+        size = -1
+        while leave.is_alive() and (grown := self._size()) != size:
+            size = grown
+            leave.join(_PATIENCE_S)
+
+    def _size(self) -> int:
+        """Return the size of the file in bytes; 0 where there is none."""
+        return self.file.stat().st_size if self.file is not None and self.file.exists() else 0
+
+
+def graph_due(step: Step) -> bool:
+    """Return whether the whole graph is to be drawn again: with every view, later with every second and so on."""
+    count = len(step.views)
+    return step.last or count % max(1, count // _GRAPH_DRAWN) == 0
 
 
 def open_stream(
@@ -127,7 +152,7 @@ def open_stream(
             images.statics(), clouds.statics(), visibility.statics(), readings.statics(name, facts or {})
         ):
             recording.log(path, archetype, static=True)
-    return RerunStream(recording, viewers, time.monotonic())
+    return RerunStream(recording, viewers, time.monotonic(), save, watched=listens or bool(viewers))
 
 
 def _own_viewers(*, spawn: bool, web: bool) -> tuple[viewer.Viewer, ...]:
