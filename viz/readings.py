@@ -63,7 +63,7 @@ def drawing(step: Step) -> Drawing:
 
 def words(step: Step) -> Drawing:
     """Yield what happened to the frame in words, and a line for the log for each pair."""
-    level = rr.TextLogLevel.INFO if step.outcome == "accepted" else rr.TextLogLevel.WARN
+    level = rr.TextLogLevel.INFO if step.accepted else rr.TextLogLevel.WARN
     if not step.edges:
         yield entities.LOG, rr.TextLog(f"frame {step.frame.index}: {step.outcome}", level=level)
     for edge in step.edges:
@@ -84,8 +84,7 @@ def pair_words(edge: Edge, step: Step) -> str:
 
 def now_words(step: Step) -> str:
     """Say in Markdown what the frame brought, pair by pair, and where the model stands."""
-    accepted = step.outcome == "accepted"
-    lines = [f"### Frame {step.frame.index}: {'accepted' if accepted else 'left out'}"]
+    lines = [f"### Frame {step.frame.index}: {'accepted' if step.accepted else 'left out'}"]
     for edge in step.edges:
         lines.append(f"- **{pair_words(edge, step)}.** {edge.posterior.outcome.advice}")
         if np.isfinite(edge.posterior.pose.covariance).all():
@@ -94,7 +93,7 @@ def now_words(step: Step) -> str:
         if left is not None and len(left) > 1:
             lines.append(f"  - all edges together leave to its modes {', '.join(f'{100 * w:.0f}%' for w in left)}")
     if not step.edges:
-        lines.append("- The first view of the object." if accepted else f"- {step.outcome}")
+        lines.append("- The first view of the object." if step.accepted else f"- {step.outcome}")
     kinds = [edge.kind for edge in step.edges_so_far if poses.takes_part(edge, step)]
     for edge in step.solution.outliers:
         lines.append(f"- {edge.source} → {edge.target} {edge.kind} is left out, for all other edges contradict it.")

@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from modeler.export.words import undetermined
-from modeler.types import Edge, Mode, RayImage, Solution, Step
+from modeler.types import ACCEPTED, Edge, Mode, RayImage, Solution, Step
 
 _SCHEMA = 1
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
@@ -59,12 +59,12 @@ class FrameRecord:
     points: int
     """Number of surface points on the object."""
     outcome: str
-    """"accepted", or why the frame was left out."""
+    """`ACCEPTED`, or why the frame was left out."""
 
     @property
     def accepted(self) -> bool:
         """Whether the frame is part of the model."""
-        return self.outcome == "accepted"
+        return self.outcome == ACCEPTED
 
 
 def frame_record(step: Step) -> FrameRecord:

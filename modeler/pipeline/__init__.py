@@ -1,4 +1,4 @@
 """The loop: frames in, steps out."""
 
-from modeler.pipeline.modeler import ACCEPTED as ACCEPTED
 from modeler.pipeline.modeler import Modeler as Modeler
+from modeler.types import ACCEPTED as ACCEPTED

@@ -16,6 +16,7 @@ from modeler.pipeline.state import Seen, State
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter
 from modeler.types import (
+    ACCEPTED,
     AbstractPrior,
     AbstractRegistrar,
     Edge,
@@ -27,7 +28,6 @@ from modeler.types import (
     Step,
 )
 
-ACCEPTED = "accepted"
 _MOST_SHARED = 0.5  # loops tell of more, but do not see what adds up along a chain: errors common to all edges
 
 
@@ -90,7 +90,7 @@ class Modeler:
                 step = replace(step, posteriors=(*step.posteriors, *(edge.posterior for edge in spans)))
                 step = replace(step, edges=(*step.edges, *spans))
                 step = replace(step, solution=state.solution, edges_so_far=state.graph.edges, views=state.views)
-            if state.views and (last or step.outcome == ACCEPTED):
+            if state.views and (last or step.accepted):
                 state = self._fused(state, last=last)
             yield replace(step, model=state.model, last=last)
 
@@ -162,7 +162,7 @@ class Modeler:
             if seen.view is not None:
                 seen = replace(seen, view=self._ready(state, seen.view))
             state, step = self._joined(state, seen, neighbour, again=True)
-            if step.outcome == ACCEPTED:
+            if step.accepted:
                 yield state, step
             waiting = [(seen, view) for seen, view in state.overdue() if (seen.frame.index, view) not in tried]
 
@@ -234,7 +234,7 @@ def _with_last(frames: Iterable[Frame]) -> Iterator[tuple[Frame, bool]]:
 
 
 def _outcome(seen: Seen, edges: Sequence[Edge], *, first: bool) -> str:
-    """Return "accepted", or in words why a frame is left out."""
+    """Return `ACCEPTED`, or in words why a frame is left out."""
     if seen.view is None:
         label = seen.segmentation.outcome
         flaw = Outcome.TOO_FEW_POINTS if label is Outcome.CONVERGED else label

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,9 @@ from modeler.types.arrays import Array
 from modeler.types.posteriors import Posterior
 from modeler.types.solution import Edge, Solution
 from modeler.types.views import Frame, RayImage, Segmentation
+
+ACCEPTED: Final = "accepted"
+"""Outcome of a frame that is part of the model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +58,7 @@ class Step:
     edges: tuple[Edge, ...]
     """Their judgement."""
     outcome: str
-    """"accepted", or why the frame was left out."""
+    """`ACCEPTED`, or why the frame was left out."""
     solution: Solution
     """All poses so far."""
     model: ObjectModel | None
@@ -65,3 +69,8 @@ class Step:
     """Every accepted view by frame number."""
     last: bool = False
     """True on the final step, whose model is made with care."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the frame is part of the model."""
+        return self.outcome == ACCEPTED

@@ -16,7 +16,7 @@ from PIL import Image
 
 from modeler import evaluation, se3
 from modeler.export import write_atomically
-from modeler.types import Array
+from modeler.types import ACCEPTED, Array
 from viz.pictures import look_at, shade
 from viz.report import plots
 from viz.report.cards import pair_cards
@@ -180,7 +180,7 @@ def _settings(result: Result) -> str:
     rows = {"sequence": report["sequence"], "seed": report["seed"], "prior": report["prior"], **report["settings"]}
     rows |= {f"seconds, {part}": f"{seconds:.1f}" for part, seconds in report["seconds"].items() if seconds is not None}
     rows |= {f"version of {name}": version for name, version in report["versions"].items()}
-    lost = [frame for frame in report["frames"] if frame["outcome"] != "accepted"]
+    lost = [frame for frame in report["frames"] if frame["outcome"] != ACCEPTED]
     rows |= {f"frame {frame['id']} left out": frame["outcome"] for frame in lost}
     lines = "".join(
         f"<tr><th>{escape(str(key).replace('_', ' '))}</th><td>{escape(str(value))}</td></tr>"
