@@ -8,7 +8,7 @@ from modeler.types import InputError
 from sequences.base import AbstractSequence
 from sequences.bop.sequence import BopSequence
 from sequences.files.json_input import read_tree
-from sequences.mesh import Mesh, read_mesh
+from sequences.rendering.mesh import Mesh, read_mesh
 
 _MM = 1e-3
 

@@ -19,8 +19,8 @@ from modeler.priors import TablePrior
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.registration.importance import AdaptiveSampler
 from modeler.types import Outcome, PoseGaussian, Posterior
-from sequences.recipe import builtin_recipes, load_recipe
-from sequences.renderer import RenderedSequence
+from sequences.rendering.recipe import builtin_recipes, load_recipe
+from sequences.rendering.renderer import RenderedSequence
 from viz.calibration import coverage_curves
 
 BLANK = Trial("tuning", "n-fold", "box", "usual", "table", OURS, 1, 0, outcome=OUTSIDE)

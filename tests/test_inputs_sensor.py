@@ -12,13 +12,13 @@ import pytest
 from modeler.cli import main
 from modeler.types import Frame, InputError
 from sequences import NoiseModel, SensedSequence, bundled, open_sequence, read_noise, write_bop
-from sequences.depth_noise import gaussian_field
 from sequences.noise.across import borders, pooled_px
 from sequences.noise.calibrate import Calibration, calibrate
 from sequences.noise.model import noise_text, object_distance_m
-from sequences.recipe import load_recipe
-from sequences.renderer import RenderedSequence
-from sequences.trajectory import Tabletop
+from sequences.rendering.depth_noise import gaussian_field
+from sequences.rendering.recipe import load_recipe
+from sequences.rendering.renderer import RenderedSequence
+from sequences.rendering.trajectory import Tabletop
 
 FRAMES = 5
 MODEL = NoiseModel(0.5, 500.0, 1e-4, (3e-6, 4e-7, 1e-8))

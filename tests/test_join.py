@@ -19,10 +19,10 @@ from modeler.graph import PoseGraph, solve
 from modeler.rays import Sensor
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Segmentation, Step
 from sequences import BopSequence, write_bop
-from sequences.recipe import Recipe, Table, Viewpoint
-from sequences.renderer import RenderedSequence
-from sequences.shapes import Capsule, Compound, Cylinder, Part, Sphere
-from sequences.trajectory import Turntable
+from sequences.rendering.recipe import Recipe, Table, Viewpoint
+from sequences.rendering.renderer import RenderedSequence
+from sequences.rendering.shapes import Capsule, Compound, Cylinder, Part, Sphere
+from sequences.rendering.trajectory import Turntable
 
 FIGURE = Compound(
     (

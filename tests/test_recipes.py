@@ -10,11 +10,11 @@ from refusal import refused
 
 from modeler import se3
 from modeler.types import InputError
-from sequences.mesh import ply_bytes
-from sequences.recipe import Recipe, Viewpoint, builtin_recipes, load_recipe
-from sequences.renderer import RenderedSequence
-from sequences.shapes import Box, Cylinder, MeshFile, Sphere
-from sequences.trajectory import Hand, Place, Places
+from sequences.rendering.mesh import ply_bytes
+from sequences.rendering.recipe import Recipe, Viewpoint, builtin_recipes, load_recipe
+from sequences.rendering.renderer import RenderedSequence
+from sequences.rendering.shapes import Box, Cylinder, MeshFile, Sphere
+from sequences.rendering.trajectory import Hand, Place, Places
 
 
 @pytest.mark.parametrize("name", builtin_recipes())

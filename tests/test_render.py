@@ -11,11 +11,11 @@ import pytest
 from modeler import se3
 from modeler.types import Camera, Frame, InputError
 from sequences import bundled, open_sequence
-from sequences.mesh import Mesh
-from sequences.recipe import Mosaic, Recipe, Table, Viewpoint, Wall, load_recipe
-from sequences.renderer import RenderedSequence, render
-from sequences.shapes import Box, Compound, Part, Sphere
-from sequences.trajectory import Hand, Place, Places, RobotReadings, Tabletop
+from sequences.rendering.mesh import Mesh
+from sequences.rendering.recipe import Mosaic, Recipe, Table, Viewpoint, Wall, load_recipe
+from sequences.rendering.renderer import RenderedSequence, render
+from sequences.rendering.shapes import Box, Compound, Part, Sphere
+from sequences.rendering.trajectory import Hand, Place, Places, RobotReadings, Tabletop
 
 SMALL = Viewpoint(160, 120, 144.0)
 NAMES = ("box", "flashlight", "tube", "mug", "figurine", "two_fold", "l_bracket", "held")

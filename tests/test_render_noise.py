@@ -5,12 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sequences.depth_noise import DisparityNoise, GrazingLoss, LateralJitter, MixedPixels, RandomLoss, gaussian_field
-from sequences.depth_sensor import EXACT, DepthSensor, Exposure
-from sequences.recipe import Recipe, Viewpoint
-from sequences.renderer import RenderedSequence
-from sequences.shapes import AnyShape, Box, Compound, Part
-from sequences.trajectory import Place, Places
+from sequences.rendering.depth_noise import (
+    DisparityNoise,
+    GrazingLoss,
+    LateralJitter,
+    MixedPixels,
+    RandomLoss,
+    gaussian_field,
+)
+from sequences.rendering.depth_sensor import EXACT, DepthSensor, Exposure
+from sequences.rendering.recipe import Recipe, Viewpoint
+from sequences.rendering.renderer import RenderedSequence
+from sequences.rendering.shapes import AnyShape, Box, Compound, Part
+from sequences.rendering.trajectory import Place, Places
 
 FOCAL_PX, BASELINE_M = 575.0, 0.075
 SHAPE = (240, 320)

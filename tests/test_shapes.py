@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from sequences.mesh import Mesh, ply_bytes
-from sequences.recipe import builtin_recipes, load_recipe
-from sequences.shapes import (
+from sequences.rendering.mesh import Mesh, ply_bytes
+from sequences.rendering.recipe import builtin_recipes, load_recipe
+from sequences.rendering.shapes import (
     AnyShape,
     Box,
     Capsule,
@@ -22,8 +22,8 @@ from sequences.shapes import (
     Sphere,
     Torus,
 )
-from sequences.surface import outer_surface
-from sequences.sweeps import ear_clipped
+from sequences.rendering.surface import outer_surface
+from sequences.rendering.sweeps import ear_clipped
 
 PI = np.pi
 L_OUTLINE = ((0.0, 0.0), (0.14, 0.0), (0.14, 0.025), (0.025, 0.025), (0.025, 0.09), (0.0, 0.09))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from modeler import se3
-from sequences.trajectory import Hand, RobotReadings, Tabletop, Turntable
+from sequences.rendering.trajectory import Hand, RobotReadings, Tabletop, Turntable
 
 
 def motions(table_from_object: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from modeler.export import mesh_of, read_model, write_atomically
 from modeler.fusion import Fuser
 from modeler.types import Array, InputError
 from sequences import true_mesh
-from sequences.mesh import Mesh
+from sequences.rendering.mesh import Mesh
 
 _SAME_M = 1e-5  # to which files of one surface agree
 

@@ -26,8 +26,8 @@ class Render:
         """Render the sequence."""
         from modeler.cli.compose import seed
         from modeler.cli.reading import reading
-        from sequences.recipe import load_recipe
-        from sequences.renderer import render
+        from sequences.rendering.recipe import load_recipe
+        from sequences.rendering.renderer import render
 
         recipe = load_recipe(self.recipe)
         with reading() as watched:

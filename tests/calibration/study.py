@@ -16,9 +16,9 @@ from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.segmentation import Segmenter, telling
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Posterior, RayImage
-from sequences.recipe import Recipe, load_recipe
-from sequences.renderer import RenderedSequence
-from sequences.trajectory import Tabletop, Turntable
+from sequences.rendering.recipe import Recipe, load_recipe
+from sequences.rendering.renderer import RenderedSequence
+from sequences.rendering.trajectory import Tabletop, Turntable
 
 OURS, CONTROL = "visibility", "icp"
 

@@ -25,7 +25,7 @@ from modeler.cli.convert import Convert
 from modeler.types import Camera, Frame
 from sequences import open_sequence, read_noise, survey, write_bop
 from sequences.pictures.tum import trajectory
-from sequences.recipe import load_recipe
+from sequences.rendering.recipe import load_recipe
 
 
 @dataclass(frozen=True)

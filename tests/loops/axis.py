@@ -27,9 +27,9 @@ from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
 from modeler.types import Array, Solution, Step
 from sequences import AbstractSequence
-from sequences.recipe import load_recipe
-from sequences.renderer import RenderedSequence
-from sequences.trajectory import Turntable
+from sequences.rendering.recipe import load_recipe
+from sequences.rendering.renderer import RenderedSequence
+from sequences.rendering.trajectory import Turntable
 
 _STEP_DEG, _SIGMA_DEG, _FRAMES = 24.0, 1.0, 15
 _FIRST = 4  # pairs that came before the axis was known

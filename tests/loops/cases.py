@@ -11,9 +11,9 @@ import numpy as np
 import sequences
 from modeler.types import Array, Frame
 from sequences import AbstractSequence
-from sequences.recipe import load_recipe
-from sequences.renderer import RenderedSequence
-from sequences.trajectory import Place, Places
+from sequences.rendering.recipe import load_recipe
+from sequences.rendering.renderer import RenderedSequence
+from sequences.rendering.trajectory import Place, Places
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 BUNDLED = Path(sequences.__file__).parent / "bundled"

@@ -3,8 +3,8 @@
 import numpy as np
 
 from modeler.types import Array, BoolArray
-from sequences.mesh import IntArray, Mesh
-from sequences.raycast import inside
+from sequences.rendering.mesh import IntArray, Mesh
+from sequences.rendering.raycast import inside
 
 _COARSE_M, _FINE_M = 0.01, 0.001
 _SKIN_M = 1e-5

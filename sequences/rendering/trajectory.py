@@ -14,7 +14,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.types import Array
-from sequences.shapes import placement
+from sequences.rendering.shapes import placement
 
 
 @final

@@ -3,7 +3,7 @@
 import numpy as np
 
 from modeler.types import Array, BoolArray
-from sequences.mesh import IntArray, Mesh
+from sequences.rendering.mesh import IntArray, Mesh
 
 
 def turned(profile_m: Array, sides: int) -> Mesh:

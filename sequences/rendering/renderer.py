@@ -16,14 +16,14 @@ from modeler import se3
 from modeler.types import Array, Camera, Frame, InputError
 from sequences.base import AbstractSequence, span
 from sequences.bop.writer import write_bop
-from sequences.depth_sensor import EXACT, DepthSensor, Exposure
-from sequences.mesh import Mesh, ply_bytes
-from sequences.raycast import Caster, Hits
-from sequences.recipe import Recipe
-from sequences.scenery import mosaic_shade, surroundings
-from sequences.shapes import placement
-from sequences.surface import outer_surface
-from sequences.trajectory import Hand
+from sequences.rendering.depth_sensor import EXACT, DepthSensor, Exposure
+from sequences.rendering.mesh import Mesh, ply_bytes
+from sequences.rendering.raycast import Caster, Hits
+from sequences.rendering.recipe import Recipe
+from sequences.rendering.scenery import mosaic_shade, surroundings
+from sequences.rendering.shapes import placement
+from sequences.rendering.surface import outer_surface
+from sequences.rendering.trajectory import Hand
 
 _MOTION, _READINGS, _FRAMES = range(3)  # keys of the seed's branches
 

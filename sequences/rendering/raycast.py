@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.types import Array, BoolArray
-from sequences.mesh import Mesh
+from sequences.rendering.mesh import Mesh
 
 if TYPE_CHECKING:
     import open3d as o3d

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.types import Array
-from sequences.mesh import Mesh, read_mesh
-from sequences.sweeps import bent, ear_clipped, extruded, turned
+from sequences.rendering.mesh import Mesh, read_mesh
+from sequences.rendering.sweeps import bent, ear_clipped, extruded, turned
 
 ROUNDNESS_M = 15e-6
 """How far facets of round shapes may lie inside the true surface in m."""

@@ -3,9 +3,9 @@
 import numpy as np
 
 from modeler.types import Array
-from sequences.mesh import Mesh
-from sequences.recipe import Mosaic, Recipe
-from sequences.shapes import Box, placement
+from sequences.rendering.mesh import Mesh
+from sequences.rendering.recipe import Mosaic, Recipe
+from sequences.rendering.shapes import Box, placement
 
 _WALL_THICKNESS_M = 0.05
 

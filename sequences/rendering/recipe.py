@@ -9,11 +9,11 @@ from typing import Literal, final
 import numpy as np
 
 from modeler.types import Array, Camera, InputError
-from sequences.depth_sensor import DepthSensor
 from sequences.files.json_input import read_tree
-from sequences.shapes import AnyShape
-from sequences.structure import build
-from sequences.trajectory import AnyTrajectory, Tabletop
+from sequences.rendering.depth_sensor import DepthSensor
+from sequences.rendering.shapes import AnyShape
+from sequences.rendering.structure import build
+from sequences.rendering.trajectory import AnyTrajectory, Tabletop
 
 
 @final
@@ -171,4 +171,4 @@ def builtin_recipes() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _FOLDER.glob("*.json")))
 
 
-_FOLDER = Path(__file__).parent / "recipes"
+_FOLDER = Path(__file__).parents[1] / "recipes"

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Array, BoolArray
-from sequences.depth_noise import DisparityNoise, GrazingLoss, LateralJitter, MixedPixels, RandomLoss
+from sequences.rendering.depth_noise import DisparityNoise, GrazingLoss, LateralJitter, MixedPixels, RandomLoss
 
 
 @final
