@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from PIL import Image
 
 from modeler import se3
 from modeler.experiment import Experiment, Pairing, Trial, evaluate, sparse_frame, sparse_view, summaries
+from modeler.experiment.viewed import viewed
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.types import (
@@ -134,6 +136,29 @@ def test_a_prior_learns_from_the_pairs_before_where_it_may(learn: bool) -> None:
     prior = Learning()
     assert len(list(experiment(prior=prior, learn=learn, methods={"good": Oracle()}).trials(Recording()))) == 5
     assert prior.seen == ([0, 1, 2, 3, 4] if learn else [])
+
+
+@pytest.mark.parametrize("pairing", [Pairing(), Pairing(offsets=(2, 1), both_ways=True), Pairing(closed=True)])
+def test_keeps_no_more_views_than_the_offset_asks_for(pairing: Pairing) -> None:
+    """Views weigh ten megabytes each, so that a sequence must not be held as a whole."""
+
+    @dataclass(eq=False)
+    class View:
+        index: int
+
+    alive: weakref.WeakSet[View] = weakref.WeakSet()
+
+    def view(index: int) -> View:
+        alive.add(made := View(index))
+        return made
+
+    pairs = list(pairing.pairs(range(40)))
+    most = 0
+    for (pair, source, target), wanted in zip(viewed(pairs, view), pairs, strict=True):
+        assert (pair, source.index, target.index) == (wanted, wanted.source, wanted.target)
+        del source, target
+        most = max(most, len(alive))
+    assert most <= max(pairing.offsets) * (1 + pairing.closed) + 1
 
 
 def test_measures_errors_in_the_units_that_it_says() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import final
 
@@ -13,6 +13,7 @@ from modeler.experiment.pairing import Pair, Pairing
 from modeler.experiment.recorded import Recorded
 from modeler.experiment.sparse import sparse_frame, sparse_view
 from modeler.experiment.trials import Trial
+from modeler.experiment.viewed import viewed
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import (
@@ -72,23 +73,23 @@ class Experiment:
                 cannot be read.
         """
         indices, poses = self._frames(recorded), recorded.truth()
-        views, lost = self._views(recorded, indices)
+        ready = self._viewing(recorded, indices)
         trusted: dict[str, list[Edge]] = {name: [] for name in self.methods}
-        for pair in self.pairing.pairs(indices):
+        for pair, source, target in viewed(self.pairing.pairs(indices), ready):
             truth = None if poses is None else true_motion(poses, pair.target, pair.source)
-            why_lost = next((lost[frame].label for frame in (pair.source, pair.target) if frame in lost), None)
+            why_lost = next((view.label for view in (source, target) if isinstance(view, Outcome)), "")
             for name, method in self.methods.items():
                 blank = _blank(recorded.name, name, pair, truth)
-                if why_lost is not None:
+                if isinstance(source, Outcome) or isinstance(target, Outcome):
                     yield replace(blank, outcome=why_lost)
                     continue
-                source, target = views[pair.source], views[pair.target]
                 answer = self._registered(method, source, target, trusted[name])
                 if isinstance(answer, str):
                     yield replace(blank, outcome=answer)
                     continue
-                if answer.usable:
-                    trusted[name].append(Edge(answer, "odometry", accepted=True, reason="the method stands by it"))
+                if self.learn and answer.usable:
+                    lasting = answer.without_samples()
+                    trusted[name].append(Edge(lasting, "odometry", accepted=True, reason="the method stands by it"))
                 yield blank.answered(answer, truth, source.centroid_m)
 
     def _frames(self, recorded: Recorded) -> tuple[int, ...]:
@@ -102,20 +103,12 @@ class Experiment:
             )
         return tuple(index for index in recorded.indices if index in truth)
 
-    def _views(self, recorded: Recorded, indices: Sequence[int]) -> tuple[dict[int, RayImage], dict[int, Outcome]]:
-        """Return the views by frame number, and of the frames without one why there is none."""
+    def _viewing(self, recorded: Recorded, indices: Sequence[int]) -> Callable[[int], RayImage | Outcome]:
+        """Return what makes the view of a frame, or tells why there is none."""
         noise = recorded.sensor()
         sensor = Sensor() if noise is None else Sensor(*noise)
         scene = self.segmenter.scene([recorded.frame(index) for index in telling(indices)])
-        views: dict[int, RayImage] = {}
-        lost: dict[int, Outcome] = {}
-        for index in indices:
-            view = self._view(recorded.frame(index), scene, sensor)
-            if isinstance(view, RayImage):
-                views[index] = view
-            else:
-                lost[index] = view
-        return views, lost
+        return lambda index: self._view(recorded.frame(index), scene, sensor)
 
     def _view(self, frame: Frame, scene: Scene, sensor: Sensor) -> RayImage | Outcome:
         """Return a frame made ready, as sparse as the experiment has it, or why it cannot be."""

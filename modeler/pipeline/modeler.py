@@ -132,7 +132,7 @@ class Modeler:
         pairing, posteriors = self._pairing(), ()
         if seen.view is not None and previous is not None:
             posteriors = pairing.placed(state, seen.view, previous, last=last, again=again)
-        lasting = [_lasting(posterior) for posterior in posteriors]
+        lasting = [posterior.without_samples() for posterior in posteriors]
         steps = state.steps(seen.frame.index, previous)
         edges = self.closer.edges(lasting, state.past, steps=steps)
         edges = pairing.explained(edges)
@@ -180,7 +180,7 @@ class Modeler:
         pairs = self.closer.spans(state.past)
         ending(stage, 0, len(pairs))
         for posterior in pairing.spanning(state, pairs):
-            edges.append(self.closer.spanning(_lasting(posterior), state.past))
+            edges.append(self.closer.spanning(posterior.without_samples(), state.past))
             ending(stage, len(edges), len(pairs))
             if hurry():
                 break
@@ -216,11 +216,6 @@ class Modeler:
             return replace(state, model=self.fuser.fuse(state.views, state.solution.trajectory, sure))
         growing = self.fuser.preview(state.views, state.solution.trajectory, state.growing)
         return replace(state, growing=growing, model=growing.model())
-
-
-def _lasting(posterior: Posterior) -> Posterior:
-    """Return a posterior without its samples, which nothing asks for once it is judged."""
-    return replace(posterior, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
 
 
 def _with_last(frames: Iterable[Frame]) -> Iterator[tuple[Frame, bool]]:

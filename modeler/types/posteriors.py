@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -73,6 +73,10 @@ class Posterior:
     def usable(self) -> bool:
         """Whether the posterior may become an edge."""
         return self.outcome in (Outcome.CONVERGED, Outcome.AMBIGUOUS)
+
+    def without_samples(self) -> Posterior:
+        """Return the posterior as it is kept once it is judged: nothing asks for its samples, which are most of it."""
+        return replace(self, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
 
 
 class AbstractRegistrar(ABC):
