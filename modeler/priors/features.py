@@ -6,9 +6,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
-from scipy.spatial import KDTree
 
+from modeler.features import fpfh, kabsch, mutual_matches
 from modeler.priors.bumps import Bumps
 from modeler.priors.general import GeneralPrior
 from modeler.priors.proposal import guided
@@ -53,7 +52,7 @@ class FeaturesPrior(AbstractPrior):
         (first_m, first), (second_m, second) = (self._features(view, voxel_m) for view in (source, target))
         if min(len(first_m), len(second_m)) < self.min_points:
             return known
-        pairs = _nearest_both_ways(first, second)
+        pairs = mutual_matches(first, second)
         motions, votes = self._motions(first_m[pairs[:, 0]], second_m[pairs[:, 1]], known, self.agreement * voxel_m)
         if not len(motions):
             return known
@@ -87,11 +86,10 @@ class FeaturesPrior(AbstractPrior):
         cloud.normals = o3d.utility.Vector3dVector(view.normals)
         cloud = cloud.voxel_down_sample(voxel_m)
         cloud.normalize_normals()
-        search = o3d.geometry.KDTreeSearchParamHybrid(self.feature_radius * voxel_m, 100)
-        features = o3d.pipelines.registration.compute_fpfh_feature(cloud, search)  # pyright: ignore[reportCallIssue]
-        points_m, histograms = np.asarray(cloud.points), np.asarray(features.data).T
+        points_m, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
         order = np.lexsort(points_m.T)  # Open3D's order is that of a hash table
-        return points_m[order], np.ascontiguousarray(histograms[order])
+        points_m, normals = points_m[order], normals[order]
+        return points_m, fpfh(points_m, normals, self.feature_radius * voxel_m)
 
     def _motions(self, source_m: Array, target_m: Array, known: AbstractMotion, reach_m: float) -> tuple[Array, Array]:
         """Return motions (k, 4, 4) that matches (m, 3) agree with three at a time, and with how many each agrees (k,).
@@ -115,35 +113,10 @@ class FeaturesPrior(AbstractPrior):
         ]
         if not len(triples):
             return np.zeros((0, 4, 4)), np.zeros(0)
-        motions = _laid(source_m[triples], target_m[triples])
+        motions = kabsch(source_m[triples], target_m[triples])
         motions = motions[np.isfinite(known.log_density(motions))][:_JUDGED]
         carried = source_m @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
         votes = np.sum(np.sum((carried - target_m) ** 2, axis=2) < reach_m**2, axis=1).astype(np.float64)
         best = np.argsort(-votes, kind="stable")[: self.bumps]
         best = best[votes[best] >= 3.0]  # its own three at least
         return motions[best], votes[best]
-
-
-def _nearest_both_ways(first: Array, second: Array) -> npt.NDArray[np.int64]:
-    """Return pairs (m, 2) of rows that are each other's nearest; of all nearest ones where those are few."""
-    forth, back = (np.asarray(KDTree(to).query(of)[1]) for of, to in ((first, second), (second, first)))
-    pairs = np.column_stack([np.arange(len(first)), forth])
-    mutual = pairs[back[forth] == pairs[:, 0]]
-    return mutual if len(mutual) >= 12 else pairs
-
-
-def _laid(source_m: Array, target_m: Array) -> Array:
-    """Return the motions (n, 4, 4) that lay triangles (n, 3, 3) on triangles: middle on middle, side along side."""
-
-    def placed(triangles_m: Array) -> tuple[Array, Array]:
-        middle = triangles_m.mean(axis=1)
-        x = triangles_m[:, 1] - triangles_m[:, 0]
-        z = np.cross(x, triangles_m[:, 2] - triangles_m[:, 0])
-        x, z = (vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-12) for vector in (x, z))
-        return middle, np.stack([x, np.cross(z, x), z], axis=2)
-
-    (source_middle, source_axes), (target_middle, target_axes) = placed(source_m), placed(target_m)
-    poses = np.broadcast_to(np.eye(4), (len(source_m), 4, 4)).copy()
-    poses[:, :3, :3] = target_axes @ np.swapaxes(source_axes, 1, 2)
-    poses[:, :3, 3] = target_middle - (poses[:, :3, :3] @ source_middle[:, :, None])[:, :, 0]
-    return poses
