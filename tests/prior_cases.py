@@ -14,7 +14,6 @@ from modeler.priors import (
     ForeseenPrior,
     GeneralPrior,
     HeldPrior,
-    MixturePrior,
     Poke,
     PokePrior,
     ProductPrior,
@@ -208,5 +207,4 @@ CASES: dict[str, Case] = {
     "features": Case(lambda _: FeaturesPrior(), proposes=True, shaken=0.3),
     "held and table": Case(lambda camera: ProductPrior(held(camera), TablePrior()), shaken=0.03),
     "velocity and held": Case(lambda camera: ProductPrior(velocity(camera), held(camera)), proposes=True, shaken=0.03),
-    "table or general": Case(lambda _: MixturePrior(TablePrior(), GeneralPrior())),
 }

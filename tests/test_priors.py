@@ -206,4 +206,4 @@ def test_names_of_parameters_carry_units() -> None:
     ]
     assert len(numbers) > 20
     for name in set(numbers) - UNITLESS:
-        assert name.endswith(("_deg", "_m", "_s", "_share", "_direction")), name
+        assert name.endswith(("_deg", "_m", "_s", "_direction")), name

@@ -30,7 +30,6 @@ from modeler.priors import (
     FeaturesPrior,
     GeneralPrior,
     HeldPrior,
-    MixturePrior,
     Poke,
     PokePrior,
     ProductPrior,
@@ -164,7 +163,7 @@ def test_steps_share_the_axis_as_far_as_no_edge_holds_it() -> None:
         ProductPrior(GeneralPrior(), unknown),
     ):
         assert guess.shared_axis(bare) == unknown.shared_axis(bare)
-    for other in (GeneralPrior(), TablePrior(), MixturePrior(unknown, GeneralPrior())):
+    for other in (GeneralPrior(), TablePrior()):
         assert other.shared_axis(bare) is None
 
 
@@ -467,12 +466,6 @@ def test_priors_that_contradict_each_other_are_refused() -> None:
     away = replace(held(HERE), camera_from_hand=se3.exp(0.4 * np.arange(5.0)[:, None] * np.eye(6)[5]) @ hand(HERE)[1])
     with pytest.raises(InputError, match="no common motion between frames 3 and 2"):
         ProductPrior(away, GeneralPrior()).between(SOURCE, TARGET)
-
-
-def test_a_mixture_holds_either(rng: np.random.Generator) -> None:
-    samples = MixturePrior(TablePrior(), GeneralPrior(), 0.7).between(SOURCE, TARGET).sample(4000, rng)
-    tilt_deg = np.degrees(np.arccos(np.clip(samples[:, :3, :3] @ NORMAL @ NORMAL, -1, 1)))
-    assert np.mean(tilt_deg < 2.0) == pytest.approx(0.7, abs=0.04)
 
 
 def test_a_guess_that_lies_outside_what_is_known_is_dropped() -> None:

@@ -5,7 +5,6 @@ from modeler.priors.features import FeaturesPrior as FeaturesPrior
 from modeler.priors.foreseen import ForeseenPrior as ForeseenPrior
 from modeler.priors.general import GeneralPrior as GeneralPrior
 from modeler.priors.held import HeldPrior as HeldPrior
-from modeler.priors.mixture import MixturePrior as MixturePrior
 from modeler.priors.poke import Poke as Poke
 from modeler.priors.poke import PokePrior as PokePrior
 from modeler.priors.product import ProductPrior as ProductPrior
