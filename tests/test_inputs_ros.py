@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bags import START_NS, Recorder
+from recorded import foxglove, scene, unpacked
 from recordings import small_frames
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -301,6 +302,31 @@ class Cut(Recorder):
     def _image(self, types, header, encoding, pixels):
         message = super()._image(types, header, encoding, pixels)
         return dataclasses.replace(message, data=message.data[:-1000]) if encoding == "16UC1" else message
+
+
+def test_what_the_library_of_the_format_wrote_is_read(tmp_path: Path) -> None:
+    sequence = open_sequence(unpacked("foxglove.mcap", tmp_path))
+    assert sequence.layout == "MCAP file, topic /camera/depth/image_raw"
+    assert len(sequence) == foxglove.COUNT
+    width, height = foxglove.SIZE
+    for number, frame in enumerate(sequence):
+        raw = scene.depth(number, width, height)
+        np.testing.assert_allclose(frame.depth_m, np.where(raw == 0, np.nan, raw * 0.001), rtol=1e-6)
+        assert frame.camera == Camera(width, height, 45.0, 45.0, width / 2, height / 2)
+        np.testing.assert_array_equal(frame.colour, scene.colour(number, width, height))
+        assert frame.time_s == pytest.approx(1e-9 * (foxglove.START_NS + number * foxglove.STEP_NS), abs=1e-6)
+
+
+def test_mcap_of_other_systems_says_so(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = unpacked("foxglove.mcap", tmp_path)
+    content = path.read_bytes()
+    assert content[17:25] == b"\x04\0\0\0ros2"
+    path.write_bytes(content[:21] + b"ros1" + content[25:])
+    assert main(["info", str(path)]) == 2
+    assert capfd.readouterr().err == (
+        f"modeler: {path}: holds messages of 'ros1' where ROS 2 is read from MCAP; give the bag of ROS 1 it was made "
+        "from, or record it with ROS 2\n"
+    )
 
 
 @pytest.mark.parametrize(("encoding", "order"), [("yuv422", (1, 0, 3, 2)), ("YUYV", (0, 1, 2, 3))])

@@ -33,6 +33,10 @@ if TYPE_CHECKING:
 storage_mcap.DECOMPRESSORS.update(lz4=of_size(from_lz4), zstd=of_size(from_zstd))
 
 
+_MCAP = b"\x89MCAP0\r\n\x01"  # what its files begin with: the format, and that a header follows
+_PROFILE_AT = 21  # behind the header's length and that of the profile's name
+
+
 @final
 @dataclass(frozen=True)
 class Stamp:
@@ -160,8 +164,25 @@ def _ros2(path: Path) -> rosbag2.Reader:
         storage.STORAGE_PLUGINS = {**storage.STORAGE_PLUGINS, "sqlite3": lambda file: Sqlite3Reader(_in_address(file))}
     elif isinstance(reader.storage, Sqlite3Reader):
         reader.storage.path = _in_address(path)
+    else:
+        _check_profile(path)
     reader.open()
     return reader
+
+
+def _check_profile(path: Path) -> None:
+    """Refuse an MCAP file of messages that are not those of ROS 2, as far as its header says so."""
+    with path.open("rb") as file:
+        start = file.read(_PROFILE_AT + 64)
+    if not start.startswith(_MCAP) or len(start) < _PROFILE_AT:
+        return  # which the library tells
+    (length,) = struct.unpack_from("<I", start, _PROFILE_AT - 4)
+    profile = start[_PROFILE_AT : _PROFILE_AT + min(length, 32)].decode("ascii", "replace")
+    if profile != "ros2":
+        raise InputError(
+            f"{path}: holds messages of {repr(profile) if profile else 'nobody knows what'} where ROS 2 is read from "
+            "MCAP; give the bag of ROS 1 it was made from, or record it with ROS 2."
+        )
 
 
 def _in_address(path: Path) -> Path:
