@@ -35,12 +35,7 @@ def join(options: Join) -> int:
     Raises:
         InputError: where a run cannot be read, or no pair of their views can be registered.
     """
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed} is negative; give a whole number from 0 on")
-    if options.pairs < 1:
-        raise InputError(f"--pairs {options.pairs} leaves nothing to join by; give at least 1")
-    if options.out.is_dir() and any(options.out.iterdir()) and not options.overwrite:
-        raise InputError(f"{options.out}: not empty; choose another --out, or give --overwrite")
+    _check(options)
     began = time.perf_counter()
     first, second = reopened(options.run_a), reopened(options.run_b)
     offset = max(record["id"] for record in first.report["frames"]) + 1
@@ -81,6 +76,20 @@ def join(options: Join) -> int:
     if report["reasons"]:
         _say(f"not to be trusted: {report['reasons'][0]}")
     return 0 if report["trustworthy"] else 3
+
+
+def _check(options: Join) -> None:
+    """Refuse options that nobody can mean, and a folder that holds something.
+
+    Raises:
+        InputError: where they are such.
+    """
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed} is negative; give a whole number from 0 on")
+    if options.pairs < 1:
+        raise InputError(f"--pairs {options.pairs} leaves nothing to join by; give at least 1")
+    if options.out.is_dir() and any(options.out.iterdir()) and not options.overwrite:
+        raise InputError(f"{options.out}: not empty; choose another --out, or give --overwrite")
 
 
 def _matches(first: Reopened, second: Reopened) -> list[Match]:

@@ -223,6 +223,7 @@ TARGETS |= {
     "run": Target(_run, ("report.json",), _poses),
     "realsense 2.56": Target(_recorded("realsense-2.56.bag"), ("*.bag",), read_all, 0.5),
     "realsense 2.58": Target(_recorded("realsense-2.58.db3"), ("*.db3",), read_all),
+    "foxglove": Target(_recorded("foxglove.mcap"), ("*.mcap",), read_all),
     "realsense 2.59": Target(_recorded("realsense-2.59.db3"), ("*.db3",), read_all),
 }
 if importlib.util.find_spec("av") is not None:
