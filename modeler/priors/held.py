@@ -10,11 +10,10 @@ import numpy as np
 from modeler import se3
 from modeler.priors.bumps import Bumps
 from modeler.priors.general import GeneralPrior, grown_limits, turned_offset_m
-from modeler.priors.proposal import guided
+from modeler.priors.proposal import guided, reach_deg
 from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, Frame, InputError, RayImage, Solution
 
 _STEP_DEG = 25.0  # such as the limit of the offset is meant for
-_ROOM_DEG = 5.0  # about what four standard deviations of the hand's errors allow
 _SAME_TIME_S = 1e-3  # poses and frames that are no farther apart in time belong together
 
 
@@ -62,9 +61,8 @@ class HeldPrior(AbstractPrior):
         if self.newest is None or target.index == self.newest:
             return moved
         # What the hand did up to an earlier view counts in the edges between; here it only tells where to look.
-        reach_deg = min(float(np.degrees(4.0 * sigma_rad)) + _ROOM_DEG, 180.0)
         offset_m = turned_offset_m(self.max_offset_m, float(se3.rotation_angle(motion)))
-        limits = GeneralPrior(reach_deg, offset_m).between(source, target)
+        limits = GeneralPrior(reach_deg(float(np.degrees(sigma_rad))), offset_m).between(source, target)
         return guided(replace(limits, middle=motion[:3, :3]), [moved])
 
     def grown(self, steps: float) -> HeldPrior:

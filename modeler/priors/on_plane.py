@@ -12,6 +12,9 @@ from modeler.priors.axis_turn import across_axis
 from modeler.priors.general import centroid_offset
 from modeler.types import Array, InputError, Plane, RayImage
 
+WOBBLE_DEG, WOBBLE_M = 0.2, 0.0007
+"""How far a table is from plane, or a turntable from true, in one motion of what stands on it: standard deviations."""
+
 
 @dataclass(frozen=True, eq=False)
 class OnPlane:

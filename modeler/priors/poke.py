@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from modeler import se3
-from modeler.priors.on_plane import OnPlane, on_plane
+from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M, OnPlane, on_plane
 from modeler.priors.table import TablePrior
 from modeler.types import AbstractMotion, AbstractPrior, Array, InputError, RayImage
 
@@ -50,9 +50,9 @@ class PokePrior(AbstractPrior):
     """Standard deviation of the centre of friction about the centroid of what is seen, in each direction."""
     friction_sigma: float = 0.25
     """Standard deviation of the log of c about the surface's root mean square distance from its centroid."""
-    sigma_tilt_deg: float = 0.2
+    sigma_tilt_deg: float = WOBBLE_DEG
     """Standard deviation of the rotation out of the plane, on top of the plane's own uncertainty."""
-    sigma_height_m: float = 0.0007
+    sigma_height_m: float = WOBBLE_M
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractMotion:

@@ -10,7 +10,8 @@ import numpy as np
 from modeler.types import AbstractMotion, Array
 
 _TRIED = 4096  # draws by which the share of a guess within the support is told
-_LEAST = 0.01  # a guess with less of its mass within the support is of no use
+_LEAST_SHARE = 0.01  # a guess with less of its mass within the support is of no use
+_ROOM_DEG = 5.0  # for a guess that is sure: limits are there to look within, not to cut off
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +65,11 @@ class Guided(AbstractMotion):
         return self.known.log_evidence(target_from_source)
 
 
+def reach_deg(sigma_deg: float) -> float:
+    """Return how far limits reach from a guess of a standard deviation, where it only tells where to look."""
+    return min(4.0 * sigma_deg + _ROOM_DEG, 180.0)
+
+
 def guided(known: AbstractMotion, guesses: Sequence[AbstractMotion], share: float = 0.8) -> AbstractMotion:
     """Return what is known, guided by those guesses that lie within its support; itself where none does.
 
@@ -74,7 +80,7 @@ def guided(known: AbstractMotion, guesses: Sequence[AbstractMotion], share: floa
     """
     rng = np.random.default_rng(0)  # the same guesses have the same density, whoever asks
     shares = [float(np.mean(np.isfinite(known.log_density(guess.sample(_TRIED, rng))))) for guess in guesses]
-    useful = [number for number, inside in enumerate(shares) if inside >= _LEAST]
+    useful = [number for number, inside in enumerate(shares) if inside >= _LEAST_SHARE]
     if not useful:
         return known
     return Guided(known, tuple(guesses[number] for number in useful), np.array([shares[n] for n in useful]), share)

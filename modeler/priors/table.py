@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from modeler.priors.general import grown_limits
-from modeler.priors.on_plane import OnPlane, on_plane
+from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M, OnPlane, on_plane
 from modeler.types import AbstractMotion, AbstractPrior, Array, RayImage
 
 
@@ -19,9 +19,9 @@ class TablePrior(AbstractPrior):
     """Largest rotation about the plane's normal between the two views."""
     max_shift_m: float = 0.05
     """Largest distance, in the plane, between the target's centroid and the source's, carried over."""
-    sigma_tilt_deg: float = 0.2
+    sigma_tilt_deg: float = WOBBLE_DEG
     """Standard deviation of the rotation out of the plane, on top of the plane's own uncertainty."""
-    sigma_height_m: float = 0.0007
+    sigma_height_m: float = WOBBLE_M
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
 
     def between(self, source: RayImage, target: RayImage) -> TableMotion:

@@ -12,8 +12,8 @@ from modeler.priors.about_axis import AboutAxis, Axis
 from modeler.priors.axis_turn import AxisTurn
 from modeler.priors.common_axis import common_axis, turn_sense
 from modeler.priors.general import GeneralPrior, grown_limits, turned_offset_m
-from modeler.priors.on_plane import no_plane, support
-from modeler.priors.proposal import guided
+from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M, no_plane, support
+from modeler.priors.proposal import guided, reach_deg
 from modeler.priors.table import TablePrior
 from modeler.types import AbstractMotion, AbstractPrior, Edge, RayImage, SharedAxis, Solution
 
@@ -21,7 +21,6 @@ _UP = (0.0, -1.0, 0.0)  # against gravity for a camera held upright: y points do
 _BROAD_DEG, _GIVEN_DEG = 30.0, 1.0
 _LEAST = 1e-5  # rad or m: densities stay finite where somebody is wholly sure
 _VAGUE_DEG = 20.0  # a direction known no better counts for nothing beside what steps show, in however many edges it is
-_ROOM_DEG = 5.0  # about what four standard deviations of the steps allow
 
 
 @dataclass(frozen=True)
@@ -52,9 +51,9 @@ class TurntablePrior(AbstractPrior):
     max_shift_m: float = 0.05
     """Largest distance, across the axis, between the target's centroid and the source's, carried over; for turns
     beyond 30 degrees it grows with them."""
-    wobble_deg: float = 0.2
+    wobble_deg: float = WOBBLE_DEG
     """Standard deviation of the rotation that is no turn about the axis."""
-    wobble_m: float = 0.0007
+    wobble_m: float = WOBBLE_M
     """Standard deviation of the shift that no turn about the axis makes."""
     needs_table: bool = False
     """Whether views that show no table are refused: the product of table and step."""
@@ -156,14 +155,16 @@ class TurntablePrior(AbstractPrior):
         """Return motions as far as the steps may reach, on the table where one is seen; all turns within are alike."""
         steps = target.index - source.index
         turn_deg = _on_circle(steps * self.step_deg)
-        reach_deg = 4.0 * self.step_sigma_deg * np.sqrt(abs(steps)) + _ROOM_DEG
-        whole_deg = min(abs(turn_deg) + reach_deg, 180.0)
+        either_side_deg = reach_deg(float(self.step_sigma_deg * np.sqrt(abs(steps))))
+        whole_deg = min(abs(turn_deg) + either_side_deg, 180.0)
         if support(source, target) is None:
             return GeneralPrior(whole_deg, self._shift_m(steps)).between(source, target)
         motion = TablePrior(whole_deg, self._shift_m(steps)).between(source, target)
-        if self.step_sign == "unknown" or reach_deg >= 180.0:
+        if self.step_sign == "unknown" or either_side_deg >= 180.0:
             return motion
-        return replace(motion, max_rotation_rad=float(np.radians(reach_deg)), middle_rad=float(np.radians(turn_deg)))
+        return replace(
+            motion, max_rotation_rad=float(np.radians(either_side_deg)), middle_rad=float(np.radians(turn_deg))
+        )
 
 
 def _on_circle(turn_deg: float) -> float:

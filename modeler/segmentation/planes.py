@@ -20,7 +20,7 @@ _UPRIGHT = 0.2  # least upward (-y) part of the normal of a plane that faces up
 _SAME_DIRECTION = np.cos(np.radians(20.0))  # between the normals of a cell and of the plane that it is part of
 _LEVEL = np.cos(np.radians(2.0))
 _LEVEL_BONUS = 1.5  # on the votes for level planes
-_PARALLEL = np.cos(np.radians(5.0))
+_PARALLEL = np.cos(np.radians(6.0))  # between the normals of planes that are parallel, as well as small ones show it
 _ABOVE_SHARE = 0.95  # of an object that lies above its support
 _REACH_SIZES = 1.5  # how far from its centre an object's surroundings go, in sizes of the object
 _LEAST_SEEN = 50  # points
@@ -115,7 +115,7 @@ def choose_support(planes: Array, body: Float32Array, ground: Float32Array, nois
     facing = upright(planes)
     rank = facing.astype(np.int64)
     if facing.any():
-        rank += facing & (planes[:, :3] @ planes[facing.argmax(), :3] > _PARALLEL)
+        rank += facing & parallel(planes, planes[facing.argmax()])
     best, found = (-1, 0.0), None
     for plane, grade in zip(planes, rank, strict=True):
         height = heights(body, plane)
@@ -170,6 +170,11 @@ def extent(points: Float32Array) -> tuple[Array, float]:
 def upright(planes: Array) -> BoolArray:
     """Return which planes (k, 4) face up in the image."""
     return -planes[:, 1] > _UPRIGHT
+
+
+def parallel(planes: Array, plane: Array) -> BoolArray:
+    """Return which planes (k, 4) are parallel to one (4,), and face the same way."""
+    return planes[:, :3] @ plane[:3] > _PARALLEL
 
 
 def _largest(cells: _Cells, free: BoolArray, level: Array | None) -> Array:

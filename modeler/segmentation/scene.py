@@ -13,13 +13,12 @@ from modeler.segmentation.clusters import Labels, edge_of, pieces
 from modeler.segmentation.layers import Layers
 from modeler.segmentation.noise import DepthNoise
 from modeler.segmentation.plane_fit import heights
-from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings, upright
+from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, parallel, surroundings, upright
 from modeler.types import Array, BoolArray, Float32Array, Plane
 
 _CARRIED_SHARE = 0.2  # of a pile that stands on its upper plane, for that to be a support and not a lid
 _NEIGHBOUR_SIZES = 0.5  # how far from what moves most, in its sizes, its other parts move
-_RIVAL = 0.3  # of the merit of all that moves: from here on something else may be the object
-_PARALLEL = np.cos(np.radians(6.0))
+_ELSEWHERE = 0.3  # of the merit of all that moves: from here on something else may be the object
 _WALL_BORDER_SHARE = 0.03  # of the image's edge that lies on a plane which runs out of the image
 _IN_FRONT_SHARE = 0.9  # of the object that a wall has in front of it
 _TOUCHING_PX = 3
@@ -97,7 +96,7 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     margin = _NEIGHBOUR_SIZES * float(np.linalg.norm(high - low))
     near = ((layers.front_m > low - margin) & (layers.front_m < high + margin)).all(axis=-1)
     elsewhere = _central(np.where(near, 0, labels), depth, layers.front_share).sum()
-    return layers.moved & allowed & near, bool(elsewhere < _RIVAL * merit.sum())
+    return layers.moved & allowed & near, bool(elsewhere < _ELSEWHERE * merit.sum())
 
 
 def _standing_object(
@@ -118,7 +117,7 @@ def _standing_object(
     levels = planes[facing] if facing.any() else planes[:1]
     if len(levels) == 0:
         return None, found, False
-    levels = levels[levels[:, :3] @ levels[0, :3] > _PARALLEL]
+    levels = levels[parallel(levels, levels[0])]
     tolerance = noise.tolerance_m(depth)
     free = allowed.copy()
     for wall in _walls(planes[~facing] if facing.any() else planes[1:], points, noise):
