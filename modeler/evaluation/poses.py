@@ -93,7 +93,7 @@ def coverage(nees_values: Iterable[float], degrees: int = 6, levels: Iterable[fl
     return dict(zip(nominal, shares, strict=True))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrajectoryErrors:
     """Errors of object_from_camera against the truth, both relative to the first frame."""
 

@@ -33,7 +33,7 @@ _SPARSE_STREAM = 1  # the random stream that thins frame k is [seed, k, this]; p
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Experiment:
     """Registers the same pairs by several methods."""
 
