@@ -106,9 +106,13 @@ def test_what_is_no_single_object_ends_with_a_reason_or_a_model(
     lost = [frame for frame in report["frames"] if frame["outcome"] != "accepted"]
     assert status == (3 if report["reasons"] else 0)
     assert bool(report["reasons"]) == (not report["trustworthy"])
-    assert capsys.readouterr().err.count("is left out") == len(lost)
+    said = capsys.readouterr().err
+    assert said.count("is left out") == len(lost)
     if change is bare:
         assert len(lost) == 3
+        assert "not to be trusted: fewer than two frames were accepted" in said
+    if change is doubled:
+        assert "3 of 3 frames: unsure mask: The object is hard to tell from its surroundings; give --roi" in said
 
 
 def test_an_object_that_fills_the_image_is_modelled_where_masks_say_so(frames: list[Frame], tmp_path: Path) -> None:

@@ -148,7 +148,9 @@ def _told(report: Mapping[str, Any], options: Build) -> int:
     frames = "1 frame" if len(report["frames"]) == 1 else f"{len(report['frames'])} frames"
     print(f"modeler: {accepted} of {frames}, {loop}, {took}: {options.out}", file=sys.stderr)
     if report["reasons"]:
-        first, *others = report["reasons"]
+        first, *others = sorted(
+            report["reasons"], key=lambda reason: reason.startswith("frame ")
+        )  # frames left out were told above
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
         print(f"modeler: not to be trusted: {first}{more}", file=sys.stderr)
     return 0 if report["trustworthy"] else 3

@@ -8,7 +8,7 @@ from rich.console import Console as Terminal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from modeler import kernels
-from modeler.types import Step
+from modeler.types import Outcome, Step
 
 
 def bar() -> Progress:
@@ -34,6 +34,7 @@ class Console:
         self._frames, self._stage = frames, ""
         self._address = address
         self._placed: dict[int, bool] = {}  # a lost frame that later views place comes a second time
+        self._unsure: set[int] = set()
 
     def __enter__(self) -> Console:
         """Show the bar."""
@@ -47,14 +48,19 @@ class Console:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave the bar as it stands."""
+        """Leave the bar as it stands, and tell in how many frames something else may have been taken for the object."""
         self._bar.stop()
+        if self._unsure:
+            doubt = Outcome.UNSURE_MASK
+            self._say(f"{len(self._unsure)} of {len(self._placed)} frames: {doubt.label}: {doubt.advice}")
 
     def __call__(self, step: Step) -> None:
         """Tell of a step."""
         loops = sum(edge.kind == "closure" and edge.accepted for edge in step.edges_so_far)
         frame, accepted = step.frame.index, step.outcome == "accepted"
         again, self._placed[frame] = frame in self._placed, accepted
+        if accepted and step.segmentation.outcome is Outcome.UNSURE_MASK:
+            self._unsure.add(frame)
         description = f"{len(step.views)} joined, {loops} loops closed"
         self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=description)
         if not accepted and not again:
