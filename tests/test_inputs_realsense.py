@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from modeler.cli import main
+from modeler.export import RunFolder
 from modeler.types import Camera, Frame, InputError
 from sequences import Given, open_sequence, survey
 from sequences.lens import Lens, known
@@ -188,6 +189,7 @@ class StandIn(AbstractCamera):
     frames: list[Frame]
     taken: list[int] = field(default_factory=list)
     times_s: tuple[float, ...] = ()
+    lasts: int = 1000
 
     @property
     def name(self) -> str:
@@ -203,6 +205,8 @@ class StandIn(AbstractCamera):
 
     def take(self) -> tuple[float, np.ndarray, np.ndarray | None]:
         number = len(self.taken)
+        if number == self.lasts:
+            raise InputError("stand-in: gives no image.")
         self.taken.append(number)
         frame = self.frames[number % len(self.frames)]
         return self.times_s[number] if self.times_s else 0.1 * number, raw_depth(frame, 1.0), frame.colour
@@ -291,6 +295,25 @@ def test_recording_a_live_camera_needs_an_end(
     assert "say how many frames to record" in capsys.readouterr().err
     assert main(["convert", "realsense:", "--frames", ":5", "--out", str(tmp_path / "bop")]) == 0
     assert open_sequence(tmp_path / "bop").indices == (0, 1, 2, 3, 4)
+
+
+@pytest.mark.parametrize("command", [("convert", "--frames", ":8"), ("build", "--prior", "general", "--method", "icp")])
+def test_a_camera_that_is_unplugged_leaves_what_it_gave(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, command: tuple[str, ...]
+) -> None:
+    camera, out = StandIn(small_frames(3), lasts=3), tmp_path / "out"
+    for module in ("modeler.cli.converting.open_sequence", "modeler.cli.compose.open_sequence"):
+        monkeypatch.setattr(
+            module, lambda path, *_: begin(camera, 2) if str(path) == "realsense:" else open_sequence(path)
+        )
+    assert main([command[0], "realsense:", "--out", str(out), *command[1:]]) in (0, 3)
+    assert "modeler: stand-in: gives no image: going on with the frames so far\n" in capsys.readouterr().err
+    if command[0] == "convert":
+        assert open_sequence(out).indices == (0, 1, 2)
+    else:
+        assert RunFolder(out).report()["complete"]
+        assert (out / "model.ply").exists()
+        assert len(RunFolder(out).report()["frames"]) == 3
 
 
 def test_a_camera_is_straightened() -> None:

@@ -12,6 +12,7 @@ from modeler.cli import compose
 from modeler.cli.build import Build
 from modeler.cli.console import Console
 from modeler.cli.interrupt import Interrupt
+from modeler.cli.reading import while_it_lasts
 from modeler.cli.remembered import Remembered
 from modeler.cli.watching import watched
 from modeler.export import RunFolder, RunMeta, alone
@@ -117,7 +118,8 @@ def _run(
     report: Mapping[str, Any] = {}
     try:
         with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
-            coming = interrupt.until(frames.until(lambda: interrupt.asked))
+            wanted = frames.until(lambda: interrupt.asked)
+            coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
             for step in modeler.run(coming, scene, hurry=lambda: interrupt.asked, ending=console.ending):
                 seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
                 seconds["total"] = time.perf_counter() - began_s

@@ -10,7 +10,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.cli.convert import Convert
-from modeler.cli.reading import reading
+from modeler.cli.reading import reading, while_it_lasts
 from modeler.export import RunFolder
 from modeler.export.files import write_atomically
 from modeler.export.tum import tum_text
@@ -51,7 +51,7 @@ def convert(options: Convert) -> int:
         unit_mm = next((unit for unit in UNITS_MM if farthest_m * 1000.0 < 65535.0 * unit), UNITS_MM[-1])
         write_bop(
             options.out,
-            watched(sequence, "writing"),
+            while_it_lasts(sequence) if sequence.live else watched(sequence, "writing"),
             sequence.truth(),
             _meta(sequence),
             depth_scale_mm=unit_mm,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol, final
 
 from modeler.cli.console import bar
-from modeler.types import Frame
+from modeler.types import Frame, InputError
 from sequences import AbstractSequence
 from sequences.base import AbstractDerived
 
@@ -34,6 +35,14 @@ class Watched(Protocol):
     def __call__(self, sequence: AbstractSequence, what: str = "", /) -> AbstractSequence:
         """Add a bar for a sequence, with what is done with its frames in a word."""
         ...
+
+
+def while_it_lasts(camera: AbstractSequence) -> Iterator[Frame]:
+    """Yield the frames of a camera; one that fails ends them with a line on stderr, for they cannot be had again."""
+    try:
+        yield from camera
+    except InputError as error:
+        print(f"modeler: {str(error).rstrip('.')}: going on with the frames so far", file=sys.stderr)
 
 
 @contextmanager
