@@ -282,7 +282,7 @@ def test_the_mesh_is_made_though_the_last_frames_are_lost(lost: tuple[int, ...])
 
 def test_an_axis_that_all_steps_share_sharpens_the_first_pairs_too() -> None:
     """Only the last solution knows of it: that of all edges and the axis together, in which each counts once."""
-    prior, known = AnyPrior(axis=SharedAxis(1e-4, 1e-5)), CommonAxis(None, 0.0, 1e-4, 1e-5, np.inf)
+    prior, known = AnyPrior(axis=SharedAxis(1e-4, 1e-5)), CommonAxis(1e-4, 1e-5, np.inf)
     plain, shared = [], []
     for seed in range(3):
         *_, before, last = run(registrar=Oracle(noise=1.0), prior=prior, seed=seed)

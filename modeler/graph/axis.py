@@ -28,6 +28,7 @@ _PLACE_SIGMAS = np.array([0.01, 0.01, *_AXIS_SIGMAS[2:]])  # where steps say not
 _LEAST_RAD = np.radians(5.0)  # a table that has turned by less in all shows no axis
 _ITERATIONS, _HALVINGS = 50, 10  # of Gauss and Newton, and of one step of theirs that overshoots
 _TOLERANCE = 1e-6  # of half the squared Mahalanobis distance: where a step lowers it by less, the next is nothing
+_KEPT = [0, 1, 3, 4, 5]  # of a step without its turn
 _FITS = 1.0 - 1e-6  # of tables that are as they are said to be; the others cost a hundred times more
 
 
@@ -45,12 +46,11 @@ class Turned:
 
 @dataclass(frozen=True)
 class CommonAxis:
-    """What is known of a turntable, beyond what the edges know: they must not hold it already."""
+    """What is known of a turntable, beyond what the edges know: they must not hold it already.
 
-    step_rad: float | None = None
-    """Turn between frames whose numbers differ by one, positive; None: not known."""
-    sigma_step_rad: float = float(np.radians(1.0))
-    """Standard deviation of that turn."""
+    How far it turns in a step is none of it: where that is known, edges hold it.
+    """
+
     sigma_tilt_rad: float = float(np.radians(0.2))
     """How far the object tilts against the axis in a step: wobble of the table, slip on it. Infinite where edges hold
     the axis' direction: what steps then share is its place."""
@@ -160,12 +160,10 @@ class _Known:
         """Return `slip` of steps (n, 2) between a target and a source, whitened."""
         axis, apart = self.axis, steps[:, 1] - steps[:, 0]
         targets, sources = (np.stack([poses[int(frame)] for frame in ends]) for ends in steps.T)
-        turns_rad = None if axis.step_rad is None else axis.step_rad * apart
-        turn = () if axis.step_rad is None else (axis.sigma_step_rad,)
         across = (axis.sigma_shift_m, axis.sigma_shift_m, axis.sigma_lift_m)
-        sigmas = np.array([axis.sigma_tilt_rad, axis.sigma_tilt_rad, *turn, *across])
+        sigmas = np.array([axis.sigma_tilt_rad, axis.sigma_tilt_rad, *across])
         whiten = 1.0 / (np.sqrt(apart)[:, None] * sigmas)
-        error, *derivatives = slip(targets, sources, poses[_AXIS], turns_rad)
+        error, *derivatives = slip(targets, sources, poses[_AXIS])
         return [whiten * error, *(whiten[..., None] * derivative for derivative in derivatives)]
 
 
@@ -210,21 +208,16 @@ def estimated_axis(trajectory: Mapping[int, Array], near_m: Array) -> Array | No
 
 
 def slip(
-    object_from_target: Array,
-    object_from_source: Array,
-    camera_from_axis: Array,
-    turns_rad: npt.NDArray[np.floating] | None,
+    object_from_target: Array, object_from_source: Array, camera_from_axis: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return what of steps is no turn about the axis (n, m), and its derivatives (n, m, 6) by ξ of the three poses.
+    """Return what of steps is no turn about the axis (n, 5), and its derivatives (n, 5, 6) by ξ of the three poses.
 
-    Tilt about the first two directions in rad, then the turn in rad beyond `turns_rad` (n,) where these are given, then
-    shift along all three in m: m is 6, or 5.
+    Tilt about the first two directions in rad, then shift along all three in m.
 
     Args:
         object_from_target: (n, 4, 4).
         object_from_source: (n, 4, 4).
         camera_from_axis: (4, 4).
-        turns_rad: what the turns should be.
     """
     target_from_source = se3.inverse(object_from_target) @ object_from_source
     step = se3.inverse(camera_from_axis) @ target_from_source @ camera_from_axis
@@ -243,15 +236,8 @@ def slip(
     rest = se3.exp(back) @ step
     xi = se3.log(rest)
     held = np.eye(6) - se3.adjoint(se3.inverse(rest))[:, :, 2, None] * slope[:, None]
-    derivative = inverse_right_jacobian(xi) @ held
-    if turns_rad is None:
-        kept = [0, 1, 3, 4, 5]
-        error, derivative = xi[:, kept], derivative[:, kept]
-    else:  # the place of the turn, which has been taken out
-        error = xi.copy()
-        error[:, 2] = np.remainder(angle - turns_rad + np.pi, 2.0 * np.pi) - np.pi
-        derivative[:, 2] = slope
+    derivative = (inverse_right_jacobian(xi) @ held)[:, _KEPT]
     of_source = derivative @ se3.adjoint(se3.inverse(camera_from_axis))
     of_target = -of_source @ se3.adjoint(se3.inverse(target_from_source))
     of_axis = derivative @ (np.eye(6) - se3.adjoint(se3.inverse(step)))
-    return error, of_target, of_source, of_axis
+    return xi[:, _KEPT], of_target, of_source, of_axis
