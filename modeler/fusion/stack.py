@@ -218,12 +218,11 @@ def stack(
     lenses, told, counts = [], [], []
     for number, ((view, pose), window) in enumerate(zip(pairs, windows, strict=True)):
         cut = _cut(view, window, margin_px=margin_px, min_cosine=min_cosine, edge_weight=edge_weight)
-        height, width = cut.index.shape
-        index[number, :height, :width] = np.where(cut.index >= 0, cut.index + sum(counts), -1)
-        free_m[number, :height, :width] = cut.free_m
-        beside_m[number, :height, :width] = cut.beside_m
+        here = number, *map(slice, cut.index.shape)
+        index[here] = np.where(cut.index >= 0, cut.index + sum(counts), -1)
+        free_m[here], beside_m[here] = cut.free_m, cut.beside_m
         if cut.colour is not None:
-            colour[number, :height, :width] = cut.colour
+            colour[here] = cut.colour
         lenses.append(cut.lens)
         told.append(_told(cut, view, pose, covariances))  # its images need not be kept
         counts.append(len(cut.points_m))

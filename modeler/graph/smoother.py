@@ -114,12 +114,8 @@ class Smoother:
             inlier, turned = self._turned(self.axis, taken, closing, trajectory, state)
         trajectory = trajectory if turned is None else turned.poses
         chosen = _taking_part(closing, inlier)
-        relative_covariance = self._hung(taken, trajectory) if grew and len(loops) == len(self.state.loops) else None
-        relative_covariance = relative_covariance or RelativeCovariance(
-            trajectory, root, (*taken, *chosen), () if turned is None else turned.rows
-        )
-        if self.shared:
-            relative_covariance = SharedCovariance(relative_covariance, (*taken, *chosen), self.shared)
+        hangs = grew and len(loops) == len(self.state.loops)
+        relative_covariance = self._covariance(taken, chosen, trajectory, turned, root=root, hangs=hangs)
         several = [link for link in (*taken, *closing) if link.modes]
         own = {link.edge: [mode.weight for mode in link.modes] for link in several}
         solution = Solution(
@@ -136,12 +132,23 @@ class Smoother:
         )
         return replace(self, graph=graph, solution=solution, state=state)
 
-    def _hung(self, tree: Sequence[Link], trajectory: Mapping[int, Array]) -> RelativeCovariance | None:
-        """Return the covariances where no loop is new: new frames hang on those before; None: they do not."""
-        before = self.solution.relative_covariance
-        if self.axis is not None or not isinstance(before, RelativeCovariance) or before.others:
-            return None
-        return before.plus(trajectory, tree[len(self.state.tree) :])
+    def _covariance(
+        self,
+        tree: Sequence[Link],
+        loops: Sequence[Link],
+        trajectory: Mapping[int, Array],
+        turned: Turned | None,
+        *,
+        root: int,
+        hangs: bool,
+    ) -> RelativeCovariance | SharedCovariance:
+        """Return the covariances of a solution; where no loop is new and frames hang on others, from those before."""
+        before, found = self.solution.relative_covariance, None
+        if hangs and turned is None and isinstance(before, RelativeCovariance) and not before.others:
+            found = before.plus(trajectory, tree[len(self.state.tree) :])
+        links = (*tree, *loops)
+        found = found or RelativeCovariance(trajectory, root, links, () if turned is None else turned.rows)
+        return SharedCovariance(found, links, self.shared) if self.shared else found
 
     def _closed(
         self, tree: Sequence[Link], loops: Sequence[Link], start: Mapping[int, Array], *, root: int, afresh: bool
