@@ -21,8 +21,8 @@ from modeler.export import (
     RunFolder,
     RunMeta,
     edges_of,
-    export_mesh,
     g2o_text,
+    mesh_of,
     poses_of,
     read_model,
     report_of,
@@ -199,7 +199,7 @@ def test_exported_mesh_is_the_same_surface(tmp_path: Path, suffix: str) -> None:
     run.mkdir()
     (run / "model.ply").write_bytes(mesh_ply(model))
     out = tmp_path / "new folder" / f"box.{suffix}"
-    export_mesh(run, out)
+    write_mesh(read_model(mesh_of(run)), out)
     mesh = _loaded(out)
     expected = model.vertices_m[model.triangles]
     np.testing.assert_allclose(mesh.triangles, expected, atol=1e-6)  # same place, same order, same side out
@@ -361,7 +361,7 @@ def test_mesh_that_cannot_be_exported_is_said_in_one_line(tmp_path: Path) -> Non
         ("good.ply", "file/a.obj", "cannot be made"),
     ):
         with pytest.raises(InputError, match=words) as caught:
-            export_mesh(tmp_path / source, tmp_path / out)
+            write_mesh(read_model(mesh_of(tmp_path / source)), tmp_path / out)
         assert "\n" not in str(caught.value)
     assert {path.name for path in tmp_path.iterdir()} == {"empty.ply", "broken.ply", "good.ply", "file"}
 

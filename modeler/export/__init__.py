@@ -4,7 +4,6 @@ from modeler.export.bop import write_bop as write_bop
 from modeler.export.files import alone as alone
 from modeler.export.files import write_atomically as write_atomically
 from modeler.export.g2o import g2o_text as g2o_text
-from modeler.export.mesh import export_mesh as export_mesh
 from modeler.export.mesh import format_of as format_of
 from modeler.export.mesh import mesh_of as mesh_of
 from modeler.export.mesh import write_mesh as write_mesh

@@ -9,26 +9,11 @@ import numpy as np
 
 from modeler.export.files import write_atomically
 from modeler.export.ply import mesh_ply
-from modeler.export.reading import read_model
 from modeler.export.texture import Texture
 from modeler.types import InputError, ObjectModel
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 TEXTURED = (".obj", ".glb")
-
-
-def export_mesh(source: Path, out: Path) -> None:
-    """Convert a fused mesh; the ending of `out` selects the format.
-
-    Args:
-        source: a run folder, or a PLY file in it.
-        out: file to write; folders on the way are made.
-
-    Raises:
-        InputError: where there is no mesh, the ending is unknown or the file cannot be written.
-    """
-    format_of(out)
-    write_mesh(read_model(mesh_of(source)), out)
 
 
 def mesh_of(source: Path) -> Path:
