@@ -10,6 +10,10 @@ from modeler.kernels import visibility as kernel
 from modeler.kernels.sight import Sight
 from modeler.types import Array, RayImage
 
+_OUTLINE = 0.5
+"""Error of a silhouette as a share of the lateral noise of its pixels, each of which errs by itself."""
+_SPARED = 0.25
+"""Beside it so much is no one's, likewise: points lie a pixel or more inside, since the rim has no plane."""
 FACING = np.array([0.1, 0.35, 0.35, 0.6], dtype=np.float32)  # see `Sight`
 
 
@@ -65,8 +69,8 @@ class Lookup:
         lateral_px = max(self.image.sigma_wh * fx, 1.0)
         return kernel.Model(
             blur_m=np.float32(np.hypot(blur_m, self.surface_m)),
-            silhouette_px=np.float32(lateral_px + blur_m * fx / self._distance_m),
-            dead_px=np.float32(1.25 * lateral_px),
+            silhouette_px=np.float32(_OUTLINE * lateral_px + blur_m * fx / self._distance_m),
+            dead_px=np.float32(_SPARED * lateral_px),
             clearance_m=np.float32(3.0 * self.image.sigma_r_m),
             worst=np.float32(self.worst),
             bend=np.float32(self.bend),

@@ -49,8 +49,12 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Least error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
     surface_detail: float = 0.003
     """Least error of local planes on a curved surface, as a share of the object's size."""
-    hidden_share: float = 0.3
-    """Share of points that face the other camera and are hidden by another part of the object."""
+    hidden_share: float = 0.5
+    """Share of points that face the other camera and are hidden by another part of the object.
+
+    Where points go behind the surface seen they lose the log of it. With a lower share the inside of a bowl, hidden
+    wherever the bowl has turned, would say that it had not.
+    """
     worst: float = 10.0
     """Most that one point may cost (nats)."""
     bend: float = 2.0
