@@ -46,14 +46,13 @@ class Placing:
         if not posteriors:
             return None, ""
         odometry = posteriors[0]
-        follows, joins = self._follows(odometry), f"joins the previous view: {odometry.outcome.label}"
-        joins = f"{joins}, overlap {odometry.overlap:.2f}"
-        if follows and (self.steps == 1 or self._off_deg(odometry) <= self.max_angle_deg):
+        joins = f"joins the previous view: {odometry.outcome.label}, overlap {odometry.overlap:.2f}"
+        if self._follows(odometry) and (self.steps == 1 or self._off_deg(odometry) <= self.max_angle_deg):
             return odometry, joins
-        standing = [posterior for posterior in posteriors[1:] if stands(posterior, self.asked)]
-        standing.sort(key=lambda posterior: -posterior.overlap)
-        for posterior in standing:
-            reason = f"joins in place of the failed previous view: overlap {posterior.overlap:.2f}"
+        standing = [posterior for posterior in posteriors if stands(posterior, self.asked)]
+        for posterior in sorted(standing, key=lambda posterior: -posterior.overlap):
+            instead = f"joins in place of the failed previous view: overlap {posterior.overlap:.2f}"
+            reason = joins if posterior is odometry else instead
             off_deg = self._off_deg(posterior)
             # Near the end of what views can be registered across, one alone may be cut off there.
             turned_deg = float(np.degrees(se3.rotation_angle(posterior.pose.mean)))
@@ -61,8 +60,6 @@ class Placing:
                 return posterior, f"{reason}, {off_deg:.0f}° from the motion going on"
             if (witness := self._witness(posterior, standing)) is not None:
                 return posterior, f"{reason}, frame {witness.target} agrees"
-        if follows and (witness := self._witness(odometry, standing)) is not None:
-            return odometry, f"{joins}, frame {witness.target} agrees"
         return None, ""
 
     def next(self, posteriors: Sequence[Posterior]) -> int | None:
