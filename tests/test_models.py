@@ -147,6 +147,46 @@ def test_another_sequence_is_not_taken_for_that_of_the_run(
     assert "The true motion is not known here" in (tmp_path / "page.html").read_text()
 
 
+@pytest.mark.parametrize(
+    "place",
+    [
+        ("settings",),
+        ("sequence",),
+        ("frames", 0, "points"),
+        ("edges", 0, "information"),
+        ("edges", 0, "covariance"),
+        ("edges", 1, "outcome"),
+        ("poses", 0, "object_from_camera"),
+        ("poses", 1),
+    ],
+)
+@pytest.mark.parametrize("value", ["gone", [1.0, 2.0], {}])
+def test_a_damaged_report_is_one_line(
+    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], place: tuple[str | int, ...], value: object
+) -> None:
+    shutil.copytree(built, tmp_path / "run", ignore=shutil.ignore_patterns("*.rrd", "*.ply"))
+    path = tmp_path / "run" / "report.json"
+    report = within = json.loads(path.read_bytes())
+    for key in place[:-1]:
+        within = within[key]
+    if value == "gone":
+        del within[place[-1]]
+    else:
+        within[place[-1]] = value
+    path.write_text(json.dumps(report))
+    if (place == ("poses", 1) and value == "gone") or (place == ("settings",) and value == {}):
+        return  # which is no damage
+    for command in (
+        ["report"],
+        ["export", "--voxel-m", "0.01", "--out", tmp_path / "m.ply"],
+        ["evaluate", "--out", tmp_path],
+    ):
+        status, out, err = _told(capsys, command[0], tmp_path / "run", *command[1:])
+        assert (status, out, err.count("\n")) == (2, "", 1)
+        assert f"{path}: " in err
+        assert "build again with --overwrite" in err
+
+
 def test_a_joined_run_is_judged_where_its_parts_know_one_surface(
     built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

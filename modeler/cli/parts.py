@@ -96,7 +96,7 @@ def parts_of(run: Path, sequences: Sequence[Path] = ()) -> tuple[Part, ...]:
 
 
 def _parts(run: Path, places: deque[Path] | None) -> tuple[Part, ...]:
-    report = RunFolder(run).report()
+    report = RunFolder(run).result()
     settings = report["settings"]
     if "joined" in settings:
         first, second = (_parts(Path(part), places) for part in settings["joined"])

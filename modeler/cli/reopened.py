@@ -49,7 +49,7 @@ def reopened(run: Path, sequences: Sequence[Path] = ()) -> Reopened:
     Raises:
         InputError: where the folder holds no finished run, or a sequence is not to be found or is another.
     """
-    report, parts = RunFolder(run).report(), parts_of(run, sequences)
+    report, parts = RunFolder(run).result(), parts_of(run, sequences)
     poses = {frame: pose.mean for frame, pose in poses_of(report).items()}
     if not poses:
         raise InputError(f"{run}: no frame was accepted; build the run again")

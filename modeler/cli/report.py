@@ -41,7 +41,7 @@ class Report:
         from viz.report import write_page
 
         out = self.run_folder / "report.html" if self.out is None else self.out
-        RunFolder(self.run_folder).report()  # without which there is nothing to tell
+        RunFolder(self.run_folder).result()  # without which there is nothing to tell
         try:
             truth = _truth(self.run_folder, self.sequence)
         except InputError:

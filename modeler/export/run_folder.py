@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from modeler.export.checking import fault
 from modeler.export.files import PART, settle, settle_soon, write_atomically
 from modeler.export.g2o import g2o_text
 from modeler.export.pairs import Pairs
@@ -109,6 +110,18 @@ class RunFolder:
             raise InputError(f"{path}: the report cannot be read ({error}); build again with --overwrite") from error
         if not isinstance(report, dict) or report.get("schema") != 1:
             raise InputError(f"{path}: not a report of schema 1; build again with --overwrite")
+        return report
+
+    def result(self) -> dict[str, Any]:
+        """Return the report after a look at all of it, for whoever relies on more than that it is there.
+
+        Raises:
+            InputError: where there is none, it cannot be read or is not as `modeler` writes it.
+        """
+        report = self.report()
+        wrong = fault(report)
+        if wrong is not None:
+            raise InputError(f"{self.path / _REPORT}: {wrong}; build again with --overwrite")
         return report
 
     def finished(self, meta: RunMeta) -> bool:
