@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from modeler.types import Outcome
 
 Test = Callable[[Any], bool]
+_FARTHEST_M, _WIDEST, _NARROWEST = 1e6, 1e9, 1e-30
+_ROUND = 1e-6
 
 
 def fault(report: Mapping[str, Any]) -> str | None:
@@ -20,7 +24,7 @@ def fault(report: Mapping[str, Any]) -> str | None:
             return f"{name!r} is missing or is not what it should be"
     for name, tests in (("frames", _FRAME), ("edges", _EDGE), ("poses", _POSE)):
         for place, record in enumerate(report[name]):
-            wrong = _wrong(record, tests)
+            wrong = _wrong(record, tests) or _impossible(record)
             if wrong is not None:
                 return f"{wrong} of entry {place} of {name!r} is missing or is not what it should be"
     wrong = _wrong(report["settings"], _SETTINGS, may_lack=frozenset(_SETTINGS))
@@ -34,6 +38,35 @@ def _wrong(record: Any, tests: Mapping[str, Test], may_lack: frozenset[str] = fr
         if not test(record[name]) if name in record else name not in may_lack:
             return repr(name)
     return None
+
+
+def _impossible(record: Mapping[str, Any]) -> str | None:
+    """Return which pose of an edge that takes part, or of a frame, is no motion, or which covariance is none."""
+    if not record.get("accepted", "object_from_camera" in record):
+        return None
+    for part in (record, *(record.get("modes") or ())):
+        for name in ("target_from_source", "object_from_camera"):
+            if name in part and not _rigid(part[name]):
+                return repr(name)
+        if not _definite(part["covariance"], 0.0 if "accepted" in record else -_ROUND):
+            return "'covariance'"
+    return None
+
+
+def _rigid(numbers: list[float | None]) -> bool:
+    pose = np.array(numbers, dtype=np.float64).reshape(4, 4)
+    turn = pose[:3, :3]
+    sound = bool((np.abs(pose) < _FARTHEST_M).all()) and bool((pose[3] == (0.0, 0.0, 0.0, 1.0)).all())  # not so of NaN
+    return sound and bool(np.abs(turn @ turn.T - np.eye(3)).max() < _ROUND) and np.linalg.det(turn) > 0.0
+
+
+def _definite(numbers: list[float | None], least: float) -> bool:
+    covariance = np.array(numbers, dtype=np.float64).reshape(6, 6)
+    if not (np.abs(covariance) < _WIDEST).all():  # not so of NaN
+        return False
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), _NARROWEST))
+    correlation = covariance / np.outer(sigmas, sigmas)
+    return bool(np.abs(correlation - correlation.T).max() < _ROUND and np.linalg.eigvalsh(correlation)[0] > least)
 
 
 def _whole(value: Any) -> bool:
