@@ -86,6 +86,20 @@ def test_a_run_that_had_ended_is_not_made_again(
     assert ({path.name: path.stat().st_mtime_ns for path in whole.iterdir()}, asked) == (before, [])
 
 
+@pytest.mark.parametrize("missing", ["frames", "reasons", "poses"])
+def test_a_run_whose_report_is_damaged_is_not_resumed(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: str
+) -> None:
+    report = RunFolder(whole).report()
+    del report[missing]
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert main(["build", BOX, "--out", str(tmp_path), *QUICK, "--resume"]) == 2
+    assert capsys.readouterr().err == (
+        f"modeler: {tmp_path / 'report.json'}: {missing!r} is missing or is not what it should be; build again with "
+        "--overwrite\n"
+    )
+
+
 def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(
     whole: Path, tmp_path: Path, asked: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

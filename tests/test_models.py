@@ -152,6 +152,8 @@ def test_another_sequence_is_not_taken_for_that_of_the_run(
     [
         ("settings",),
         ("sequence",),
+        ("seconds",),
+        ("frames",),
         ("frames", 0, "points"),
         ("edges", 0, "information"),
         ("edges", 0, "covariance"),
@@ -174,7 +176,7 @@ def test_a_damaged_report_is_one_line(
     else:
         within[place[-1]] = value
     path.write_text(json.dumps(report))
-    if (place == ("poses", 1) and value == "gone") or (place == ("settings",) and value == {}):
+    if (place, value) in ((("poses", 1), "gone"), (("settings",), {}), (("seconds",), {})):
         return  # which is no damage
     for command in (
         ["report"],

@@ -146,7 +146,7 @@ def _told(report: Mapping[str, Any], options: Build) -> int:
     """Say on stderr what came out, and return the exit status."""
     accepted = sum(frame["outcome"] == "accepted" for frame in report["frames"])
     loop = "loop closed" if report["closed"] else "no loop closed"
-    took = f"{report['seconds']['total']:.0f} s"
+    took = f"{report['seconds'].get('total', 0.0):.0f} s"
     frames = "1 frame" if len(report["frames"]) == 1 else f"{len(report['frames'])} frames"
     print(f"modeler: {accepted} of {frames}, {loop}, {took}: {options.out}", file=sys.stderr)
     if report["reasons"]:

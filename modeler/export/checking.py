@@ -104,6 +104,10 @@ _WHOLE: dict[str, Test] = {
     "frames": _is(list),
     "edges": _is(list),
     "poses": _is(list),
+    "closed": _is(bool),
+    "trustworthy": _is(bool),
+    "reasons": lambda value: isinstance(value, list) and all(map(_is(str), value)),
+    "seconds": lambda value: isinstance(value, dict) and all(map(_number, value.values())),
 }
 _FRAME: dict[str, Test] = {"id": _whole, "timestamp": _number, "points": _whole, "outcome": _is(str)}
 _POSE: dict[str, Test] = {"id": _whole, "object_from_camera": _numbers(16), "covariance": _numbers(36)}

@@ -132,7 +132,7 @@ class RunFolder:
         """
         if not (self.path / _REPORT).exists():
             return False
-        report = self.report()
+        report = self.result()
         settings = report.get("settings")
         before = {name: report.get(name) for name in ("sequence", "seed", "prior")}
         before |= settings if isinstance(settings, dict) else {}
