@@ -74,8 +74,8 @@ class Sensor:
             Radius in m of the ball, in px at the nearest point, and the step between its pixels; and the least noise of
             inverse depth (1/m) that a plane's residuals are taken to show.
         """
-        if rows.size == 0:
-            return (0.01, 1, 1), self.sigma_r_m
+        if rows.size == 0:  # nothing to smooth
+            return (0.0, 1, 1), 0.0
         depth_m = frame.depth_m[rows, columns]
         nearest_m, middle_m = (float(value) for value in np.percentile(depth_m, [2, 50]))
         metres_per_px = middle_m / frame.camera.fx

@@ -10,9 +10,9 @@ import pytest
 import tabletop
 
 from modeler import registration, se3
-from modeler.priors import GeneralPrior
+from modeler.priors import ForeseenPrior, GeneralPrior
 from modeler.rays import Sensor
-from modeler.types import AbstractMotion, AbstractRegistrar, Array, Frame, Outcome, Posterior, RayImage
+from modeler.types import AbstractMotion, AbstractRegistrar, Array, Frame, Outcome, PoseGaussian, Posterior, RayImage
 
 PRIOR = GeneralPrior(max_rotation_deg=25.0, max_offset_m=0.02)
 BODY = tabletop.Box((0.05, 0.08, 0.035))
@@ -107,6 +107,38 @@ def test_does_not_move_identical_views(method: AbstractRegistrar) -> None:
 @every_method
 def test_swapping_the_views_inverts_the_motion(method: AbstractRegistrar) -> None:
     assert_close(method, se3.inverse(registered(method, 1, 0).pose.mean), registered(method, 0, 1).pose.mean)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [registration.VisibilityRegistrar(), registration.PaperRegistrar(samples=300_000, points=4)],
+    ids=lambda m: type(m).__name__,
+)
+def test_a_guess_tells_where_to_look_and_is_no_evidence(method: AbstractRegistrar) -> None:
+    """Guesses on either side of the truth, surer than four points are, do not pull the answer to themselves."""
+    source, target = view(0), view(1)
+    truth = POSES[1] @ se3.inverse(POSES[0])
+    axis = se3.log(truth)[:3] / np.linalg.norm(se3.log(truth)[:3])
+    about = se3.adjoint(se3.translation(source.centroid_m))
+    spread = about @ np.diag(np.repeat([np.radians(1.0), 0.002], 3) ** 2) @ about.T
+    turned_deg = []
+    for off_deg in (-6.0, 6.0):
+        xi = np.concatenate([np.radians(off_deg) * axis, np.zeros(3)])
+        guess = ForeseenPrior(PRIOR, PoseGaussian(se3.moved(truth, xi, source.centroid_m), spread))
+        found = method.register(source, target, guess.between(source, target), rng=np.random.default_rng(5))
+        turned_deg.append(np.degrees(se3.difference(truth, found.pose.mean, source.centroid_m)[:3] @ axis))
+    assert abs(turned_deg[1] - turned_deg[0]) < 1.5  # of the 12 between the guesses
+
+
+@every_method
+def test_failure_hands_on_what_was_known(method: AbstractRegistrar) -> None:
+    nothing, seen = empty(0), view(1)
+    found = method.register(nothing, seen, PRIOR.between(nothing, seen), rng=np.random.default_rng(5))
+    assert not found.usable
+    assert found.seconds >= 0.0
+    sigma_m = np.sqrt(np.diag(found.pose.covariance)[3:])
+    assert np.all((sigma_m > 0.1 * PRIOR.max_offset_m) & (sigma_m < 100.0 * PRIOR.max_offset_m))
+    assert np.linalg.eigvalsh(found.pose.covariance)[0] > 0.0
 
 
 @every_cloud_method

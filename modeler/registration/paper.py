@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from modeler.kernels import paper as kernel
 from modeler.registration.free_space import Draws, FreeSpace, Measured
 from modeler.registration.importance import effective_samples, pareto_tail
 from modeler.registration.posterior import failed, intrinsics, weighted_gaussian
+from modeler.registration.visibility import VisibilityRegistrar
 from modeler.se3 import matrices, rows
 from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, Posterior, RayImage
 
@@ -46,26 +47,28 @@ class PaperRegistrar(AbstractRegistrar):
         """Return the posterior of target_from_source; failure is its outcome."""
         started = time.perf_counter()
         if min(len(source.points_m), len(target.points_m)) < 10:
-            return failed(source, target, Outcome.TOO_FEW_POINTS)
+            return failed(source, target, Outcome.TOO_FEW_POINTS, motion, rng)
         views = measured(source, self.points, rng), measured(target, self.points, rng)
         kept_poses, kept_weights, drawn = [], [], 0
         for tried, passing in self._passing(views, motion, rng):
             drawn += tried
-            log_weights = self.log_weights(passing, views)
+            log_weights = self.log_weights(passing, views) + _known(motion, passing)
             alive = np.isfinite(log_weights)
             kept_poses.append(matrices(passing[alive]))
             kept_weights.append(log_weights[alive])
         poses, log_weights = np.concatenate(kept_poses), np.concatenate(kept_weights)
         if len(poses) == 0:
-            return failed(source, target, Outcome.NO_OVERLAP)
+            nothing = failed(source, target, Outcome.NO_OVERLAP, motion, rng)
+            return replace(nothing, seconds=time.perf_counter() - started)
         weights = np.exp(log_weights - log_weights.max())
         effective = effective_samples(log_weights)
+        pose = weighted_gaussian(poses, weights, source.centroid_m)
         return Posterior(
             source=source.index,
             target=target.index,
-            pose=weighted_gaussian(poses, weights, source.centroid_m),
+            pose=pose,
             outcome=Outcome.CONVERGED if effective >= self.min_effective else Outcome.DEGENERATE,
-            overlap=1.0,  # free space is all that the likelihood tests; nothing says which surface both views share
+            overlap=VisibilityRegistrar().pair(source, target, rng).overlap(pose.mean),
             samples=poses,
             weights=weights / weights.sum(),
             effective_samples=effective,
@@ -107,6 +110,14 @@ class PaperRegistrar(AbstractRegistrar):
             for first in range(0, samples, _DRAWN):
                 count = min(_DRAWN, samples - first)
                 yield count, free.passing(draws, first, count)
+
+
+def _known(motion: AbstractMotion, poses: Array) -> Array | float:
+    """Return what is known (n,) of poses (n, 12) beyond that they were drawn from the motion: 0 but for a guess."""
+    if motion.evidence:
+        return 0.0
+    drawn = matrices(poses)
+    return motion.log_evidence(drawn) - motion.log_density(drawn)
 
 
 def noise(view: RayImage) -> Array:

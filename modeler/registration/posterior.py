@@ -5,6 +5,8 @@ import numpy as np
 from modeler import se3
 from modeler.types import AbstractMotion, Array, Outcome, PoseGaussian, Posterior, RayImage
 
+_SAMPLES = 500  # of a prior, enough for its mean and covariance
+
 
 def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaussian:
     """Return the mean and covariance of weighted motions (paper, E[f(T)] ≈ Σ w_l f(T_l)).
@@ -37,10 +39,28 @@ def share_at_limit(
     return float(weights @ ~np.isfinite(motion.log_density(nudged)))
 
 
-def failed(source: RayImage, target: RayImage, outcome: Outcome) -> Posterior:
-    """Return the posterior of a registration that could not be made: nothing is known."""
-    pose = PoseGaussian(np.eye(4), np.diag(np.repeat([np.pi, 10.0], 3) ** 2))
-    return Posterior(source=source.index, target=target.index, pose=pose, outcome=outcome, overlap=0.0)
+def failed(
+    source: RayImage,
+    target: RayImage,
+    outcome: Outcome,
+    motion: AbstractMotion | None = None,
+    rng: np.random.Generator | None = None,
+) -> Posterior:
+    """Return the posterior of a registration that could not be made: what was known before, or nothing.
+
+    Args:
+        source: first view.
+        target: second view.
+        outcome: why it could not be made.
+        motion: what was known of the motion, whose mean and covariance are handed on; without it every rotation within
+            10 m is within one standard deviation.
+        rng: source of all randomness, with a motion.
+    """
+    if motion is None or rng is None:
+        pose = PoseGaussian(np.eye(4), np.diag(np.repeat([np.pi, 10.0], 3) ** 2))
+    else:
+        pose = weighted_gaussian(motion.sample(_SAMPLES, rng), np.ones(_SAMPLES), source.centroid_m)
+    return Posterior(source=source.index, target=target.index, pose=pose, outcome=outcome, overlap=0.0, seconds=0.0)
 
 
 def intrinsics(view: RayImage) -> Array:

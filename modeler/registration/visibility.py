@@ -96,7 +96,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return the posterior of target_from_source; failure is its outcome."""
         started = time.perf_counter()
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
-            return failed(source, target, Outcome.TOO_FEW_POINTS)
+            return failed(source, target, Outcome.TOO_FEW_POINTS, motion, rng)
         pair = self.pair(source, target, rng)
         posterior = self._explored(pair, self.search, motion, rng=rng)
         if not posterior.usable:  # a place may have been missed: look once more, and harder
