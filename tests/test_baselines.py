@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.experiment import sparse_view
+from modeler.features import kabsch, mutual_matches
 from modeler.priors import GeneralPrior
 from modeler.registration import FpfhIcpRegistrar, FpfhRegistrar, GicpRegistrar, IcpRegistrar
 from modeler.registration.clouds import (
@@ -27,7 +28,6 @@ from modeler.registration.clouds import (
     scaled_information,
     start,
 )
-from modeler.registration.fpfh import kabsch, mutual_matches
 from modeler.types import AbstractMotion, Array, Outcome, RayImage
 
 BODY = tabletop.Box((0.05, 0.08, 0.035))

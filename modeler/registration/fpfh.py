@@ -10,6 +10,7 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from modeler import se3
+from modeler.features import fpfh, kabsch, mutual_matches
 from modeler.registration.clouds import (
     Cloud,
     Fit,
@@ -84,7 +85,8 @@ class FpfhRegistrar(AbstractRegistrar):
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return None
         radius_m, reach_m = self.feature_radius * voxel_m, self.reach * voxel_m
-        pairs = mutual_matches(fpfh(source, radius_m), fpfh(target, radius_m))
+        first, second = (fpfh(cloud.points_m, cloud.normals, radius_m) for cloud in (source, target))
+        pairs = mutual_matches(first, second)
         tree = KDTree(target.points_m)
         scored = source.points_m[rng.permutation(len(source.points_m))[: self.scored_points]]
         pose = self._ransac(
@@ -117,40 +119,6 @@ class FpfhRegistrar(AbstractRegistrar):
         source_edges, target_edges = (np.linalg.norm(t - np.roll(t, 1, axis=1), axis=2) for t in (source_m, target_m))
         shorter, longer = np.minimum(source_edges, target_edges), np.maximum(source_edges, target_edges)
         return np.all((shorter > self.edge_ratio * longer) & (shorter > 0.0), axis=1)
-
-
-def fpfh(cloud: Cloud, radius_m: float) -> Array:
-    """Return the feature (n, 33) of each point, from the neighbours within `radius_m` (at most 100)."""
-    import open3d as o3d  # slow to load, and only needed here
-
-    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m))
-    points.normals = o3d.utility.Vector3dVector(cloud.normals)
-    search = o3d.geometry.KDTreeSearchParamHybrid(radius_m, 100)
-    features = o3d.pipelines.registration.compute_fpfh_feature(points, search)  # pyright: ignore[reportCallIssue]
-    return np.ascontiguousarray(np.asarray(features.data).T)
-
-
-def mutual_matches(source: Array, target: Array) -> npt.NDArray[np.int64]:
-    """Return pairs (m, 2) of rows that are each other's nearest; of all nearest targets where those are too few."""
-    a, b = source.astype(np.float32), target.astype(np.float32)
-    squares = np.sum(a**2, axis=1)[:, None] + np.sum(b**2, axis=1) - 2.0 * a @ b.T
-    forth, back = np.argmin(squares, axis=1), np.argmin(squares, axis=0)
-    pairs = np.column_stack([np.arange(len(a)), forth])
-    mutual = pairs[back[forth] == pairs[:, 0]]
-    return mutual if len(mutual) >= 3 * _DRAW else pairs
-
-
-def kabsch(source_m: Array, target_m: Array) -> Array:
-    """Return the motions (n, 4, 4) that best carry point sets (n, k, 3) onto their partners (n, k, 3) (Kabsch 1976)."""
-    source_mean, target_mean = source_m.mean(axis=1), target_m.mean(axis=1)
-    spread = np.swapaxes(source_m - source_mean[:, None], 1, 2) @ (target_m - target_mean[:, None])
-    left, _, right = np.linalg.svd(spread)
-    handed = np.sign(np.linalg.det(left @ right))
-    left[:, :, 2] *= handed[:, None]
-    poses = np.broadcast_to(np.eye(4), (len(source_m), 4, 4)).copy()
-    poses[:, :3, :3] = np.swapaxes(left @ right, 1, 2)
-    poses[:, :3, 3] = target_mean - (poses[:, :3, :3] @ source_mean[:, :, None])[:, :, 0]
-    return poses
 
 
 @dataclass(frozen=True, eq=False)
