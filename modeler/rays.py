@@ -53,7 +53,7 @@ class Sensor:
         smooth = cells[rows, columns, planes.KIND] == planes.SURFACE
         rows, columns = rows[smooth], columns[smooth]
         points_m, normals = surface_points(cells, rows, columns, intrinsics)
-        cosine = -np.sum(points_m * normals, axis=1) / np.linalg.norm(points_m, axis=1)
+        cosine = -_dot(points_m, normals) / np.sqrt(_dot(points_m, points_m))
         frontal = cosine > self.min_cosine
         rows, columns, points_m, normals = rows[frontal], columns[frontal], points_m[frontal], normals[frontal]
         return RayImage(
@@ -103,5 +103,10 @@ def surface_points(cells: np.ndarray, rows: np.ndarray, columns: np.ndarray, int
     normals = cells[rows, columns, : planes.NORMAL_Z + 1].astype(np.float64)
     distance_m = cells[rows, columns, planes.DISTANCE].astype(np.float64)
     rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones(len(rows))], axis=1)
-    points_m = rays * (-distance_m / np.sum(normals * rays, axis=1))[:, None]
-    return points_m, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    points_m = rays * (-distance_m / _dot(normals, rays))[:, None]
+    return points_m, normals / np.sqrt(_dot(normals, normals))[:, None]
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Return the products (n,) of vectors (n, 3)."""
+    return np.einsum("ni,ni->n", a, b)

@@ -53,7 +53,8 @@ class OnPlane:
         rotation, normal = target_from_source[:, :3, :3], self.normal
         tilted = np.einsum("nij,j->ni", rotation, normal)
         upright = np.einsum("ni,i->n", tilted, normal)
-        tilt_rad = np.arctan2(np.linalg.norm(np.cross(tilted, normal), axis=1), upright)
+        aside = tilted - upright[:, None] * normal
+        tilt_rad = np.arctan2(np.sqrt(np.einsum("ni,ni->n", aside, aside)), upright)
         # What is left of the rotation once the tilt is undone turns about the normal.
         twist = np.einsum("nij,ij->n", rotation, se3.hat(normal))
         turn_rad = np.arctan2(twist, np.einsum("nii->n", rotation) - upright)

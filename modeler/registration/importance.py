@@ -82,7 +82,7 @@ class AdaptiveSampler:
     """Samples of the first round; what they miss altogether, later ones may miss too."""
     draws: int = 200
     """Samples of a later round, at least."""
-    enough: float = 570.0
+    enough: float = 580.0
     """Effective size with which no further round is needed."""
     max_draws: int = 8000
     """No further round begins after so many samples."""
@@ -90,9 +90,9 @@ class AdaptiveSampler:
     """Least effective size of the samples to which a Gaussian is fitted."""
     widening: float = 1.1
     """How much wider than these the next ones lie."""
-    yields: float = 0.65
+    yields: float = 0.75
     """Share of a round that is expected to be effective where nothing is tempered: so many are drawn as are missing."""
-    kept: int = 800
+    kept: int = 750
     """Samples of the result, at most."""
 
     def run(

@@ -129,7 +129,9 @@ class Search:
             sharp = self._ranked(pair, motion, motion.sample(starts, rng), prior, fine_m)
         sharp = self._along(pair, motion, sharp, prior)
         blunt = replace(blunt, blunt=np.ones(len(blunt), dtype=np.bool_))
-        return replace(sharp.beside(blunt), beyond=float(self.scores(pair, poses, fine_m).max() - sharp.scores[0]))
+        outside = poses[~np.isfinite(motion.log_evidence(poses))]
+        beyond = self.scores(pair, outside, fine_m).max() - sharp.scores[0] if len(outside) else -np.inf
+        return replace(sharp.beside(blunt), beyond=float(beyond))
 
     def onward(
         self, pair: Pair, motion: AbstractMotion, found: Candidates, poses: Array, rng: np.random.Generator
@@ -224,7 +226,7 @@ class Search:
 
 def _gaussian(poses: Array, centre_m: Array) -> PoseGaussian:
     """Return the mean of poses, and the covariance of ξ about it at the centre."""
-    mean, covariance = se3.mean(poses, np.ones(len(poses)), about_m=centre_m)
+    mean, covariance = se3.mean(poses, np.ones(len(poses)), about_m=centre_m, iterations=4)
     return PoseGaussian(mean, covariance + np.diag(np.repeat([1e-4, 1e-5], 3) ** 2))
 
 
