@@ -172,10 +172,15 @@ def mean(poses, weights, start, about, iterations, tolerance):
         iterations: at most so many steps.
         tolerance: a shorter step (rad, m) is the last.
     """
-    centre, moved, r = start.copy(), np.empty(12), np.empty((3, 3))
+    centre, moved, r = np.empty(12), np.empty(12), np.empty((3, 3))
     first, second = np.empty(6), np.empty((6, 6))
-    for turn_number in range(iterations + 1):
-        first[:], second[:] = 0.0, 0.0
+    for k in range(12):  # loops, not slices, which take seconds to compile
+        centre[k] = start[k]
+    for step in range(iterations + 1):
+        for k in range(6):
+            first[k] = 0.0
+            for m in range(6):
+                second[k, m] = 0.0
         for i in range(len(poses)):
             xi = difference(centre, poses[i], about, r)
             for k in range(6):
@@ -183,13 +188,14 @@ def mean(poses, weights, start, about, iterations, tolerance):
                 first[k] += part
                 for m in range(k + 1):
                     second[k, m] += part * xi[m]
-        length = 0.0
+        square = 0.0
         for k in range(6):
-            length += first[k] * first[k]
-        if turn_number == iterations or math.sqrt(length) < tolerance:
+            square += first[k] * first[k]
+        if step == iterations or square < tolerance * tolerance:
             break
         turn(centre, first, about, r, moved)
-        centre[:] = moved
+        for k in range(12):
+            centre[k] = moved[k]
     for k in range(6):
         for m in range(k):
             second[m, k] = second[k, m]
