@@ -156,7 +156,7 @@ def test_a_walk_keeps_its_strides_and_ends_at_the_floor(rng):
     for floor, steps in ((np.inf, 0), (-np.inf, 4)):
         ground = ridges.Ground(empty[0], empty[1], empty[0], empty[1], model(), model(), 0.5, 0.0, 0.3, floor)
         visited, counts = ridges.walk(
-            rows(start[None]), spread[None], axis[None], np.array([2.0]), ground, centre_m, 0.001, pull, 4
+            rows(start[None]), spread[None], axis[None], 2.0, ground, centre_m, 0.001, pull, 4
         )
         assert counts.tolist() == [steps]
     want = [se3.moved(start, number * 0.2 * axis, centre_m) for number in range(1, 5)]

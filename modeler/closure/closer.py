@@ -50,7 +50,7 @@ class Closer:
     min_overlap: float = 0.4
     """Smallest overlap (0..1) of an edge to any but the previous view, predicted and found."""
     max_evidence_drop_nats: float = 40.0
-    """How far the evidence of such an edge may lie below that of the others, half a nat an effective point."""
+    """How far the evidence of such an edge may lie below that of the others, a nat an effective point."""
     trust: Trust = field(default_factory=Trust)
     """In covariances that edges state."""
 

@@ -19,10 +19,10 @@ class Ground(NamedTuple):
     """The source's points in the target, and"""
     backward: Sight
     """the target's in the source: those that lead downhill."""
-    all_forward: Sight
-    """Likewise, and"""
-    all_backward: Sight
-    """likewise: those that tell how good a place is."""
+    judging_forward: Sight
+    """More of the source's points in the target, and"""
+    judging_backward: Sight
+    """of the target's in the source: those that tell how good a place is."""
     forward_model: Model
     """The likelihood of either direction, and"""
     backward_model: Model
@@ -40,20 +40,20 @@ class Ground(NamedTuple):
 @numba.njit(cache=True)
 def height(pose, ground, room):
     """Return how good a pose (12,) is (nats): the tempered likelihood; room as for `visibility.compare`."""
-    sights, models = (ground.all_forward, ground.all_backward), (ground.forward_model, ground.backward_model)
+    sights, models = (ground.judging_forward, ground.judging_backward), (ground.forward_model, ground.backward_model)
     plain, explained = compare(pose, sights[0], sights[1], models[0], models[1], room)
     return ground.per_point * plain - ground.no_overlap * math.exp(-ground.per_explained * explained)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def walk(poses, spreads, axes, strides, ground, centre, surface_m, pull, max_strides):
+def walk(poses, spreads, axes, stride, ground, centre, surface_m, pull, max_strides):
     """Walk from each pose along its axis until it is no longer good, with two Gauss-Newton steps across after each.
 
     Args:
         poses: (k, 12) where walkers start.
         spreads: (k, 6, 6) lower triangular roots of the covariances of ξ about the centre.
         axes: (k, 6) unit vectors in units of those spreads.
-        strides: (k,) lengths in such units, negative for the other way.
+        stride: length of a stride in such units.
         ground: see `Ground`.
         centre: (3,) point of the source in m.
         surface_m: noise of the surfaces in m beyond that of points and planes.
@@ -65,14 +65,14 @@ def walk(poses, spreads, axes, strides, ground, centre, surface_m, pull, max_str
     """
     visited, counts = np.empty((len(poses), max_strides, 12)), np.zeros(len(poses), dtype=np.int64)
     room, gradient, matrix = workroom(ground.forward, ground.backward), np.empty(6), np.empty((6, 6))
-    looked = buffers(ground.all_forward), buffers(ground.all_backward), np.empty(12)
+    looked = buffers(ground.judging_forward), buffers(ground.judging_backward), np.empty(12)
     step, z, rotation = np.empty(6), np.empty(6), np.empty((3, 3))
     pose, moved = np.empty(12), np.empty(12)
     for i in range(len(poses)):
         pose[:] = poses[i]
         for number in range(max_strides):
             for k in range(6):
-                z[k] = strides[i] * axes[i, k]
+                z[k] = stride * axes[i, k]
             spread_out(spreads[i], z, step)
             turn(pose, step, centre, rotation, moved)
             pose[:] = moved

@@ -133,8 +133,8 @@ class Pair:
         ground = ridges.Ground(
             forward=self.forward.sight(coarse),
             backward=self.backward.sight(coarse),
-            all_forward=self.forward.sight(fine),
-            all_backward=self.backward.sight(fine),
+            judging_forward=self.forward.sight(fine),
+            judging_backward=self.backward.sight(fine),
             forward_model=self.forward.model(blur_m),
             backward_model=self.backward.model(blur_m),
             per_point=fine * effective_points / self.points,
@@ -142,10 +142,9 @@ class Pair:
             per_explained=fine / (self.points * self.little_overlap),
             floor=float(floor),
         )
-        strides = np.full(len(poses), stride)
         pull = _for_every(pull, coarse)
         visited, counts = ridges.walk(
-            rows(poses), spreads, axes, strides, ground, self.centre_m, blur_m, pull, max_strides
+            rows(poses), spreads, axes, stride, ground, self.centre_m, blur_m, pull, max_strides
         )
         return matrices(visited[np.arange(max_strides) < counts[:, None]])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 import time
 from pathlib import Path
@@ -81,6 +82,4 @@ def record(rs: Any, path: Path, count: int, pause_s: float = 0.1) -> None:
 
 
 if __name__ == "__main__":
-    import pyrealsense2
-
-    record(pyrealsense2, Path(sys.argv[1]), 3)
+    record(importlib.import_module("pyrealsense2"), Path(sys.argv[1]), 3)
