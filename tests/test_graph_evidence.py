@@ -35,7 +35,7 @@ class Known(AbstractMotion):
         return self.mean @ CENTRE @ se3.exp(xi) @ se3.inverse(CENTRE)
 
     def log_density(self, target_from_source: Array) -> Array:
-        return _log_gaussian(target_from_source, self.mean)
+        return _log_gaussian(target_from_source, self.mean) - 3.0 * np.log(2.0 * np.pi * VARIANCE)
 
 
 def _log_gaussian(poses: Array, mean: Array) -> Array:

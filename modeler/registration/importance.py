@@ -101,7 +101,7 @@ class AdaptiveSampler:
         """Return samples of what is known of a motion × likelihood.
 
         Args:
-            motion: where to draw first, and what is known.
+            motion: where to draw first, and what is known; its density is normalised, as every motion's is.
             log_likelihood: of poses (n, 4, 4), (n,); asked only where what is known allows.
             centre_m: (3,) point of the source about which Gaussians turn.
             rng: source of all randomness.
