@@ -118,22 +118,24 @@ class AdaptiveSampler:
             return _Drawn(poses, log_likelihoods, log_known + log_likelihoods, log_density)
 
         drawn, learnt = weighed(first, log_count + motion.log_density(first)), None
-        while (effective := effective_samples(drawn.log_weights)) < self.enough and len(drawn.poses) < self.max_draws:
+        log_weights = drawn.log_weights
+        while (effective := effective_samples(log_weights)) < self.enough and len(drawn.poses) < self.max_draws:
             told = effective >= self.least
-            power = 1.0 if told else _power(drawn.log_weights, self.least)
+            power = 1.0 if told else _power(log_weights, self.least)
             count = max(int((self.enough - effective) / self.yields) + 1, self.draws) if told else self.draws
-            new = self._fitted(drawn.poses, normalised(power * drawn.log_weights), centre_m).times(count)
+            new = self._fitted(drawn.poses, normalised(power * log_weights), centre_m).times(count)
             learnt = new if learnt is None else learnt.beside(new)
             fresh = new.sample(count, rng)
             density = np.logaddexp(log_count + motion.log_density(fresh), learnt.log_density(fresh))
             drawn = drawn.spread_over(new).beside(weighed(fresh, density))
-        chosen, weights = thinned(normalised(drawn.log_weights), self.kept, rng)
+            log_weights = drawn.log_weights
+        chosen, weights = thinned(normalised(log_weights), self.kept, rng)
         return Population(
             drawn.poses[chosen],
             weights,
             drawn.log_likelihoods[chosen],
-            log_mean_exp(drawn.log_weights),
-            pareto_tail(drawn.log_weights),
+            log_mean_exp(log_weights),
+            pareto_tail(log_weights),
         )
 
     def _fitted(self, poses: Array, weights: Array, centre_m: Array) -> Gaussians:
