@@ -104,6 +104,21 @@ def composed_covariance(covariance_ab: Array, pose_bc: Array, covariance_bc: Arr
     return matrix @ covariance_ab @ matrix.T + covariance_bc
 
 
+def covariance_about(covariance: Array, point_m: Array) -> Array:
+    """Return the covariance (..., 6, 6) of η in `pose @ exp(ξ) = moved(pose, η, point_m)` where ξ has `covariance`.
+
+    About an object's centre rotation and translation have least to do with each other, and the translation is that of
+    the centre. With `-point_m` it leads back: from about a point to about the origin.
+
+    Args:
+        covariance: (..., 6, 6) of ξ, which turns about the origin of what the pose moves.
+        point_m: (3,) of what the pose moves.
+    """
+    matrix = adjoint(translation(-np.asarray(point_m, dtype=np.float64)))
+    about = matrix @ covariance @ matrix.T
+    return 0.5 * (about + np.swapaxes(about, -1, -2))  # rounding alone would leave it a little askew
+
+
 def mean(
     poses: Array, weights: Array, *, about_m: Array | None = None, start: Array | None = None, iterations: int = 20
 ) -> tuple[Array, Array]:

@@ -169,6 +169,28 @@ def test_covariance_of_a_composition_against_monte_carlo(seed: int) -> None:
     _assert_same_covariance(_sample_covariance(first @ second, samples), expected, count)
 
 
+@LAWS
+@given(poses(), tangents(), SEEDS)
+def test_covariance_about_a_point_is_that_of_the_step_about_it(pose: se3.Array, eta: se3.Array, seed: int) -> None:
+    point_m = np.random.default_rng(seed).normal(size=3)
+    xi = se3.log(se3.inverse(pose) @ se3.moved(pose, eta, point_m))
+    # Every covariance is a sum of such products, and the function is linear in it.
+    scale = 1.0 + float(xi @ xi) + float(eta @ eta)
+    about = se3.covariance_about(np.outer(xi, xi), point_m)
+    np.testing.assert_allclose(about, np.outer(eta, eta), atol=1e-11 * scale)
+
+
+@LAWS
+@given(SEEDS)
+def test_covariance_about_a_point_is_symmetric_and_leads_back(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    point_m, covariances = rng.normal(size=3), np.stack([_covariance(rng, 0.01, 0.003) for _ in range(3)])
+    about = se3.covariance_about(covariances, point_m)
+    np.testing.assert_array_equal(about, np.swapaxes(about, 1, 2))
+    np.testing.assert_array_equal(about[1], se3.covariance_about(covariances[1], point_m))
+    np.testing.assert_allclose(se3.covariance_about(about, -point_m), covariances, atol=1e-17, rtol=1e-10)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_mean_solves_its_equation_and_recovers_the_gaussian(seed: int) -> None:
     rng = np.random.default_rng(seed)

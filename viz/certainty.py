@@ -30,9 +30,8 @@ def sd_of(pose: PoseGaussian, centre_m: Array) -> Sd:
     """
     if not np.isfinite(pose.covariance).all():
         return Sd(math.nan, math.nan)
-    jacobian = np.concatenate([-se3.hat(centre_m), np.eye(3)], axis=1)
-    shift_m = worst_axis_sd(jacobian @ pose.covariance @ jacobian.T)
-    return Sd(math.degrees(worst_axis_sd(pose.covariance[:3, :3])), 1000.0 * shift_m)
+    covariance = se3.covariance_about(pose.covariance, centre_m)
+    return Sd(math.degrees(worst_axis_sd(covariance[:3, :3])), 1000.0 * worst_axis_sd(covariance[3:, 3:]))
 
 
 def worst_axis_sd(covariance: Array) -> float:

@@ -98,19 +98,13 @@ def _factor(modes: Sequence[Mode], view: RayImage) -> float:
     radius_m = float(np.linalg.norm(view.points_m - view.centroid_m, axis=1).max())
     widest_rad, widest_m = 0.0, 0.0
     for mode in modes:
-        covariance = about_centre(mode.pose.covariance, view.centroid_m)
+        covariance = se3.covariance_about(mode.pose.covariance, view.centroid_m)
         turn_rad, shift_m = (certainty.worst_axis_sd(block) for block in (covariance[:3, :3], covariance[3:, 3:]))
         widest_rad, widest_m = max(widest_rad, turn_rad), max(widest_m, math.hypot(radius_m * turn_rad, shift_m))
     if not widest_m > 0.0:
         return 1.0
     wanted = min(_SHOWN_SD * radius_m / widest_m, _MOST_RAD / max(widest_rad, 1e-9))
     return min(uncertainty.rounded_down(wanted), 1000.0) if wanted >= 1.0 else 1.0
-
-
-def about_centre(covariance: Array, centre_m: Array) -> Array:
-    """Return the covariance (6, 6) of a motion's ξ about a point (3,) of the source instead of its camera."""
-    to_centre = se3.adjoint(se3.translation(-centre_m))
-    return to_centre @ covariance @ to_centre.T
 
 
 def _means(view: RayImage, modes: Sequence[Mode], colours: npt.NDArray[np.int64]) -> rr.Points3D:
@@ -137,7 +131,8 @@ def _centres(view: RayImage, ghosts: Ghosts, colours: npt.NDArray[np.int64]) -> 
     poses = np.array([mode.pose.mean for mode in ghosts.modes])
     rotations = poses[:, :3, :3]
     centres = np.array([se3.transform(pose, view.centroid_m) for pose in poses])
-    blocks = np.array([about_centre(mode.pose.covariance, view.centroid_m)[3:, 3:] for mode in ghosts.modes])
+    covariances = np.array([mode.pose.covariance for mode in ghosts.modes])
+    blocks = se3.covariance_about(covariances, view.centroid_m)[:, 3:, 3:]
     half_axes, quaternions = uncertainty.ellipsoids(rotations @ blocks @ np.swapaxes(rotations, 1, 2))
     for path, sigmas, style in (
         (entities.GHOST_CENTRE_1_SIGMA, 1.0, rr.components.FillMode.Solid),

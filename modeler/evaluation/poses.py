@@ -73,9 +73,7 @@ def about(estimate: PoseGaussian, point_m: Array) -> PoseGaussian:
         point_m: (3,) in the source camera.
     """
     point_m = np.asarray(point_m, dtype=np.float64)
-    to_point = se3.adjoint(se3.translation(-point_m))
-    covariance = to_point @ estimate.covariance @ to_point.T
-    return PoseGaussian(estimate.mean @ se3.translation(point_m), 0.5 * (covariance + covariance.T))
+    return PoseGaussian(estimate.mean @ se3.translation(point_m), se3.covariance_about(estimate.covariance, point_m))
 
 
 def coverage(nees_values: Iterable[float], degrees: int = 6, levels: Iterable[float] = LEVELS) -> dict[float, float]:

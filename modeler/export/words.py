@@ -42,8 +42,8 @@ def _free(pose: PoseGaussian, view: RayImage | None) -> Iterator[str]:
                 yield f"free to turn about {_name(axis, view)}: {_degrees(sigma_rad)} sd"
     if view is None or not len(view.points_m):
         return
-    to_centre = se3.adjoint(se3.translation(-view.centroid_m))  # how the object's middle moves, not the camera's
-    sigmas_m, axes = _principal((to_centre @ pose.covariance @ to_centre.T)[3:, 3:])
+    of_centre = se3.covariance_about(pose.covariance, view.centroid_m)[3:, 3:]  # how the object's middle moves
+    sigmas_m, axes = _principal(of_centre)
     for sigma_m, axis in zip(sigmas_m, axes, strict=True):
         if sigma_m > _FREE_M:
             yield f"free to shift along {_name(axis, view)}: {1000.0 * sigma_m:.0f} mm sd"

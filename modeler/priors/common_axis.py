@@ -70,10 +70,9 @@ def _gap(pose: PoseGaussian, direction: Array, point_m: Array, wobble: Array) ->
     The angle is whatever fits best. The four numbers are tilts about, and shifts along, two directions across the axis.
     """
     # All about the axis' point, which lies near the object: there rotation and shift are told apart best.
-    to_axis = se3.translation(-point_m)
-    motion = to_axis @ pose.mean @ se3.translation(point_m)
-    carry = se3.adjoint(to_axis)
-    whiten = np.linalg.inv(np.linalg.cholesky(carry @ pose.covariance @ carry.T + np.diag(wobble)))
+    motion = se3.translation(-point_m) @ pose.mean @ se3.translation(point_m)
+    covariance = se3.covariance_about(pose.covariance, point_m) + np.diag(wobble)
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     twist = np.concatenate([direction, np.zeros(3)])
     back = se3.inverse(se3.exp(_turn(motion, direction) * twist))
     along = whiten @ twist

@@ -30,8 +30,7 @@ class ForeseenPrior(AbstractPrior):
         Raises:
             InputError: where the views lack what the prior needs.
         """
-        to_object = se3.adjoint(se3.translation(-source.centroid_m))
-        covariance = to_object @ self.expected.covariance @ to_object.T
+        covariance = se3.covariance_about(self.expected.covariance, source.centroid_m)
         sigma_rad, sigma_m = (
             float(np.sqrt(np.linalg.eigvalsh(c)[-1])) for c in (covariance[:3, :3], covariance[3:, 3:])
         )

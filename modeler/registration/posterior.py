@@ -20,10 +20,8 @@ def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaus
         centre_m: (3,) point of the source.
     """
     mean, covariance = se3.mean(poses, weights, about_m=centre_m)
-    to_camera = se3.adjoint(se3.translation(centre_m))
     floor = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)  # keeps the covariance of a single sample positive definite
-    covariance = to_camera @ (covariance + floor) @ to_camera.T
-    return PoseGaussian(mean, 0.5 * (covariance + covariance.T))
+    return PoseGaussian(mean, se3.covariance_about(covariance + floor, -centre_m))  # from the centre to the camera
 
 
 def share_at_limit(
