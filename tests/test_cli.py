@@ -91,6 +91,33 @@ def test_every_command_has_help_on_stdout(run: Run, command: str) -> None:
     assert ended.out.startswith(f"usage: modeler {command}")
 
 
+def test_help_of_the_program_tells_each_command_in_a_sentence_and_a_command_tells_all(run: Run) -> None:
+    overall, alone = (" ".join(run(*words, "--help").out.replace("│", " ").split()) for words in ((), ("build",)))
+    for text in (overall, alone):
+        assert "Build the model of an object from a sequence: register its frames, close loops, fuse." in text
+    assert "Ctrl-C ends the run with the frames so far" in alone
+    assert "Ctrl-C" not in overall
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_takes_a_seed(run: Run, command: str) -> None:
+    # Enough for every command, too much for none: names of files that are never opened.
+    folders = {"register": ("S", "1", "0"), "join": ("A", "B")}.get(command, ("S",))
+    out = () if command in ("register", "info", "view") else ("--out", "OUT")
+    assert parsed((command, *folders, *out, "--seed", "7")) != parsed((command, *folders, *out, "--seed", "8"))
+    for seed in ("-1", "one", "1.5", "NaN"):
+        ended = run(command, *folders, *out, "--seed", seed)
+        assert (ended.status, ended.out) == (2, "")
+        assert f"--seed takes a whole number from 0 on, not '{seed}'; see modeler {command} --help\n" in ended.err
+
+
+def test_commands_that_draw_nothing_say_so_and_give_the_same_with_any_seed(run: Run) -> None:
+    for command in ("info", "convert", "calibrate-sensor", "view", "report", "export"):
+        words = " ".join(run(command, "--help").out.replace("│", " ").split())
+        assert "--seed N Without effect: this command draws nothing at random." in words
+    assert run("info", BOX, "--json", "--seed", "7") == run("info", BOX, "--json")
+
+
 @pytest.mark.parametrize("option", DOCUMENTED.split())
 def test_build_offers_what_is_documented(run: Run, option: str) -> None:
     assert re.search(rf"^│ --{option}\b", run("build", "--help").out, re.MULTILINE)
@@ -171,7 +198,7 @@ def test_the_readme_names_every_file_of_a_run_folder() -> None:
         (("build", BOX, "--out", "OUT", "--every", "0"), "--every 0"),
         (("build", BOX, "--out", "OUT", "--frames", "1-3"), "--frames '1-3'"),
         (("build", BOX, "--out", "OUT", "--frames", "50:60"), "0 to 13"),
-        (("build", BOX, "--out", "OUT", "--seed", "-1"), "--seed -1"),
+        (("build", BOX, "--out", "OUT", "--seed", "-1"), "--seed takes a whole number from 0 on, not '-1'"),
         (("build", BOX, "--out", "OUT", "--prior", "table", "--max-offset-m", "1"), "--max-offset-m"),
         (("build", BOX, "--out", "OUT", "--prior", "table+table"), "names table twice"),
         (("build", BOX, "--out", "OUT", "--prior", "held"), "no robot.txt"),

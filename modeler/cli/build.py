@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from modeler.cli.options import FrameOptions, MethodOptions, ObjectOptions, PriorOptions
+from modeler.cli.options import FrameOptions, MethodOptions, ObjectOptions, PriorOptions, default
 
 
 @dataclass(frozen=True)
@@ -31,17 +31,15 @@ class Build:
     """Another program is still writing into SEQUENCE: take the frames as they come."""
     idle_s: Annotated[float, tyro.conf.arg(metavar="S")] = 10.0
     """With --watch: the sequence is over when nothing has come for so long (or a file `done` has, or after Ctrl-C)."""
-    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: as SEQUENCE says)")] = (
-        None
-    )
+    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as SEQUENCE says")] = None
     """Noise of the depth camera, as `modeler calibrate-sensor` measured it."""
     view: bool = False
     """Watch in the Rerun viewer."""
     web: bool = False
     """Watch in the browser, served on 127.0.0.1 only."""
-    connect: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="(default: none)")] = None
+    connect: Annotated[str | None, tyro.conf.arg(metavar="URL"), default("none")] = None
     """Watch in a Rerun viewer that is already open: rerun+http://HOST:PORT/proxy."""
-    voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M", help_behavior_hint="(default: as the data)")] = None
+    voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("as the data")] = None
     """Side of a voxel of the model: its detail."""
     prior: PriorOptions = field(default_factory=PriorOptions)
     method: MethodOptions = field(default_factory=MethodOptions)

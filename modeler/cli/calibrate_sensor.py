@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from modeler.cli.input_options import InputOptions
+from modeler.cli.options import IdleSeed
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class CalibrateSensor:
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """JSON file to write; one that is there is replaced."""
     given: InputOptions = field(default_factory=InputOptions)
+    randomness: IdleSeed = field(default_factory=IdleSeed)
 
     def run(self) -> int:
         """Measure the noise, store it, and print what was measured at which distance and angle."""

@@ -13,7 +13,7 @@ from modeler.fusion import Fuser
 from modeler.pipeline import Modeler
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
-from modeler.types import AbstractPrior, AbstractRegistrar, InputError
+from modeler.types import AbstractPrior, AbstractRegistrar
 from sequences import AbstractSequence
 
 
@@ -38,24 +38,13 @@ def modeler(
         registrar=registrar(method.method),
         closer=Closer(),
         fuser=Fuser(),
-        seed=seed(method.seed),
+        seed=method.seed,
     )
 
 
 def segmenter(options: ObjectOptions) -> Segmenter:
     """Return the segmenter with the limits asked for."""
     return Segmenter(roi=options.roi, max_depth_m=options.max_depth_m)
-
-
-def seed(given: int) -> int:
-    """Return a seed that generators take.
-
-    Raises:
-        InputError: where it is none.
-    """
-    if given < 0:
-        raise InputError(f"--seed {given} is negative; give a whole number from 0 on")
-    return given
 
 
 def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:

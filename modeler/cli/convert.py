@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from modeler.cli.input_options import InputOptions
-from modeler.cli.options import FrameOptions
+from modeler.cli.options import FrameOptions, IdleSeed, default
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,11 @@ class Convert:
     """A sequence in any format that is read, or a run folder."""
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """BOP scene folder to make; scene_gt.json or poses.txt for a run."""
-    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: as INPUT says)")] = None
+    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as INPUT says")] = None
     """Noise of the depth camera, as `modeler calibrate-sensor` measured it, to write into sequence.json."""
     selection: FrameOptions = field(default_factory=FrameOptions)
     given: InputOptions = field(default_factory=InputOptions)
+    randomness: IdleSeed = field(default_factory=IdleSeed)
 
     def run(self) -> int:
         """Convert the input."""

@@ -8,7 +8,7 @@ from typing import Annotated, get_args
 
 import tyro
 
-from modeler.cli.options import FrameOptions, Method, ObjectOptions, PriorOptions
+from modeler.cli.options import SEED, FrameOptions, Method, ObjectOptions, PriorOptions, default
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,12 @@ class Evaluate:
     made of the same frames with their true poses: models.json, models.csv and a table.
     """
 
-    sequences: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SEQUENCE|RUN...")]
-    """BOP scene folders with scene_gt.json, or run folders made of such; without, a full turn with --closed."""
+    sequences: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="SEQUENCE|RUN...", help_behavior_hint="(at least one)"),
+    ]
+    """BOP scene folders with scene_gt.json, which those of a full turn need not have with --closed; or run folders
+    made of such."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder for the results; those of an earlier evaluation are replaced at the end."""
     methods: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ",".join(get_args(Method))
@@ -35,9 +39,9 @@ class Evaluate:
     leave, of how much they turn one by one, is told too: it judges a sequence without ground truth."""
     learn: bool = False
     """The prior learns from the pairs before, as in `build`: the axis and sense of a turntable that nobody tells."""
-    points: Annotated[int | None, tyro.conf.arg(metavar="N"), tyro.conf.arg(help_behavior_hint="(default: all)")] = None
+    points: Annotated[int | None, tyro.conf.arg(metavar="N"), default("all")] = None
     """Keep so many of the object's surface points a view, drawn at random: very sparse clouds."""
-    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same errors."""
     prior: PriorOptions = field(default_factory=PriorOptions)
     selection: FrameOptions = field(default_factory=FrameOptions)

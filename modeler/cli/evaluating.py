@@ -33,7 +33,7 @@ def evaluate(options: Evaluate) -> int:
     if runs:
         if len(runs) < len(options.sequences):
             raise InputError("sequences and run folders are evaluated apart; give one kind at a time")
-        print(columns(models_table(evaluate_models(runs, options.out, compose.seed(options.seed))), left=3))
+        print(columns(models_table(evaluate_models(runs, options.out, options.seed)), left=3))
         return 0
     kept = frame_range(options.selection.frames)
     recorded = [compose.open_sequence(path).select(options.selection.every, kept) for path in options.sequences]
@@ -46,7 +46,7 @@ def evaluate(options: Evaluate) -> int:
         segmenter=compose.segmenter(options.where),
         points=options.points,
         learn=options.learn,
-        seed=compose.seed(options.seed),
+        seed=options.seed,
     )
     with bar() as progress:
         task = progress.add_task("", total=sum(plan.size(sequence) for sequence in recorded))

@@ -67,7 +67,7 @@ def _scan(options: Export) -> Scan | None:
     """Return the views of the run, where the mesh has to be made anew."""
     if not (options.watertight or options.texture or options.voxel_m is not None):
         return None
-    run = reopened(options.run_folder, options.sequence)
+    run = reopened(options.run_folder, options.moved.sequence)
     return run.scan(Fuser(voxel_m=options.voxel_m or run.report["settings"].get("voxel_m")))
 
 

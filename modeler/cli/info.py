@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from modeler.cli.input_options import InputOptions
+from modeler.cli.options import IdleSeed
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Info:
     json: bool = False
     """Print a JSON object instead of lines."""
     given: InputOptions = field(default_factory=InputOptions)
+    randomness: IdleSeed = field(default_factory=IdleSeed)
 
     def run(self) -> int:
         """Print what was found; status 2 where the input cannot be used."""

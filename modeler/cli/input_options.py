@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from modeler.cli.options import default
+
 if TYPE_CHECKING:
     from sequences import Given
-
-
-def _default(text: str) -> object:
-    return tyro.conf.arg(help_behavior_hint=f"(default: {text})")
 
 
 @dataclass(frozen=True)
@@ -20,14 +18,14 @@ class InputOptions:
     """What counts more than what the input says."""
 
     intrinsics: Annotated[
-        tuple[float, float, float, float] | None, tyro.conf.arg(metavar="FX FY CX CY"), _default("as the input says")
+        tuple[float, float, float, float] | None, tyro.conf.arg(metavar="FX FY CX CY"), default("as the input says")
     ] = None
     """Intrinsics of the depth camera in px."""
-    depth_scale_mm: Annotated[float | None, tyro.conf.arg(metavar="MM"), _default("as the input says")] = None
+    depth_scale_mm: Annotated[float | None, tyro.conf.arg(metavar="MM"), default("as the input says")] = None
     """Millimetres per unit of stored depth."""
-    depth_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), _default("the only one")] = None
+    depth_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), default("the only one")] = None
     """Topic of the depth images in a ROS bag."""
-    colour_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), _default("the one aligned to depth")] = None
+    colour_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), default("the one aligned to depth")] = None
     """Topic of the colour images in a ROS bag."""
 
     def stated(self) -> Given:

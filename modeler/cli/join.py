@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from modeler.cli.options import SEED
+
 
 @dataclass(frozen=True)
 class Join:
@@ -27,7 +29,7 @@ class Join:
     """Replace the results of an earlier run in the folder."""
     pairs: Annotated[int, tyro.conf.arg(metavar="N")] = 6
     """Pairs of views, one of each run, that are registered."""
-    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same result, to the bit."""
 
     def run(self) -> int:

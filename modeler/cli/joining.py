@@ -84,8 +84,6 @@ def _check(options: Join) -> None:
     Raises:
         InputError: where they are such.
     """
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed} is negative; give a whole number from 0 on")
     if options.pairs < 1:
         raise InputError(f"--pairs {options.pairs} leaves nothing to join by; give at least 1")
     if options.out.is_dir() and any(options.out.iterdir()) and not options.overwrite:

@@ -2,15 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
 
-def _default(text: str) -> object:
+def default(text: str) -> object:
+    """Return what lets help tell in words what an option is where it is not given."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {text})")
+
+
+def _seed(words: Sequence[str]) -> int:
+    """Read a seed that generators take."""
+    if not words[0].isdecimal():
+        raise ValueError(f"takes a whole number from 0 on, not {words[0]!r}")
+    return int(words[0])
+
+
+SEED = tyro.constructors.PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="N",
+    instance_from_str=_seed,
+    is_instance=lambda seed: seed is None or isinstance(seed, int),
+    str_from_instance=lambda seed: [str(seed)],
+)
+"""How a seed is read, by every command alike."""
+
+
+@dataclass(frozen=True)
+class IdleSeed:
+    """What every command takes, so that scripts may give it to all."""
+
+    seed: Annotated[int, SEED] = 0
+    """Without effect: this command draws nothing at random."""
+
+
+@dataclass(frozen=True)
+class MovedOptions:
+    """Where the sequence is now, if it has moved since the run was made."""
+
+    sequence: Annotated[
+        tuple[Path, ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="SEQUENCE"),
+        default("as in RUN"),
+    ] = ()
+    """The sequence; of a joined run, once for each of its parts, in order."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +59,7 @@ class FrameOptions:
 
     every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Use the first frame and every N-th after it."""
-    frames: Annotated[str, tyro.conf.arg(metavar="A:B"), _default("all")] = ":"
+    frames: Annotated[str, tyro.conf.arg(metavar="A:B"), default("all")] = ":"
     """Use frame numbers from A up to, but not including, B; either may be left out."""
 
 
@@ -27,11 +67,11 @@ class FrameOptions:
 class ObjectOptions:
     """Where the object is, in sequences without masks."""
 
-    roi: Annotated[tuple[int, int, int, int] | None, tyro.conf.arg(metavar="X0 Y0 X1 Y1"), _default("whole image")] = (
+    roi: Annotated[tuple[int, int, int, int] | None, tyro.conf.arg(metavar="X0 Y0 X1 Y1"), default("whole image")] = (
         None
     )
     """Look for the object within these pixels: columns X0 to X1, rows Y0 to Y1, ends not included."""
-    max_depth_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("no limit")] = None
+    max_depth_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("no limit")] = None
     """Take nothing farther away than this for the object."""
 
 
@@ -45,54 +85,54 @@ class PriorOptions:
     """What is known of the motion between two frames."""
 
     prior: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME[+NAME]"), _default("as sequence.json says, else general")
+        str | None, tyro.conf.arg(metavar="NAME[+NAME]"), default("as sequence.json says, else general")
     ] = None
     """general: any motion within limits of rotation and shift. table: the object stays on the table it stands on.
     turntable: it turns by a commanded step about one axis. held: a robot's hand carries it (robot.txt). poke: somebody
     pushes it along the table. Guesses that only tell where to look: velocity, the motion goes on; axes, long objects
     stay aligned; features, matching shape. What is joined by + holds together: held+table, features+table."""
-    max_rotation_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), _default("50")] = None
+    max_rotation_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("50")] = None
     """Largest rotation between two frames (general, table)."""
-    max_offset_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("0.04")] = None
+    max_offset_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.04")] = None
     """Largest distance between the centroids of what two frames see (general, held)."""
-    max_shift_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("0.05")] = None
+    max_shift_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.05")] = None
     """Largest shift of the object on the table, or across the axis (table, turntable)."""
-    step_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), _default("as sequence.json says")] = None
+    step_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("as sequence.json says")] = None
     """Turn from one frame number to the next, right-handed about the axis, which points up (turntable)."""
-    step_sigma_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), _default("1")] = None
+    step_sigma_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("1")] = None
     """Standard deviation of one step (turntable)."""
     step_sign: Annotated[
         Literal["known", "unknown"] | None,
-        _default("known if the step is negative, or the axis or sequence.json given"),
+        default("known if the step is negative, or the axis or sequence.json given"),
     ] = None
     """Whether the sign of the step is meant, or the table may turn either way (turntable)."""
     axis_direction: Annotated[
-        _Three | None, tyro.conf.arg(metavar="X Y Z"), _default("normal to the table where one is seen, else about up")
+        _Three | None, tyro.conf.arg(metavar="X Y Z"), default("normal to the table where one is seen, else about up")
     ] = None
     """Direction of the axis in camera coordinates: x right, y down, z forward (turntable)."""
-    axis_point_m: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), _default("anywhere")] = None
+    axis_point_m: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), default("anywhere")] = None
     """A point of the axis in camera coordinates (turntable)."""
     axis_sigma_deg: Annotated[
-        float | None, tyro.conf.arg(metavar="DEG"), _default("1 if given, the plane's if seen, else 30 about up")
+        float | None, tyro.conf.arg(metavar="DEG"), default("1 if given, the plane's if seen, else 30 about up")
     ] = None
     """Standard deviation of the axis' direction; 180: any direction (turntable)."""
-    axis_sigma_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("0.005")] = None
+    axis_sigma_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.005")] = None
     """Standard deviation of the axis' point (turntable)."""
-    held_sigma_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), _default("3")] = None
+    held_sigma_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("3")] = None
     """Standard deviation of slip and calibration error in the rotation of one motion, about each axis (held)."""
-    held_sigma_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("0.008")] = None
+    held_sigma_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.008")] = None
     """Standard deviation of slip and calibration error in the shift of one motion, along each axis (held)."""
-    max_gap_s: Annotated[float | None, tyro.conf.arg(metavar="S"), _default("1")] = None
+    max_gap_s: Annotated[float | None, tyro.conf.arg(metavar="S"), default("1")] = None
     """Poses of the hand farther apart in time than this are not interpolated (held)."""
-    poke_point_m: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), _default("as sequence.json says")] = None
+    poke_point_m: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), default("as sequence.json says")] = None
     """Where the finger touches the object before it pushes, in camera coordinates (poke)."""
-    poke_direction: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), _default("as sequence.json says")] = None
+    poke_direction: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), default("as sequence.json says")] = None
     """Which way the finger moves, in camera coordinates (poke)."""
-    poke_length_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("as sequence.json says")] = None
+    poke_length_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("as sequence.json says")] = None
     """How far the finger pushes (poke)."""
-    velocity_sigma_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), _default("5")] = None
+    velocity_sigma_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("5")] = None
     """Standard deviation of the change of rotation from one motion to the next, about each axis (velocity)."""
-    velocity_sigma_m: Annotated[float | None, tyro.conf.arg(metavar="M"), _default("0.01")] = None
+    velocity_sigma_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.01")] = None
     """Standard deviation of the change of shift from one motion to the next, along each axis (velocity)."""
 
     def given(self, name: str, accepted: Collection[str]) -> dict[str, Any]:
@@ -144,7 +184,7 @@ class MethodOptions:
 
     method: Method = "visibility"
     """visibility: ours. paper: Wüthrich et al. 2012. The others are baselines."""
-    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same result, to the bit."""
 
 

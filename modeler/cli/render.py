@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from modeler.cli.options import SEED, default
+
 
 @dataclass(frozen=True)
 class Render:
@@ -17,19 +19,16 @@ class Render:
     """Recipe in JSON or TOML, or the name of a built-in one: box, flashlight, tube and more."""
     out: Annotated[Path, tyro.conf.arg(metavar="SEQUENCE")]
     """BOP scene folder to make."""
-    seed: Annotated[
-        int | None, tyro.conf.arg(metavar="N"), tyro.conf.arg(help_behavior_hint="(default: the recipe's own)")
-    ] = None
+    seed: Annotated[int | None, SEED, default("the recipe's own")] = None
     """Seed of the camera's noise and of the object's motion."""
 
     def run(self) -> int:
         """Render the sequence."""
-        from modeler.cli.compose import seed
         from modeler.cli.reading import reading
         from sequences.rendering.recipe import load_recipe
         from sequences.rendering.renderer import render
 
         recipe = load_recipe(self.recipe)
         with reading() as watched:
-            render(recipe if self.seed is None else replace(recipe, seed=seed(self.seed)), self.out, watched)
+            render(recipe if self.seed is None else replace(recipe, seed=self.seed), self.out, watched)
         return 0

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from modeler.cli.options import IdleSeed, MovedOptions, default
 
 if TYPE_CHECKING:
     from modeler.types import Array
@@ -23,16 +25,10 @@ class Report:
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Run folder, as `modeler build` makes it."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html", help_behavior_hint="(default: RUN/report.html)")] = (
-        None
-    )
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html"), default("RUN/report.html")] = None
     """Page to write."""
-    sequence: Annotated[
-        tuple[Path, ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(metavar="SEQUENCE", help_behavior_hint="(default: as in RUN)"),
-    ] = ()
-    """Where the sequence is now, if it has moved; of a joined run, once for each of its parts, in order."""
+    moved: MovedOptions = field(default_factory=MovedOptions)
+    randomness: IdleSeed = field(default_factory=IdleSeed)
 
     def run(self) -> int:
         """Write the page."""
@@ -43,9 +39,9 @@ class Report:
         out = self.run_folder / "report.html" if self.out is None else self.out
         RunFolder(self.run_folder).result()  # without which there is nothing to tell
         try:
-            truth = _truth(self.run_folder, self.sequence)
+            truth = _truth(self.run_folder, self.moved.sequence)
         except InputError:
-            if self.sequence:
+            if self.moved.sequence:
                 raise
             truth = None
         write_page(self.run_folder, out, truth)

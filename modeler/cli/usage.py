@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Sequence
 from itertools import groupby
-from typing import Annotated, get_args
+from typing import Annotated, Any, Union
 
 import tyro
 
@@ -22,21 +22,21 @@ from modeler.cli.render import Render
 from modeler.cli.report import Report
 from modeler.cli.view import View
 
-Command = (
-    Annotated[Build, tyro.conf.subcommand("build")]
-    | Annotated[Info, tyro.conf.subcommand("info")]
-    | Annotated[Convert, tyro.conf.subcommand("convert")]
-    | Annotated[CalibrateSensor, tyro.conf.subcommand("calibrate-sensor")]
-    | Annotated[Register, tyro.conf.subcommand("register")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Render, tyro.conf.subcommand("render")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Report, tyro.conf.subcommand("report")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Join, tyro.conf.subcommand("join")]
-)
+Command = Build | Info | Convert | CalibrateSensor | Register | Evaluate | Render | View | Report | Export | Join
 
-_NAMES = tuple(subcommand.name for _, subcommand in map(get_args, get_args(Command)))
+_COMMANDS: dict[str, type[Command]] = {
+    "build": Build,
+    "info": Info,
+    "convert": Convert,
+    "calibrate-sensor": CalibrateSensor,
+    "register": Register,
+    "evaluate": Evaluate,
+    "render": Render,
+    "view": View,
+    "report": Report,
+    "export": Export,
+    "join": Join,
+}
 _STYLE = (
     tyro.conf.OmitSubcommandPrefixes,
     tyro.conf.OmitArgPrefixes,
@@ -54,6 +54,7 @@ _REWORDED = (
     (r"Missing from modeler [a-z-]+: ", "missing: "),
     (r"Missing value for argument '(\S+)'\. .*", r"\1 lacks its value"),
     (r"Expected one of \{(.*)\}", r"give a command: \1"),
+    (r"Error parsing (\S+): takes ", r"\1 takes "),
     (r"Error parsing (\S+): no type matching \{?(.*?)\}? could be .* from \[(.*?)\]\. .*", r"\1 takes \2, not \3"),
     (r"Error parsing (\S+): invalid literal for int\(\) with base 10: (.*)", r"\1 takes INT, not \2"),
     (r"'None', |, 'None'", ""),  # an option that may be left out
@@ -66,23 +67,38 @@ _REWORDED = (
 _DESCRIPTION = "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr."
 
 
-def parsed(
-    arguments: Sequence[str],
-) -> Build | Info | Convert | CalibrateSensor | Register | Evaluate | Render | View | Report | Export | Join:
+def parsed(arguments: Sequence[str]) -> Command:
     """Return the command that the arguments (after the program's name) ask for.
 
     Raises:
         SystemExit: with status 0 after help, with 2 and one line on stderr for arguments that are no command.
     """
     complaint = io.StringIO()
+    asked = next((name for name in arguments[:1] if name in _COMMANDS), None)
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(Command, prog="modeler", description=_DESCRIPTION, args=arguments, config=_STYLE)  # pyright: ignore[reportReturnType, reportArgumentType]
+            return tyro.cli(
+                _choice(brief=asked is None), prog="modeler", description=_DESCRIPTION, args=arguments, config=_STYLE
+            )
     except SystemExit as ending:
         if ending.code:
-            asked = "".join(f"{name} " for name in arguments[:1] if name in _NAMES)
-            print(f"modeler: {_one_line(complaint.getvalue(), asked)}; see modeler {asked}--help", file=sys.stderr)
+            named = "" if asked is None else f"{asked} "
+            print(f"modeler: {_one_line(complaint.getvalue(), named)}; see modeler {named}--help", file=sys.stderr)
         raise
+
+
+def _choice(*, brief: bool) -> Any:
+    """Return the type that is any of the commands, each told of by its first sentence alone, or by all that it says."""
+    return Union[  # noqa: UP007
+        tuple(
+            Annotated[kind, tyro.conf.subcommand(name, description=_first_paragraph(kind) if brief else None)]
+            for name, kind in _COMMANDS.items()
+        )
+    ]
+
+
+def _first_paragraph(kind: type[Command]) -> str:
+    return (kind.__doc__ or "").split("\n\n", maxsplit=1)[0]
 
 
 def _one_line(box: str, asked: str) -> str:

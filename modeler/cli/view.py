@@ -1,11 +1,15 @@
 """`modeler view`: look at a recording."""
 
+from __future__ import annotations
+
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+from modeler.cli.options import IdleSeed
 
 
 @dataclass(frozen=True)
@@ -16,6 +20,7 @@ class View:
     """Run folder, as `modeler build` makes it."""
     web: bool = False
     """Serve the viewer in the browser, on 127.0.0.1 only, until Ctrl-C."""
+    randomness: IdleSeed = field(default_factory=IdleSeed)
 
     def run(self) -> int:
         """Open the viewer; in the browser, wait until the user is done."""
