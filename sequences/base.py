@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
@@ -111,8 +111,7 @@ class AbstractSequence(ABC):
         Raises:
             InputError: where nothing is left.
         """
-        if every < 1:
-            raise InputError(f"--every {every} keeps no frame; give a whole number of at least 1.")
+        check_every(every)
         start, stop = (None, None) if frames is None else (frames.start, frames.stop)
         kept = tuple(i for i in self.indices if (start is None or i >= start) and (stop is None or i < stop))[::every]
         if not kept:
@@ -182,6 +181,19 @@ class AbstractDerived(AbstractSequence):
         """What the reader assumed, or left out."""
         return self.whole.notes
 
+    @property
+    def live(self) -> bool:
+        """Whether more frames come than `indices` tells."""
+        return self.whole.live
+
+    def recorded(self) -> AbstractSequence:
+        """Return what is there already, which ends by itself, of a live sequence."""
+        return replace(self, whole=self.whole.recorded())
+
+    def until(self, stop: Callable[[], bool]) -> AbstractSequence:
+        """Return the sequence that, where it is live, ends as soon as `stop` says so."""
+        return replace(self, whole=self.whole.until(stop))
+
 
 @final
 @dataclass(frozen=True)
@@ -208,6 +220,16 @@ class SelectedSequence(AbstractDerived):
         """Return the true camera_from_model (4, 4) by frame number; None where it is not known."""
         truth = self.whole.truth()
         return None if truth is None else {index: truth[index] for index in self.kept if index in truth} or None
+
+
+def check_every(every: int) -> None:
+    """Refuse to keep every so many-th frame where that is none.
+
+    Raises:
+        InputError: where it keeps nothing.
+    """
+    if every < 1:
+        raise InputError(f"--every {every} keeps no frame; give a whole number of at least 1.")
 
 
 def frame_range(text: str) -> slice:

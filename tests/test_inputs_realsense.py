@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from modeler.cli import main
 from modeler.export import RunFolder
 from modeler.types import Camera, Frame, InputError
-from sequences import Given, open_sequence, survey
+from sequences import Given, NoiseModel, SensedSequence, open_sequence, survey
 from sequences.lens import Lens, known
 from sequences.live.realsense import open_camera
 from sequences.live.sequence import AbstractCamera, begin
@@ -231,6 +231,16 @@ def test_images_are_taken_when_they_are_asked_for() -> None:
     assert [frame.index for frame in sequence.select(every=2, frames=slice(1, 6))] == [1, 3, 5]
     with pytest.raises(InputError, match="frame 7 is not kept; the first ones are 0 to 1"):
         sequence.frame(7)
+
+
+def test_a_live_camera_stays_live_whatever_it_is_wrapped_in() -> None:
+    camera = StandIn(small_frames(3))
+    sensed = SensedSequence(begin(camera, first=2), NoiseModel(0.5, 500.0, 0.001, (0.0, 0.0, 0.0)))
+    assert sensed.live
+    assert [frame.index for frame in sensed.recorded()] == [0, 1]
+    assert len(camera.taken) == 2  # to look at what it has shown takes nothing from it
+    assert [frame.index for frame in sensed.until(lambda: len(camera.taken) == 3)] == [0, 1, 2]
+    assert [frame.index for frame in sensed.select(every=2).select(every=2, frames=slice(0, 9))] == [0, 4, 8]
 
 
 def test_an_image_that_comes_again_is_not_taken_for_a_new_one() -> None:

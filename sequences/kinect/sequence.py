@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import weakref
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,16 +13,14 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types import Array, Frame, InputError
+from modeler.types import InputError
 from sequences.alignment import Alignment
 from sequences.files.broken import told
 from sequences.files.images import MAX_PIXELS, Packed, metres, read_colour
 from sequences.files.json_input import Node
 from sequences.given import Given
 from sequences.kinect.calibration import colour_from_depth, colour_lens, depth_lens
-from sequences.lens import Lens
-from sequences.pictures.tum import MAX_APART_S, nearest
-from sequences.recording import AbstractRecording
+from sequences.streams import AbstractStreams, paired
 
 ADVICE = "pip install 'modeler[kinect]'"
 _AGAIN = "record or copy it anew"
@@ -31,44 +28,35 @@ _AGAIN = "record or copy it anew"
 
 @final
 @dataclass(frozen=True)
-class KinectSequence(AbstractRecording):
-    """The depth track of a recording, and colour brought to its pixels."""
+class KinectSequence(AbstractStreams[int]):
+    """The depth track of a recording, and colour brought to its pixels. Images are found by their time stamps."""
 
     file: Matroska
     """The open file."""
-    shots: Mapping[int, tuple[int, int | None]]
-    """By frame number: time stamps of the depth and of the colour packet."""
-    lens: Lens
-    """The depth camera."""
     alignment: Alignment | None
     """Where the colour camera is; None without colour."""
     unit_mm: float
     """Millimetres per unit of depth."""
 
-    @property
-    def indices(self) -> tuple[int, ...]:
-        """Frame numbers, ascending: places in the track."""
-        return tuple(self.shots)
-
-    def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`, without the lens's distortion."""
-        if index not in self.shots:
-            raise self.absent(index)
-        stamp, partner = self.shots[index]
-        camera = self.lens.camera
-        data, time_s = self.file.packet("DEPTH", stamp)
+    def seen_m(self, index: int, stamp: int) -> npt.NDArray[np.float32]:
+        """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured."""
+        camera, data = self.lens.camera, self.file.packet("DEPTH", stamp)
         if len(data) != 2 * camera.width * camera.height:
             raise InputError(f"{self.path}: depth image {index} is cut off; record it anew.")
-        raw = np.frombuffer(data, ">u2").reshape(camera.height, camera.width).astype(np.uint16)
-        depth_m = self.lens.straight(metres(raw, self.unit_mm), float("nan"))
-        colour = None
-        if partner is not None and self.alignment is not None:
-            colour = self.alignment.aligned(depth_m, self._picture(index, partner))
-        return Frame(index, time_s, depth_m, camera, None, colour)
+        return metres(np.frombuffer(data, ">u2").reshape(camera.height, camera.width).astype(np.uint16), self.unit_mm)
 
-    def truth(self) -> dict[int, Array] | None:
-        """Return None: recordings do not tell the object's pose."""
-        return None
+    def aligned(self, index: int, stamp: int, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
+        """Return colour (h, w, 3) as RGB at the pixels of depth; None without a colour camera."""
+        if self.alignment is None:
+            return None
+        picture = self.file.picture("COLOR", stamp, f"{self.path}: colour image {index}")
+        camera = self.alignment.colour.camera
+        if picture.shape[:2] != (camera.height, camera.width):
+            raise InputError(
+                f"{self.path}: colour image {index} is {picture.shape[1]} x {picture.shape[0]} pixels where the track "
+                f"says {camera.width} x {camera.height}; record it anew."
+            )
+        return self.alignment.aligned(depth_m, picture)
 
     @property
     def layout(self) -> str:
@@ -79,17 +67,6 @@ class KinectSequence(AbstractRecording):
     def depth_unit(self) -> str:
         """What one unit of stored depth is."""
         return f"{self.unit_mm:g} mm ({'of the format' if self.unit_mm == 1.0 else '--depth-scale-mm'})"
-
-    def _picture(self, index: int, stamp: int) -> npt.NDArray[np.uint8]:
-        assert self.alignment is not None
-        picture = self.file.picture("COLOR", stamp, f"{self.path}: colour image {index}")
-        camera = self.alignment.colour.camera
-        if picture.shape[:2] != (camera.height, camera.width):
-            raise InputError(
-                f"{self.path}: colour image {index} is {picture.shape[1]} x {picture.shape[0]} pixels where the track "
-                f"says {camera.width} x {camera.height}; record it anew."
-            )
-        return picture
 
 
 def open_kinect(path: Path, given: Given) -> KinectSequence:
@@ -111,13 +88,9 @@ def open_kinect(path: Path, given: Given) -> KinectSequence:
     if colour_size is not None:
         colours = file.stamps("COLOR")
         alignment = Alignment(lens.camera, colour_lens(calibration, colour_size), colour_from_depth(calibration))
-    partners = nearest([time_s for time_s, _ in stamps], [time_s for time_s, _ in colours], MAX_APART_S)
-    shots = {
-        index: (stamp, None if partner is None else colours[partner][1])
-        for index, ((_, stamp), partner) in enumerate(zip(stamps, partners, strict=True))
-    }
     unit_mm = 1.0 if given.depth_scale_mm is None else given.depth_scale_mm
-    return KinectSequence(path, file, shots, lens, alignment, unit_mm)
+    pairs, left = paired(stamps, colours)
+    return KinectSequence(path, lens, pairs, tuple(left), file, alignment, unit_mm)
 
 
 @final
@@ -156,11 +129,10 @@ class Matroska:
             found = {int(packet.pts) for packet in self._container.demux(track) if packet.pts is not None}
             return [(float(stamp * track.time_base), stamp) for stamp in sorted(found)]
 
-    def packet(self, title: str, stamp: int) -> tuple[bytes, float]:
-        """Return the bytes of one image and its time in s."""
+    def packet(self, title: str, stamp: int) -> bytes:
+        """Return the bytes of one image."""
         with told(self.path, "recording", _AGAIN):
-            packet = self._find(title, stamp)
-            return bytes(packet), float(stamp * (packet.time_base or 0))
+            return bytes(self._find(title, stamp))
 
     def picture(self, title: str, stamp: int, where: str) -> npt.NDArray[np.uint8]:
         """Return one image as RGB (h, w, 3)."""

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Array, Frame, InputError
-from sequences.base import AbstractSequence, span
+from sequences.base import AbstractSequence, check_every, span
 from sequences.files.images import metres
 from sequences.lens import Lens
 
@@ -110,9 +110,8 @@ class LiveSequence(AbstractSequence):
         Raises:
             InputError: where nothing is left.
         """
-        if every < 1:
-            raise InputError(f"--every {every} keeps no frame; give a whole number of at least 1.")
-        return replace(self, every=every, kept=self.kept if frames is None else frames)
+        check_every(every)
+        return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
 
     def truth(self) -> dict[int, Array] | None:
         """Return None: a camera does not know."""

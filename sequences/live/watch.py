@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import final
 
-from modeler.types import Array, Frame, InputError
-from sequences.base import AbstractSequence
+from modeler.types import Frame, InputError
+from sequences.base import AbstractDerived, AbstractSequence, check_every
 from sequences.given import Given
 from sequences.recognise import open_sequence
 from sequences.survey import survey
@@ -36,7 +36,7 @@ class Patience:
 
 @final
 @dataclass(frozen=True)
-class WatchedSequence(AbstractSequence):
+class WatchedSequence(AbstractDerived):
     """The frames in a folder, and those that will come, each once it is complete.
 
     What is not iterated over, such as `indices` and `name`, is as it was when the sequence was opened.
@@ -44,8 +44,6 @@ class WatchedSequence(AbstractSequence):
 
     path: Path
     """The folder, in any layout of pictures."""
-    seen: AbstractSequence
-    """What was there when it was opened."""
     given: Given = field(default_factory=Given)
     """What a person says of it."""
     patience: Patience = field(default_factory=Patience)
@@ -58,14 +56,9 @@ class WatchedSequence(AbstractSequence):
     """Asked while waiting: whether to come to an end."""
 
     @property
-    def name(self) -> str:
-        """What the sequence is called."""
-        return self.seen.name
-
-    @property
     def indices(self) -> tuple[int, ...]:
         """Frame numbers so far."""
-        wanted = [index for index in self.seen.indices if self._wants(index)]
+        wanted = [index for index in self.whole.indices if self._wants(index)]
         return tuple(wanted[:: self.every])
 
     @property
@@ -75,11 +68,7 @@ class WatchedSequence(AbstractSequence):
 
     def recorded(self) -> AbstractSequence:
         """Return what was there when it was opened."""
-        return self.seen
-
-    def frame(self, index: int) -> Frame:
-        """Return a frame that was there when the sequence was opened."""
-        return self.seen.frame(index)
+        return self.whole
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield each frame when it is complete, until none has come for a while.
@@ -107,47 +96,13 @@ class WatchedSequence(AbstractSequence):
         Raises:
             InputError: where `every` keeps nothing.
         """
-        if every < 1:
-            raise InputError(f"--every {every} keeps no frame; give a whole number of at least 1.")
+        check_every(every)
         return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
-
-    def truth(self) -> dict[int, Array] | None:
-        """Return the true poses of the frames that were there when it was opened."""
-        return self.seen.truth()
-
-    def sensor(self) -> tuple[float, float] | None:
-        """Return the sensor's noise `(sigma_wh, sigma_r_m)`; None where the sequence does not say."""
-        return self.seen.sensor()
-
-    @property
-    def motion(self) -> Mapping[str, object] | None:
-        """What is known of the motion; None where nothing is."""
-        return self.seen.motion
-
-    @property
-    def robot_path(self) -> Path | None:
-        """The trajectory of the hand that holds the object; None where there is none."""
-        return self.seen.robot_path
-
-    @property
-    def model_path(self) -> Path | None:
-        """The true surface as a mesh in m; None where it is not known."""
-        return self.seen.model_path
 
     @property
     def layout(self) -> str:
         """What the sequence is stored as."""
-        return f"{self.seen.layout}, being written"
-
-    @property
-    def depth_unit(self) -> str:
-        """What one unit of stored depth is."""
-        return self.seen.depth_unit
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What the reader assumed, or left out."""
-        return self.seen.notes
+        return f"{self.whole.layout}, being written"
 
     def _wants(self, index: int) -> bool:
         low, high = self.kept.start, self.kept.stop
@@ -197,7 +152,7 @@ def watch(path: str | Path, given: Given | None = None, patience: Patience | Non
         raise InputError(f"{path}: no frame has come in {patience.idle_s:g} s; start the program that writes them.")
     seen = open_sequence(path, given).select(frames=slice(None, first[-1] + 1))
     survey(seen, truth=False)
-    return WatchedSequence(path, seen, given, patience)
+    return WatchedSequence(seen, path, given, patience)
 
 
 def _after(last: int, path: Path, given: Given, *, with_newest: bool) -> Iterator[Frame]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
@@ -23,15 +23,6 @@ class SensedSequence(AbstractDerived):
     def sensor(self) -> tuple[float, float]:
         """Return the noise `(sigma_wh, sigma_r_m)` at the distance of the object in the first frame."""
         return self._at_object
-
-    @property
-    def live(self) -> bool:
-        """Whether more frames come."""
-        return self.whole.live
-
-    def until(self, stop: Callable[[], bool]) -> SensedSequence:
-        """Return the sequence that, where it is live, ends as soon as `stop` says so."""
-        return replace(self, whole=self.whole.until(stop))
 
     def select(self, every: int = 1, frames: slice | None = None) -> SensedSequence:
         """Return a part of the sequence."""

@@ -17,13 +17,12 @@ from sequences.files.intrinsics import find_intrinsics
 from sequences.files.json_input import read_text
 from sequences.given import Given
 from sequences.pictures.sequence import PictureSequence, Shot
+from sequences.streams import paired
 
 UNIT_MM = 0.2
 """The benchmark stores 5000 units per metre."""
 CALIBRATION = (525.0, 525.0, 319.5, 239.5)
 """What the benchmark recommends for its images of 640 x 480, which come without intrinsics."""
-MAX_APART_S = 0.02
-"""Depth and colour farther apart in time than this are no pair (the benchmark's own tool has the same)."""
 FARTHEST_M = 1e6
 """No camera moves so far."""
 MAX_GAP_S = 0.2
@@ -42,18 +41,13 @@ def open_tum(path: Path, given: Given) -> PictureSequence:
     colour = _list(path / "rgb.txt", 2) if (path / "rgb.txt").exists() else []
     folder = first_folder(path, ("mask", "masks"))
     masks = {} if folder is None else pictures(folder, (".png",), path)
-    partner = nearest([time for time, _ in depth], [time for time, _ in colour], MAX_APART_S)
+    pairs, remarks = paired(depth, colour)
     shots: dict[int, Shot] = {}
-    for index, (time_s, words) in enumerate(depth):
-        picture = _listed(path, "depth.txt", words[0])
-        other = partner[index]
-        shot_colour = None if other is None else _listed(path, "rgb.txt", colour[other][1][0])
+    for index, pair in pairs.items():
+        picture = _listed(path, "depth.txt", pair.depth[0])
+        shot_colour = None if pair.colour is None else _listed(path, "rgb.txt", pair.colour[0])
         mask = masks.get(picture.stem) or (None if shot_colour is None else masks.get(shot_colour.stem))
-        shots[index] = Shot(time_s, picture, shot_colour, mask)
-    remarks = []
-    alone = sum(other is None for other in partner)
-    if colour and alone:
-        remarks.append(f"{alone} depth images have no colour image within {MAX_APART_S * 1000:g} ms")
+        shots[index] = Shot(pair.time_s, picture, shot_colour, mask)
     found = find_intrinsics(path, given)
     if found is None:
         width, height = picture_size(shots[0].depth)
@@ -74,21 +68,6 @@ def open_tum(path: Path, given: Given) -> PictureSequence:
         read_truth=lambda: _truth(path / "groundtruth.txt", [time for time, _ in depth]),
         remarks=tuple(remarks),
     )
-
-
-def nearest(times_s: Sequence[float], others_s: Sequence[float], limit_s: float) -> list[int | None]:
-    """Return for each time the place of the nearest other time within a limit; None where there is none."""
-    if not others_s:
-        return [None] * len(times_s)
-    gaps = np.asarray(others_s, dtype=np.float64)
-    order = np.argsort(gaps, kind="stable")
-    right = np.searchsorted(gaps[order], times_s).clip(1, len(gaps)) if len(gaps) > 1 else np.ones(len(times_s), int)
-    found: list[int | None] = []
-    for time_s, after in zip(times_s, right.tolist(), strict=True):
-        candidates = [int(order[place]) for place in (after - 1, after) if place < len(gaps)]
-        best = min(candidates, key=lambda place: abs(others_s[place] - time_s))
-        found.append(best if abs(others_s[best] - time_s) <= limit_s else None)
-    return found
 
 
 def trajectory(path: Path) -> list[tuple[float, Array]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -10,18 +9,17 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types import Array, Frame, InputError
+from modeler.types import InputError
 from sequences.given import Given
 from sequences.lens import Lens
-from sequences.pictures.tum import MAX_APART_S, nearest
-from sequences.recording import AbstractRecording
 from sequences.ros import images, topics
 from sequences.ros.bag import Bag, Stamp
+from sequences.streams import AbstractStreams, paired
 
 
 @final
 @dataclass(frozen=True)
-class RosSequence(AbstractRecording):
+class RosSequence(AbstractStreams[Stamp]):
     """The depth images of one topic, and the colour images that are aligned to them."""
 
     bag: Bag
@@ -30,37 +28,27 @@ class RosSequence(AbstractRecording):
     """Topic of the depth images."""
     colour: topics.Colour | None
     """Where colour comes from."""
-    lens: Lens
-    """The depth camera."""
     unit_mm: float
     """Millimetres per unit of 16-bit depth."""
     unit: str
     """The unit in words."""
-    shots: Mapping[int, tuple[float, Stamp, Stamp | None]]
-    """By frame number: time in s, the depth message and the colour message."""
-    remarks: tuple[str, ...]
-    """What was assumed or left out."""
 
-    @property
-    def indices(self) -> tuple[int, ...]:
-        """Frame numbers, ascending: places in order of time."""
-        return tuple(self.shots)
-
-    def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`, without the lens's distortion."""
-        if index not in self.shots:
-            raise self.absent(index)
-        time_s, depth_stamp, colour_stamp = self.shots[index]
+    def seen_m(self, index: int, stamp: Stamp) -> npt.NDArray[np.float32]:
+        """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured."""
         where = f"{self.path}: {self.depth_topic}, image {index}"
-        depth_m = images.depth_m(self.bag.message(self.depth_topic, depth_stamp), self.unit_mm, where)
+        depth_m = images.depth_m(self.bag.message(self.depth_topic, stamp), self.unit_mm, where)
         self._check_size(where, depth_m.shape, self.lens)
-        camera = self.lens.camera
-        depth_m = self.lens.straight(depth_m, float("nan"))
-        return Frame(index, time_s, depth_m, camera, None, self._colour(index, depth_m, colour_stamp))
+        return depth_m
 
-    def truth(self) -> dict[int, Array] | None:
-        """Return None: bags do not tell the object's pose."""
-        return None
+    def aligned(self, index: int, stamp: Stamp, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
+        """Return colour (h, w, 3) as RGB at the pixels of depth; None without a topic of colour."""
+        if self.colour is None:
+            return None
+        where = f"{self.path}: {self.colour.topic}, for image {index}"
+        picture = images.colour(self.bag.message(self.colour.topic, stamp), where)
+        alignment = self.colour.alignment
+        self._check_size(where, picture.shape[:2], self.lens if alignment is None else alignment.colour)
+        return self.lens.straight(picture) if alignment is None else alignment.aligned(depth_m, picture)
 
     @property
     def layout(self) -> str:
@@ -73,22 +61,6 @@ class RosSequence(AbstractRecording):
     def depth_unit(self) -> str:
         """What one unit of stored depth is."""
         return self.unit
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was assumed or left out."""
-        return self.remarks
-
-    def _colour(
-        self, index: int, depth_m: npt.NDArray[np.float32], stamp: Stamp | None
-    ) -> npt.NDArray[np.uint8] | None:
-        if stamp is None or self.colour is None:
-            return None
-        where = f"{self.path}: {self.colour.topic}, for image {index}"
-        picture = images.colour(self.bag.message(self.colour.topic, stamp), where)
-        alignment = self.colour.alignment
-        self._check_size(where, picture.shape[:2], self.lens if alignment is None else alignment.colour)
-        return self.lens.straight(picture) if alignment is None else alignment.aligned(depth_m, picture)
 
     def _check_size(self, where: str, found: tuple[int, ...], lens: Lens) -> None:
         camera = lens.camera
@@ -114,16 +86,8 @@ def open_ros(path: Path, given: Given) -> RosSequence:
     times = _times(bag, depth_topic)
     if not times:
         raise InputError(f"{path}: holds no message of {depth_topic}; record it anew.")
-    colours = [] if colour is None else _times(bag, colour.topic)
-    partners = nearest([time_s for time_s, _ in times], [time_s for time_s, _ in colours], MAX_APART_S)
-    shots = {
-        index: (time_s, stamp, None if partner is None else colours[partner][1])
-        for index, ((time_s, stamp), partner) in enumerate(zip(times, partners, strict=True))
-    }
-    alone = sum(partner is None for partner in partners)
-    if colours and alone:
-        left.append(f"{alone} depth images have no colour image within {MAX_APART_S * 1000:g} ms")
-    return RosSequence(path, bag, depth_topic, colour, lens, unit_mm, unit, shots, tuple(left))
+    pairs, alone = paired(times, [] if colour is None else _times(bag, colour.topic))
+    return RosSequence(path, lens, pairs, (*left, *alone), bag, depth_topic, colour, unit_mm, unit)
 
 
 def _times(bag: Bag, topic: str) -> list[tuple[float, Stamp]]:
