@@ -18,6 +18,7 @@ import trimesh
 
 from modeler import priors, se3
 from modeler.cli import main
+from modeler.cli.building import comes_back
 from modeler.cli.interrupt import Interrupt
 from modeler.cli.options import PriorOptions
 from modeler.cli.usage import parsed
@@ -212,14 +213,22 @@ def test_the_readme_names_every_file_of_a_run_folder() -> None:
         (("build", BOX, "--out", "OUT", "--resume", "--overwrite"), "--resume"),
         (("build", "NOWHERE", "--out", "OUT"), "NOWHERE"),
         (("register", BOX, "0", "99"), "no frame 99"),
+        (("register", BOX, "3", "3"), "SOURCE and TARGET are both frame 3"),
+        (
+            ("register", BOX, "0", "1", "--roi", "640", "0", "700", "9"),
+            "lies outside the images of box, which are 640 x",
+        ),
+        (("build", BOX, "--out", "OUT", "--roi", "0", "480", "9", "500"), "--roi 0 480 9 500 lies outside"),
         (("register", BOX, "0", "1", "--max-depth-m", "0.1"), "too few points"),
         (("evaluate", "--out", "OUT"), "no sequence"),
         (("evaluate", BOX, "--out", "OUT", "--methods", "icp,magic"), "'magic'"),
         (("evaluate", BOX, "--out", "OUT", "--offsets", "0"), "--offsets 0"),
         (("evaluate", BOX, "--out", "OUT", "--points", "0"), "--points 0"),
+        (("evaluate", BOX, "--out", "OUT", "--roi", "0", "480", "9", "500"), "--roi 0 480 9 500 lies outside"),
         (("render", "nothing", "--out", "OUT"), "box"),
         (("view", "NOWHERE"), "NOWHERE"),
         (("export", "NOWHERE", "--out", "OUT.glb"), "NOWHERE"),
+        (("export", BOX, "--out", "OUT.glb"), "there is no report; is "),
     ],
 )
 def test_unusable_input_gives_status_2_and_one_line(
@@ -280,6 +289,8 @@ def test_the_sequence_says_what_is_known_and_the_user_is_told(run: Run, tmp_path
     assert told.status == 0
     assert "prior table, as sequence.json says" in told.err
     assert told.out == run("register", BOX, "1", "0", "--method", "icp", "--prior", "table").out
+    told = run("register", BOX, "1", "0", "--method", "icp", "--prior", "turntable")
+    assert "step 25°, as sequence.json says" in told.err
     ended = run("build", BOX, "--out", tmp_path / "run", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:2")
     assert ended.err.startswith("modeler: prior table, as sequence.json says\n")
     assert report(tmp_path / "run")["prior"] == "table"
@@ -293,6 +304,20 @@ def test_register_gives_the_edge_that_build_finds(run: Run, built: Path) -> None
 
 
 # build
+
+
+@pytest.mark.parametrize(
+    ("frames", "given_deg", "expected"),
+    [
+        (slice(0, 14), None, False),  # 13 steps of 25°, as sequence.json says, and 35° to go
+        (slice(0, 14), 27.0, True),
+        (slice(0, 14), -27.0, True),
+        (slice(0, 8), 50.0, True),
+        (slice(0, 8), 25.0, False),
+    ],
+)
+def test_a_turn_that_is_told_by_hand_counts_more(frames: slice, given_deg: float | None, *, expected: bool) -> None:
+    assert comes_back(open_sequence(BOX).select(frames=frames), given_deg, reach_deg=20.0) is expected
 
 
 def test_build_fills_a_run_folder(built: Path) -> None:

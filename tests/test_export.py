@@ -357,7 +357,7 @@ def test_mesh_that_cannot_be_exported_is_said_in_one_line(tmp_path: Path) -> Non
         ("empty.ply", "a.obj", "no triangles"),
         ("broken.ply", "a.ply", "broken.ply"),
         ("good.ply", "a.fbx", "unknown mesh format '.fbx'; use .ply, .obj, .glb, .stl"),
-        ("good.ply", "a", "unknown mesh format"),
+        ("good.ply", "a", "a: no ending says the mesh format; use .ply"),
         ("good.ply", "file/a.obj", "cannot be made"),
     ):
         with pytest.raises(InputError, match=words) as caught:

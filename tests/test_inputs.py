@@ -332,10 +332,21 @@ def test_poses_of_a_run_go_to_bop_and_tum(tmp_path: Path, rng: np.random.Generat
     run = tmp_path / "run"
     run.mkdir()
     poses = {index: se3.exp(0.3 * rng.normal(size=6)) for index in (2, 5)}
+    frame = {"points": 900, "outcome": "accepted"}
+    covariance = {"covariance": np.eye(6).ravel().tolist()}
     report = {
         "schema": 1,
-        "frames": [{"id": index, "timestamp": 0.5 * index} for index in (2, 3, 5)],
-        "poses": [{"id": index, "object_from_camera": pose.ravel().tolist()} for index, pose in poses.items()],
+        "sequence": "cup",
+        "settings": {},
+        "seconds": {},
+        "closed": False,
+        "trustworthy": True,
+        "reasons": [],
+        "frames": [{"id": index, "timestamp": 0.5 * index} | frame for index in (2, 3, 5)],
+        "edges": [],
+        "poses": [
+            {"id": index, "object_from_camera": pose.ravel().tolist()} | covariance for index, pose in poses.items()
+        ],
     }
     (run / "report.json").write_text(json.dumps(report))
     assert main(["convert", str(run), "--out", str(tmp_path / "scene_gt.json")]) == 0
@@ -350,9 +361,15 @@ def test_poses_of_a_run_go_to_bop_and_tum(tmp_path: Path, rng: np.random.Generat
     np.testing.assert_allclose(rows[:, 0], [1.0, 2.5])
     np.testing.assert_allclose(rows[:, 1:4], [pose[:3, 3] for pose in poses.values()])
     assert main(["convert", str(run), "--out", str(tmp_path / "poses.csv")]) == 2
-    (run / "report.json").write_text('{"schema": 1, "poses": [{"id": "x"}]}')
-    assert main(["convert", str(run), "--out", str(tmp_path / "other.txt")]) == 2
-    assert not (tmp_path / "other.txt").exists()
+    stray = {"id": 7, "object_from_camera": np.eye(4).ravel().tolist()} | covariance
+    for broken in (
+        {"schema": 1, "poses": [{"id": "x"}]},
+        report | {"poses": [stray]},
+        report | {"poses": [stray | {"id": 2, "object_from_camera": [2.0] * 16}]},
+    ):
+        (run / "report.json").write_text(json.dumps(broken))
+        assert main(["convert", str(run), "--out", str(tmp_path / "other.txt")]) == 2
+        assert not (tmp_path / "other.txt").exists()
 
 
 # Commands

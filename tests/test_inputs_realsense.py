@@ -312,7 +312,7 @@ def test_a_camera_that_is_unplugged_leaves_what_it_gave(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, command: tuple[str, ...]
 ) -> None:
     camera, out = StandIn(small_frames(3), lasts=3), tmp_path / "out"
-    for module in ("modeler.cli.converting.open_sequence", "modeler.cli.compose.open_sequence"):
+    for module in ("modeler.cli.converting.open_sequence", "modeler.cli.building.open_sequence"):
         monkeypatch.setattr(
             module, lambda path, *_: begin(camera, 2) if str(path) == "realsense:" else open_sequence(path)
         )

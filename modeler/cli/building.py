@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from modeler.cli import compose
+from modeler.cli import compose, nonvisual
 from modeler.cli.build import Build
 from modeler.cli.console import Console
 from modeler.cli.interrupt import Interrupt
@@ -18,8 +18,8 @@ from modeler.cli.watching import watched
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.pipeline import Modeler
 from modeler.segmentation import Scene
-from modeler.types import InputError
-from sequences import AbstractSequence, SensedSequence, frame_range, read_noise, survey
+from modeler.types import ACCEPTED, InputError
+from sequences import AbstractSequence, SensedSequence, frame_range, open_sequence, read_noise, survey
 from viz.ending import ends_whole
 from viz.stream import open_stream
 
@@ -35,13 +35,13 @@ def build(options: Build) -> int:
     whole, frames = _opened(options)
     modeler = compose.modeler(whole, options.prior, options.method, options.where)
     modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=options.voxel_m))
-    prior, remark = compose.told_prior(options.prior, whole)
+    prior, remark = nonvisual.told(options.prior, whole)
     meta = RunMeta(
         sequence=str(options.sequence),
         seed=options.method.seed,
         prior=prior,
         settings=options.settings(),
-        closure_expected=_comes_back(frames, modeler.closer.max_angle_deg),
+        closure_expected=comes_back(frames, options.prior.step_deg, modeler.closer.max_angle_deg),
     )
     if options.resume and RunFolder(options.out).finished(meta):
         print("modeler: the run had come to its end; --overwrite makes it anew", file=sys.stderr)
@@ -82,7 +82,7 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
         InputError: where something cannot be read.
     """
     path = options.sequence
-    whole = watched(path, options.idle_s) if options.watch else compose.open_sequence(path)
+    whole = watched(path, options.idle_s) if options.watch else open_sequence(path)
     whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     if not frames.live:
@@ -134,9 +134,15 @@ def _run(
     return report
 
 
-def _comes_back(frames: AbstractSequence, reach_deg: float) -> bool:
-    """Return whether the sequence says that the object turns as far as its first view, or nearly."""
-    step_deg = (frames.motion or {}).get("step_deg")
+def comes_back(frames: AbstractSequence, given_deg: float | None, reach_deg: float) -> bool:
+    """Return whether the object is said to turn as far as its first view, or nearly.
+
+    Args:
+        frames: the sequence, which may tell the turn from frame to frame.
+        given_deg: that turn where a person tells it, who counts more.
+        reach_deg: how near to a view another must look for them to be registered.
+    """
+    step_deg = (frames.motion or {}).get("step_deg") if given_deg is None else given_deg
     if not isinstance(step_deg, int | float):
         return False
     return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
@@ -144,7 +150,7 @@ def _comes_back(frames: AbstractSequence, reach_deg: float) -> bool:
 
 def _told(report: Mapping[str, Any], options: Build) -> int:
     """Say on stderr what came out, and return the exit status."""
-    accepted = sum(frame["outcome"] == "accepted" for frame in report["frames"])
+    accepted = sum(frame["outcome"] == ACCEPTED for frame in report["frames"])
     loop = "loop closed" if report["closed"] else "no loop closed"
     took = f"{report['seconds'].get('total', 0.0):.0f} s"
     frames = "1 frame" if len(report["frames"]) == 1 else f"{len(report['frames'])} frames"

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import sequences
 from modeler import registration
 from modeler.cli import nonvisual
 from modeler.cli.options import Method, MethodOptions, ObjectOptions, PriorOptions
@@ -13,13 +10,8 @@ from modeler.fusion import Fuser
 from modeler.pipeline import Modeler
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
-from modeler.types import AbstractPrior, AbstractRegistrar
+from modeler.types import AbstractRegistrar, InputError
 from sequences import AbstractSequence
-
-
-def open_sequence(path: Path) -> AbstractSequence:
-    """Open the sequence in a folder."""
-    return sequences.open_sequence(path)
 
 
 def modeler(
@@ -30,16 +22,33 @@ def modeler(
     Raises:
         InputError: where an option cannot be used.
     """
+    check_region(where, sequence)
     noise = sequence.sensor()
     return Modeler(
         segmenter=segmenter(where),
         sensor=Sensor() if noise is None else Sensor(*noise),
-        prior=prior(prior_options, sequence),
+        prior=nonvisual.prior(prior_options, sequence),
         registrar=registrar(method.method),
         closer=Closer(),
         fuser=Fuser(),
         seed=method.seed,
     )
+
+
+def check_region(where: ObjectOptions, sequence: AbstractSequence) -> None:
+    """Refuse a region of the image in which nothing can be.
+
+    Raises:
+        InputError: where it lies outside the first frame.
+    """
+    if where.roi is None:
+        return
+    camera = sequence.frame(sequence.indices[0]).camera
+    if where.roi[0] >= camera.width or where.roi[1] >= camera.height:
+        raise InputError(
+            f"--roi {' '.join(map(str, where.roi))} lies outside the images of {sequence.name}, which are "
+            f"{camera.width} x {camera.height} pixels; move it there"
+        )
 
 
 def segmenter(options: ObjectOptions) -> Segmenter:
@@ -50,22 +59,6 @@ def segmenter(options: ObjectOptions) -> Segmenter:
 def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
     """Return what frames spread over the whole sequence teach the segmenter."""
     return modeler.segmenter.scene([sequence.frame(index) for index in telling(sequence.indices)])
-
-
-def prior(options: PriorOptions, sequence: AbstractSequence | None = None) -> AbstractPrior:
-    """Return the prior asked for, or that `sequence.json` asks for.
-
-    Raises:
-        InputError: where there is no such prior, a parameter cannot be used, or the sequence lacks what it needs.
-    """
-    return nonvisual.prior(options, sequence)
-
-
-def told_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
-    """Return the name of the prior, and in words what was chosen or assumed without being asked for."""
-    name = nonvisual.prior_name(options, sequence)
-    said = () if options.prior is not None or name == "general" else (f"prior {name}, as sequence.json says",)
-    return name, "; ".join((*said, *sequence.notes))
 
 
 def registrar(method: Method) -> AbstractRegistrar:

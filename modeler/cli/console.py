@@ -57,7 +57,7 @@ class Console:
     def __call__(self, step: Step) -> None:
         """Tell of a step."""
         loops = sum(edge.kind == "closure" and edge.accepted for edge in step.edges_so_far)
-        frame, accepted = step.frame.index, step.outcome == "accepted"
+        frame, accepted = step.frame.index, step.accepted
         again, self._placed[frame] = frame in self._placed, accepted
         if accepted and step.segmentation.outcome is Outcome.UNSURE_MASK:
             self._unsure.add(frame)

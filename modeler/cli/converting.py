@@ -6,12 +6,10 @@ import json
 import sys
 from pathlib import Path
 
-import numpy as np
-
 from modeler import se3
 from modeler.cli.convert import Convert
 from modeler.cli.reading import reading, while_it_lasts
-from modeler.export import RunFolder
+from modeler.export import RunFolder, poses_of
 from modeler.export.files import write_atomically
 from modeler.export.tum import tum_text
 from modeler.types import InputError
@@ -23,10 +21,6 @@ UNITS_MM = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 10.0)
 
 LIVE_REACH_M = 16.0
 """What lies farther away of what a live camera sees is an error of its."""
-
-
-FARTHEST_M = 1e6
-"""No pose lies farther away."""
 
 
 def convert(options: Convert) -> int:
@@ -76,34 +70,19 @@ def _meta(sequence: AbstractSequence) -> dict[str, object]:
     return meta
 
 
-def _rigid(pose: np.ndarray) -> bool:
-    """Return whether a matrix (4, 4) of whatever numbers is a rigid motion."""
-    if not (np.abs(pose) < FARTHEST_M).all():  # not so of NaN
-        return False
-    return np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < 1e-6 and (pose[3] == (0.0, 0.0, 0.0, 1.0)).all()
-
-
 def _poses(run: Path, out: Path) -> int:
     """Write the poses of a run as BOP's scene_gt.json, with the object frame as model frame, or as TUM lines.
 
     Raises:
         InputError: where the report cannot be read or the file's ending says neither.
     """
-    report = RunFolder(run).report()
-    try:
-        entries = {int(entry["id"]): np.array(entry["object_from_camera"], float) for entry in report["poses"]}
-        poses = {index: entry.reshape(4, 4) for index, entry in entries.items()}
-        times_s = {int(frame["id"]): float(frame["timestamp"]) for frame in report["frames"]}
-        missing = poses.keys() - times_s.keys() or {index for index, pose in poses.items() if not _rigid(pose)}
-    except (KeyError, TypeError, ValueError):
-        missing, poses, times_s = {-1}, {}, {}
-    if missing:
-        raise InputError(f"{run / 'report.json'}: lacks frames, or poses that are any; build again with --overwrite")
+    report = RunFolder(run).result()
+    poses = {frame: pose.mean for frame, pose in poses_of(report).items()}
     if out.suffix == ".json":
         lines = (f' "{index}": {json.dumps([pose_entry(se3.inverse(pose))])}' for index, pose in poses.items())
         write_atomically(out, "{\n" + ",\n".join(lines) + "\n}\n")
     elif out.suffix == ".txt":
-        write_atomically(out, tum_text(poses, times_s))
+        write_atomically(out, tum_text(poses, {frame["id"]: frame["timestamp"] for frame in report["frames"]}))
     else:
         raise InputError(f"{out}: poses are written as scene_gt.json (BOP) or .txt (TUM); give --out such a name.")
     print(f"modeler: {len(poses)} poses: {out}", file=sys.stderr)

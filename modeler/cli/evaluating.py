@@ -8,14 +8,14 @@ from dataclasses import replace
 from typing import get_args
 
 from modeler import experiment
-from modeler.cli import compose
+from modeler.cli import compose, nonvisual
 from modeler.cli.console import bar
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.evaluating_models import evaluate_models, is_run, models_table
 from modeler.cli.options import Method
 from modeler.experiment import Experiment, Pairing, Summary
 from modeler.types import AbstractRegistrar, InputError
-from sequences import frame_range
+from sequences import frame_range, open_sequence
 from viz import figures
 
 
@@ -36,12 +36,14 @@ def evaluate(options: Evaluate) -> int:
         print(columns(models_table(evaluate_models(runs, options.out, options.seed)), left=3))
         return 0
     kept = frame_range(options.selection.frames)
-    recorded = [compose.open_sequence(path).select(options.selection.every, kept) for path in options.sequences]
+    recorded = [open_sequence(path).select(options.selection.every, kept) for path in options.sequences]
+    for sequence in recorded:
+        compose.check_region(options.where, sequence)
     # Tables are compared with each other: all sequences have the same prior, `general` if none is asked for.
     prior = replace(options.prior, prior=options.prior.prior or "general")
     plan = Experiment(
         methods=_methods(options.methods),
-        prior=compose.prior(prior, recorded[0] if len(recorded) == 1 else None),
+        prior=nonvisual.prior(prior, recorded[0] if len(recorded) == 1 else None),
         pairing=Pairing(_offsets(options.offsets), both_ways=options.both_ways, closed=options.closed),
         segmenter=compose.segmenter(options.where),
         points=options.points,
@@ -63,7 +65,8 @@ def evaluate(options: Evaluate) -> int:
 
 def table(rows: Sequence[Summary]) -> str:
     """Return summaries as text in columns; what nothing is known of is left out."""
-    heading = ("sequence", "method", "apart", "pairs", "usable", "right", "rot deg", "90 %", "max", "mm", "90 %", "max")
+    measured = tuple(f"{what} {share}" for what in ("deg", "mm") for share in ("50 %", "90 %", "max"))
+    heading = ("sequence", "method", "apart", "pairs", "usable", "right", *measured)
     cells = [
         (
             row.sequence,

@@ -22,6 +22,7 @@ def export(options: Export) -> None:
         InputError: where the options exclude each other, or something cannot be read or written.
     """
     _check(options)
+    files.RunFolder(options.run_folder).report()  # a sequence may hold a model.ply as well: the true one
     scan = _scan(options)
     if scan is None:
         model = files.read_model(files.mesh_of(options.run_folder))

@@ -20,7 +20,7 @@ from modeler.fusion import Fuser, Match, Matcher, own_covariances
 from modeler.graph import PoseGraph, solve
 from modeler.priors.bumps import Bumps
 from modeler.registration import VisibilityRegistrar
-from modeler.types import Array, Edge, InputError, Outcome, Posterior, Segmentation, Solution, Step
+from modeler.types import ACCEPTED, Array, Edge, InputError, Outcome, Posterior, Segmentation, Solution, Step
 from viz.stream import open_stream
 
 _SIGMA_RAD, _SIGMA_M = 0.12, 0.01  # how far off the laid models may be
@@ -209,7 +209,7 @@ def _written(
         view=last,
         posteriors=(),
         edges=(),
-        outcome="accepted",
+        outcome=ACCEPTED,
         solution=solution,
         model=model,
         edges_so_far=graph.edges,

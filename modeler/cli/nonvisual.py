@@ -104,6 +104,17 @@ def prior_name(options: PriorOptions, sequence: AbstractSequence | None) -> str:
     return kind if fits and kind in enough and enough[kind]() else "general"
 
 
+def told(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
+    """Return the name of the prior, and in words what was chosen or assumed without being asked for."""
+    name, said = prior_name(options, sequence), []
+    if options.prior is None and name != "general":
+        said.append(f"prior {name}, as sequence.json says")
+    step_deg = _number((sequence.motion or {}).get("step_deg"))
+    if "turntable" in name.split("+") and options.step_deg is None and step_deg is not None:
+        said.append(f"step {step_deg:g}°, as sequence.json says")
+    return name, "; ".join((*said, *sequence.notes))
+
+
 def _known(name: str, given: dict[str, Any], sequence: AbstractSequence | None) -> AbstractPrior:
     """Return a prior that is evidence, by its name."""
     match name:

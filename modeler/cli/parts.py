@@ -11,9 +11,8 @@ from typing import Any, final
 from modeler.cli import compose
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.export import RunFolder
-from modeler.pipeline import ACCEPTED
-from modeler.types import Array, InputError, RayImage
-from sequences import AbstractSequence, SensedSequence, read_noise
+from modeler.types import ACCEPTED, Array, InputError, RayImage
+from sequences import AbstractSequence, SensedSequence, open_sequence, read_noise
 
 _ALIKE = 0.02  # share by which the number of an object's points may change with the version of a library
 
@@ -107,7 +106,7 @@ def _parts(run: Path, places: deque[Path] | None) -> tuple[Part, ...]:
     where = Path(report["sequence"]) if places is None else places.popleft()
     if not where.exists():
         raise InputError(f"{where}: the sequence of {run} is not there; say where it is with --sequence")
-    whole = compose.open_sequence(where)
+    whole = open_sequence(where)
     whole = SensedSequence(whole, read_noise(Path(settings["sensor"]))) if "sensor" in settings else whole
     return (Part(run, report, whole),)
 

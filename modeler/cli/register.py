@@ -32,11 +32,14 @@ class Register:
 
     def run(self) -> int:
         """Register the pair; status 3 where the result would not become an edge."""
-        from modeler.cli import compose
+        from modeler.cli import compose, nonvisual
         from modeler.export import edge_record
         from modeler.types import Edge, InputError, Solution
+        from sequences import open_sequence
 
-        sequence = compose.open_sequence(self.sequence)
+        if self.source == self.target:
+            raise InputError(f"SOURCE and TARGET are both frame {self.source}; name two frames")
+        sequence = open_sequence(self.sequence)
         modeler = compose.modeler(sequence, self.prior, self.method, self.where)
         scene = compose.scene(modeler, sequence)
         views = []
@@ -50,7 +53,7 @@ class Register:
         edge = Edge(posterior, "odometry", posterior.usable, posterior.outcome.advice)
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}
         print(json.dumps(record, allow_nan=False))
-        _, remark = compose.told_prior(self.prior, sequence)
+        _, remark = nonvisual.told(self.prior, sequence)
         said = [f"{posterior.outcome.label} after {posterior.seconds:.2f} s", *([remark] if remark else [])]
         print(f"modeler: {'; '.join(said)}", file=sys.stderr)
         return 0 if posterior.usable else 3

@@ -27,6 +27,8 @@ def fault(report: Mapping[str, Any]) -> str | None:
             wrong = _wrong(record, tests) or _impossible(record)
             if wrong is not None:
                 return f"{wrong} of entry {place} of {name!r} is missing or is not what it should be"
+    if not {pose["id"] for pose in report["poses"]} <= {frame["id"] for frame in report["frames"]}:
+        return "'poses' has frames that 'frames' has not"
     wrong = _wrong(report["settings"], _SETTINGS, may_lack=frozenset(_SETTINGS))
     return None if wrong is None else f"{wrong} of 'settings' is not what it should be"
 

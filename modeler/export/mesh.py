@@ -29,7 +29,8 @@ def format_of(out: Path) -> str:
     """
     suffix = out.suffix.lower()
     if suffix not in FORMATS:
-        raise InputError(f"{out}: unknown mesh format {suffix or 'without an ending'!r}; use {', '.join(FORMATS)}")
+        what = f"unknown mesh format {suffix!r}" if suffix else "no ending says the mesh format"
+        raise InputError(f"{out}: {what}; use {', '.join(FORMATS)}")
     return suffix
 
 

@@ -77,7 +77,7 @@ def _posterior(edge: Mapping[str, Any]) -> Posterior:
         source=edge["source"],
         target=edge["target"],
         pose=_gaussian(edge),
-        modes=tuple(Mode(_number(mode["weight"]), _gaussian(mode)) for mode in edge.get("modes", ())),
+        modes=tuple(Mode(_number(mode["weight"]), _gaussian(mode)) for mode in edge.get("modes") or ()),
         outcome=Outcome(edge["outcome"]),
         overlap=_number(edge["overlap"]),
         information=None if information is None else _matrix(information, 6),

@@ -18,6 +18,9 @@ from modeler.types import ACCEPTED, Edge, Mode, RayImage, Solution, Step
 
 _SCHEMA = 1
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
+_LITTLE_OVERLAP = 0.5  # views farther apart are registered wrongly now and then, and surely so
+_UNSURE_DEG = 5.0  # standard deviation of a frame's turn beyond which the model shows a surface several times
+_OUTLIER = "the optimisation left it out: all other edges contradict it"
 
 
 def _versions() -> dict[str, str]:
@@ -164,11 +167,6 @@ def _taking_part(step: Step) -> list[Edge]:
 
 def _reason(edge: Edge, step: Step) -> str:
     return _OUTLIER if edge in step.solution.outliers else edge.reason
-
-
-_LITTLE_OVERLAP = 0.5  # views farther apart are registered wrongly now and then, and surely so
-_UNSURE_DEG = 5.0  # standard deviation of a frame's turn beyond which the model shows a surface several times
-_OUTLIER = "the optimisation left it out: all other edges contradict it"
 
 
 def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) -> dict[str, Any]:
