@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +14,7 @@ from modeler.closure.prospects import Outlook
 from modeler.closure.reckoning import came_back, onwards
 from modeler.closure.trust import Trust
 from modeler.closure.verdict import Agreement, Standard, flaw, modes, standard
-from modeler.closure.ways import Way, ways
+from modeler.closure.ways import Ways
 from modeler.types import Edge, EdgeKind, PoseGaussian, Posterior, Solution
 
 _NOWHERE = "neither the previous view nor another one places the frame with certainty"
@@ -72,23 +72,20 @@ class Closer:
         if self.max_closures == 0 or len(frames) < 2:
             return ()
         expected = past.solution.trajectory[base.target] @ modes(base)[0][1].mean
-        angle_deg = np.degrees(se3.rotation_angle(se3.inverse(past.poses(frames)) @ expected))
+        angle_deg = np.degrees(se3.rotation_angle(se3.inverse(past.all_poses) @ expected))
         own = self.trust.systematic(1, past.views[base.target].centroid_m)
         outlook = Outlook(past, base.target, expected, own, self.max_angle_deg)
-        near = [
-            number
-            for number, (frame, angle) in enumerate(zip(frames, angle_deg, strict=True))
-            if frame != base.target and outlook.within(frame, angle) >= _LEAST_CHANCE
-        ]
+        in_reach = outlook.within(frames, angle_deg) >= _LEAST_CHANCE
+        near = [int(number) for number in np.flatnonzero(in_reach) if frames[number] != base.target]
         chosen, spanned = [], False
         for prospect in outlook.prospects([frames[number] for number in near], angle_deg[near], self.min_gain_nats):
             if prospect.overlap >= self.min_overlap:
-                back = self._back(prospect.frame, base.source, outlook.reach, past.solution)
+                back = self._back(prospect.frame, base.source, outlook.reach, past)
                 if back or not spanned:  # one large step over many small ones is enough
                     chosen.append(prospect.frame)
                 spanned = spanned or not back
         first = frames[0]
-        if first in chosen or (last and 0 in near and self._back(first, base.source, outlook.reach, past.solution)):
+        if first in chosen or (last and 0 in near and self._back(first, base.source, outlook.reach, past)):
             chosen = [first, *(frame for frame in chosen if frame != first)]  # to close on the first is best
         return tuple(chosen[: self.max_closures])
 
@@ -146,10 +143,10 @@ class Closer:
             steps: how many frames lie between the previous view and this frame, this one counted.
         """
         base, base_reason = self.base(posteriors, past, steps=steps)
-        reach = ways(past.edges, past.solution, base.target) if base is not None and len(posteriors) > 1 else {}
+        reach = past.ways(base.target) if base is not None and len(posteriors) > 1 else Ways()
         edges, asked = [], self._asked(past)
         for number, posterior in enumerate(posteriors):
-            back = number > 0 and self._back(posterior.target, posterior.source, reach, past.solution)
+            back = number > 0 and self._back(posterior.target, posterior.source, reach, past)
             places = number == 0 or base is None or posterior is base
             kind: EdgeKind = "closure" if back else "odometry" if places else "span"
             if posterior is base:
@@ -165,16 +162,16 @@ class Closer:
 
     def spanning(self, posterior: Posterior, past: Past) -> Edge:
         """Return the judged edge between two views of the graph, from a registration that it does not hold yet."""
-        reach = ways(past.edges, past.solution, posterior.source)
-        kind = "closure" if self._back(posterior.target, posterior.source, reach, past.solution) else "span"
+        reach = past.ways(posterior.source)
+        kind = "closure" if self._back(posterior.target, posterior.source, reach, past) else "span"
         if (found := flaw(posterior, self._asked(past))) is not None:
             return Edge(posterior, kind, accepted=False, reason=found)
         foretold = [(1.0, past.solution.relative_gaussian(posterior.target, posterior.source))]
         length, centroid_m = reach[posterior.target].edges, past.views[posterior.source].centroid_m
         return _judged(posterior, kind, self.trust.agreement(posterior, foretold, length=length, centroid_m=centroid_m))
 
-    def _back(self, target: int, source: int, reach: Mapping[int, Way], solution: Solution) -> bool:
-        return came_back(target, source, reach, solution, away_deg=self.away_deg)
+    def _back(self, target: int, source: int, reach: Ways, past: Past) -> bool:
+        return came_back(target, source, reach, past, away_deg=self.away_deg)
 
     def _placing(self, past: Past, *, steps: int = 1) -> Placing:
         return Placing(past, self._asked(past), self.trust, self.max_angle_deg, steps)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from modeler.closure.ways import Network, Ways
 from modeler.types import Array, Edge, RayImage, Solution
 
 
@@ -21,11 +23,24 @@ class Past:
     edges: Sequence[Edge] = ()
     """Every edge judged so far."""
 
-    @property
+    @cached_property
     def frames(self) -> list[int]:
         """Numbers of the views that have a pose, in order of acceptance."""
         return [frame for frame in self.views if frame in self.solution.trajectory]
 
+    @cached_property
+    def all_poses(self) -> Array:
+        """object_from_camera (n, 4, 4) of these."""
+        return self.poses(self.frames)
+
+    def ways(self, start: int) -> Ways:
+        """Return the surest ways from a frame to all others."""
+        return self._network.ways(start)
+
     def poses(self, frames: Sequence[int]) -> Array:
         """Return object_from_camera (n, 4, 4) of frames."""
         return np.array([self.solution.trajectory[frame] for frame in frames]).reshape(-1, 4, 4)
+
+    @cached_property
+    def _network(self) -> Network:
+        return Network.of(self.edges, self.solution)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -13,7 +12,6 @@ from modeler.closure.past import Past
 from modeler.closure.reckoning import continued
 from modeler.closure.trust import Trust
 from modeler.closure.verdict import Standard, flaw, modes, stands
-from modeler.closure.ways import ways
 from modeler.types import Posterior
 
 
@@ -72,7 +70,7 @@ class Placing:
             posteriors: what was tried for the frame, the previous view first.
         """
         tried = [posterior.target for posterior in posteriors]
-        left = [frame for frame in self._frames if frame not in tried]
+        left = [frame for frame in self.past.frames if frame not in tried]
         if not left:
             return None
         poses = self.past.poses(left)
@@ -82,14 +80,10 @@ class Placing:
             if angle_deg.min() <= self.max_angle_deg:
                 return left[int(np.argmin(angle_deg))]
         if len(tried) == 1:
-            expected = continued(self.past.solution, self._frames, posteriors[0].source)
+            expected = continued(self.past.solution, self.past.frames, posteriors[0].source)
             return left[int(np.argmin(se3.rotation_angle(se3.inverse(poses) @ expected)))]
         apart = [se3.rotation_angle(se3.inverse(pose) @ poses) for pose in self.past.poses(tried)]
         return left[int(np.argmax(np.min(apart, axis=0)))]
-
-    @cached_property
-    def _frames(self) -> list[int]:
-        return self.past.frames
 
     def _follows(self, odometry: Posterior) -> bool:
         """Return whether the previous view's registration came to an end, and after lost frames matches like others."""
@@ -101,7 +95,7 @@ class Placing:
         # A pace that changes at random from step to step goes astray with the root of their number.
         if self._off_deg(posterior) > float(np.sqrt(self.steps)) * self.max_angle_deg:
             return None
-        reach = ways(self.past.edges, self.past.solution, posterior.target)
+        reach = self.past.ways(posterior.target)
         others = (other for other in standing if other is not posterior)
         agreeing = (
             other for other in others if self.trust.agreement_by_way_of(posterior, other, self.past, reach).agrees
@@ -110,8 +104,8 @@ class Placing:
 
     def _off_deg(self, posterior: Posterior) -> float:
         """Return the angle between where a registration puts a frame and where the motion going on would have."""
-        if len(self._frames) == 1:
+        if len(self.past.frames) == 1:
             return 0.0
-        expected = continued(self.past.solution, self._frames, posterior.source)
+        expected = continued(self.past.solution, self.past.frames, posterior.source)
         placed = self.past.solution.trajectory[posterior.target] @ modes(posterior)[0][1].mean
         return float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ placed)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +11,7 @@ from scipy.special import ndtr
 
 from modeler import se3
 from modeler.closure.past import Past
-from modeler.closure.ways import Way, ways
+from modeler.closure.ways import Ways
 from modeler.types import Array
 
 _ASKED = 6  # views whose motion's covariance is worked out: the most promising by a bound that costs little
@@ -54,22 +54,21 @@ class Outlook:
     edges have in common and no loop shows."""
 
     @cached_property
-    def reach(self) -> Mapping[int, Way]:
+    def reach(self) -> Ways:
         """The surest ways from the view that the new one hangs on."""
-        return ways(self.past.edges, self.past.solution, self.previous)
+        return self.past.ways(self.previous)
 
-    def within(self, frame: int, angle_deg: float) -> float:
-        """Return the chance that the turn to a view is no larger than views are registered across.
+    def within(self, frames: Sequence[int], angle_deg: Array) -> Array:
+        """Return the chances (n,) that the turns to views are no larger than views are registered across.
 
         Args:
-            frame: number of the view.
-            angle_deg: predicted rotation to it, believed as surely as the surest way there says.
+            frames: numbers of the views.
+            angle_deg: (n,) predicted rotations to them, believed as surely as the surest ways there say.
         """
-        if frame not in self.reach:
-            return 0.0
+        variance_rad2, _ = self.reach.to(frames)
         one_edge_rad2 = _rotation_variance(self._one_edge) if self.hangs and self._one_edge is not None else 0.0
-        sigma_deg = np.degrees(np.sqrt(self.reach[frame].variance_rad2 + one_edge_rad2))
-        return float(ndtr((self.max_angle_deg - angle_deg) / max(sigma_deg, 1e-6)))
+        sigma_deg = np.maximum(np.degrees(np.sqrt(variance_rad2 + one_edge_rad2)), 1e-6)
+        return np.where(np.isinf(variance_rad2), 0.0, ndtr((self.max_angle_deg - angle_deg) / sigma_deg))
 
     def prospects(self, frames: Sequence[int], angle_deg: Array, least_nats: float) -> list[Prospect]:
         """Return the most promising of `frames`, whose predicted rotations to the new view are `angle_deg` (n,).
@@ -88,24 +87,22 @@ class Outlook:
         one_edge = self._one_edge
         if one_edge is None:
             return []
-        variance_rad2 = _rotation_variance(one_edge)
-        own_rad2 = _rotation_variance(self.systematic)
-        bounded = []
-        for frame, angle in zip(frames, angle_deg, strict=True):
-            if frame in self.reach:
-                way = self.reach[frame]
-                ratio = float(self.hangs) + (way.variance_rad2 + way.edges * own_rad2) / variance_rad2
-                bound_nats = 3.0 * self._chance(frame, angle) * np.log1p(self._tells(angle) * ratio)
-                bounded.append((float(bound_nats), frame, float(angle)))
+        chance, tells = self._chance(frames, angle_deg), self._tells(angle_deg)
+        way_rad2, length = self.reach.to(frames)
+        known_rad2 = np.where(chance > 0.0, way_rad2 + length * _rotation_variance(self.systematic), 0.0)
+        ratio = float(self.hangs) + known_rad2 / _rotation_variance(one_edge)
+        bound_nats = 3.0 * chance * np.log1p(tells * ratio)
+        order = np.lexsort((np.array(frames), bound_nats))[::-1]
         found = []
-        for _, frame, angle in sorted((b for b in bounded if b[0] >= least_nats), reverse=True)[:_ASKED]:
+        for place in order[bound_nats[order] >= least_nats][:_ASKED]:
+            frame = frames[place]
             overlap = self._overlap(frame)
             known = self.past.solution.relative_covariance(frame, self.previous)
-            known = known + float(self.hangs) * one_edge + self.reach[frame].edges * self.systematic
-            ratio = overlap * self._tells(angle) * np.linalg.solve(one_edge, known)
-            gain_nats = self._chance(frame, angle) * 0.5 * float(np.linalg.slogdet(np.eye(6) + ratio)[1])
+            known = known + float(self.hangs) * one_edge + float(length[place]) * self.systematic
+            more = overlap * tells[place] * np.linalg.solve(one_edge, known)
+            gain_nats = 0.5 * float(chance[place] * np.linalg.slogdet(np.eye(6) + more)[1])
             if gain_nats >= least_nats:
-                found.append(Prospect(frame, angle, overlap, gain_nats))
+                found.append(Prospect(frame, float(angle_deg[place]), overlap, gain_nats))
         return sorted(found, key=lambda prospect: -prospect.gain_nats)
 
     @cached_property
@@ -115,14 +112,14 @@ class Outlook:
         recent = [self.past.solution.pose_of(edge).covariance for edge in edges]
         return np.asarray(np.mean(recent, axis=0) + self.systematic) if recent else None
 
-    def _tells(self, angle_deg: float) -> float:
-        """Return how much an edge over an angle tells, against one over none."""
-        return float(np.cos(np.radians(min(angle_deg, self.max_angle_deg))) ** self.power)
+    def _tells(self, angle_deg: Array) -> Array:
+        """Return how much edges over angles (n,) tell, against one over none."""
+        return np.cos(np.radians(np.minimum(angle_deg, self.max_angle_deg))) ** self.power
 
-    def _chance(self, frame: int, angle_deg: float) -> float:
-        """Return the chance that an edge is found."""
-        shown_again = np.cos(0.5 * np.radians(min(angle_deg, self.max_angle_deg))) ** 2
-        return float(shown_again) * self.within(frame, angle_deg)
+    def _chance(self, frames: Sequence[int], angle_deg: Array) -> Array:
+        """Return the chances (n,) that edges are found."""
+        shown_again = np.cos(0.5 * np.radians(np.minimum(angle_deg, self.max_angle_deg))) ** 2
+        return shown_again * self.within(frames, angle_deg)
 
     def _overlap(self, frame: int) -> float:
         """Return the share of a view's surface that should face the new view's camera."""

@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from modeler import se3
-from modeler.closure.ways import Way, along
+from modeler.closure.past import Past
+from modeler.closure.ways import Ways
 from modeler.types import Array, PoseGaussian, Solution
 
 
-def came_back(target: int, source: int, reach: Mapping[int, Way], solution: Solution, *, away_deg: float) -> bool:
+def came_back(target: int, source: int, reach: Ways, past: Past, *, away_deg: float) -> bool:
     """Return whether the object turned well away from a view before another frame, or on the way between the two.
 
     Args:
         target: number of the view.
         source: number of the other frame.
         reach: ways from the view that it hangs on.
-        solution: the poses so far.
+        past: what is known so far.
         away_deg: what counts as well away.
     """
-    frames = {frame for frame in solution.trajectory if min(target, source) < frame < max(target, source)}
-    frames |= set(along(reach, target))
-    rotations = np.stack([solution.trajectory[frame][:3, :3] for frame in (target, *frames)])
-    cosine = 0.5 * (np.einsum("ij,nij->n", rotations[0], rotations) - 1.0)
-    return bool(cosine.min() <= np.cos(np.radians(away_deg)))
+    frames = np.array(past.frames)
+    between = (frames > min(target, source)) & (frames < max(target, source))
+    rotations = [past.all_poses[between, :3, :3], past.poses(reach.along(target))[:, :3, :3]]
+    cosine = 0.5 * (np.tensordot(np.concatenate(rotations), past.solution.trajectory[target][:3, :3], 2) - 1.0)
+    return bool(cosine.min(initial=1.0) <= np.cos(np.radians(away_deg)))
 
 
 def onwards(way: PoseGaussian, motion: PoseGaussian) -> PoseGaussian:

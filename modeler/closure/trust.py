@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from modeler import se3
 from modeler.closure.past import Past
 from modeler.closure.reckoning import onwards
 from modeler.closure.verdict import Agreement, agreement, modes
-from modeler.closure.ways import Way
+from modeler.closure.ways import Ways
 from modeler.types import Array, PoseGaussian, Posterior
 
 
@@ -65,7 +65,7 @@ class Trust:
         base: Posterior,
         posterior: Posterior,
         past: Past,
-        reach: Mapping[int, Way],
+        reach: Ways,
     ) -> Agreement:
         """Return how well a registration of a frame agrees with the way through the graph and along another of it.
 

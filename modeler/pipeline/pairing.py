@@ -43,8 +43,8 @@ class Pairing:
             last: whether it is the last.
             again: whether it was tried before: then no others are tried to place it.
         """
-        steps = state.steps(view.index, previous)
-        prior, known = self.prior.learned(state.solution, state.graph.edges), state.graph.edges
+        steps, known = state.steps(view.index, previous), state.graph.edges
+        prior = self.prior.learned(state.solution, known)
         odometry = self._pair(state, view, previous, prior.grown(steps) if steps > 1 else prior)
         posteriors = (odometry,)
         base, _ = self.closer.base(posteriors, state.past, steps=steps)
@@ -54,7 +54,7 @@ class Pairing:
         if base is None:
             return posteriors
         tried = {previous, *(posterior.target for posterior in posteriors)}
-        tried |= {edge.target for edge in known if edge.source == view.index}
+        tried |= {edge.target for edge in known if edge.source == view.index} if again else set()
         targets = self.closer.closures(base, state.past, last=last)
         targets = [target for target in targets if target not in tried]
         foreseen = [ForeseenPrior(prior, self.closer.foreseen(base, target, state.solution)) for target in targets]

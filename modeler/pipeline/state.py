@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 from modeler.closure import Past
 from modeler.fusion import Growing
@@ -50,7 +51,7 @@ class State:
         """The poses so far."""
         return self.smoother.solution
 
-    @property
+    @cached_property
     def past(self) -> Past:
         """What closures are chosen and judged by."""
         return Past(self.views, self.solution, self.graph.edges)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -26,6 +27,11 @@ class PoseGaussian:
     def inverse(self) -> PoseGaussian:
         """Return the Gaussian of the inverse motion."""
         return PoseGaussian(se3.inverse(self.mean), se3.inverse_covariance(self.mean, self.covariance))
+
+    @cached_property
+    def rotation_variance_rad2(self) -> float:
+        """Variance of the rotation, summed over its three directions."""
+        return float(self.covariance[0, 0] + self.covariance[1, 1] + self.covariance[2, 2])
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 from modeler import se3
@@ -67,7 +68,11 @@ class Solution:
 
     def takes_part(self, edge: Edge) -> bool:
         """Return whether an edge was accepted and the optimisation did not leave it out since."""
-        return edge.accepted and edge not in self.outliers
+        return edge.accepted and edge not in self._left_out
+
+    @cached_property
+    def _left_out(self) -> frozenset[Edge]:
+        return frozenset(self.outliers)
 
     def pose_of(self, edge: Edge) -> PoseGaussian:
         """Return target_from_source of an edge as it took part: of several modes, as all edges together have it."""
