@@ -11,7 +11,7 @@ from modeler.fusion.stack import Stack
 from modeler.kernels import fusion, isosurface
 from modeler.types import Array
 
-MOST = 15  # of the 26 neighbours of a voxel
+MOST_NEIGHBOURS = 15  # of the 26 of a voxel
 FAINT = 1e-3  # weight of a voxel that only its neighbours know
 
 
@@ -85,7 +85,7 @@ def measure(grid: Grid, views: Stack, *, tau_m: float, empty_weight: float) -> F
 
 def filled(field: Field) -> Field:
     """Return the field with gaps of a few voxels closed: unknown voxels that most of their neighbours know."""
-    cells, means = isosurface.fill(field.values_m, field.weights, field.known, MOST)
+    cells, means = isosurface.fill(field.values_m, field.weights, field.known, MOST_NEIGHBOURS)
     if not len(cells):
         return field
     values, weights = field.values_m.copy(), field.weights.copy()

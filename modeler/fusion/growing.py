@@ -19,7 +19,7 @@ from modeler.types import Array, ObjectModel, RayImage
 if TYPE_CHECKING:
     from modeler.fusion.fuser import Fuser
 
-FAINT = 0.02  # weight below which nothing is known of a voxel; what taking back leaves is far less
+KNOWN = 0.02  # weight from which on something is known of a voxel; what taking a view back leaves is far less
 MARGIN_PX = 8  # what a view saw empty is used so far around the object
 UNIT = 8  # the box grows by so many voxels
 BULK = (0.005, 0.995)  # points outside these quantiles do not stretch the box
@@ -97,7 +97,7 @@ class Growing:
     def model(self) -> ObjectModel:
         """Return the surface as a mesh, and its vertices as the cloud."""
         weights = self.sums[..., 0].copy()
-        weights[weights < FAINT] = 0.0
+        weights[weights < KNOWN] = 0.0
         for axis in range(3):
             np.moveaxis(weights, axis, 0)[[0, -1]] = 0.0
         known = weights > 0.0
@@ -121,11 +121,11 @@ class Growing:
 
     def _colours(self, places: Array) -> npt.NDArray[np.uint8] | None:
         """Return the RGB (n, 3) of the voxels nearest to places in voxels, None where there is no colour at all."""
-        if not np.any(self.sums[..., 2] > FAINT):
+        if not np.any(self.sums[..., 2] > KNOWN):
             return None
         told = self.sums[tuple(np.rint(places).astype(np.int64).T)]
         share = told[:, 2:3]
-        mean = np.where(share > FAINT, told[:, 3:] / np.maximum(share, FAINT), GREY)
+        mean = np.where(share > KNOWN, told[:, 3:] / np.maximum(share, KNOWN), GREY)
         return np.clip(np.rint(mean), 0.0, 255.0).astype(np.uint8)
 
     def _box(self, pairs: list[tuple[RayImage, Array]]) -> tuple[Corner, Corner]:
@@ -150,7 +150,7 @@ class Growing:
 
     def _tell(self, view: RayImage, place: _Place, sign: float) -> None:
         """Add to the sums, in place, what a view says from its place, or take it back."""
-        index, free_m, lens = _images(view)
+        index, free_m, lens = _images(view, self.how.margin_px)
         cosine = -np.sum(view.points_m * view.normals, axis=1) / np.linalg.norm(view.points_m, axis=1)
         colours = np.ones((len(view.points_m), 4))
         colours[:, :3] = colours_at(view)
@@ -179,7 +179,7 @@ def _corner(numbers: npt.NDArray[np.int64]) -> Corner:
     return int(numbers[0]), int(numbers[1]), int(numbers[2])
 
 
-def _images(view: RayImage) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32], Array]:
+def _images(view: RayImage, margin_px: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32], Array]:
     """Return a view's number of the surface point at a pixel, its empty space, and its lens, cut to the object."""
     camera, depth_m = view.frame.camera, view.frame.depth_m
     low = np.maximum(view.pixels.min(axis=0) - MARGIN_PX, 0)
@@ -188,7 +188,7 @@ def _images(view: RayImage) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float
     measured = np.isfinite(cut) & (cut > 0.0)
     index = np.full(cut.shape, -1, dtype=np.int32)
     index[tuple((view.pixels - low).T)] = np.arange(len(view.pixels))
-    reach_m = minimum_filter(np.where(measured, cut, np.inf), size=5, mode="nearest")
+    reach_m = minimum_filter(np.where(measured, cut, np.inf), size=2 * margin_px + 1, mode="nearest")
     lens = np.array([camera.fx, camera.fy, camera.cx - low[1], camera.cy - low[0]])
     return index, np.where(measured, reach_m, 0.0).astype(np.float32), lens
 

@@ -11,9 +11,8 @@ from modeler.fusion.stack import GREY, Stack
 from modeler.kernels import fusion
 from modeler.types import Array
 
-PRIOR_VIEWS = (
-    3.0  # the noise at a point is that of all points as if so many views had shown it, until its own tell more
-)
+# The noise at a point is that of all points as if so many views had shown it, until its own tell more.
+PRIOR_VIEWS = 3.0
 BATCH = 1 << 18  # points asked at a time
 
 

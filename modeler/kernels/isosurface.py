@@ -36,9 +36,8 @@ def _pieces() -> np.ndarray:
             inside = [bool(case >> corner & 1) for corner in face]
             edges = [_edge(face[k], face[(k + 1) % 4]) for k in range(4)]
             crossed = [edges[k] for k in range(4) if inside[k] != inside[(k + 1) % 4]]
-            if (
-                len(crossed) == 4
-            ):  # join the inside: cut off the outside corners, each with the two edges that meet there
+            if len(crossed) == 4:
+                # Join the inside: cut off the outside corners, each with the two edges that meet there.
                 pairs = [(edges[k - 1], edges[k]) for k in range(4) if not inside[k]]
             else:
                 pairs = [(crossed[0], crossed[1])] if crossed else []
@@ -107,24 +106,33 @@ def extract(values, totals, cells, pieces):
         cells: (n, 3) known voxels, in ascending order.
         pieces: `PIECES`.
     """
-    # First the vertices: one for each piece in each cell whose eight corners are known.
+    first, cases, count = _numbered(values, totals, cells, pieces)
+    vertices, quads = _vertices(values, cells, pieces, first, cases, count)
+    return vertices, _triangles(values, cells, pieces, first, cases, vertices, quads)
+
+
+@njit(cache=True)
+def _numbered(values, totals, cells, pieces):
+    """Return the number of each cell's first vertex, -1 = none, its case, and how many vertices there are.
+
+    A vertex stands for each piece in each cell whose eight corners are known.
+    """
     first = np.full(values.shape, -1, dtype=np.int32)
     cases = np.zeros(values.shape, dtype=np.uint8)
     count = 0
     for n in range(len(cells)):
         i, j, k = cells[n, 0], cells[n, 1], cells[n, 2]
-        case, known = 0, True
-        for c in range(8):
-            a, b, d = i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1)
-            if totals[a, b, d] == 0.0:
-                known = False
-                break
-            if values[a, b, d] < 0.0:
-                case |= 1 << c
-        if known and 0 < case < 255:
+        case = _case(values, totals, i, j, k)
+        if 0 < case < 255:
             cases[i, j, k] = case
             first[i, j, k] = count
             count += np.max(pieces[case]) + 1
+    return first, cases, count
+
+
+@njit(cache=True)
+def _vertices(values, cells, pieces, first, cases, count):
+    """Return the mean (v, 3) of where each piece crosses edges, and the number of edges that quads may lie around."""
     vertices = np.zeros((count, 3))
     crossings = np.zeros(count)
     quads = 0
@@ -137,13 +145,7 @@ def extract(values, totals, cells, pieces):
             if piece < 0:
                 continue
             axis, a, b = edge // 4, (edge >> 1) & 1, edge & 1
-            x, y, z = i, j, k
-            if axis == 0:
-                y, z = y + a, z + b
-            elif axis == 1:
-                x, z = x + a, z + b
-            else:
-                x, y = x + a, y + b
+            x, y, z = _beside(i, j, k, axis, a, b)
             start = values[x, y, z]
             stop = values[x + (axis == 0), y + (axis == 1), z + (axis == 2)]
             share = start / (start - stop)
@@ -152,13 +154,18 @@ def extract(values, totals, cells, pieces):
             vertices[v, 1] += y + (share if axis == 1 else 0.0)
             vertices[v, 2] += z + (share if axis == 2 else 0.0)
             crossings[v] += 1.0
-            if a == 1 and b == 1:
-                quads += 1
+            quads += a & b
     for v in range(count):
-        for c in range(3):
-            vertices[v, c] /= crossings[v]
+        vertices[v] /= crossings[v]
+    return vertices, quads
 
-    # Then a quad around every crossed edge: seen by the cell that has it as its last one, and its three neighbours.
+
+@njit(cache=True)
+def _triangles(values, cells, pieces, first, cases, vertices, quads):
+    """Return the triangles (t, 3) of a quad around every crossed edge whose four cells are known.
+
+    An edge is seen by the cell that has it as its last one along its axis.
+    """
     triangles = np.empty((2 * quads, 3), dtype=np.int64)
     corner = np.empty(4, dtype=np.int64)
     count = 0
@@ -169,17 +176,10 @@ def extract(values, totals, cells, pieces):
         for axis in range(3):
             if pieces[cases[i, j, k], 4 * axis + 3] < 0:
                 continue
-            x, y, z = i + (axis != 0), j + (axis != 1), k + (axis != 2)  # where the edge starts
             known = True
             for turn in range(4):  # the cells around the edge, counter-clockwise in the plane of the two other axes
-                one, two = (turn == 1 or turn == 2), turn >= 2
-                p, q, r = i, j, k
-                if axis == 0:
-                    q, r = q + one, r + two
-                elif axis == 1:
-                    p, r = p + one, r + two
-                else:
-                    p, q = p + one, q + two
+                one, two = int(turn == 1 or turn == 2), int(turn >= 2)
+                p, q, r = _beside(i, j, k, axis, one, two)
                 if first[p, q, r] < 0:
                     known = False
                     break
@@ -187,6 +187,7 @@ def extract(values, totals, cells, pieces):
                 corner[turn] = first[p, q, r] + pieces[cases[p, q, r], edge]
             if not known:
                 continue
+            x, y, z = _beside(i, j, k, axis, 1, 1)  # where the edge starts
             # x × z points against y, so the middle axis turns the other way round.
             if (values[x, y, z] >= 0.0) != (axis == 1):
                 corner[1], corner[3] = corner[3], corner[1]
@@ -200,7 +201,17 @@ def extract(values, totals, cells, pieces):
                 triangles[count, 1] = corner[(shift + 1 + half) % 4]
                 triangles[count, 2] = corner[(shift + 2 + half) % 4]
                 count += 1
-    return vertices, triangles[:count]
+    return triangles[:count]
+
+
+@njit(cache=True)
+def _beside(i, j, k, axis, one, two):
+    """Return the voxel that lies some steps beside another, along the two axes beside `axis` in ascending order."""
+    if axis == 0:
+        return i, j + one, k + two
+    if axis == 1:
+        return i + one, j, k + two
+    return i + one, j + two, k
 
 
 @njit(cache=True)
@@ -235,27 +246,7 @@ def pinched(values, totals, cells, pieces):
             c, d = bool(case & (1 << (step | one | two))), bool(case & (1 << (step | two)))
             if a != c or b != d or a == b:
                 continue
-            # The face's edges along the two other axes, as each cell numbers them.
-            joined = True
-            for cell in range(2):
-                level = 1 - cell
-                table = pieces[case] if cell == 0 else pieces[beyond]
-                first = -1
-                for other in range(3):
-                    if other == axis:
-                        continue
-                    for side in range(2):
-                        # Offsets along the two axes beside `other`, in ascending order.
-                        if axis < 3 - other - axis:
-                            edge = 4 * other + 2 * level + side
-                        else:
-                            edge = 4 * other + 2 * side + level
-                        piece = table[edge]
-                        if first < 0:
-                            first = piece
-                        elif piece != first:
-                            joined = False
-            if not joined:
+            if not (_joined(pieces[case], axis, 1) and _joined(pieces[beyond], axis, 0)):
                 continue
             # Of the two corners outside, the one that is less so.
             best, least = -1, np.inf
@@ -266,13 +257,34 @@ def pinched(values, totals, cells, pieces):
                 value = values[i + (number >> 2), j + ((number >> 1) & 1), k + (number & 1)]
                 if value < least:
                     best, least = number, value
-            found[count, 0], found[count, 1], found[count, 2] = (
-                i + (best >> 2),
-                j + ((best >> 1) & 1),
-                k + (best & 1),
-            )
+            found[count, 0] = i + (best >> 2)
+            found[count, 1] = j + ((best >> 1) & 1)
+            found[count, 2] = k + (best & 1)
             count += 1
     return found[:count]
+
+
+@njit(cache=True)
+def _joined(table, axis, level):
+    """Return whether all four edges of a cell's face belong to one piece.
+
+    Args:
+        table: (12,) piece of each edge, a row of `PIECES`.
+        axis: along which the face is perpendicular.
+        level: 0 = the face on the cell's lower side, 1 = on its upper.
+    """
+    first = -1
+    for other in range(3):
+        if other == axis:
+            continue
+        for side in range(2):
+            # Offsets along the two axes beside `other`, in ascending order.
+            edge = 4 * other + (2 * level + side if axis < 3 - other - axis else 2 * side + level)
+            if first < 0:
+                first = table[edge]
+            elif table[edge] != first:
+                return False
+    return True
 
 
 @njit(cache=True)

@@ -7,7 +7,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types import Array, Plane
+from modeler.types import Array, BoolArray, Plane
 
 Real = TypeVar("Real", bound=np.floating[Any])
 
@@ -49,22 +49,11 @@ def fit_plane(
     if len(points) < _MIN_POINTS:
         return None
     sigma = np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), len(points))
-    weight = 1.0 / sigma**2
-    widths = [1.0] * 4
-    if guess is None:
-        # Trim from the outside in: start at the scale the points show, end at the noise.
-        plane = least_squares(points, weight)
-        shown = 1.5 * float(np.median(np.abs(heights(points, plane)) / sigma))
-        widths = [max(1.0, shown / 2**k) for k in range(6)] + widths
-    else:
-        plane = np.asarray(guess, dtype=np.float64)
-    inlier = np.zeros(len(points), dtype=np.bool_)
-    for width in widths:
-        inlier = np.abs(heights(points, plane)) < _TRIM * width * sigma
-        if np.count_nonzero(inlier) < _MIN_POINTS:
-            return None
-        plane = least_squares(points[inlier], weight[inlier])
-    near, weight = points[inlier], weight[inlier]
+    found = _trimmed(points, sigma, guess)
+    if found is None:
+        return None
+    plane, inlier = found
+    near, weight = points[inlier], sigma[inlier] ** -2.0
     centre = np.average(near, axis=0, weights=weight)
     axes = np.linalg.svd(plane[None, :3])[2][1:]
     uv = (near - centre) @ axes.T
@@ -79,6 +68,25 @@ def fit_plane(
     share = _SYSTEMATIC_SHARE * float(np.linalg.norm(foot))
     offset = at_foot @ covariance @ at_foot + _SYSTEMATIC_OFFSET_M**2 + share**2
     return Plane(plane[:3], float(plane[3]), float(np.sqrt(tilt)), float(np.sqrt(offset)))
+
+
+def _trimmed(points: Array, sigma: Array, guess: Array | None) -> tuple[Array, BoolArray] | None:
+    """Return the plane (4,) of the points (n, 3) that agree and which (n,) these are; None where they are too few."""
+    weight, widths = sigma**-2.0, [1.0] * 4
+    if guess is None:
+        # Trim from the outside in: start at the scale the points show, end at the noise.
+        plane = least_squares(points, weight)
+        shown = 1.5 * float(np.median(np.abs(heights(points, plane)) / sigma))
+        widths = [max(1.0, shown / 2**k) for k in range(6)] + widths
+    else:
+        plane = np.asarray(guess, dtype=np.float64)
+    inlier = np.zeros(len(points), dtype=np.bool_)
+    for width in widths:
+        inlier = np.abs(heights(points, plane)) < _TRIM * width * sigma
+        if np.count_nonzero(inlier) < _MIN_POINTS:
+            return None
+        plane = least_squares(points[inlier], weight[inlier])
+    return plane, inlier
 
 
 def least_squares(points: Array, weight: Array) -> Array:
