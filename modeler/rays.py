@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler.kernels import planes
-from modeler.types import Array, Frame, Plane, RayImage
+from modeler.kernels.silhouette import silhouette_distance
+from modeler.types import Frame, Plane, RayImage
 
 
 @dataclass(frozen=True)
@@ -45,17 +46,12 @@ class Sensor:
         cells = planes.local_planes(
             depth_m,
             mask,
-            planes.silhouette_distance(outline, self.max_silhouette_px),
+            silhouette_distance(outline, self.max_silhouette_px),
             intrinsics,
             ball,
             sigma_inverse,
         )
-        smooth = cells[rows, columns, planes.KIND] == planes.SURFACE
-        rows, columns = rows[smooth], columns[smooth]
-        points_m, normals = surface_points(cells, rows, columns, intrinsics)
-        cosine = -_dot(points_m, normals) / np.sqrt(_dot(points_m, points_m))
-        frontal = cosine > self.min_cosine
-        rows, columns, points_m, normals = rows[frontal], columns[frontal], points_m[frontal], normals[frontal]
+        points_m, normals, pixels, variance_m2 = planes.frontal_points(cells, mask, intrinsics, self.min_cosine)
         return RayImage(
             frame=frame,
             plane=plane,
@@ -63,8 +59,8 @@ class Sensor:
             sigma_r_m=self.sigma_r_m,
             points_m=points_m,
             normals=normals,
-            pixels=np.stack([rows, columns], axis=1),
-            layers={"cells": cells, "variance_m2": cells[rows, columns, planes.VARIANCE].astype(np.float64)},
+            pixels=pixels,
+            layers={"cells": cells, "variance_m2": variance_m2},
         )
 
     def _smoothing(self, frame: Frame, rows: np.ndarray, columns: np.ndarray) -> tuple[tuple[float, int, int], float]:
@@ -95,18 +91,3 @@ def _places(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     top, bottom, left, right = planes.bounds(mask)
     rows, columns = np.nonzero(mask[top:bottom, left:right])
     return rows + top, columns + left
-
-
-def surface_points(cells: np.ndarray, rows: np.ndarray, columns: np.ndarray, intrinsics: Array) -> tuple[Array, Array]:
-    """Return the points (n, 3) in m where pixels' rays meet their local planes, and the planes' normals (n, 3)."""
-    fx, fy, cx, cy = intrinsics
-    normals = cells[rows, columns, : planes.NORMAL_Z + 1].astype(np.float64)
-    distance_m = cells[rows, columns, planes.DISTANCE].astype(np.float64)
-    rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones(len(rows))], axis=1)
-    points_m = rays * (-distance_m / _dot(normals, rays))[:, None]
-    return points_m, normals / np.sqrt(_dot(normals, normals))[:, None]
-
-
-def _dot(a: Array, b: Array) -> Array:
-    """Return the products (n,) of vectors (n, 3)."""
-    return np.einsum("ni,ni->n", a, b)

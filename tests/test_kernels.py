@@ -5,10 +5,13 @@ import os
 import naive
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from modeler import kernels, se3
 from modeler.kernels import matching, mixture, paper, patches, planes, ridges, visibility
 from modeler.kernels.sight import Sight, buffers
+from modeler.kernels.silhouette import silhouette_distance
+from modeler.registration.mixture import Gaussians
 from modeler.se3 import matrices, rows
 
 INTRINSICS = np.array([40.0, 42.0, 9.3, 7.1])
@@ -243,9 +246,9 @@ def test_a_noise_free_plane_is_found_whatever_its_tilt():
 def test_silhouette_distance_is_euclidean_within_the_chamfer_error(rng):
     mask = rng.random((40, 50)) < 0.004
     mask[20, 25] = True
-    got, want = planes.silhouette_distance(mask, 60.0), naive.silhouette_distance(mask)
+    got, want = silhouette_distance(mask, 60.0), naive.silhouette_distance(mask)
     assert (np.abs(got - want) <= 0.09 * want + 1e-5).all()
-    np.testing.assert_array_equal(planes.silhouette_distance(mask, 3.0), np.minimum(got, 3.0))
+    np.testing.assert_allclose(silhouette_distance(mask, 3.0), np.minimum(got, 3.0), atol=1e-4)
 
 
 def test_compiled_kernels_older_than_any_source_are_dropped(tmp_path):
@@ -276,6 +279,23 @@ def test_of_a_crowd_the_first_are_kept(rng, crowd):
         before = kept[kept < number]
         assert (number in kept) == (near[before, number].sum() < crowd)
     np.testing.assert_array_equal(mixture.uncrowded(rows(poses), sigmas, centre_m, crowd, 5), kept[:5])
+
+
+@pytest.mark.parametrize("sigma_rad", [0.01, 0.5, 3.0])
+def test_densities_of_a_mixture_leave_out_nothing_that_counts(rng, sigma_rad):
+    """However far apart the Gaussians lie, and where no pose is near any of them."""
+    centre_m = np.array([0.1, 0.0, 0.8])
+    means, poses = (np.stack([random_pose(rng, sigma_rad) for _ in range(count)]) for count in (12, 50))
+    spreads = np.linalg.cholesky(np.stack([0.01 * np.cov(rng.normal(size=(6, 20))) for _ in means]))
+    log_weights = rng.normal(0.0, 3.0, len(means))
+    want = np.empty((len(means), len(poses)))
+    for k, (mean, spread) in enumerate(zip(means, spreads, strict=True)):
+        xi = se3.difference(mean, poses, centre_m)
+        half_rad = 0.5 * np.linalg.norm(xi[:, :3], axis=1)
+        want[k] = log_weights[k] + multivariate_normal.logpdf(xi, cov=spread @ spread.T)
+        want[k] += 4.0 * np.log(half_rad / np.sin(half_rad))
+    got = Gaussians(means, spreads, log_weights, centre_m).log_density(poses)
+    np.testing.assert_allclose(got, np.logaddexp.reduce(want, axis=0), rtol=1e-9, atol=1e-9)
 
 
 def test_distances_are_in_standard_deviations(rng):

@@ -196,6 +196,14 @@ def normal_equations(poses, forward, backward, centre, surface_m):
     return gradients, matrices
 
 
+@numba.njit(cache=True)
+def normal_equation(pose, forward, backward, centre, surface_m):
+    """Return the gradient (6,) and the matrix (6, 6) of one pose (12,): to wake other threads would take longer."""
+    gradient, matrix = np.empty(6), np.empty((6, 6))
+    equations(pose, forward, backward, centre, surface_m, workroom(forward, backward), gradient, matrix)
+    return gradient, matrix
+
+
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def descend(poses, forward, backward, centre, surface_m, pull, steps):
     """Return poses (m, 12) after so many damped Gauss-Newton steps, each held by a `Pull`; see `equations`."""
@@ -207,19 +215,16 @@ def descend(poses, forward, backward, centre, surface_m, pull, steps):
         for i in range(number * group, min((number + 1) * group, poses.shape[0])):
             for _ in range(steps):
                 equations(moved[i], forward, backward, centre, surface_m, room, gradient, matrix)
-                held_step(moved[i], pull, centre, gradient, matrix, step, rotation)
+                held_step(moved[i], pull, centre, gradient, matrix, step)
                 turn(moved[i], step, centre, rotation, further)
                 moved[i] = further
     return moved
 
 
 @numba.njit(cache=True)
-def held_step(pose, pull, centre, gradient, matrix, step, rotation):
-    """Write the Gauss-Newton step (6,) of a pose (12,) from its normal equations, and a pull; spoils the matrix.
-
-    Room for a rotation (3, 3) is handed in.
-    """
-    away = difference(pull.mean, pose, centre, rotation)
+def held_step(pose, pull, centre, gradient, matrix, step):
+    """Write the Gauss-Newton step (6,) of a pose (12,) from its normal equations, and a pull; spoils the matrix."""
+    away = difference(pull.mean, pose, centre)
     for k in range(6):
         step[k] = gradient[k]
         for m in range(6):

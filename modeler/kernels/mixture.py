@@ -10,42 +10,83 @@ from modeler.kernels.moves import difference
 _NEGLIGIBLE = 40.0  # nats below the best Gaussian
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def log_densities(poses, means, roots, log_weights, centre):
+@numba.njit(cache=True, error_model="numpy")
+def log_densities(poses, means, roots, widths, log_weights, centre):
     """Return the log density (n,) at each pose, with respect to the uniform measure of rotation (rad³) and translation.
+
+    The trace of a rotation and the way of the centre bound how far a pose is from a Gaussian at least: the most
+    promising one is worked out first, and then only those that may not be negligible beside it.
 
     Args:
         poses: (n, 12) upper three rows of their matrices.
         means: (k, 12) of the components, likewise.
         roots: (k, 6, 6) upper triangular R with RᵀR the precision of ξ = log(mean⁻¹ pose) about the centre.
+        widths: (k, 2) largest variances of a rotation and of a translation.
         log_weights: (k,) of any sum of exponentials.
         centre: (3,) point in m.
     """
-    log_tops = log_weights - 3.0 * math.log(2.0 * math.pi)
-    for k in range(len(means)):
+    count = len(means)
+    log_tops, bounds, places = np.empty(count), np.empty(count), np.empty((count, 3))
+    for k in range(count):
+        log_tops[k] = log_weights[k] - 3.0 * math.log(2.0 * math.pi)
         for u in range(6):
             log_tops[k] += math.log(roots[k, u, u])
-    result = np.empty(poses.shape[0])
-    for i in numba.prange(poses.shape[0]):
-        total, top, r = 0.0, -np.inf, np.empty((3, 3))
-        for k in range(means.shape[0]):
-            xi = difference(means[k], poses[i], centre, r)
-            density = log_tops[k]
-            for u in range(6):
-                z = 0.0
-                for v in range(u, 6):
-                    z += roots[k, u, v] * xi[v]
-                density -= 0.5 * z * z
-            if density < top - _NEGLIGIBLE:
-                continue
-            narrower = (0.5 * xi[6]) ** 4
-            if density > top:
-                total = total * math.exp(top - density) + narrower
-                top = density
-            else:
-                total += narrower * math.exp(density - top)
+        places[k, 0], places[k, 1], places[k, 2] = placed(means[k], centre)
+    result = np.empty(len(poses))
+    for i in range(len(poses)):
+        x, y, z = placed(poses[i], centre)
+        best = 0
+        for k in range(count):
+            square = (x - places[k, 0]) ** 2 + (y - places[k, 1]) ** 2 + (z - places[k, 2]) ** 2
+            turned = max(3.0 - trace_between(means[k], poses[i]), 0.0)  # no more than the square of the angle
+            bounds[k] = log_tops[k] - 0.5 * max(turned / widths[k, 0], square / widths[k, 1])
+            if bounds[k] > bounds[best]:
+                best = k
+        top, total = log_density(means[best], poses[i], roots[best], log_tops[best], centre)
+        for k in range(count):
+            if k != best and bounds[k] > top - _NEGLIGIBLE:
+                density, narrower = log_density(means[k], poses[i], roots[k], log_tops[k], centre)
+                if density > top:
+                    total = total * math.exp(top - density) + narrower
+                    top = density
+                else:
+                    total += narrower * math.exp(density - top)
         result[i] = top + math.log(total)
     return result
+
+
+@numba.njit(cache=True, inline="always")
+def placed(pose, point):
+    """Return where a pose (12,) takes a point (3,)."""
+    return (
+        pose[0] * point[0] + pose[1] * point[1] + pose[2] * point[2] + pose[3],
+        pose[4] * point[0] + pose[5] * point[1] + pose[6] * point[2] + pose[7],
+        pose[8] * point[0] + pose[9] * point[1] + pose[10] * point[2] + pose[11],
+    )
+
+
+@numba.njit(cache=True, inline="always")
+def trace_between(a, b):
+    """Return the trace of the rotation between two poses (12,)."""
+    return (
+        (a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+        + (a[4] * b[4] + a[5] * b[5] + a[6] * b[6])
+        + (a[8] * b[8] + a[9] * b[9] + a[10] * b[10])
+    )
+
+
+@numba.njit(cache=True, inline="always")
+def log_density(mean, pose, root, log_top, centre):
+    """Return the log density of ξ at a pose (12,), and the factor that turns it into one of the uniform measure."""
+    w0, w1, w2, u0, u1, u2, scale = difference(mean, pose, centre)
+    # In single numbers: a loop over the tuple would take three times as long.
+    z0 = root[0, 0] * w0 + root[0, 1] * w1 + root[0, 2] * w2 + root[0, 3] * u0 + root[0, 4] * u1 + root[0, 5] * u2
+    z1 = root[1, 1] * w1 + root[1, 2] * w2 + root[1, 3] * u0 + root[1, 4] * u1 + root[1, 5] * u2
+    z2 = root[2, 2] * w2 + root[2, 3] * u0 + root[2, 4] * u1 + root[2, 5] * u2
+    z3 = root[3, 3] * u0 + root[3, 4] * u1 + root[3, 5] * u2
+    z4, z5 = root[4, 4] * u1 + root[4, 5] * u2, root[5, 5] * u2
+    square = (z0 * z0 + z1 * z1) + (z2 * z2 + z3 * z3) + (z4 * z4 + z5 * z5)
+    return log_top - 0.5 * square, (0.5 * scale) ** 4
 
 
 @numba.njit(cache=True)
@@ -58,10 +99,10 @@ def distances(means, roots, centre):
         centre: (3,) point in m.
     """
     count = len(means)
-    result, rotation, z = np.zeros((count, count)), np.empty((3, 3)), np.empty(6)
+    result, z = np.zeros((count, count)), np.empty(6)
     for i in range(count):
         for j in range(count):
-            xi = difference(means[i], means[j], centre, rotation)
+            xi = difference(means[i], means[j], centre)
             square = 0.0
             for k in range(6):
                 z[k] = xi[k]
@@ -84,12 +125,11 @@ def uncrowded(poses, sigmas, centre, crowd, most):
         crowd: at most so many lie in the neighbourhood of the next.
         most: at most so many are returned.
     """
-    kept, rotation = np.empty(min(len(poses), most), dtype=np.int64), np.empty((3, 3))
-    count = 0
+    kept, count = np.empty(min(len(poses), most), dtype=np.int64), 0
     for i in range(len(poses)):
         near = 0
         for number in range(count):
-            xi = difference(poses[kept[number]], poses[i], centre, rotation)
+            xi = difference(poses[kept[number]], poses[i], centre)
             square = 0.0
             for k in range(6):
                 square += (xi[k] / sigmas[k]) ** 2
@@ -101,3 +141,45 @@ def uncrowded(poses, sigmas, centre, crowd, most):
             if count == len(kept):
                 break
     return kept[:count]
+
+
+@numba.njit(cache=True)
+def moments(xi, weights):
+    """Return the sum of weights (n,), and mean (6,) and covariance (6, 6) of weighted ξ (n, 6)."""
+    total, mean, covariance = 0.0, np.zeros(6), np.zeros((6, 6))
+    for i in range(len(xi)):
+        total += weights[i]
+        for k in range(6):
+            mean[k] += weights[i] * xi[i, k]
+    mean /= total
+    for i in range(len(xi)):
+        for k in range(6):
+            part = weights[i] * (xi[i, k] - mean[k])
+            for m in range(k + 1):
+                covariance[k, m] += part * (xi[i, m] - mean[m])
+    for k in range(6):
+        for m in range(k + 1):
+            covariance[k, m] /= total
+            covariance[m, k] = covariance[k, m]
+    return total, mean, covariance
+
+
+@numba.njit(cache=True)
+def sides(xi, weights, mean, axes):
+    """Return on which side (n,) of a mean (6,) weighted ξ (n, 6) lie along that of some axes where they peak least.
+
+    Args:
+        xi: (n, 6).
+        weights: (n,), and
+        mean: (6,) theirs.
+        axes: (6, 6), a column each, in which their variance is 1.
+    """
+    fourths, along = np.zeros(6), np.empty((len(xi), 6))
+    for i in range(len(xi)):
+        for k in range(6):
+            z = 0.0
+            for m in range(6):
+                z += (xi[i, m] - mean[m]) * axes[m, k]
+            along[i, k] = z
+            fourths[k] += weights[i] * (z * z) * (z * z)
+    return along[:, np.argmin(fourths)] > 0.0

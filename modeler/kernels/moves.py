@@ -15,49 +15,57 @@ def cross(ax, ay, az, bx, by, bz):
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@numba.njit(cache=True)
-def rotation_vector(r):
-    """Return the rotation vector (3 numbers, rad) of a rotation matrix (3, 3), by its quaternion (Shepperd 1978).
+_NEAR_TRACE = 2.96  # of a rotation by 0.2 rad
 
-    And the cosine of half the angle a, and a / sin(a / 2).
+# asin(s) / s in powers of s², for half of such an angle to the last bit.
+_ASIN_1, _ASIN_2, _ASIN_3, _ASIN_4 = 1.0 / 6.0, 3.0 / 40.0, 5.0 / 112.0, 35.0 / 1152.0
+_ASIN_5, _ASIN_6, _ASIN_7 = 63.0 / 2816.0, 231.0 / 13312.0, 143.0 / 10240.0
+
+
+@numba.njit(cache=True)
+def quaternion(r00, r01, r02, r10, r11, r12, r20, r21, r22):
+    """Return x, y, z and the real part of a rotation matrix's quaternion (Shepperd 1978), and a / sin(a / 2).
+
+    a is the angle of the rotation; of its two quaternions the one with the shorter way.
     """
-    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    trace = r00 + r11 + r22
     if trace > 0.0:
         real = 0.5 * math.sqrt(1.0 + trace)
         scale = 0.25 / real
-        x, y, z = (r[2, 1] - r[1, 2]) * scale, (r[0, 2] - r[2, 0]) * scale, (r[1, 0] - r[0, 1]) * scale
+        x, y, z = (r21 - r12) * scale, (r02 - r20) * scale, (r10 - r01) * scale
+        if trace > _NEAR_TRACE:
+            square = x * x + y * y + z * z
+            high = _ASIN_4 + square * (_ASIN_5 + square * (_ASIN_6 + square * _ASIN_7))
+            low = 1.0 + square * (_ASIN_1 + square * (_ASIN_2 + square * (_ASIN_3 + square * high)))
+            return x, y, z, real, 2.0 * low
+    elif r00 >= r11 and r00 >= r22:
+        x = 0.5 * math.sqrt(max(1.0 + r00 - r11 - r22, 1e-300))
+        scale = 0.25 / x
+        real, y, z = (r21 - r12) * scale, (r10 + r01) * scale, (r20 + r02) * scale
+    elif r11 >= r22:
+        y = 0.5 * math.sqrt(max(1.0 + r11 - r22 - r00, 1e-300))
+        scale = 0.25 / y
+        real, z, x = (r02 - r20) * scale, (r21 + r12) * scale, (r01 + r10) * scale
     else:
-        i = 0
-        if r[1, 1] > r[0, 0]:
-            i = 1
-        if r[2, 2] > r[i, i]:
-            i = 2
-        j, k = (i + 1) % 3, (i + 2) % 3
-        imaginary = np.empty(3)
-        imaginary[i] = 0.5 * math.sqrt(max(1.0 + r[i, i] - r[j, j] - r[k, k], 1e-300))
-        scale = 0.25 / imaginary[i]
-        real = (r[k, j] - r[j, k]) * scale
-        imaginary[j], imaginary[k] = (r[j, i] + r[i, j]) * scale, (r[k, i] + r[i, k]) * scale
-        if real < 0.0:  # of the two quaternions of a rotation, the one with the shorter way
-            real, imaginary = -real, -imaginary
-        x, y, z = imaginary[0], imaginary[1], imaginary[2]
+        z = 0.5 * math.sqrt(max(1.0 + r22 - r00 - r11, 1e-300))
+        scale = 0.25 / z
+        real, x, y = (r10 - r01) * scale, (r02 + r20) * scale, (r12 + r21) * scale
+    if real < 0.0:
+        x, y, z, real = -x, -y, -z, -real
     length = math.sqrt(x * x + y * y + z * z)
-    scale = 2.0 * math.atan2(length, real) / length if length > 1e-12 else 2.0
-    return scale * x, scale * y, scale * z, real, scale
+    return x, y, z, real, 2.0 * math.atan2(length, real) / length
 
 
-@numba.njit(cache=True)
-def logarithm(r, tx, ty, tz):
-    """Return ξ (6 numbers: rad, m) of a motion given by its rotation (3, 3) and translation, and a / sin(a / 2).
+@numba.njit(cache=True, inline="always")
+def logarithm(r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz):
+    """Return ξ (6 numbers: rad, m) of a motion given by its upper three rows, and a / sin(a / 2).
 
     a is the angle of the rotation: ξ runs wider there than the uniform measure of motions, by ((a / 2) / sin(a / 2))⁴.
     """
-    wx, wy, wz, cosine, scale = rotation_vector(r)
+    x, y, z, cosine, scale = quaternion(r00, r01, r02, r10, r11, r12, r20, r21, r22)
+    wx, wy, wz = scale * x, scale * y, scale * z
     square = wx * wx + wy * wy + wz * wz
-    if square < 1e-8:
-        last = 1.0 / 12.0 + square / 720.0
-    else:
-        last = (1.0 - 0.5 * scale * cosine) / square
+    last = (1.0 - 0.5 * scale * cosine) / square if square > 1e-8 else 1.0 / 12.0 + square / 720.0
     ax, ay, az = cross(wx, wy, wz, tx, ty, tz)
     bx, by, bz = cross(wx, wy, wz, ax, ay, az)
     return wx, wy, wz, tx - 0.5 * ax + last * bx, ty - 0.5 * ay + last * by, tz - 0.5 * az + last * bz, scale
@@ -87,26 +95,63 @@ def exponential(wx, wy, wz, ux, uy, uz, r):
     return ux + second * ax + third * bx, uy + second * ay + third * by, uz + second * az + third * bz
 
 
-@numba.njit(cache=True)
-def difference(first, second, centre, r):
+@numba.njit(cache=True, inline="always")
+def difference(first, second, centre):
     """Return ξ = log(C⁻¹ first⁻¹ second C) for poses (12,), C the shift to `centre` (3,), as `logarithm` does.
 
-    Room for a rotation, `r` (3, 3), is handed in.
+    All in single numbers: with the rotation in an array it takes three times as long.
     """
-    b = second
-    # Where the poses put the centre, one beside the other; then seen from `first`.
-    x = b[3] - first[3] + b[0] * centre[0] + b[1] * centre[1] + b[2] * centre[2]
-    y = b[7] - first[7] + b[4] * centre[0] + b[5] * centre[1] + b[6] * centre[2]
-    z = b[11] - first[11] + b[8] * centre[0] + b[9] * centre[1] + b[10] * centre[2]
-    for k in range(3):
-        for m in range(3):
-            r[k, m] = first[k] * b[m] + first[4 + k] * b[4 + m] + first[8 + k] * b[8 + m]
-    return logarithm(
-        r,
-        first[0] * x + first[4] * y + first[8] * z - centre[0],
-        first[1] * x + first[5] * y + first[9] * z - centre[1],
-        first[2] * x + first[6] * y + first[10] * z - centre[2],
+    a0, a1, a2, a4, a5, a6, a8, a9, a10 = (
+        first[0],
+        first[1],
+        first[2],
+        first[4],
+        first[5],
+        first[6],
+        first[8],
+        first[9],
+        first[10],
     )
+    b0, b1, b2, b4, b5, b6, b8, b9, b10 = (
+        second[0],
+        second[1],
+        second[2],
+        second[4],
+        second[5],
+        second[6],
+        second[8],
+        second[9],
+        second[10],
+    )
+    # Where the poses put the centre, one beside the other; then seen from `first`.
+    x = second[3] - first[3] + b0 * centre[0] + b1 * centre[1] + b2 * centre[2]
+    y = second[7] - first[7] + b4 * centre[0] + b5 * centre[1] + b6 * centre[2]
+    z = second[11] - first[11] + b8 * centre[0] + b9 * centre[1] + b10 * centre[2]
+    return logarithm(
+        a0 * b0 + a4 * b4 + a8 * b8,
+        a0 * b1 + a4 * b5 + a8 * b9,
+        a0 * b2 + a4 * b6 + a8 * b10,
+        a0 * x + a4 * y + a8 * z - centre[0],
+        a1 * b0 + a5 * b4 + a9 * b8,
+        a1 * b1 + a5 * b5 + a9 * b9,
+        a1 * b2 + a5 * b6 + a9 * b10,
+        a1 * x + a5 * y + a9 * z - centre[1],
+        a2 * b0 + a6 * b4 + a10 * b8,
+        a2 * b1 + a6 * b5 + a10 * b9,
+        a2 * b2 + a6 * b6 + a10 * b10,
+        a2 * x + a6 * y + a10 * z - centre[2],
+    )
+
+
+@numba.njit(cache=True)
+def differences(first, poses, centre):
+    """Return the `difference` (n, 6) of poses (n, 12) from one (12,)."""
+    xi = np.empty((len(poses), 6))
+    for i in range(len(poses)):
+        one = difference(first, poses[i], centre)
+        for k in range(6):
+            xi[i, k] = one[k]
+    return xi
 
 
 @numba.njit(cache=True)
@@ -154,7 +199,9 @@ def logarithms(poses):
     xi = np.empty((len(poses), 6))
     for i in range(len(poses)):
         p = poses[i]
-        w = logarithm(p, p[0, 3], p[1, 3], p[2, 3])
+        w = logarithm(
+            p[0, 0], p[0, 1], p[0, 2], p[0, 3], p[1, 0], p[1, 1], p[1, 2], p[1, 3], p[2, 0], p[2, 1], p[2, 2], p[2, 3]
+        )
         for k in range(6):
             xi[i, k] = w[k]
     return xi
@@ -182,7 +229,7 @@ def mean(poses, weights, start, about, iterations, tolerance):
             for m in range(6):
                 second[k, m] = 0.0
         for i in range(len(poses)):
-            xi = difference(centre, poses[i], about, r)
+            xi = difference(centre, poses[i], about)
             for k in range(6):
                 part = weights[i] * xi[k]
                 first[k] += part

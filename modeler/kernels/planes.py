@@ -203,36 +203,42 @@ def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse):
 
 
 @numba.njit(cache=True)
-def silhouette_distance(mask, limit_px):
-    """Return the distance (h, w) float32 in px of every pixel from the mask, cut at `limit_px`; by chamfer sweeps."""
-    distance = np.full(mask.shape, limit_px, dtype=np.float32)
+def frontal_points(cells, mask, intrinsics, min_cosine):
+    """Return the points where pixels' rays meet their local planes, of those that are seen at no flatter an angle.
+
+    Args:
+        cells: (h, w, 8) of `local_planes`.
+        mask: (h, w) bool, object.
+        intrinsics: (4,) fx, fy, cx, cy in px.
+        min_cosine: least cosine of the angle between a plane's normal and the way to the camera.
+
+    Returns:
+        Points (n, 3) in m, unit normals (n, 3), rows and columns (n, 2), variances along the normals (n,) in m².
+    """
+    fx, fy, cx, cy = intrinsics
     top, bottom, left, right = bounds(mask)
-    reach = math.ceil(limit_px)  # farther from the mask nothing changes
-    near = slice(max(top - reach, 0), bottom + reach), slice(max(left - reach, 0), right + reach)
-    sweep(mask[near[0], near[1]], distance[near[0], near[1]])
-    sweep(mask[near[0], near[1]][::-1, ::-1], distance[near[0], near[1]][::-1, ::-1])
-    return distance
-
-
-@numba.njit(cache=True)
-def sweep(mask, distance):
-    """Hand distances (h, w) on from each pixel to the next, and from each row to the one below."""
-    for row in range(mask.shape[0]):
-        for column in range(mask.shape[1]):
-            best = np.float32(0.0) if mask[row, column] else distance[row, column]
-            if best > 0.0 and column > 0:
-                best = min(best, distance[row, column - 1] + np.float32(1.0))
-            if best > 0.0 and row > 0:
-                best = min(best, row_above(distance[row - 1], column))
-            distance[row, column] = best
-
-
-@numba.njit(cache=True, inline="always")
-def row_above(line, column):
-    """Return the least distance that a neighbouring row (w,) hands on to a pixel at `column`."""
-    best = line[column] + 1.0
-    if column > 0:
-        best = min(best, line[column - 1] + math.sqrt(2.0))
-    if column + 1 < len(line):
-        best = min(best, line[column + 1] + math.sqrt(2.0))
-    return best
+    most = 0
+    for row in range(top, bottom):
+        for column in range(left, right):
+            most += cells[row, column, KIND] == SURFACE
+    points_m, normals = np.empty((most, 3)), np.empty((most, 3))
+    pixels, variance_m2 = np.empty((most, 2), dtype=np.int64), np.empty(most)
+    count = 0
+    for row in range(top, bottom):
+        for column in range(left, right):
+            cell = cells[row, column]
+            if cell[KIND] != SURFACE:
+                continue
+            x, y, z = np.float64(cell[NORMAL_X]), np.float64(cell[NORMAL_Y]), np.float64(cell[NORMAL_Z])
+            w, h = (column - cx) / fx, (row - cy) / fy
+            towards = -(x * w + y * h + z)
+            length = math.sqrt(x * x + y * y + z * z)
+            if towards <= min_cosine * length * math.sqrt(w * w + h * h + 1.0):
+                continue
+            depth_m = np.float64(cell[DISTANCE]) / towards
+            points_m[count, 0], points_m[count, 1], points_m[count, 2] = w * depth_m, h * depth_m, depth_m
+            normals[count, 0], normals[count, 1], normals[count, 2] = x / length, y / length, z / length
+            pixels[count, 0], pixels[count, 1] = row, column
+            variance_m2[count] = cell[VARIANCE]
+            count += 1
+    return points_m[:count], normals[:count], pixels[:count], variance_m2[:count]

@@ -78,7 +78,7 @@ def walk(poses, spreads, axes, stride, ground, centre, surface_m, pull, max_stri
             pose[:] = moved
             for _ in range(2):
                 equations(pose, ground.forward, ground.backward, centre, surface_m, room, gradient, matrix)
-                held_step(pose, pull, centre, gradient, matrix, step, rotation)
+                held_step(pose, pull, centre, gradient, matrix, step)
                 along = 0.0
                 for k in range(6):  # in units of the spread
                     z[k] = step[k]

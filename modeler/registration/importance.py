@@ -9,10 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
+from modeler.kernels import mixture
 from modeler.registration.mixture import Gaussians
 from modeler.types import AbstractMotion, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
+_FLOOR = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)  # keeps the covariance of a few samples positive definite
 _PARAMETERS = 28.0  # of one Gaussian more: mean, covariance, share
 
 
@@ -157,8 +159,7 @@ class AdaptiveSampler:
         if effective < 0.99 * self.least:
             return whole
         scales, axes = np.linalg.eigh(covariance)
-        along = (xi - mean) @ axes / np.sqrt(scales)
-        side = along[:, np.argmin(weights @ along**4)] > 0.0
+        side = mixture.sides(xi, weights, mean, axes / np.sqrt(scales))
         halves = [(xi[chosen], weights[chosen]) for chosen in (side, ~side)]
         gain = 0.5 * np.linalg.slogdet(covariance)[1]
         for half in halves:
@@ -169,10 +170,8 @@ class AdaptiveSampler:
 
 def _moments(xi: Array, weights: Array) -> tuple[float, Array, Array]:
     """Return the sum of weights (n,), and mean (6,) and covariance (6, 6) of ξ (n, 6)."""
-    total = float(np.sum(weights))
-    mean = weights @ xi / total
-    away = xi - mean
-    return total, mean, (away * weights[:, None]).T @ away / total + np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
+    total, mean, covariance = mixture.moments(xi, weights)
+    return total, mean, covariance + _FLOOR
 
 
 def thinned(weights: Array, count: int, rng: np.random.Generator) -> tuple[npt.NDArray[np.int64], Array]:

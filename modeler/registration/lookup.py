@@ -58,7 +58,10 @@ class Lookup:
 
     def sight(self, stride: int = 1) -> Sight:
         """Return what every `stride`-th point meets, as kernels take it."""
-        return Sight(np.ascontiguousarray(self._columns[:, ::stride]), self._cells, self._camera, FACING)
+        if stride not in self._sights:
+            columns = np.ascontiguousarray(self._columns[:, ::stride])
+            self._sights[stride] = Sight(columns, self._cells, self._camera, FACING)
+        return self._sights[stride]
 
     def model(self, blur_m: float, typical: float = 0.5) -> kernel.Model:
         """Return what the likelihood takes for granted where surfaces are blurred by so many m.
@@ -78,6 +81,11 @@ class Lookup:
             typical=np.float32(typical),
             table=self._table,
         )
+
+    @cached_property
+    def _sights(self) -> dict[int, Sight]:
+        """By stride: what was made once."""
+        return {}
 
     @cached_property
     def _columns(self) -> np.ndarray:

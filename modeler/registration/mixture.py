@@ -29,13 +29,13 @@ class Gaussians:
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Draw motions (count, 4, 4), each Gaussian by its share of the weight."""
         chosen = rng.choice(len(self.means), count, p=np.exp(self.log_weights - self.log_weight))
-        xi = (self.spreads[chosen] @ rng.normal(size=(count, 6, 1)))[:, :, 0]
+        xi = np.einsum("nij,nj->ni", self.spreads[chosen], rng.normal(size=(count, 6)))
         return se3.moved(self.means[chosen], xi, self.centre_m)
 
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log (n,) of the weighted sum of densities at motions (n, 4, 4)."""
         return mixture.log_densities(
-            rows(target_from_source), rows(self.means), self._roots, self.log_weights, self.centre_m
+            rows(target_from_source), rows(self.means), *self._shapes, self.log_weights, self.centre_m
         )
 
     def times(self, factor: float) -> Gaussians:
@@ -57,11 +57,16 @@ class Gaussians:
         return float(np.logaddexp.reduce(self.log_weights))
 
     @cached_property
-    def _roots(self) -> Array:
-        """Upper triangular roots (k, 6, 6) of the precisions: with C = U Uᵀ and U upper triangular, U⁻¹."""
-        flipped = (self.spreads @ self.spreads.transpose(0, 2, 1))[:, ::-1, ::-1]
-        upper = np.linalg.cholesky(flipped)[:, ::-1, ::-1]
-        return np.ascontiguousarray(np.triu(np.linalg.inv(upper)), dtype=np.float64)
+    def _shapes(self) -> tuple[Array, Array]:
+        """Upper triangular roots (k, 6, 6) of the precisions; largest variances (k, 2) of rotation and translation.
+
+        With C = U Uᵀ and U upper triangular, a root is U⁻¹.
+        """
+        covariances = self.spreads @ self.spreads.transpose(0, 2, 1)
+        upper = np.linalg.cholesky(covariances[:, ::-1, ::-1])[:, ::-1, ::-1]
+        blocks = np.stack([covariances[:, :3, :3], covariances[:, 3:, 3:]], axis=1)
+        roots = np.ascontiguousarray(np.triu(np.linalg.inv(upper)), dtype=np.float64)
+        return roots, np.ascontiguousarray(np.linalg.eigvalsh(blocks)[:, :, -1], dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,6 +97,11 @@ class Pair:
         gradients, equations = matching.normal_equations(rows(poses), *sights, self.centre_m, surface_m)
         return stride * gradients, stride * equations
 
+    def normal_equation(self, pose: Array, surface_m: float) -> tuple[Array, Array]:
+        """Return gradient (6,) and matrix (6, 6) of one pose (4, 4), see `normal_equations`."""
+        sights = self.forward.sight(), self.backward.sight()
+        return matching.normal_equation(rows(pose), *sights, self.centre_m, surface_m)
+
     def downhill(self, poses: Array, surface_m: float, pull: matching.Pull, *, steps: int, stride: int) -> Array:
         """Return poses (n, 4, 4) so many Gauss-Newton steps further down, each held by a pull."""
         sights = self.forward.sight(stride), self.backward.sight(stride)

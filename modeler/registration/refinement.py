@@ -72,12 +72,12 @@ class Refiner:
             return spread, np.zeros((6, 6))
         by_own, by_other = by_own @ spread, by_other @ spread
         # The noise of either surface's normals would add up in its own square; in their product it averages out.
-        products = 0.5 * weights[:, None, None] * (by_own[:, :, None] * by_other[:, None, :])
-        sensitivity, axes = np.linalg.eigh((products + products.transpose(0, 2, 1)).sum(axis=0))
-        numbers, count = patches.halved(places, halvings), 2**halvings
-        scores, parts = np.zeros((count, 6)), np.zeros((count, 6))
-        np.add.at(scores, numbers, 0.5 * (by_own + by_other) @ axes * (weights * residuals)[:, None])
-        np.add.at(parts, numbers, (by_own @ axes) * (by_other @ axes) * weights[:, None])
+        product = (by_own.T * weights) @ by_other
+        sensitivity, axes = np.linalg.eigh(0.5 * (product + product.T))
+        count = 2**halvings
+        members = (patches.halved(places, halvings) == np.arange(count)[:, None]).astype(np.float64)
+        scores = members @ (0.5 * (by_own + by_other) @ axes * (weights * residuals)[:, None])
+        parts = members @ ((by_own @ axes) * (by_other @ axes) * weights[:, None])
         variability = scores.T @ scores * count / (count - 1.0)
         error = np.std(parts, axis=0, ddof=1) * np.sqrt(count)
         sure = np.diag(np.maximum(sensitivity - self.caution * error, 0.0))
@@ -91,9 +91,9 @@ def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: f
     precision = np.linalg.inv(spread @ spread.T)
     pose, noise_m = start, pair.surface_noise_m(start, fine_m)
     for _ in range(8):
-        gradient, matrix = pair.normal_equations(pose[None], noise_m)
+        gradient, matrix = pair.normal_equation(pose, noise_m)
         away = se3.difference(start, pose, centre_m)
-        step = np.linalg.solve(matrix[0] + precision, gradient[0] - precision @ away)
+        step = np.asarray(np.linalg.solve(matrix + precision, gradient - precision @ away), dtype=np.float64)
         pose = se3.moved(pose, step, centre_m)
         noise_m = pair.surface_noise_m(pose, fine_m)
         if np.linalg.norm(np.linalg.solve(spread, step)) < 0.01:  # standard deviations
