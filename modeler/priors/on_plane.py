@@ -42,7 +42,8 @@ class OnPlane:
         tilt = rng.normal(0.0, self.sigma_tilt_rad, (count, 2)) @ axes[:2]
         zero = np.zeros((count, 3))
         turn = turn_rad[:, None] * self.normal
-        motion = se3.exp(np.concatenate([tilt, zero], axis=1)) @ se3.exp(np.concatenate([turn, zero], axis=1))
+        tilted = se3.exp(np.concatenate([tilt, zero], axis=1))
+        motion = se3.moved(tilted, np.concatenate([turn, zero], axis=1), np.zeros(3))
         lift_m = rng.normal(self._lift_m, self.sigma_lift_m, (count, 1))
         offset_m = np.concatenate([shift_m, lift_m], axis=1) @ axes
         motion[:, :3, 3] = self.target_centroid_m + offset_m - motion[:, :3, :3] @ self.source_centroid_m
