@@ -11,11 +11,34 @@ import numpy as np
 from PIL import Image
 from recordings import matrix, raw_depth
 from rosbags import rosbag1, rosbag2
+from rosbags.interfaces import Connection
+from rosbags.rosbag2.storage_mcap import Channel, McapWriter, Schema, write_channel, write_schema
 from rosbags.typesys import Stores, get_typestore
 
 from modeler.types import Frame
 
 START_NS = 1_700_000_000_000_000_000
+
+
+class Ros1Mcap(McapWriter):
+    """Writes messages of ROS 1, as `mcap convert` does a bag's."""
+
+    def __init__(self, path: Path, compression: rosbag2.CompressionMode) -> None:
+        super().__init__(path, compression)
+        self.bio.seek(21)  # behind the magic, the header's length and that of the profile
+        self.bio.write(b"ros1")
+        self.bio.seek(0, io.SEEK_END)
+
+    def add_msgtype(self, connection: Connection) -> None:
+        name = connection.msgtype.replace("/msg/", "/")
+        self.schemas.append(Schema(len(self.schemas) + 1, name, "ros1msg", connection.msgdef.data))
+        write_schema(self.chunk.bio, self.schemas[-1])
+
+    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
+        name = connection.msgtype.replace("/msg/", "/")
+        self.channels.append(Channel(connection.id, name, connection.topic, "ros1", b""))
+        self.channel_stats[connection.id] = 0
+        write_channel(self.chunk.bio, self.channels[-1], self.schemas)
 
 
 @dataclass(frozen=True)
@@ -49,6 +72,8 @@ class Recorder:
     """Topics."""
     colour_scale: float = 1.0
     """What the colour camera's focal length is a multiple of."""
+    ros1: bool = False
+    """Whether MCAP holds messages of ROS 1."""
 
     def write(self, path: Path, frames: list[Frame]) -> Path:
         """Write `*.bag` for ROS 1, `*.mcap` for one such file, and a folder of ROS 2 otherwise."""
@@ -59,6 +84,8 @@ class Recorder:
         else:
             plugin = rosbag2.StoragePlugin.SQLITE3 if path.suffix == ".db3" else rosbag2.StoragePlugin.MCAP
             writer = rosbag2.Writer(path.with_suffix(""), version=9, storage_plugin=plugin)
+            if self.ros1:
+                writer.STORAGE_PLUGINS = {plugin: Ros1Mcap}
             if self.packed is not None:
                 writer.set_compression(self.packed, rosbag2.CompressionFormat.ZSTD)
         with writer:
@@ -70,7 +97,7 @@ class Recorder:
         return path if path.suffix == ".bag" else path.with_suffix("")
 
     def _fill(self, writer: Any, frames: list[Frame]) -> None:
-        ros1 = isinstance(writer, rosbag1.Writer)
+        ros1 = self.ros1 or isinstance(writer, rosbag1.Writer)
         store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
         types, connections = store.types, {}
 

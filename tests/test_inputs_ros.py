@@ -123,7 +123,7 @@ class Rig(Recorder):
     """Records fixed transforms too."""
 
     def _fill(self, writer: Any, frames: list[Frame]) -> None:
-        ros1 = isinstance(writer, rosbag1.Writer)
+        ros1 = self.ros1 or isinstance(writer, rosbag1.Writer)
         store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
         if ros1:
             store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
@@ -317,15 +317,38 @@ def test_what_the_library_of_the_format_wrote_is_read(tmp_path: Path) -> None:
         assert frame.time_s == pytest.approx(1e-9 * (foxglove.START_NS + number * foxglove.STEP_NS), abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    "recorder",
+    [
+        Recorder(ros1=True),
+        Recorder("32FC1", "bgr8", ros1=True, packed=rosbag2.CompressionMode.STORAGE),
+        Recorder("compressedDepth", "jpeg", ros1=True),
+        Rig(ros1=True, colour_scale=1.1),
+    ],
+    ids=["raw", "packed", "pictures", "fixed frames"],
+)
+def test_mcap_of_ros1_is_read_as_its_bag(tmp_path: Path, frames: list[Frame], recorder: Recorder) -> None:
+    mcap = recorder.write(tmp_path / "s.mcap", frames)
+    bag = dataclasses.replace(recorder, ros1=False, packed=None).write(tmp_path / "s.bag", frames)
+    assert mcap.read_bytes()[17:25] == b"\x04\0\0\0ros1"
+    ours, theirs = open_sequence(mcap), open_sequence(bag)
+    assert ours.layout.removeprefix("MCAP file") == theirs.layout.removeprefix("ROS 1 bag")
+    assert (ours.indices, ours.depth_unit, ours.notes) == (theirs.indices, theirs.depth_unit, theirs.notes)
+    for one, other in zip(ours, theirs, strict=True):
+        assert (one.camera, one.time_s) == (other.camera, other.time_s)
+        np.testing.assert_array_equal(one.depth_m, other.depth_m)
+        assert one.colour is not None
+        np.testing.assert_array_equal(one.colour, other.colour)
+
+
 def test_mcap_of_other_systems_says_so(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = unpacked("foxglove.mcap", tmp_path)
     content = path.read_bytes()
     assert content[17:25] == b"\x04\0\0\0ros2"
-    path.write_bytes(content[:21] + b"ros1" + content[25:])
+    path.write_bytes(content[:21] + b"ros3" + content[25:])
     assert main(["info", str(path)]) == 2
     assert capfd.readouterr().err == (
-        f"modeler: {path}: holds messages of 'ros1' where ROS 2 is read from MCAP; give the bag of ROS 1 it was made "
-        "from, or record it with ROS 2\n"
+        f"modeler: {path}: holds messages of 'ros3' where those of ROS are read from MCAP; record it with ROS\n"
     )
 
 

@@ -1,19 +1,21 @@
-"""ROS 1 and ROS 2 bags, and MCAP files, by the rosbags library: topics and their messages, without ROS."""
+"""ROS 1 and ROS 2 bags, and MCAP files of either, by the rosbags library: topics and their messages, without ROS."""
 
 from __future__ import annotations
 
 import bz2
+import io
 import struct
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, BinaryIO, cast, final
 from urllib.parse import quote
 
 import lz4.frame
 from rosbags import rosbag1, rosbag2
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag1.reader import Chunk
 from rosbags.rosbag2 import storage_mcap
 from rosbags.rosbag2.reader import DirectoryReader
@@ -29,12 +31,23 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
 
-# The library unpacks chunks of MCAP to whatever they hold, and has no other place to say how.
-storage_mcap.DECOMPRESSORS.update(lz4=of_size(from_lz4), zstd=of_size(from_zstd))
-
-
 _MCAP = b"\x89MCAP0\r\n\x01"  # what its files begin with: the format, and that a header follows
 _PROFILE_AT = 21  # behind the header's length and that of the profile's name
+_ROS1_SCHEMA = "ros1msg"  # what MCAP calls definitions of ROS 1's messages
+
+
+def _definition(
+    schema: storage_mcap.Schema | None, known: Callable[[storage_mcap.Schema | None], MessageDefinition]
+) -> MessageDefinition:
+    """Return the definition of a message, also of ROS 1, which the library has no name for."""
+    if schema is not None and schema.encoding == _ROS1_SCHEMA:
+        return MessageDefinition(MessageDefinitionFormat.MSG, schema.data)
+    return known(schema)
+
+
+# The library unpacks chunks of MCAP to whatever they hold, and has no other place to say how, nor what it may read.
+storage_mcap.DECOMPRESSORS.update(lz4=of_size(from_lz4), zstd=of_size(from_zstd))
+storage_mcap.get_msgdef = partial(_definition, known=storage_mcap.get_msgdef)
 
 
 @final
@@ -56,15 +69,15 @@ class Bag:
     path: Path
     """`*.bag`, `*.mcap`, `*.db3`, or the folder of a ROS 2 bag."""
 
-    @property
+    @cached_property
     def is_ros1(self) -> bool:
-        """Whether it is a bag of ROS 1, whose fields are named in capitals."""
-        return self.path.suffix.lower() == ".bag"
+        """Whether its messages are those of ROS 1, whose fields are named in capitals."""
+        return self._is_bag or (self.path.suffix.lower() == ".mcap" and _profile(self.path) == "ros1")
 
     @property
     def types(self) -> dict[str, str]:
         """Message types by topic, as in `sensor_msgs/msg/Image`."""
-        named = ((str(connection.topic), str(connection.msgtype)) for connection in self._reader.connections)
+        named = ((str(connection.topic), _kind(connection)) for connection in self._reader.connections)
         return {topic: kind for topic, kind in named if topic.isprintable()}
 
     def messages(self, topic: str, most: int | None = None) -> Iterator[tuple[Stamp, Any]]:
@@ -104,7 +117,7 @@ class Bag:
         return [connection for connection in self._reader.connections if str(connection.topic) == topic]
 
     def _message(self, connection: Connection, data: bytes) -> Any:
-        store, kind = _typestore(ros1=self.is_ros1), str(connection.msgtype)
+        store, kind = _typestore(ros1=self.is_ros1), _kind(connection)
         if not self.is_ros1:
             # Recorders pack messages by themselves and need not say so; no message begins as packed ones do.
             return store.deserialize_cdr(from_zstd(data) if is_zstd(data) else data, kind)
@@ -112,13 +125,18 @@ class Bag:
 
     @property
     def _advice(self) -> str:
-        return "reindex it (rosbag reindex), or record it anew" if self.is_ros1 else "record or copy it anew"
+        return "reindex it (rosbag reindex), or record it anew" if self._is_bag else "record or copy it anew"
+
+    @property
+    def _is_bag(self) -> bool:
+        """Whether it is a file of ROS 1's own format."""
+        return self.path.suffix.lower() == ".bag"
 
     @cached_property
     def _reader(self) -> rosbag1.Reader | rosbag2.Reader:
         """Return the open reader, which is closed when this bag is forgotten."""
         with told(self.path, "bag", self._advice):
-            if self.is_ros1:
+            if self._is_bag:
                 reader = rosbag1.Reader(self.path)
                 reader.open()
                 reader.chunks = {place: _bounded(chunk) for place, chunk in reader.chunks.items()}
@@ -128,6 +146,12 @@ class Bag:
                     reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
             weakref.finalize(self, reader.close)
             return reader
+
+
+def _kind(connection: Connection) -> str:
+    """Return the type of a topic's messages as ROS 2 writes it, `sensor_msgs/msg/Image`, also where ROS 1 did."""
+    kind = str(connection.msgtype)
+    return kind.replace("/", "/msg/") if kind.count("/") == 1 else kind
 
 
 def _image_alone(data: bytes) -> bytes:
@@ -166,22 +190,54 @@ def _ros2(path: Path) -> rosbag2.Reader:
         reader.storage.path = _in_address(path)
     else:
         _check_profile(path)
+        if _profile(path) == "ros1" and isinstance(reader.storage, storage_mcap.McapReader):
+            reader.storage.path = cast("Path", _AsRos2(path))
     reader.open()
     return reader
 
 
-def _check_profile(path: Path) -> None:
-    """Refuse an MCAP file of messages that are not those of ROS 2, as far as its header says so."""
+@final
+@dataclass(frozen=True)
+class _AsRos2:
+    """An MCAP file of ROS 1 that calls itself one of ROS 2, for the library opens no other and reads both alike."""
+
+    path: Path
+
+    def open(self, mode: str) -> BinaryIO:
+        """Open the file."""
+        return io.BufferedReader(_Renamed(self.path, mode))
+
+
+@final
+class _Renamed(io.FileIO):
+    """A file in which the last letter of the profile reads 2."""
+
+    def readinto(self, buffer: Any) -> int:
+        """Read into a buffer and return how many bytes."""
+        place = _PROFILE_AT + 3 - self.tell()
+        count = super().readinto(buffer) or 0
+        if 0 <= place < count:
+            buffer[place : place + 1] = b"2"
+        return count
+
+
+def _profile(path: Path) -> str | None:
+    """Return whose messages an MCAP file says to hold, as in `ros2`; None where it is none."""
     with path.open("rb") as file:
         start = file.read(_PROFILE_AT + 64)
     if not start.startswith(_MCAP) or len(start) < _PROFILE_AT:
-        return  # which the library tells
+        return None
     (length,) = struct.unpack_from("<I", start, _PROFILE_AT - 4)
-    profile = start[_PROFILE_AT : _PROFILE_AT + min(length, 32)].decode("ascii", "replace")
-    if profile != "ros2":
+    return start[_PROFILE_AT : _PROFILE_AT + min(length, 32)].decode("ascii", "replace")
+
+
+def _check_profile(path: Path) -> None:
+    """Refuse an MCAP file of messages that are not ROS's, as far as its header says so."""
+    profile = _profile(path)
+    if profile not in ("ros1", "ros2", None):  # what is no MCAP file at all the library tells
         raise InputError(
-            f"{path}: holds messages of {repr(profile) if profile else 'nobody knows what'} where ROS 2 is read from "
-            "MCAP; give the bag of ROS 1 it was made from, or record it with ROS 2."
+            f"{path}: holds messages of {repr(profile) if profile else 'nobody knows what'} where those of ROS are "
+            "read from MCAP; record it with ROS."
         )
 
 

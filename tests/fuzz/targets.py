@@ -138,6 +138,7 @@ TARGETS: dict[str, Target] = {
         ("s.bag",),
         read_all,
     ),
+    "mcap of ros1": Target(_bag("s.mcap", bags.Recorder(ros1=True)), ("s.mcap",), read_all),
     "ros1 fixed": Target(_bag("s.bag", ros.Rig(colour_scale=1.1)), ("s.bag",), read_all),
     "realsense": Target(
         _bag("s.bag", realsense.OldRecorder("mono16", "rgb8", names=realsense.NAMES, colour_scale=1.1)),
