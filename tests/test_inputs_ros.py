@@ -24,6 +24,7 @@ from sequences import Given, open_sequence
 from sequences.lens import Lens
 from sequences.ros import images as ros_images
 from sequences.ros.sequence import RosSequence
+from sequences.ros.unpacking import zstd
 
 SUFFIXES = (".bag", ".mcap", ".db3", "")
 
@@ -350,6 +351,24 @@ def test_mcap_of_other_systems_says_so(tmp_path: Path, capfd: pytest.CaptureFixt
     assert capfd.readouterr().err == (
         f"modeler: {path}: holds messages of 'ros3' where those of ROS are read from MCAP; record it with ROS\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("told", "data", "says"),
+    [
+        ("YUYV; zstd; 4x2 step=8", b"nothing", "cannot be unpacked"),
+        ("YUYV; zstd; 4x2 step=8", zstd.compress(bytes(16))[:-3], "cannot be unpacked"),
+        ("YUYV; zstd; 4x2 step=8", zstd.compress(bytes(1000)), "cannot be unpacked"),
+        ("YUYV; zstd; 4x2 step=8", zstd.compress(bytes(15)), "has 15 bytes"),
+        ("UYVY; zstd; 4x2 step=7", zstd.compress(bytes(14)), "7 a row"),
+        ("UYVY; zstd; 99999x99999 step=199998", zstd.compress(bytes(16)), "99999 x 99999 pixels"),
+    ],
+)
+def test_packed_chroma_that_is_not_what_it_says_is_one_line(told: str, data: bytes, says: str) -> None:
+    message = SimpleNamespace(__msgtype__=ros_images.PACKED, format=told, data=np.frombuffer(data, np.uint8))
+    assert ros_images.is_colour(message)
+    with pytest.raises(InputError, match=says):
+        ros_images.colour(message, "here")
 
 
 @pytest.mark.parametrize(("encoding", "order"), [("yuv422", (1, 0, 3, 2)), ("YUYV", (0, 1, 2, 3))])

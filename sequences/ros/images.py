@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from dataclasses import dataclass
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +13,7 @@ from modeler.types import Camera, InputError
 from sequences.files.images import MAX_PIXELS, Packed, read_colour, read_depth
 from sequences.given import sane
 from sequences.lens import Lens, known
+from sequences.ros.unpacking import MAX_BYTES, from_zstd
 
 IMAGE, PACKED, CAMERA = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 MILLIMETRES = ("16UC1", "mono16")
@@ -19,6 +22,7 @@ COLOURS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4, "
 """Bytes a pixel; what OpenCV calls 8UC3 is BGR."""
 YUV = {"yuv422": (1, 0, 2), "UYVY": (1, 0, 2), "yuv422_yuy2": (0, 1, 3), "YUYV": (0, 1, 3)}
 """Where Y, U and V stand in the four bytes of two pixels."""
+_PACKED_YUV = re.compile(r"(YUYV|UYVY); zstd; (\d{1,5})x(\d{1,5}) step=(\d{1,6})")  # RealSense's recorder, since 2.59
 _PACKED_DEPTH_HEADER = 12  # bytes of image_transport's compressedDepth before the PNG
 
 
@@ -33,6 +37,8 @@ def is_colour(message: Any) -> bool:
     """Return whether an image message holds colour or grey that can be read."""
     if _is_raw(message):
         return message.encoding in COLOURS or message.encoding in YUV
+    if _PACKED_YUV.fullmatch(message.format):
+        return True
     return not is_depth(message) and any(kind in message.format for kind in ("jpeg", "jpg", "png"))
 
 
@@ -69,6 +75,9 @@ def colour(message: Any, where: str) -> npt.NDArray[np.uint8]:
     """
     if not is_colour(message):
         raise InputError(f"{where}: is {_kind(message)} where images before it are colour; record it anew.")
+    packed = None if _is_raw(message) else _PACKED_YUV.fullmatch(message.format)
+    if packed is not None:
+        return colour(_unpacked(message, packed, where), where)
     if not _is_raw(message):
         return read_colour(Packed(bytes(message.data), where))
     if message.encoding in YUV:
@@ -79,6 +88,29 @@ def colour(message: Any, where: str) -> npt.NDArray[np.uint8]:
         return np.repeat(pixels, 3, axis=2)
     in_order = pixels[..., :3] if message.encoding.startswith("rgb") else pixels[..., 2::-1]
     return np.ascontiguousarray(in_order)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Raw:
+    """An image message as if its pixels had not been packed."""
+
+    encoding: str
+    width: int
+    height: int
+    step: int
+    data: npt.NDArray[np.uint8]
+    __msgtype__: str = IMAGE
+
+
+def _unpacked(message: Any, told: re.Match[str], where: str) -> _Raw:
+    """Return an image whose pixels are packed by zstd, as `told` by its format, without that."""
+    width, height, step = (int(number) for number in told.groups()[1:])
+    try:
+        data = from_zstd(bytes(message.data), min(step * height, MAX_BYTES))
+    except ValueError as error:
+        raise InputError(f"{where}: cannot be unpacked ({error}); record it anew.") from None
+    return _Raw(told[1], width, height, step, np.frombuffer(data, np.uint8))
 
 
 def lens(message: Any, where: str, *, ros1: bool) -> Lens:

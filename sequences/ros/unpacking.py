@@ -47,12 +47,15 @@ def from_zstd(data: bytes, most: int = MAX_BYTES) -> bytes:
     """Return what was packed.
 
     Raises:
-        ValueError: where that is more than `most` bytes, or cut off.
+        ValueError: where that is more than `most` bytes, cut off, or not packed by zstd.
     """
     unpacked, ended = b"", False
     while data:
         unpacker = zstd.ZstdDecompressor()
-        unpacked += unpacker.decompress(data, most + 1 - len(unpacked))
+        try:
+            unpacked += unpacker.decompress(data, most + 1 - len(unpacked))
+        except zstd.ZstdError as error:
+            raise ValueError(str(error)) from None
         ended, data = unpacker.eof, unpacker.unused_data
         if not ended or len(unpacked) > most:
             break

@@ -260,6 +260,7 @@ TARGETS |= {
     "realsense 2.58": Target(_recorded("realsense-2.58.db3"), ("*.db3",), read_all),
     "foxglove": Target(_recorded("foxglove.mcap"), ("*.mcap",), read_all),
     "realsense 2.59": Target(_recorded("realsense-2.59.db3"), ("*.db3",), read_all),
+    "realsense 2.59 yuyv": Target(_recorded("realsense-2.59-yuyv.db3"), ("*.db3",), read_all),
 }
 if importlib.util.find_spec("av") is not None:
     TARGETS["mkv"] = Target(_kinect, ("s.mkv",), read_all, 0.5)

@@ -3,6 +3,7 @@
 They run by themselves, where NumPy and the library are; no camera is needed:
 
     pip install numpy pyrealsense2==2.56.5.9235 && python realsense.py realsense-2.56.bag && xz realsense-2.56.bag
+    pip install numpy pyrealsense2==2.59.1.11053 && python realsense.py realsense-2.59-yuyv.db3 && xz *-yuyv.db3
     pip install numpy pillow pyk4a-bundle==1.5.0 && python kinect.py kinect.mkv kinect_pixels.json && xz kinect.mkv
     pip install numpy mcap-ros2-support==0.6.0 && python foxglove.py foxglove.mcap && xz foxglove.mcap
 """

@@ -23,8 +23,8 @@ SHIFT_M = (0.015, 0.001, 0.002)
 class Device:
     """A camera that exists in software only."""
 
-    def __init__(self, rs: Any) -> None:
-        self.rs = rs
+    def __init__(self, rs: Any, *, yuyv: bool) -> None:
+        self.rs, self.yuyv = rs, yuyv
         self.kept: list[np.ndarray] = []
         self.device = rs.software_device()
         self.device.register_info(rs.camera_info.name, "Software D455")
@@ -34,7 +34,14 @@ class Device:
         self.profiles = []
         kinds = (
             (rs.stream.depth, rs.format.z16, 2, DEPTH, rs.distortion.brown_conrady, (0.0,) * 5),
-            (rs.stream.color, rs.format.rgb8, 3, COLOUR, rs.distortion.inverse_brown_conrady, BEND),
+            (
+                rs.stream.color,
+                rs.format.yuyv if yuyv else rs.format.rgb8,
+                2 if yuyv else 3,
+                COLOUR,
+                rs.distortion.inverse_brown_conrady,
+                BEND,
+            ),
         )
         for uid, (kind, pixels, size, (width, height, focal_px), model, bend) in enumerate(kinds):
             lens = rs.intrinsics()
@@ -51,7 +58,10 @@ class Device:
 
     def see(self, number: int) -> None:
         """Take an image of each kind."""
-        for place, pixels in enumerate((depth(number, *DEPTH[:2]), colour(number, *COLOUR[:2]))):
+        picture = colour(number, *COLOUR[:2])
+        if self.yuyv:
+            picture = grey(picture)
+        for place, pixels in enumerate((depth(number, *DEPTH[:2]), picture)):
             image = self.rs.software_video_frame()
             image.pixels, image.stride = pixels, pixels.strides[0]
             image.bpp = pixels.strides[1]
@@ -63,9 +73,14 @@ class Device:
             self.sensors[place].on_video_frame(image)
 
 
-def record(rs: Any, path: Path, count: int, pause_s: float = 0.1) -> None:
+def grey(picture: np.ndarray) -> np.ndarray:
+    """Return the brightness of an image, taken for its green, as YUYV (h, w, 2) without colour."""
+    return np.stack([picture[..., 1], np.full_like(picture[..., 1], 128)], axis=2)
+
+
+def record(rs: Any, path: Path, count: int, pause_s: float = 0.1, *, yuyv: bool = False) -> None:
     """Write a recording of so many images."""
-    device = Device(rs)
+    device = Device(rs, yuyv=yuyv)
     recorder = rs.recorder(str(path), device.device)
     sensors, queue = recorder.query_sensors(), rs.frame_queue(50, True)
     for place in range(len(sensors)):
@@ -82,4 +97,4 @@ def record(rs: Any, path: Path, count: int, pause_s: float = 0.1) -> None:
 
 
 if __name__ == "__main__":
-    record(importlib.import_module("pyrealsense2"), Path(sys.argv[1]), 3)
+    record(importlib.import_module("pyrealsense2"), Path(sys.argv[1]), 3, yuyv="yuyv" in sys.argv[1])
