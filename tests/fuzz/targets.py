@@ -189,17 +189,6 @@ def _recipe(folder: Path) -> Path:
     return folder / "s.json"
 
 
-def _run(folder: Path) -> Path:
-    pose = {"object_from_camera": np.eye(4).ravel().tolist(), "covariance": np.eye(6).ravel().tolist()}
-    report = {
-        "schema": 1,
-        "frames": [{"id": k, "timestamp": 0.1 * k, "points": 9, "outcome": "accepted"} for k in range(3)],
-        "poses": [{"id": k, **pose} for k in range(3)],
-    }
-    (folder / "report.json").write_text(json.dumps(report))
-    return folder
-
-
 def _report(folder: Path) -> Path:
     """Write a report with all that other commands rely on."""
     gaussian = {"target_from_source": np.eye(4).ravel().tolist(), "covariance": (1e-4 * np.eye(6)).ravel().tolist()}
@@ -218,7 +207,12 @@ def _report(folder: Path) -> Path:
         | {"modes": [gaussian | {"weight": 0.6}, gaussian | {"weight": 0.4}]}
         for k in range(2)
     ]
-    report = json.loads((_run(folder) / "report.json").read_text())
+    pose = {"object_from_camera": np.eye(4).ravel().tolist(), "covariance": np.eye(6).ravel().tolist()}
+    report: dict[str, object] = {
+        "schema": 1,
+        "frames": [{"id": k, "timestamp": 0.1 * k, "points": 9, "outcome": "accepted"} for k in range(3)],
+        "poses": [{"id": k, **pose} for k in range(3)],
+    }
     report |= {"sequence": "s", "seed": 0, "prior": "table", "edges": edges}
     report |= {"closed": False, "trustworthy": True, "reasons": ["none"], "seconds": {"total": 1.5}}
     report["settings"] = {"roi": [0, 0, 9, 9], "max_depth_m": 2.0, "voxel_m": 0.002, "frames": ":"}
@@ -254,7 +248,7 @@ TARGETS |= {
     "plain": Target(_intrinsics("intrinsics.txt", "30 30.5 11.5 7.5\n"), ("s/*.txt",), read_all, 0.5),
     "robot": Target(_robot, ("robot.txt",), trajectory),
     "recipe": Target(_recipe, ("s.json",), load_recipe),
-    "run": Target(_run, ("report.json",), _poses),
+    "run": Target(_report, ("report.json",), _poses),
     "report": Target(_report, ("report.json",), _reopen),
     "realsense 2.56": Target(_recorded("realsense-2.56.bag"), ("*.bag",), read_all, 0.5),
     "realsense 2.58": Target(_recorded("realsense-2.58.db3"), ("*.db3",), read_all),
