@@ -426,7 +426,15 @@ def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
         return replace(step, edges_so_far=tuple(edges))
 
     report = _spoilt(refuse, META, tmp_path)
-    assert report["reasons"] == ["none of 1 loop closures was accepted; the last, frame 9 on frame 3: it lies"]
+    assert report["reasons"] == ["none of 1 closures closed a loop; the last refused, frame 9 on frame 3: it lies"]
+
+    def break_off(step: Step) -> Step:  # 5 -> 7 falls, so that the closure 9 -> 3 is all that holds the rest
+        edges = [replace(edge, accepted=(edge.source, edge.target) != (7, 5)) for edge in step.edges_so_far]
+        return replace(step, edges_so_far=tuple(edges))
+
+    report = _spoilt(break_off, META, tmp_path)
+    assert report["closed"] is False
+    assert report["reasons"] == ["what joins the first frames to the last is confirmed by nothing: no loop was closed"]
 
     def see_little(step: Step) -> Step:
         edges = [replace(edge, posterior=replace(edge.posterior, overlap=0.45)) for edge in step.edges_so_far]

@@ -8,7 +8,7 @@ from rich.console import Console as Terminal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from modeler import kernels
-from modeler.types import Outcome, Step
+from modeler.types import Outcome, Step, loops_closed
 
 
 def bar() -> Progress:
@@ -56,7 +56,7 @@ class Console:
 
     def __call__(self, step: Step) -> None:
         """Tell of a step."""
-        loops = sum(edge.kind == "closure" and edge.accepted for edge in step.edges_so_far)
+        loops = loops_closed([edge for edge in step.edges_so_far if edge.accepted])
         frame, accepted = step.frame.index, step.accepted
         again, self._placed[frame] = frame in self._placed, accepted
         if accepted and step.segmentation.outcome is Outcome.UNSURE_MASK:

@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from modeler.export.words import undetermined
-from modeler.types import ACCEPTED, Edge, Mode, RayImage, Solution, Step
+from modeler.types import ACCEPTED, Edge, Mode, RayImage, Solution, Step, loops_closed
 
 _SCHEMA = 1
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
@@ -97,7 +97,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "versions": dict(meta.versions),
         "seconds": dict(meta.seconds),
         "complete": step.last and not meta.interrupted,
-        "closed": any(edge.kind == "closure" for edge in _taking_part(step)),
+        "closed": loops_closed(_taking_part(step)) > 0,
         "trustworthy": not reasons,
         "reasons": reasons,
         "frames": [vars(frame) for frame in frames],
@@ -120,15 +120,20 @@ def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> l
     reasons += [f"frame {frame.id} was left out: {frame.outcome}" for frame in frames if not frame.accepted]
     if sum(frame.accepted for frame in frames) < 2:
         reasons.append("fewer than two frames were accepted: there is nothing to align")
-    tried = [edge for edge in step.edges_so_far if edge.kind == "closure"]
-    if not any(edge.kind == "closure" for edge in _taking_part(step)):
-        if tried:
-            last = tried[-1]
+    edges = _taking_part(step)
+    if not loops_closed(edges):
+        closures = [edge for edge in step.edges_so_far if edge.kind == "closure"]
+        refused = [edge for edge in closures if edge not in edges]
+        if refused:
+            last = refused[-1]
             pair = f"frame {last.source} on frame {last.target}"
-            reasons.append(f"none of {len(tried)} loop closures was accepted; the last, {pair}: {_reason(last, step)}")
+            reasons.append(
+                f"none of {len(closures)} closures closed a loop; the last refused, {pair}: {_reason(last, step)}"
+            )
+        elif closures:
+            reasons.append("what joins the first frames to the last is confirmed by nothing: no loop was closed")
         elif meta.closure_expected:
             reasons.append("the object never came back to an earlier view, so that no loop was closed")
-    edges = _taking_part(step)
     reasons += [
         f"frames {edge.source} and {edge.target} share little surface (overlap {edge.posterior.overlap:.2f}), and no "
         "other edge confirms how they were joined"

@@ -16,7 +16,7 @@ from PIL import Image
 
 from modeler import evaluation, se3
 from modeler.export import write_atomically
-from modeler.types import ACCEPTED, Array
+from modeler.types import ACCEPTED, Array, loops_closed
 from viz.pictures import look_at, shade
 from viz.report import plots
 from viz.report.cards import pair_cards
@@ -65,7 +65,7 @@ def _head(result: Result, mesh: Mesh | None) -> str:
         if report["trustworthy"]
         else f'<div class="verdict no">This model is not to be trusted:<ul>{reasons}</ul></div>'
     )
-    closed = sum(edge.kind == "closure" and edge.accepted for edge in result.edges)
+    closed = loops_closed([edge for edge in result.edges if edge.accepted])
     total_s = report["seconds"].get("total")
     figures = [
         (f"{len(result.poses)} of {len(report['frames'])}", "frames placed"),
