@@ -15,6 +15,12 @@ FARTHEST_M = 100.0
 """No depth camera for objects measures nearer or farther; a median beyond tells of a wrong unit."""
 
 
+LIKELY_M = (0.15, 5.0)
+"""Half of what a camera that watches an object sees lies within these limits; elsewhere the unit may be wrong."""
+OFF_MIDDLE = 0.1
+"""Principal points lie within such a share of an image's longer side of its middle."""
+
+
 @final
 @dataclass(frozen=True)
 class Survey:
@@ -60,6 +66,28 @@ class Survey:
         if self.empty_masks:
             lacks.append(f"nothing measured inside the mask in frames {_some(self.empty_masks)}: they will be left out")
         return tuple(lacks)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What may be meant otherwise than it is said, in words."""
+        middle_m, doubts = self.range_m[1], []
+        if not LIKELY_M[0] <= middle_m <= LIKELY_M[1]:
+            what = "near" if middle_m < LIKELY_M[0] else "far"
+            doubts.append(
+                f"half of the depth lies within {middle_m:.2f} m, very {what} for an object: is the unit right? "
+                "If not, convert with --depth-scale-mm"
+            )
+        for camera in self.cameras[:1]:
+            off_px, swapped_px = (
+                float(np.hypot(x - camera.width / 2, y - camera.height / 2))
+                for x, y in ((camera.cx, camera.cy), (camera.cy, camera.cx))
+            )
+            if swapped_px < off_px and off_px > OFF_MIDDLE * max(camera.width, camera.height):
+                doubts.append(
+                    f"the principal point ({camera.cx:.0f}, {camera.cy:.0f}) lies {off_px:.0f} px off the images' middle: "
+                    "are cx and cy exchanged?"
+                )
+        return tuple(doubts)
 
 
 def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:

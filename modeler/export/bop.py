@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -37,16 +38,8 @@ def write_bop(model: ObjectModel, out: Path) -> None:
     low, high = model.vertices_m.min(axis=0), model.vertices_m.max(axis=0)
     origin_m = 0.5 * (low + high)
     places_mm = 1000.0 * (model.vertices_m - origin_m)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        path = out.with_name(INFO)
-        entries = json.loads(path.read_text()) if path.exists() else {}
-    except OSError as error:
-        raise InputError(f"{out.parent}: cannot be used ({error.strerror}); choose another place with --out") from error
-    except ValueError as error:
-        raise InputError(
-            f"{out.with_name(INFO)}: cannot be read ({error}); mend it or choose another folder"
-        ) from error
+    path = out.with_name(INFO)
+    entries = _entries(path)
     size_mm = 1000.0 * (high - low)
     entries[number] = {
         "diameter": _diameter(places_mm),
@@ -56,6 +49,26 @@ def write_bop(model: ObjectModel, out: Path) -> None:
     }
     write_atomically(out, ply_bytes(places_mm, model.vertex_normals, model.vertex_colours, model.triangles))
     write_atomically(path, json.dumps(dict(sorted(entries.items(), key=lambda entry: int(entry[0]))), indent=2) + "\n")
+
+
+def _entries(path: Path) -> dict[str, Any]:
+    """Return the entries of other objects, by their numbers, in a `models_info.json` whose folder is made if need be.
+
+    Raises:
+        InputError: where it cannot be read, or is no such file.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        entries = json.loads(path.read_text()) if path.exists() else {}
+    except OSError as error:
+        raise InputError(
+            f"{path.parent}: cannot be used ({error.strerror}); choose another place with --out"
+        ) from error
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be read ({error}); mend it or choose another folder") from error
+    if not isinstance(entries, dict) or not all(number.isdecimal() for number in entries):
+        raise InputError(f"{path}: lists no objects by their numbers; mend it or choose another folder")
+    return entries
 
 
 def _diameter(points: Array) -> float:

@@ -122,7 +122,11 @@ class Fuser:
         return Scan(self, seen.carving(tau_m), box, tau_m, box.voxel_m + 2.0 * spread_m, sigma_m)
 
     def side_m(self, pairs: list[tuple[RayImage, Array]]) -> float:
-        """Return the side of a voxel, before the box is known."""
+        """Return the side of a voxel, before the box is known.
+
+        Raises:
+            InputError: where the one that was given is none.
+        """
         if self.voxel_m is not None:
             if not self.voxel_m > 0.0:
                 raise InputError(f"voxel size {self.voxel_m} m is not positive; give a length in m, or none")

@@ -31,7 +31,11 @@ class AxesPrior(AbstractPrior):
     """Least ratio of the standard deviations along the first principal axis and the second."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
-        """Return the density of target_from_source: that of what is known, unless both surfaces are long."""
+        """Return the density of target_from_source: that of what is known, unless both surfaces are long.
+
+        Raises:
+            InputError: where the views lack what `known` needs.
+        """
         known = self.known.between(source, target)
         first, second = (long_axis(view.points_m, self.min_elongation) for view in (source, target))
         if first is None or second is None:
@@ -72,7 +76,9 @@ class Aligned(AbstractMotion):
     target_centroid_m: Array
     """(3,)."""
     sigma_rad: float
+    """Standard deviation of the angle between the axes, about each axis across them."""
     sigma_m: float
+    """Standard deviation of the distance between the centroids, along each axis."""
     evidence: bool = False
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:

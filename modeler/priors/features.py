@@ -43,7 +43,11 @@ class FeaturesPrior(AbstractPrior):
     """Fewest points a side after thinning; with fewer, features say nothing."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
-        """Return the density of target_from_source: that of what is known, where no three matches agree."""
+        """Return the density of target_from_source: that of what is known, where no three matches agree.
+
+        Raises:
+            InputError: where the views lack what `known` needs.
+        """
         known = self.known.between(source, target)
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return known

@@ -39,7 +39,9 @@ class GeneralMotion(AbstractMotion):
     target_centroid_m: Array
     """(3,)."""
     max_rotation_rad: float
+    """Largest angle of the rotation from the middle."""
     max_offset_m: float
+    """Radius of the ball of where the target's centroid lies from the source's, carried over."""
     middle: Array = field(default_factory=lambda: np.eye(3))
     """(3, 3) rotation from which the limit counts."""
     evidence: bool = True

@@ -61,7 +61,9 @@ class Product(AbstractMotion):
     """The normalised product of two densities, drawn by importance from a Gaussian fitted to it and from both."""
 
     first: AbstractMotion
+    """One density."""
     second: AbstractMotion
+    """The other."""
     gaussian: Gaussian
     """Covers the product."""
     log_volume: float

@@ -54,7 +54,9 @@ class TableMotion(AbstractMotion):
     plane: OnPlane
     """Where the object stands."""
     max_rotation_rad: float
+    """Largest turn from the middle, either way."""
     max_shift_m: float
+    """Radius of the disc, in the plane, of where the target's centroid lies from the source's, carried over."""
     middle_rad: float = 0.0
     """The turn from which the limit counts."""
     evidence: bool = True

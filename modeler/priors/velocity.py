@@ -30,7 +30,11 @@ class VelocityPrior(AbstractPrior):
     """Frame numbers and object_from_camera (4, 4) of the poses so far, in order of frames."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
-        """Return the density of target_from_source: that of what is known, until two frames have shown a pace."""
+        """Return the density of target_from_source: that of what is known, until two frames have shown a pace.
+
+        Raises:
+            InputError: where the views lack what `known` needs.
+        """
         known = self.known.between(source, target)
         poses = dict(self.trajectory)
         if len(poses) < 2 or target.index not in poses or source.index in poses:

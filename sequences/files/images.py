@@ -164,7 +164,7 @@ def check_size(path: Path, found: tuple[int, ...], depth: tuple[int, ...]) -> No
     if found != depth:
         raise InputError(
             f"{path}: is {found[1]} x {found[0]} pixels where its depth image is {depth[1]} x {depth[0]}; "
-            "colour and masks must be aligned to depth."
+            "colour and masks must be aligned to depth; align them, or move colour away to do without."
         )
 
 

@@ -24,7 +24,10 @@ _CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 @final
 @dataclass(frozen=True)
 class Node:
-    """One value of a file, and where it stands there."""
+    """One value of a file, and where it stands there.
+
+    Methods return it as what it should be, and raise an InputError that names the place where it is not.
+    """
 
     value: object
     """The value as parsed."""

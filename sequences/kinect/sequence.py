@@ -135,7 +135,11 @@ class Matroska:
             return bytes(self._find(title, stamp))
 
     def picture(self, title: str, stamp: int, where: str) -> npt.NDArray[np.uint8]:
-        """Return one image as RGB (h, w, 3)."""
+        """Return one image as RGB (h, w, 3); `where` names it for messages.
+
+        Raises:
+            InputError: where it cannot be decoded.
+        """
         with told(self.path, "recording", _AGAIN):
             packet = self._find(title, stamp)
             content = bytes(packet)

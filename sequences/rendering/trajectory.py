@@ -2,6 +2,8 @@
 
 The table frame has its origin in the middle of the table's surface, z up, y away from the camera. The object frame is
 the object as it rests: standing on z = 0, its bounding box centred over the origin.
+
+Real tables are not plane and real turntables not true: what moves on them may wobble, tilted and lifted in each frame.
 """
 
 from __future__ import annotations
@@ -34,10 +36,14 @@ class Tabletop:
     """The object stays within this distance of the middle of the table."""
     start_deg: float = 0.0
     """Turn of the first frame."""
+    wobble_deg: float = 0.0
+    """Standard deviation of the tilt about each horizontal direction in one motion from frame to frame."""
+    wobble_m: float = 0.0
+    """Standard deviation of the lift in one motion from frame to frame in m."""
 
     def __post_init__(self) -> None:
         """Check the sizes."""
-        _checked(self.frames, self.step_sigma_deg, self.shift_m)
+        _checked(self.frames, self.step_sigma_deg, self.shift_m, self.wobble_deg, self.wobble_m)
         if self.shift_m > self.reach_m:
             raise ValueError("reach_m must be at least shift_m")
 
@@ -49,7 +55,7 @@ class Tabletop:
             turn_deg += rng.normal(self.step_deg, self.step_sigma_deg)
             place_m = self._next_place(place_m, rng)
             poses.append(placement((place_m[0], place_m[1], 0.0), (0.0, 0.0, turn_deg)))
-        return np.array(poses)
+        return _wobbling(np.array(poses), self.wobble_deg, self.wobble_m, rng)
 
     def _next_place(self, place_m: Array, rng: np.random.Generator) -> Array:
         while True:  # from within reach at least a third of the directions stay within reach, so this soon ends
@@ -76,17 +82,22 @@ class Turntable:
     """Standard deviation of the turn."""
     offset_m: tuple[float, float] = (0.02, 0.01)
     """Where the object stands on the disc at the start, from its axis, in m."""
+    wobble_deg: float = 0.0
+    """Standard deviation of the tilt about each horizontal direction in one motion from frame to frame."""
+    wobble_m: float = 0.0
+    """Standard deviation of the lift in one motion from frame to frame in m."""
 
     def __post_init__(self) -> None:
         """Check the sizes."""
-        _checked(self.frames, self.step_sigma_deg)
+        _checked(self.frames, self.step_sigma_deg, self.wobble_deg, self.wobble_m)
 
     def table_from_object(self, centre_m: Array, rng: np.random.Generator) -> Array:
         """Draw the poses (frames, 4, 4)."""
         steps_deg = rng.normal(self.step_deg, self.step_sigma_deg, self.frames - 1)
         on_disc = se3.translation(np.array([*self.offset_m, 0.0]))
         turns_deg = np.concatenate([[0.0], np.cumsum(steps_deg)])
-        return np.array([placement((0.0, 0.0, 0.0), (0.0, 0.0, turn_deg)) @ on_disc for turn_deg in turns_deg])
+        poses = np.array([placement((0.0, 0.0, 0.0), (0.0, 0.0, turn_deg)) @ on_disc for turn_deg in turns_deg])
+        return _wobbling(poses, self.wobble_deg, self.wobble_m, rng)
 
     def motion(self) -> Mapping[str, object]:
         """Return what `sequence.json` says of it."""
@@ -189,6 +200,24 @@ class Places:
 
 
 AnyTrajectory = Tabletop | Turntable | Hand | Places
+
+
+def _wobbling(table_from_object: Array, wobble_deg: float, wobble_m: float, rng: np.random.Generator) -> Array:
+    """Return upright poses (n, 4, 4), each tilted about where the object stands and lifted at random.
+
+    A motion takes the wobble of two frames, hence the root of two. What does not wobble draws no numbers: its random
+    stream is that of a true table.
+    """
+    count = len(table_from_object)
+    if wobble_deg > 0.0:
+        tilt = np.zeros((count, 6))
+        tilt[:, :2] = rng.normal(0.0, np.radians(wobble_deg) / np.sqrt(2.0), (count, 2))
+        table_from_object = table_from_object @ se3.exp(tilt)
+    if wobble_m > 0.0:
+        lift = np.tile(np.eye(4), (count, 1, 1))
+        lift[:, 2, 3] = rng.normal(0.0, wobble_m / np.sqrt(2.0), count)
+        table_from_object = lift @ table_from_object
+    return table_from_object
 
 
 def _checked(frames: int, *spreads: float) -> None:
