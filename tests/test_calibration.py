@@ -104,6 +104,15 @@ def test_staging_changes_what_the_condition_says(name: str) -> None:
     assert not np.allclose(usual.truth()[0], RenderedSequence(staged(recipe, Condition(), frames=4, seed=8)).truth()[0])
 
 
+@pytest.mark.parametrize("name", ["box", "tube", "jar"])
+def test_the_table_of_the_study_is_as_plane_as_the_prior_takes_it(name: str) -> None:
+    recipe, prior = staged(load_recipe(name), Condition(), frames=2001, seed=7), TablePrior()
+    table_from_object = se3.inverse(recipe.view.camera_from_table()) @ [*RenderedSequence(recipe).truth().values()]
+    motions = table_from_object[1:] @ se3.inverse(table_from_object[:-1])
+    np.testing.assert_allclose(np.degrees(motions[:, :2, 2].std(axis=0)), prior.sigma_tilt_deg, rtol=0.06)
+    assert np.diff(table_from_object[:, 2, 3]).std() == pytest.approx(prior.sigma_height_m, rel=0.06)
+
+
 @pytest.mark.parametrize("axis", range(6))
 def test_an_error_along_one_axis_counts_there(axis: int) -> None:
     sigmas = np.array([0.01, 0.02, 0.03, 0.001, 0.002, 0.003])

@@ -14,7 +14,7 @@ from sequences.rendering.mesh import ply_bytes
 from sequences.rendering.recipe import Recipe, Viewpoint, builtin_recipes, load_recipe
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.shapes import Box, Cylinder, MeshFile, Sphere
-from sequences.rendering.trajectory import Hand, Place, Places
+from sequences.rendering.trajectory import Hand, Place, Places, Tabletop, Turntable
 
 
 @pytest.mark.parametrize("name", builtin_recipes())
@@ -74,6 +74,18 @@ def test_toml_and_json_say_the_same(tmp_path: Path) -> None:
     assert replace(json_recipe, sensor=toml_recipe.sensor) == toml_recipe
 
 
+@pytest.mark.parametrize("kind", [Tabletop, Turntable])
+def test_recipes_may_say_how_much_motions_wobble(tmp_path: Path, kind: type[Tabletop | Turntable]) -> None:
+    path = tmp_path / "r.json"
+    wobble = {"kind": kind.__name__.lower(), "wobble_deg": 0.2, "wobble_m": 7e-4}
+    path.write_text(json.dumps({"object": json.loads(BOX), "trajectory": wobble}))
+    assert load_recipe(path).trajectory == kind(wobble_deg=0.2, wobble_m=7e-4)
+    truth = np.array(list(RenderedSequence(load_recipe(path)).truth().values()))
+    table_from_object = se3.inverse(Viewpoint().camera_from_table()) @ truth
+    assert 0.0 < np.degrees(np.abs(table_from_object[:, :2, 2])).max() < 1.0  # the truth is what wobbles
+    assert 0.0 < np.abs(table_from_object[:, 2, 3] - 0.05).max() < 0.003
+
+
 def test_mesh_files_are_found_beside_the_recipe(tmp_path: Path) -> None:
     (tmp_path / "part.ply").write_bytes(ply_bytes(Box((100, 100, 100)).mesh()))
     (tmp_path / "r.json").write_text('{"object": {"kind": "mesh_file", "path": "part.ply", "scale": 0.001}}')
@@ -115,6 +127,11 @@ FAULTS = {
     "colour": (f'{{"object": {BOX}, "colour": "bmp"}}', '"jpg"'),
     "no frames": (f'{{"object": {BOX}, "trajectory": {{"kind": "hand", "frames": 0}}}}', "number of frames"),
     "far shifts": (f'{{"object": {BOX}, "trajectory": {{"kind": "tabletop", "shift_m": 1}}}}', "reach_m"),
+    "wobble negative": (
+        f'{{"object": {BOX}, "trajectory": {{"kind": "tabletop", "wobble_m": -1}}}}',
+        "not be negative",
+    ),
+    "wobble in a hand": (f'{{"object": {BOX}, "trajectory": {{"kind": "hand", "wobble_deg": 1}}}}', "is not known"),
     "no baseline": (f'{{"object": {BOX}, "sensor": {{"baseline_m": 0}}}}', "baseline_m must not be 0"),
     "ranges": (f'{{"object": {BOX}, "sensor": {{"min_range_m": 9}}}}', "less than max_range_m"),
     "bad effect": (f'{{"object": {BOX}, "sensor": {{"mixed": {{"probability": 2}}}}}}', "from 0 to 1"),

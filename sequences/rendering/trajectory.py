@@ -205,17 +205,18 @@ AnyTrajectory = Tabletop | Turntable | Hand | Places
 def _wobbling(table_from_object: Array, wobble_deg: float, wobble_m: float, rng: np.random.Generator) -> Array:
     """Return upright poses (n, 4, 4), each tilted about where the object stands and lifted at random.
 
-    A motion takes the wobble of two frames, hence the root of two. What does not wobble draws no numbers: its random
-    stream is that of a true table.
+    A motion takes the wobble of two frames, hence the root of two. It is drawn from streams of its own: turns and
+    shifts are those on a true table, and a sequence begins as a shorter one does.
     """
     count = len(table_from_object)
+    tilt_rng, lift_rng = rng.spawn(2)
     if wobble_deg > 0.0:
         tilt = np.zeros((count, 6))
-        tilt[:, :2] = rng.normal(0.0, np.radians(wobble_deg) / np.sqrt(2.0), (count, 2))
+        tilt[:, :2] = tilt_rng.normal(0.0, np.radians(wobble_deg) / np.sqrt(2.0), (count, 2))
         table_from_object = table_from_object @ se3.exp(tilt)
     if wobble_m > 0.0:
         lift = np.tile(np.eye(4), (count, 1, 1))
-        lift[:, 2, 3] = rng.normal(0.0, wobble_m / np.sqrt(2.0), count)
+        lift[:, 2, 3] = lift_rng.normal(0.0, wobble_m / np.sqrt(2.0), count)
         table_from_object = lift @ table_from_object
     return table_from_object
 
