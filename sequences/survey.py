@@ -84,8 +84,8 @@ class Survey:
             )
             if swapped_px < off_px and off_px > OFF_MIDDLE * max(camera.width, camera.height):
                 doubts.append(
-                    f"the principal point ({camera.cx:.0f}, {camera.cy:.0f}) lies {off_px:.0f} px off the images' middle: "
-                    "are cx and cy exchanged?"
+                    f"the principal point ({camera.cx:.0f}, {camera.cy:.0f}) lies {off_px:.0f} px off the middle of "
+                    "the images: are cx and cy exchanged?"
                 )
         return tuple(doubts)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -271,6 +272,19 @@ def test_onboarding_scenes_are_read(tmp_path: Path, frames: list[Frame], truth: 
     assert sequence.notes == ("1 colour images have no depth image and are left out",)
     with pytest.raises(InputError, match="holds 1 sequences; give one of them: obj_000001_up"):
         open_sequence(tmp_path / "onboarding_static")
+
+
+def test_what_may_be_meant_otherwise_is_asked(tmp_path: Path, frames: list[Frame]) -> None:
+    write_bop(tmp_path / "right", frames, depth_scale_mm=1.0)
+    assert survey(open_sequence(tmp_path / "right")).doubts == ()
+    write_bop(tmp_path / "unit", [replace(one, depth_m=10.0 * one.depth_m) for one in frames], depth_scale_mm=1.0)
+    (doubt,) = survey(open_sequence(tmp_path / "unit")).doubts
+    assert "very far for an object: is the unit right?" in doubt
+    cameras = [replace(one.camera, cx=one.camera.cy, cy=one.camera.cx) for one in frames]
+    swapped = [replace(one, camera=camera) for one, camera in zip(frames, cameras, strict=True)]
+    write_bop(tmp_path / "swapped", swapped, depth_scale_mm=1.0)
+    (doubt,) = survey(open_sequence(tmp_path / "swapped")).doubts
+    assert doubt.endswith("are cx and cy exchanged?")
 
 
 def test_onboarding_video_has_truth_for_its_first_frame_only(

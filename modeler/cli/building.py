@@ -86,7 +86,8 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
     whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     if not frames.live:
-        survey(frames, truth=False)
+        for doubt in survey(frames, truth=False).doubts:
+            print(f"modeler: {doubt}", file=sys.stderr)
     return whole, frames
 
 

@@ -54,7 +54,7 @@ def convert(options: Convert) -> int:
             },
         )
     print(f"modeler: {len(open_sequence(options.out))} frames ({sequence.layout}): {options.out}", file=sys.stderr)
-    for note in sequence.notes:
+    for note in (*found.doubts, *sequence.notes):
         print(f"modeler: {note}", file=sys.stderr)
     return 0
 

@@ -47,7 +47,7 @@ def record(sequence: AbstractSequence, found: Survey) -> dict[str, object]:
         "sensor": None if sensor is None else {"sigma_wh": sensor[0], "sigma_r_m": sensor[1]},
         "motion": None if motion is None else dict(motion),
         "missing": list(found.missing),
-        "notes": list(sequence.notes),
+        "notes": [*found.doubts, *sequence.notes],
     }
 
 
@@ -79,7 +79,7 @@ def rows(sequence: AbstractSequence, found: Survey) -> list[tuple[str, str]]:
     if motion is not None:
         lines.append(("motion", ", ".join(f"{key} {value}" for key, value in motion.items())))
     lines += [("missing", what) for what in found.missing]
-    return lines + [("note", note) for note in sequence.notes]
+    return lines + [("note", note) for note in (*found.doubts, *sequence.notes)]
 
 
 def _sizes(cameras: tuple[Camera, ...]) -> list[tuple[int, int]]:
