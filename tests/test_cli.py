@@ -223,7 +223,13 @@ def test_the_readme_names_every_file_of_a_run_folder() -> None:
         (("evaluate", "--out", "OUT"), "no sequence"),
         (("evaluate", BOX, "--out", "OUT", "--methods", "icp,magic"), "'magic'"),
         (("evaluate", BOX, "--out", "OUT", "--offsets", "0"), "--offsets 0"),
+        (
+            ("evaluate", BOX, "--out", "OUT", "--offsets", "1,14"),
+            "--offsets 14: no pair of frames is so far apart in 14",
+        ),
         (("evaluate", BOX, "--out", "OUT", "--points", "0"), "--points 0"),
+        (("build", BOX, "--out", "OUT", "--connect", "nowhere"), "--connect nowhere: not the address of a viewer"),
+        (("report", __file__, "--out", "OUT"), "there is no report; is "),
         (("evaluate", BOX, "--out", "OUT", "--roi", "0", "480", "9", "500"), "--roi 0 480 9 500 lies outside"),
         (("render", "nothing", "--out", "OUT"), "box"),
         (("view", "NOWHERE"), "NOWHERE"),

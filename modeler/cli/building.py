@@ -22,6 +22,7 @@ from modeler.types import ACCEPTED, InputError
 from sequences import AbstractSequence, SensedSequence, frame_range, open_sequence, read_noise, survey
 from viz.ending import ends_whole
 from viz.stream import open_stream
+from viz.viewer import reachable
 
 
 def build(options: Build) -> int:
@@ -73,6 +74,8 @@ def _check(options: Build) -> None:
         raise InputError("--resume keeps what --overwrite deletes; give one of them")
     if options.voxel_m is not None and not 0.0 < options.voxel_m < 1.0:
         raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m between 0 and 1")
+    if options.connect is not None:
+        reachable(options.connect)  # refuses what is no address; whether somebody listens is asked when there is news
 
 
 def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:

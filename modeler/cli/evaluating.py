@@ -15,7 +15,7 @@ from modeler.cli.evaluating_models import evaluate_models, is_run, models_table
 from modeler.cli.options import Method
 from modeler.experiment import Experiment, Pairing, Summary
 from modeler.types import AbstractRegistrar, InputError
-from sequences import frame_range, open_sequence
+from sequences import AbstractSequence, frame_range, open_sequence
 from viz import figures
 
 
@@ -50,6 +50,7 @@ def evaluate(options: Evaluate) -> int:
         learn=options.learn,
         seed=options.seed,
     )
+    _check_offsets(plan.pairing, recorded)
     with bar() as progress:
         task = progress.add_task("", total=sum(plan.size(sequence) for sequence in recorded))
         rows = experiment.evaluate(
@@ -115,6 +116,19 @@ def _methods(names: str) -> dict[str, AbstractRegistrar]:
         if name not in known:
             raise InputError(f"--methods {names}: there is no method {name!r}; there are {', '.join(known)}")
     return {name: compose.registrar(known[name]) for name in chosen}
+
+
+def _check_offsets(pairing: Pairing, recorded: Sequence[AbstractSequence]) -> None:
+    """Refuse frames so far apart that no sequence has two of them.
+
+    Raises:
+        InputError: where they are.
+    """
+    for offset in pairing.offsets:
+        alone = replace(pairing, offsets=(offset,))
+        if not any(True for sequence in recorded for _ in alone.pairs(sequence.indices)):
+            most = max(map(len, recorded))
+            raise InputError(f"--offsets {offset}: no pair of frames is so far apart in {most} frames; give less")
 
 
 def _offsets(text: str) -> tuple[int, ...]:

@@ -104,7 +104,7 @@ class RunFolder:
         path = self.path / _REPORT
         try:
             report = json.loads(path.read_bytes())
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             raise InputError(f"{path}: there is no report; is {self.path} the folder of a run?") from None
         except (OSError, ValueError) as error:
             raise InputError(f"{path}: the report cannot be read ({error}); build again with --overwrite") from error

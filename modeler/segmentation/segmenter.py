@@ -50,7 +50,7 @@ class Segmenter:
                 f"--roi {' '.join(map(str, self.roi))} is empty; give X0 Y0 X1 Y1 with X0 < X1 and Y0 < Y1."
             )
         if self.max_depth_m is not None and not self.max_depth_m > 0.0:
-            raise InputError(f"--max-depth-m {self.max_depth_m} leaves nothing; give a positive depth in m.")
+            raise InputError(f"--max-depth-m {self.max_depth_m:g} leaves nothing; give a positive depth in m.")
 
     def scene(self, frames: Sequence[Frame]) -> Scene:
         """Learn what stands still, where the object is and what it stands on.
