@@ -50,6 +50,9 @@ MIN_AGREEMENT = np.float32(0.8)
 MAX_SIGMAS = np.float32(3.0)
 """A point farther from the surface than so many standard deviations does not match it."""
 
+LOOSE_SIGMAS = 4.0
+"""Where points are judged and not weighed they match as far as this: what may be noise is not held against a pose."""
+
 # Nodes of the table of log((1 - hidden) exp(match) + hidden); below the first it is log(hidden) within 3e-6.
 TABLE_LOW, TABLE_HIGH, TABLE_STEPS = np.float32(-14.0), np.float32(4.0), 2304
 _PER_STEP = np.float32(TABLE_STEPS / (TABLE_HIGH - TABLE_LOW))
@@ -211,10 +214,10 @@ def classify(pose, sight, model):
         elif found[KIND, j] == SURFACE:
             in_front = height_over(carried, found, j)
             variance = sight.points[VARIANCE_M2, j] + found[VARIANCE, j] + model.blur_m * model.blur_m
-            if in_front > 4.0 * math.sqrt(variance):
+            if in_front > LOOSE_SIGMAS * math.sqrt(variance):
                 verdicts[j] = IN_FRONT
             elif carried[FACES, j] > 0.5:
-                verdicts[j] = MATCHED if in_front > -4.0 * math.sqrt(variance) else BEHIND
+                verdicts[j] = MATCHED if in_front > -LOOSE_SIGMAS * math.sqrt(variance) else BEHIND
             else:
                 verdicts[j] = HIDDEN
     return verdicts
@@ -226,7 +229,7 @@ def excess(pose, sight, blur_m):
 
     Returns:
         Sum in m² of the squared distances from the surface, less the variances of point and plane, over the points that
-        are no farther than 4 standard deviations, of which `blur_m` is a part; and how many they are.
+        are no farther than `LOOSE_SIGMAS` standard deviations, of which `blur_m` is a part; and how many they are.
     """
     carried, pixels, found = buffers(sight)
     look(pose, sight, carried, pixels, found)
@@ -236,7 +239,7 @@ def excess(pose, sight, blur_m):
             continue
         square = np.float64(height_over(carried, found, j)) ** 2
         known = np.float64(sight.points[VARIANCE_M2, j]) + np.float64(found[VARIANCE, j])
-        if square < 16.0 * (known + blur_m * blur_m):
+        if square < LOOSE_SIGMAS * LOOSE_SIGMAS * (known + blur_m * blur_m):
             total += square - known
             count += 1
     return total, count
