@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rings import edge, measured, spin, spun, turntable
 
+from modeler import se3
 from modeler.graph import PoseGraph, Smoother, marginals, smoother, solve
 from modeler.types import Edge, Mode, PoseGaussian, Solution
 
@@ -36,13 +37,14 @@ def _spoilt(of: Edge, rng: np.random.Generator) -> Edge:
 
 
 def _assert_same(one: Solution, other: Solution) -> None:
+    """Poses are the same to half a hundredth of their standard deviations, covariances to a hundredth."""
     assert set(one.trajectory) == set(other.trajectory)
     for frame, pose in one.trajectory.items():
-        np.testing.assert_allclose(pose, other.trajectory[frame], atol=3e-6)  # sigmas are 1e-2 rad and 2e-3 m
         np.testing.assert_allclose(one.odometry[frame], other.odometry[frame], atol=1e-12)
-    last = max(one.trajectory)
-    whiten = np.linalg.inv(np.linalg.cholesky(other.covariances[last]))
-    np.testing.assert_allclose(whiten @ one.covariances[last] @ whiten.T, np.eye(6), atol=1e-3)
+        whiten = np.linalg.inv(np.linalg.cholesky(other.covariances[frame]))
+        if frame != next(iter(one.trajectory)):
+            assert np.linalg.norm(whiten @ se3.log(se3.inverse(other.trajectory[frame]) @ pose)) < 5e-3
+        np.testing.assert_allclose(whiten @ one.covariances[frame] @ whiten.T, np.eye(6), atol=1e-2)
     assert set(one.outliers) == set(other.outliers)
     assert set(one.mode_weights) == set(other.mode_weights)
     for pair, weights in one.mode_weights.items():
@@ -166,7 +168,8 @@ def test_covariances_of_all_are_worked_out_again_only_where_a_loop_has_closed(mo
     closing = _arrivals(np.random.default_rng(14))[-1][1:]
     growing = growing.plus(closing)
     assert growing.solution.covariances[1].shape == (6, 6)
-    assert asked[6:] == [len(growing.graph.edges)]
+    assert len(asked) == 7
+    assert asked[6] < len(growing.graph.edges) // 2  # those around the loop
 
 
 def test_what_hangs_on_one_solution_in_two_ways_is_not_mixed_up() -> None:

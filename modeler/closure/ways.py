@@ -95,20 +95,18 @@ class Network:
     def of(cls, edges: Sequence[Edge], solution: Solution) -> Network:
         """Return the network of edges, as they were judged, by what a solution makes of them."""
         taking_part = [edge for edge in edges if solution.takes_part(edge)]
+        ends = np.array([(edge.posterior.source, edge.posterior.target) for edge in taking_part], dtype=np.int64)
         sure = np.array([solution.pose_of(edge).rotation_variance_rad2 for edge in taking_part])
-        ends = [(edge.source, edge.target) for edge in taking_part]
-        places: dict[int, int] = {}
-        for pair in ends:
-            for frame in pair:
-                places.setdefault(frame, len(places))
-        rows, columns = np.array([[places[one], places[other]] for one, other in ends], dtype=np.int64).reshape(-1, 2).T
-        rows, columns = np.concatenate([rows, columns]), np.concatenate([columns, rows])
+        frames, places = np.unique(ends.reshape(-1, 2), return_inverse=True)
+        places = places.reshape(-1, 2)
+        rows, columns = np.concatenate([places, places[:, ::-1]]).T
         order = np.lexsort((np.tile(sure, 2), columns, rows))
         rows, columns, sure = rows[order], columns[order], np.tile(sure, 2)[order]
         first = np.ones(len(order), dtype=bool)  # of several edges between two frames, the surest
         first[1:] = (np.diff(rows) != 0) | (np.diff(columns) != 0)
-        size = len(places)
-        return cls(places, csr_array((sure[first], (rows[first], columns[first])), shape=(size, size)))
+        size = len(frames)
+        matrix = csr_array((sure[first], (rows[first], columns[first])), shape=(size, size))
+        return cls({frame: place for place, frame in enumerate(frames.tolist())}, matrix)
 
     def ways(self, start: int) -> Ways:
         """Return the surest way from a frame to every other that hangs together with it (Dijkstra 1959)."""

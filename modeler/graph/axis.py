@@ -17,7 +17,7 @@ from scipy import stats
 
 from modeler import se3
 from modeler.graph.links import Link, inverse_right_jacobian
-from modeler.graph.marginals import Rows, gaussian_factor
+from modeler.graph.square_root import Rows
 from modeler.types import Array
 
 _AXIS = gtsam.symbol("a", 0)  # frames are numbered far below
@@ -80,7 +80,7 @@ class CommonAxis:
         for _ in range(_ITERATIONS):
             linear = gtsam.GaussianFactorGraph()
             for blocks, error in rows:
-                linear.add(gaussian_factor(blocks, -error))
+                linear.add(_gaussian_factor(blocks, -error))
             step = linear.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR).optimize()
             moved, moved_rows = poses, rows
             for halvings in range(_HALVINGS):
@@ -241,3 +241,14 @@ def slip(
     of_target = -of_source @ se3.adjoint(se3.inverse(target_from_source))
     of_axis = derivative @ (np.eye(6) - se3.adjoint(se3.inverse(step)))
     return xi[:, _KEPT], of_target, of_source, of_axis
+
+
+def _gaussian_factor(rows: Rows, right: Array) -> gtsam.JacobianFactor:
+    """Return rows of one to three variables, and their right sides (m,), as GTSAM takes them."""
+    (key, block), *more = rows.items()
+    unit = gtsam.noiseModel.Unit.Create(len(block))
+    if not more:
+        return gtsam.JacobianFactor(key, block, right, unit)
+    if len(more) == 1:
+        return gtsam.JacobianFactor(key, block, *more[0], right, unit)
+    return gtsam.JacobianFactor(key, block, *more[0], *more[1], right, unit)

@@ -6,7 +6,7 @@ GTSAM expresses as `target_from_source @ exp(ξ)`, rotation first: the package's
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -29,12 +29,12 @@ class Link:
     pose: PoseGaussian
     """target_from_source as the optimisation takes it."""
 
-    @property
+    @cached_property
     def target(self) -> int:
         """Frame number of the target view."""
         return self.edge.target
 
-    @property
+    @cached_property
     def source(self) -> int:
         """Frame number of the source view."""
         return self.edge.source
@@ -71,34 +71,65 @@ class Link:
         return np.asarray(np.triu(np.linalg.inv(upper)), dtype=np.float64)
 
 
-def split(links: Iterable[Link], root: int) -> tuple[list[Link], list[Link]]:
-    """Return the links that first connect each frame with the root, odometry preferred, and the rest that close loops.
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """How links hang together: those that first connect each frame with the root, odometry preferred, and loops."""
 
-    Links that do not hang together with the root are in neither.
-    """
-    tree: list[Link] = []
-    loops: list[Link] = []
-    group: dict[int, set[int]] = {}
-    for link in sorted(links, key=lambda link: _FIRST.index(link.edge.kind)):  # stable: by arrival within a kind
-        target, source = (group.setdefault(frame, {frame}) for frame in (link.target, link.source))
-        if source is target:
-            loops.append(link)
-            continue
-        tree.append(link)
-        larger, smaller = (target, source) if len(target) >= len(source) else (source, target)
-        larger |= smaller
-        group.update(dict.fromkeys(smaller, larger))
-    reached = group.get(root, {root})
-    return [link for link in tree if link.target in reached], [link for link in loops if link.target in reached]
+    links: Sequence[Link] = ()
+    """All of them, in order of arrival."""
+    tree: Sequence[Link] = ()
+    """Those that connect, whatever closes loops."""
+    loops: Sequence[Link] = ()
+    """The rest; links that do not hang together with the root are in neither."""
+    reached: frozenset[int] = frozenset()
+    """The frames of the tree, and the root."""
+
+    @classmethod
+    def of(cls, links: Sequence[Link], root: int) -> Frames:
+        """Return how links hang together with the root."""
+        tree: list[Link] = []
+        loops: list[Link] = []
+        group: dict[int, set[int]] = {}
+        for link in sorted(links, key=_preferred):  # stable: by arrival within a kind
+            target, source = (group.setdefault(frame, {frame}) for frame in (link.target, link.source))
+            if source is target:
+                loops.append(link)
+                continue
+            tree.append(link)
+            larger, smaller = (target, source) if len(target) >= len(source) else (source, target)
+            larger |= smaller
+            group.update(dict.fromkeys(smaller, larger))
+        reached = frozenset(group.get(root, {root}))
+        tree, loops = ([link for link in some if link.target in reached] for some in (tree, loops))
+        return cls(links, tree, loops, reached)
+
+    def plus(self, links: Sequence[Link]) -> Frames | None:
+        """Return it with more links; None where these would have connected other frames than the tree did."""
+        if len(self.tree) + len(self.loops) < len(self.links):
+            return None
+        tree, loops, reached = list(self.tree), list(self.loops), set(self.reached)
+        last = max(map(_preferred, tree), default=0)
+        for link in sorted(links, key=_preferred):
+            known = (link.target in reached) + (link.source in reached)
+            if known == 0 or (known == 2 and _preferred(link) < last):
+                return None
+            (loops if known == 2 else tree).append(link)
+            reached |= {link.target, link.source}
+            last = max(last, _preferred(link))
+        return Frames([*self.links, *links], tree, loops, frozenset(reached))
 
 
-def walk(tree: Sequence[Link], root: int) -> Iterator[tuple[int, int, Link]]:
-    """Yield (frame, neighbour, link) over a tree of links, outwards from the root, nearer frames first."""
+def _preferred(link: Link) -> int:
+    return _FIRST.index(link.edge.kind)
+
+
+def walk(tree: Sequence[Link], *starts: int) -> Iterator[tuple[int, int, Link]]:
+    """Yield (frame, neighbour, link) over links that make no loop, outwards from frames, nearer frames first."""
     links: dict[int, list[Link]] = {}
     for link in tree:
         links.setdefault(link.target, []).append(link)
         links.setdefault(link.source, []).append(link)
-    waiting, reached = [root], {root}
+    waiting, reached = list(starts), set(starts)
     for frame in waiting:
         for link in links.get(frame, []):
             neighbour = link.source if link.target == frame else link.target
@@ -111,10 +142,10 @@ def walk(tree: Sequence[Link], root: int) -> Iterator[tuple[int, int, Link]]:
 def chain(tree: Sequence[Link], root: int, guess: Mapping[int, Array]) -> dict[int, Array]:
     """Return object_from_camera by frame, outwards from the root: the guess, or else dead reckoning."""
     poses = {root: np.eye(4)}
-    for frame, neighbour, link in walk(tree, root):
-        if neighbour in guess:
-            poses[neighbour] = guess[neighbour]
-            continue
+    poses |= {frame: guess[frame] for link in tree for frame in (link.target, link.source) if frame in guess}
+    poses[root] = np.eye(4)
+    open_links = [link for link in tree if link.target not in poses or link.source not in poses]
+    for frame, neighbour, link in walk(open_links, *poses):
         target_from_source = link.pose.mean
         frame_from_neighbour = target_from_source if link.target == frame else se3.inverse(target_from_source)
         poses[neighbour] = poses[frame] @ frame_from_neighbour

@@ -6,7 +6,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.graph.belief import belief
-from modeler.graph.links import Link, split, walk
+from modeler.graph.links import Frames, Link, walk
 from modeler.graph.pose_graph import PoseGraph
 from modeler.types import PoseGaussian
 
@@ -21,7 +21,7 @@ def dead_reckoning(graph: PoseGraph) -> dict[int, PoseGaussian]:
     root = graph.root
     if root is None:
         return {}
-    tree, _ = split((Link(edge, belief(edge.posterior)) for edge in graph.accepted), root)
+    tree = Frames.of([Link(edge, belief(edge.posterior)) for edge in graph.accepted], root).tree
     poses = {root: PoseGaussian(np.eye(4), _GAUGE_SIGMA**2 * np.eye(6))}
     for frame, neighbour, link in walk(tree, root):
         before = poses[frame]

@@ -86,8 +86,11 @@ def values_of(poses: Mapping[int, Array]) -> gtsam.Values:
 
 def poses_of(values: gtsam.Values, frames: Iterable[int], root: int) -> dict[int, Array]:
     """Return object_from_camera (4, 4) by frame number; the root's, pinned by `anchor`, is the identity."""
-    poses = {frame: np.asarray(values.atPose3(frame).matrix(), dtype=np.float64) for frame in frames}
-    return poses | {root: np.eye(4)}
+    rows = np.asarray(gtsam.utilities.extractPose3(values), dtype=np.float64)  # by key: rotation, translation
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
+    found = dict(zip(values.keys(), poses, strict=True))
+    return {frame: found[frame] for frame in frames} | {root: np.eye(4)}
 
 
 def agree(loops: Iterable[Link], values: gtsam.Values, threshold: float) -> tuple[bool, ...]:

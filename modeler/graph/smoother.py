@@ -13,7 +13,7 @@ import numpy as np
 from modeler.graph.axis import CommonAxis, Turned
 from modeler.graph.belief import belief
 from modeler.graph.incremental import Incremental
-from modeler.graph.links import Link, anchored, chain, split
+from modeler.graph.links import Frames, Link, anchored, chain
 from modeler.graph.marginals import PoseCovariances, RelativeCovariance
 from modeler.graph.modes import decide
 from modeler.graph.optimise import agree, optimise, poses_of, values_of
@@ -34,8 +34,8 @@ class _State:
     root: int | None = None
     links: Mapping[Edge, Link] = field(default_factory=dict)
     """Every accepted edge as one Gaussian, before any loop."""
-    tree: tuple[Link, ...] = ()
-    loops: tuple[Link, ...] = ()
+    frames: Frames = field(default_factory=Frames)
+    """How these hang together."""
     decided: Mapping[Edge, Link] = field(default_factory=dict)
     """Edges with several modes on loops, after them."""
     weights: Mapping[Edge, Array] = field(default_factory=dict)
@@ -91,20 +91,20 @@ class Smoother:
             return replace(self, graph=graph, solution=Solution(), state=_State())
         known = self.state.links
         links = {edge: known.get(edge) or Link(edge, belief(edge.posterior)) for edge in graph.accepted}
-        tree, loops = split(links.values(), root)
-        grew = root == self.state.root and _begins(tree, self.state.tree) and _begins(loops, self.state.loops)
+        frames, grew = self._frames(list(links.values()), root)
+        tree, loops, closes = frames.tree, frames.loops, not grew or len(frames.loops) > len(self.state.frames.loops)
         odometry = chain(tree, root, self.solution.odometry if grew else {})
         weights, decided = self.state.weights, self.state.decided
-        if not grew or len(loops) > len(self.state.loops):
+        if closes:
             weights, decided = self._decided(tree, loops, root, grew=grew)
         taken, closing = ([decided.get(link.edge, link) for link in some] for some in (tree, loops))
         jumped = _jumped(decided, self.state)
         start = chain(taken, root, {} if jumped else anchored(self.solution.trajectory, root))
         inlier, engine = self.state.inlier, self.state.engine
         trajectory: Mapping[int, Array] = start if grew or loops else chain(taken, root, {})
-        if not grew or len(loops) > len(self.state.loops):  # otherwise the new frames hang on one edge each
+        if closes:  # otherwise the new frames hang on one edge each
             trajectory, inlier, engine = self._closed(taken, closing, start, root=root, afresh=jumped or not grew)
-        state = _State(root, links, tuple(tree), tuple(loops), decided, weights, inlier, engine)
+        state = _State(root, links, frames, decided, weights, inlier, engine)
         if grew and decided and inlier.count(False) > self.state.inlier.count(False):
             again = replace(self, state=_State()).to(graph)  # it may be that other modes make fewer loops lie
             if len(again.solution.outliers) < inlier.count(False):
@@ -113,9 +113,10 @@ class Smoother:
         if self.axis is not None:
             inlier, turned = self._turned(self.axis, taken, closing, trajectory, state)
         trajectory = trajectory if turned is None else turned.poses
-        chosen = _taking_part(closing, inlier)
-        hangs = grew and len(loops) == len(self.state.loops)
-        relative_covariance = self._covariance(taken, chosen, trajectory, turned, root=root, hangs=hangs)
+        links_taking_part = [*taken, *_taking_part(closing, inlier)]
+        relative_covariance = self._covariance(
+            links_taking_part, trajectory, turned, root=root, grew=grew and graph is not self.graph
+        )
         several = [link for link in (*taken, *closing) if link.modes]
         own = {link.edge: [mode.weight for mode in link.modes] for link in several}
         solution = Solution(
@@ -132,22 +133,33 @@ class Smoother:
         )
         return replace(self, graph=graph, solution=solution, state=state)
 
+    def _frames(self, links: list[Link], root: int) -> tuple[Frames, bool]:
+        """Return how links hang together, and whether those before hung together so and have but grown."""
+        before = self.state.frames
+        count = len(before.links)
+        if root == self.state.root and len(links) >= count and all(map(operator.is_, links, before.links)):
+            grown = before.plus(links[count:])
+            if grown is not None:
+                return grown, True
+        return Frames.of(links, root), False
+
     def _covariance(
         self,
-        tree: Sequence[Link],
-        loops: Sequence[Link],
+        links: Sequence[Link],
         trajectory: Mapping[int, Array],
         turned: Turned | None,
         *,
         root: int,
-        hangs: bool,
+        grew: bool,
     ) -> RelativeCovariance | SharedCovariance:
-        """Return the covariances of a solution; where no loop is new and frames hang on others, from those before."""
-        before, found = self.solution.relative_covariance, None
-        if hangs and turned is None and isinstance(before, RelativeCovariance) and not before.others:
-            found = before.plus(trajectory, tree[len(self.state.tree) :])
-        links = (*tree, *loops)
-        found = found or RelativeCovariance(trajectory, root, links, () if turned is None else turned.rows)
+        """Return the covariances of a solution, where the graph grew from those before as far as these stayed."""
+        before = self.solution.relative_covariance
+        if isinstance(before, SharedCovariance):
+            before = before.independent
+        if turned is None and isinstance(before, RelativeCovariance) and grew:
+            found = before.to(trajectory, links)
+        else:
+            found = RelativeCovariance(trajectory, root, links, () if turned is None else turned.rows)
         return SharedCovariance(found, links, self.shared) if self.shared else found
 
     def _closed(
@@ -212,15 +224,15 @@ class Smoother:
             inlier = (*before, *choice)
             found = engine.plus([*tree, *_taking_part(loops, inlier)], start)
             if found is not None and agree(loops, found.values, threshold) == inlier:
+                if all(choice):
+                    return inlier, found
                 cost = found.error + threshold * inlier.count(False)
                 if best is None or cost < best[0]:
                     best = cost, inlier, found
-                if all(choice):
-                    break
         return None if best is None else best[1:]
 
     def _decided(
-        self, tree: list[Link], loops: list[Link], root: int, *, grew: bool
+        self, tree: Sequence[Link], loops: Sequence[Link], root: int, *, grew: bool
     ) -> tuple[dict[Edge, Array], dict[Edge, Link]]:
         """Return what the loops leave to the modes of edges with several, and those edges as one Gaussian each."""
         threshold, before = 0.5 * self.outlier_distance**2, self.state.weights if grew else {}
@@ -236,10 +248,6 @@ class Smoother:
 
 def _taking_part(loops: Sequence[Link], inlier: Sequence[bool]) -> list[Link]:
     return [loop for loop, good in zip(loops, inlier, strict=True) if good]
-
-
-def _begins(links: Sequence[Link], beginning: Sequence[Link]) -> bool:
-    return len(links) >= len(beginning) and all(map(operator.is_, links, beginning))
 
 
 def _jumped(decided: Mapping[Edge, Link], state: _State) -> bool:

@@ -76,7 +76,10 @@ class Solution:
 
     def pose_of(self, edge: Edge) -> PoseGaussian:
         """Return target_from_source of an edge as it took part: of several modes, as all edges together have it."""
-        return self.edge_poses.get((edge.source, edge.target), edge.posterior.pose)
+        posterior = edge.posterior
+        if not self.edge_poses:
+            return posterior.pose
+        return self.edge_poses.get((posterior.source, posterior.target), posterior.pose)
 
     def relative_gaussian(self, target: int, source: int) -> PoseGaussian:
         """Return target_from_source between two different solved frames, with its uncertainty."""
