@@ -36,6 +36,21 @@ def log(pose: Array) -> Array:
     return moves.logarithms(pose.reshape(-1, 4, 4)).reshape(*pose.shape[:-2], 6)
 
 
+def is_rigid(matrix: Array, *, tolerance: float, farthest_m: float) -> bool:
+    """Return whether a matrix (4, 4) of whatever numbers, NaN among them, is a rigid motion.
+
+    Args:
+        matrix: as somebody wrote it.
+        tolerance: how far the rotation may be from orthonormal, in each product of two rows.
+        farthest_m: no motion leads so far along any axis.
+    """
+    rotation, shift_m = matrix[:3, :3], matrix[:3, 3]
+    if not ((np.abs(rotation) < 2.0).all() and (np.abs(shift_m) < farthest_m).all()):  # not so of NaN
+        return False
+    orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < tolerance and np.linalg.det(rotation) > 0.0
+    return bool(orthonormal and (matrix[3] == (0.0, 0.0, 0.0, 1.0)).all())
+
+
 def inverse(pose: Array) -> Array:
     """Return the inverse motions (..., 4, 4)."""
     pose = np.asarray(pose, dtype=np.float64)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from modeler import se3
 from modeler.types import Outcome
 
 Test = Callable[[Any], bool]
@@ -57,9 +58,7 @@ def _impossible(record: Mapping[str, Any]) -> str | None:
 
 def _rigid(numbers: list[float | None]) -> bool:
     pose = np.array(numbers, dtype=np.float64).reshape(4, 4)
-    turn = pose[:3, :3]
-    sound = bool((np.abs(pose) < _FARTHEST_M).all()) and bool((pose[3] == (0.0, 0.0, 0.0, 1.0)).all())  # not so of NaN
-    return sound and bool(np.abs(turn @ turn.T - np.eye(3)).max() < _ROUND) and np.linalg.det(turn) > 0.0
+    return se3.is_rigid(pose, tolerance=_ROUND, farthest_m=_FARTHEST_M)
 
 
 def _definite(numbers: list[float | None], least: float) -> bool:

@@ -4,23 +4,22 @@ import numpy as np
 
 from modeler import se3
 from modeler.types import Array
+from sequences.files.intrinsics import of_matrix
 from sequences.files.json_input import Node
+from sequences.given import Intrinsics
 
 
-def intrinsics(node: Node) -> tuple[float, float, float, float]:
+def intrinsics(node: Node) -> Intrinsics:
     """Return (fx, fy, cx, cy) in px of one entry of `scene_camera.json`.
 
     Raises:
         InputError: where `cam_K` is missing or is not the matrix of a pinhole camera.
     """
     entry = node.need("cam_K")
-    matrix = entry.numbers(9).reshape(3, 3)
-    fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    expected = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    sane = 1.0 <= min(fx, fy) and max(fx, fy, abs(cx), abs(cy)) <= 1e6
-    if not sane or np.abs(matrix - expected).max() > 1e-6 * fx:
+    found = of_matrix(entry.numbers(9).reshape(3, 3))
+    if found is None:
         raise entry.fault("[fx, 0, cx, 0, fy, cy, 0, 0, 1] in px with fx and fy of at least 1")
-    return fx, fy, cx, cy
+    return found
 
 
 def depth_scale_mm(node: Node) -> float:

@@ -54,14 +54,15 @@ def _from_text(path: Path) -> Intrinsics:
     except ValueError:
         raise InputError(f"{path}: holds words that are no numbers; it must be {expected}.") from None
     if len(numbers) == 1 and len(numbers[0]) >= 4:
-        found = numbers[0][:4]
+        fx, fy, cx, cy = numbers[0][:4]
+        found = (fx, fy, cx, cy) if sane((fx, fy, cx, cy)) else None
     elif numbers and {len(numbers)} == {len(row) for row in numbers} <= {3, 4}:
-        found = _of_matrix(np.array(numbers)[:3, :3])
+        found = of_matrix(np.array(numbers)[:3, :3])
     else:
         found = None
-    if found is None or not sane((found[0], found[1], found[2], found[3])):
+    if found is None:
         raise InputError(f"{path}: does not describe a pinhole camera; it must be {expected}, in px.")
-    return found[0], found[1], found[2], found[3]
+    return found
 
 
 def _from_json(node: Node) -> Intrinsics:
@@ -82,15 +83,15 @@ def _from_json(node: Node) -> Intrinsics:
         matrix = np.stack([row.numbers(3) for row in entry.elements()])
     else:
         matrix = entry.numbers(9).reshape(3, 3)
-    found = _of_matrix(matrix) or _of_matrix(matrix.T)
-    if found is None or not sane((found[0], found[1], found[2], found[3])):
+    found = of_matrix(matrix) or of_matrix(matrix.T)
+    if found is None:
         raise entry.fault("the matrix of a pinhole camera in px with fx and fy of at least 1")
-    return found[0], found[1], found[2], found[3]
+    return found
 
 
-def _of_matrix(matrix: Array) -> list[float] | None:
-    """Return fx, fy, cx, cy of a matrix (3, 3); None where it has another form."""
+def of_matrix(matrix: Array) -> Intrinsics | None:
+    """Return fx, fy, cx, cy of the matrix (3, 3) of a pinhole camera; None where it is that of none."""
     fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     expected = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    close = bool(np.isfinite(matrix).all()) and np.abs(matrix - expected).max() <= 1e-6 * max(abs(fx), 1.0)
-    return [fx, fy, cx, cy] if close else None
+    known = sane((fx, fy, cx, cy)) and bool(np.abs(matrix - expected).max() <= 1e-6 * fx)  # not so of NaN
+    return (fx, fy, cx, cy) if known else None

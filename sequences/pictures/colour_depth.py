@@ -18,6 +18,8 @@ from sequences.pictures.sequence import PictureSequence, Shot
 
 COLOUR_FOLDERS = ("color", "rgb", "colour", "image")
 MASK_FOLDERS = ("masks", "mask")
+FARTHEST_M = 1e6
+"""No camera is farther away."""
 
 
 def open_colour_depth(path: Path, given: Given) -> PictureSequence:
@@ -133,8 +135,6 @@ def _rigid(rows: list[list[str]], path: Path) -> Array:
         matrix = np.array(rows, dtype=np.float64)
     except ValueError:
         matrix = np.zeros(0)
-    if matrix.shape == (4, 4) and (np.abs(matrix) < 1e6).all():  # not so of NaN
-        rotation = matrix[:3, :3]
-        if np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-2 and np.linalg.det(rotation) > 0.0:
-            return matrix
+    if matrix.shape == (4, 4) and se3.is_rigid(matrix, tolerance=1e-2, farthest_m=FARTHEST_M):
+        return matrix
     raise InputError(f"{path}: is no rigid motion; write four rows of four numbers, the last 0 0 0 1.")

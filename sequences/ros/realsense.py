@@ -17,6 +17,8 @@ from sequences.lens import Lens, known
 from sequences.ros import frames
 from sequences.ros.bag import Bag
 
+FARTHEST_M = 10.0
+"""No two cameras of one device are so far apart."""
 TEXT = "std_msgs/msg/String"
 _STREAM = r"(/device_\d+/sensor_\d+)/\w+"
 
@@ -89,9 +91,7 @@ def _pose(message: Any, where: str) -> Array:
         # Matrices of the camera's library stand column by column.
         pose = se3.translation(_numbers(said.get("translation", ""), 3))
         pose[:3, :3] = _numbers(said.get("rotation", ""), 9).reshape(3, 3).T
-    turn = pose[:3, :3]
-    sound = bool((np.abs(pose) < 1e3).all()) and np.abs(turn @ turn.T - np.eye(3)).max() < 1e-3  # not so of NaN
-    if not sound or np.abs(pose[:3, 3]).max() > 10.0:
+    if not se3.is_rigid(pose, tolerance=1e-3, farthest_m=FARTHEST_M):
         raise InputError(f"{where}: is no rigid motion; record it anew.")
     return pose
 
