@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from modeler.types import InputError
+from sequences import clouds
 from sequences.base import AbstractSequence
 from sequences.bop.sequence import BopSequence
 from sequences.files.folders import entries
@@ -18,7 +19,6 @@ FORMATS = (
     "an Azure Kinect .mkv, or realsense:"
 )
 BAGS = (".bag", ".mcap", ".db3")
-CLOUDS = (".pcd", ".ply")
 
 
 def open_sequence(path: str | Path, given: Given | None = None) -> AbstractSequence:
@@ -55,10 +55,8 @@ def _open(path: Path, given: Given) -> AbstractSequence:
         from sequences.kinect.sequence import open_kinect
 
         return open_kinect(path, given)
-    if (path.is_file() and path.suffix.lower() in CLOUDS) or _holds_clouds(path):
-        from sequences.clouds import open_clouds
-
-        return open_clouds(path, given)
+    if (path.is_file() and path.suffix.lower() in clouds.SUFFIXES) or _holds_clouds(path):
+        return clouds.open_clouds(path, given)
     if not path.is_dir():
         raise InputError(f"{path}: a file of this kind holds no sequence; give {FORMATS}.")
     if (path / "scene_camera.json").exists():
@@ -82,7 +80,7 @@ def _holds_clouds(path: Path) -> bool:
     """Return whether a folder holds clouds and no depth images."""
     if not path.is_dir() or any((path / mark).exists() for mark in ("scene_camera.json", "depth.txt", "depth")):
         return False
-    return any(entry.suffix.lower() in CLOUDS for entry in entries(path))
+    return any(entry.suffix.lower() in clouds.SUFFIXES for entry in entries(path))
 
 
 def _advice(path: Path) -> str:

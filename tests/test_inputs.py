@@ -380,6 +380,8 @@ def test_poses_of_a_run_go_to_bop_and_tum(tmp_path: Path, rng: np.random.Generat
         {"schema": 1, "poses": [{"id": "x"}]},
         report | {"poses": [stray]},
         report | {"poses": [stray | {"id": 2, "object_from_camera": [2.0] * 16}]},
+        report | {"frames": [{"id": 2, "timestamp": 10**400} | frame], "poses": []},
+        report | {"poses": [stray | {"id": 2, "object_from_camera": [10**400, *stray["object_from_camera"][1:]]}]},
     ):
         (run / "report.json").write_text(json.dumps(broken))
         assert main(["convert", str(run), "--out", str(tmp_path / "other.txt")]) == 2

@@ -159,6 +159,9 @@ def test_pokes_are_read() -> None:
         ),
         (PriorOptions(prior="held", held_sigma_m=-0.1), TURNTABLE, "--held-sigma-m -0.1 is out of range"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"one": POKE}}), "poke 'one' is not told by a frame number"),
+        (PriorOptions(), Telling({"kind": "poke", "pokes": {"9" * 5000: POKE}}), "is not told by a frame number"),
+        (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": POKE | {"length_m": 10**400}}}), "poke '1' must be"),
+        (PriorOptions(prior="turntable"), Telling({"kind": "turntable", "step_deg": 10**400}), "give --step-deg"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": {"point_m": [0, 0]}}}), "poke '1' must be"),
     ],
 )

@@ -23,6 +23,7 @@ from modeler.priors import (
 )
 from modeler.types import AbstractPrior, InputError
 from sequences import AbstractSequence
+from sequences.files.folders import frame_number
 from sequences.pictures.tum import trajectory
 
 _GIVEN = {
@@ -184,19 +185,16 @@ def _poke(given: dict[str, Any], sequence: AbstractSequence | None) -> PokePrior
             raise InputError(f"--prior poke needs --{missing[0].replace('_', '-')} as well; give all three")
         return PokePrior(Poke(given["poke_point_m"], given["poke_direction"], given["poke_length_m"]))
     told = None if sequence is None or sequence.motion is None else sequence.motion.get("pokes")
-    if not isinstance(told, dict) or not told:
+    if sequence is None or not isinstance(told, dict) or not told:
         raise InputError("--prior poke needs --poke-point-m, --poke-direction and --poke-length-m; give them")
-    return PokePrior(pokes={_frame(frame): _one_poke(frame, entry) for frame, entry in told.items()})
+    return PokePrior(pokes=dict(_one_poke(f"{sequence.name}: sequence.json", *one) for one in told.items()))
 
 
-def _frame(text: str) -> int:
-    if not text.isdecimal():
-        raise InputError(f"sequence.json: poke {text!r} is not told by a frame number; use the first frame after it")
-    return int(text)
-
-
-def _one_poke(frame: str, entry: object) -> Poke:
-    """Return a push as `sequence.json` has it."""
+def _one_poke(where: str, frame: str, entry: object) -> tuple[int, Poke]:
+    """Return a push as `sequence.json` has it, and the first frame after it; `where` is for messages."""
+    number = frame_number(frame)
+    if number is None:
+        raise InputError(f"{where}: poke {frame!r} is not told by a frame number; use the first frame after it")
     values = entry if isinstance(entry, dict) else {}
     point_m, direction, length_m = (values.get(name) for name in ("point_m", "direction", "length_m"))
     threes = [
@@ -206,14 +204,18 @@ def _one_poke(frame: str, entry: object) -> Poke:
     length_m = _number(length_m)
     if any(None in three for three in threes) or not any(threes[1]) or length_m is None or not 0.0 < length_m <= 10.0:
         raise InputError(
-            f'sequence.json: poke {frame!r} must be {{"point_m": [x, y, z], "direction": [x, y, z], "length_m": l}} '
+            f'{where}: poke {frame!r} must be {{"point_m": [x, y, z], "direction": [x, y, z], "length_m": l}} '
             "in camera coordinates; correct it there"
         )
-    return Poke(threes[0], threes[1], length_m)  # pyright: ignore[reportArgumentType]
+    return number, Poke(threes[0], threes[1], length_m)  # pyright: ignore[reportArgumentType]
 
 
 def _number(value: object) -> float | None:
     """Return a finite number; None where the value is none."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float):
         return None
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # whole numbers of a file may have any number of digits
+        return None
+    return number if math.isfinite(number) else None
