@@ -19,9 +19,11 @@ MAX_BEND = 0.05
 DISTANCE_STEP = 1.15
 """Ratio of the ends of a class of distances."""
 ANGLE_STEP_RAD = np.radians(10.0)
+"""Width of a class of angles."""
 MIN_PIXELS = 200
 """Classes with fewer pixels say nothing."""
-MAX_ANGLE_RAD = np.radians(80.0)
+STEEPEST_RAD = np.radians(80.0)
+"""Steeper surfaces are not measured: the quadric spans too much of them."""
 
 
 @final
@@ -115,7 +117,7 @@ def _pooled(distance_m: Array, angle_rad: Array, varies: Array, stays: Array) ->
     tilt = np.floor(angle_rad / ANGLE_STEP_RAD).astype(np.int64)
     found = []
     for key in np.unique(np.stack([near, tilt], axis=1), axis=0):
-        inside = (near == key[0]) & (tilt == key[1]) & (angle_rad < MAX_ANGLE_RAD)
+        inside = (near == key[0]) & (tilt == key[1]) & (angle_rad < STEEPEST_RAD)
         if np.count_nonzero(inside) < MIN_PIXELS:
             continue
         variance = _calm_mean(varies[inside]) + max(_calm_mean(stays[inside]), 0.0)

@@ -14,6 +14,7 @@ from modeler.types import Array, Frame
 from sequences.files.json_input import Node, read_tree
 
 MAX_ANGLE_RAD = np.radians(85.0)
+"""Beyond, where the model's noise would grow without bounds, it stays as it is here."""
 
 
 @final
