@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from modeler import se3
 from modeler.priors.axis_turn import across_axis
-from modeler.priors.general import GeneralPrior, centroid_offset
-from modeler.priors.proposal import guided
-from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, SharedAxis, Solution
+from modeler.priors.general import centroid_offset
+from modeler.priors.proposal import AbstractGuess, guided
+from modeler.types import AbstractMotion, Array, RayImage
 
 
 @dataclass(frozen=True)
-class AxesPrior(AbstractPrior):
+class AxesPrior(AbstractGuess):
     """The long axes of the two surfaces come to lie along each other, either way round; it proposes and is no evidence.
 
     Whatever turns about that axis is left open. Surfaces that are not long say nothing.
     """
 
-    known: AbstractPrior = field(default_factory=GeneralPrior)
-    """What is independently known of motions."""
     axes_sigma_deg: float = 6.0
     """Standard deviation of the angle between the axes, about each axis across them."""
     axes_sigma_m: float = 0.015
@@ -49,18 +46,6 @@ class AxesPrior(AbstractPrior):
             sigma_m=self.axes_sigma_m,
         )
         return guided(known, [aligned])
-
-    def learned(self, solution: Solution, edges: Sequence[Edge]) -> AxesPrior:
-        """Return the prior over what is known by now."""
-        return replace(self, known=self.known.learned(solution, edges))
-
-    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
-        """Return the axis that all steps share, as what is known has it."""
-        return self.known.shared_axis(views)
-
-    def grown(self, steps: float) -> AxesPrior:
-        """Return the prior within limits that hold for several steps."""
-        return replace(self, known=self.known.grown(steps))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from modeler.features import fpfh, kabsch, mutual_matches
 from modeler.priors.bumps import Bumps
-from modeler.priors.general import GeneralPrior
-from modeler.priors.proposal import guided
-from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, SharedAxis, Solution
+from modeler.priors.proposal import AbstractGuess, guided
+from modeler.types import AbstractMotion, Array, RayImage
 
 _DRAWS = 20_000  # triples looked at
 _JUDGED = 1000  # at most so many of their motions are put to the vote
 
 
 @dataclass(frozen=True)
-class FeaturesPrior(AbstractPrior):
+class FeaturesPrior(AbstractGuess):
     """Triples of matching points lay the surfaces on each other; a bump about each good one proposes, no evidence.
 
     Fast Point Feature Histograms (Rusu, Blodow and Beetz 2009) of thinned surfaces are matched; of many triples of
     matches whose distances agree, those motions are kept with which most other matches agree.
     """
 
-    known: AbstractPrior = field(default_factory=GeneralPrior)
-    """What is independently known of motions."""
     features_sigma_deg: float = 4.0
     """Standard deviation of the bump about each motion, about each axis."""
     features_sigma_m: float = 0.006
@@ -69,18 +65,6 @@ class FeaturesPrior(AbstractPrior):
             evidence=False,
         )
         return guided(known, [guess])
-
-    def learned(self, solution: Solution, edges: Sequence[Edge]) -> FeaturesPrior:
-        """Return the prior over what is known by now."""
-        return replace(self, known=self.known.learned(solution, edges))
-
-    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
-        """Return the axis that all steps share, as what is known has it."""
-        return self.known.shared_axis(views)
-
-    def grown(self, steps: float) -> FeaturesPrior:
-        """Return the prior within limits that hold for several steps."""
-        return replace(self, known=self.known.grown(steps))
 
     def _features(self, view: RayImage, voxel_m: float) -> tuple[Array, Array]:
         """Return the points (n, 3) of a thinned surface and their features (n, 33)."""

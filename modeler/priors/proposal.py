@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from modeler.types import AbstractMotion, Array
+from modeler.priors.general import GeneralPrior
+from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, SharedAxis, Solution
 
 _TRIED = 4096  # draws by which the share of a guess within the support is told
 _LEAST_SHARE = 0.01  # a guess with less of its mass within the support is of no use
 _ROOM_DEG = 5.0  # for a guess that is sure: limits are there to look within, not to cut off
+
+
+@dataclass(frozen=True)
+class AbstractGuess(AbstractPrior):
+    """A prior that only tells where to look, within another that is evidence and alone learns, grows or has an axis."""
+
+    known: AbstractPrior = field(default_factory=GeneralPrior)
+    """What is independently known of motions."""
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
+        """Return the prior over what is known by now."""
+        return replace(self, known=self.known.learned(solution, edges))
+
+    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
+        """Return the axis that all steps share, as what is known has it."""
+        return self.known.shared_axis(views)
+
+    def grown(self, steps: float) -> AbstractPrior:
+        """Return the prior within limits that hold for several steps."""
+        return replace(self, known=self.known.grown(steps))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from modeler import se3
 from modeler.priors.bumps import Bumps
-from modeler.priors.general import GeneralPrior
-from modeler.priors.proposal import guided
-from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, SharedAxis, Solution
+from modeler.priors.proposal import AbstractGuess, guided
+from modeler.types import AbstractMotion, Array, Edge, RayImage, Solution
 
 _MOST_STEPS = 3.0  # beyond, it is anybody's guess
 
 
 @dataclass(frozen=True)
-class VelocityPrior(AbstractPrior):
+class VelocityPrior(AbstractGuess):
     """Constant velocity within what is known; it proposes and is no evidence."""
 
-    known: AbstractPrior = field(default_factory=GeneralPrior)
-    """What is independently known of motions."""
     velocity_sigma_deg: float = 5.0
     """Standard deviation of the change of rotation from one motion to the next, about each axis."""
     velocity_sigma_m: float = 0.01
@@ -59,11 +56,3 @@ class VelocityPrior(AbstractPrior):
         """Return the prior that goes on from the poses so far."""
         trajectory = tuple(sorted(solution.trajectory.items(), key=lambda item: item[0]))
         return replace(self, known=self.known.learned(solution, edges), trajectory=trajectory)
-
-    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
-        """Return the axis that all steps share, as what is known has it."""
-        return self.known.shared_axis(views)
-
-    def grown(self, steps: float) -> VelocityPrior:
-        """Return the prior within limits that hold for several steps."""
-        return replace(self, known=self.known.grown(steps))
