@@ -37,14 +37,14 @@ def _spoilt(of: Edge, rng: np.random.Generator) -> Edge:
 
 
 def _assert_same(one: Solution, other: Solution) -> None:
-    """Poses are the same to half a hundredth of their standard deviations, covariances to a hundredth."""
+    """Poses are the same to half a hundredth of their standard deviations, covariances to two hundredths."""
     assert set(one.trajectory) == set(other.trajectory)
     for frame, pose in one.trajectory.items():
         np.testing.assert_allclose(one.odometry[frame], other.odometry[frame], atol=1e-12)
         whiten = np.linalg.inv(np.linalg.cholesky(other.covariances[frame]))
         if frame != next(iter(one.trajectory)):
             assert np.linalg.norm(whiten @ se3.log(se3.inverse(other.trajectory[frame]) @ pose)) < 5e-3
-        np.testing.assert_allclose(whiten @ one.covariances[frame] @ whiten.T, np.eye(6), atol=1e-2)
+        np.testing.assert_allclose(whiten @ one.covariances[frame] @ whiten.T, np.eye(6), atol=2e-2)
     assert set(one.outliers) == set(other.outliers)
     assert set(one.mode_weights) == set(other.mode_weights)
     for pair, weights in one.mode_weights.items():

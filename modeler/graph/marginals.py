@@ -24,7 +24,7 @@ from modeler.graph.square_root import Clique, Rows, SquareRoot
 from modeler.types import Array
 
 _GAUGE_SIGMA = 1e-9  # rad and m: a pose relative to itself, as a covariance that is still positive definite
-_NEAR = 1e-3  # rad and m by which a pose may be off the place where its links were taken
+_NEAR = 4e-3  # rad and m by which a pose may be off the place where its links were taken: a hundredth of a covariance
 (_solve_triangular,) = get_lapack_funcs(("trtrs",))  # without the checks that take ten times as long
 
 
