@@ -552,7 +552,7 @@ def test_what_stands_right_before_the_background_is_carved():
 # Closing what nobody saw.
 
 
-def test_cells_that_a_view_looks_through_or_that_lie_below_its_table_are_known_empty():
+def test_views_find_cells_empty_at_a_surface_or_hidden():
     free_m = np.full((2, 40, 40), 0.8, dtype=np.float32)
     free_m[1] = 0.0
     poses = np.tile(np.eye(4)[:3], (2, 1, 1))
@@ -561,8 +561,10 @@ def test_cells_that_a_view_looks_through_or_that_lie_below_its_table_are_known_e
     shape = np.array([10, 10, 10])
     counts = closing.looked_through(np.array([-0.25, -0.25, 0.5]), 0.05, shape, 0.05, free_m, poses, lenses, planes)
     centres = np.array([-0.25, -0.25, 0.5]) + 0.05 * (np.argwhere(np.ones(shape)) + 0.5)
-    expected = (centres[:, 2] < 0.75).astype(int) + (centres[:, 1] > 0.15)
-    assert np.array_equal(counts.ravel(), expected)
+    below = centres[:, 1] > 0.15
+    assert np.array_equal(counts[0].ravel(), (centres[:, 2] < 0.75).astype(int) + below)
+    assert np.array_equal(counts[1].ravel(), np.abs(centres[:, 2] - 0.8) < 0.05)
+    assert np.array_equal(counts[2].ravel(), centres[:, 2] > 0.85)
 
 
 def test_the_smallest_surface_across_an_open_tube_is_flat():
@@ -609,6 +611,17 @@ def test_a_watertight_model_is_closed_and_marks_what_it_made_up():
     assert under.any()
     volume = trimesh.Trimesh(brick.vertices_m, brick.triangles, process=False).volume
     assert volume == pytest.approx(8.0 * np.prod(BRICK.half_m), rel=0.06)
+
+
+@pytest.mark.parametrize("off", [0, 3])
+def test_one_view_whose_pose_is_off_does_not_hollow_a_watertight_model(off):
+    body, poses = tabletop.Box((0.05, 0.04, 0.07)), tabletop.turntable(14, tilt_deg=0.0)  # neither end is seen
+    trajectory = tabletop.trajectory(poses)
+    trajectory[off] = trajectory[off] @ se3.translation(np.array([0.0, 0.0, 0.03]))
+    views = {k: tabletop.view(body, pose, k, table=False) for k, pose in enumerate(poses)}
+    model = FUSER.scanned(views, trajectory).model(watertight=True)
+    volume = trimesh.Trimesh(model.vertices_m, model.triangles, process=False).volume
+    assert volume == pytest.approx(8.0 * np.prod(body.half_m), rel=0.05)
 
 
 @pytest.mark.parametrize("seed", range(3))

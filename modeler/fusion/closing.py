@@ -16,6 +16,7 @@ from modeler.types import Array, BoolArray
 CELLS = 80**3  # the unseen is decided on a grid of no more cells
 ROUNDS = 400
 SPANNING = 60  # steps towards the neighbours' mean that made-up vertices take
+CONTRARY = 0.1  # share of the views of a cell that may be wrong about it, for their poses are off
 OUTER = 3  # layers of voxels at the border that are outside
 
 
@@ -35,24 +36,27 @@ def without(field: Field, rejected_m: Array, kept_m: Array, reach_m: float) -> F
 def enclosing(field: Field, seen: Stack, tau_m: float) -> Field:
     """Return the field with all that is unknown decided: outside or inside.
 
-    What a view looks through or knows to be below the table is outside; the rest is parted where the surface between
-    inside and outside is smallest, as a soap film across the rims of what was seen.
+    What views look through or know to be below the table is outside, unless nearly all others have surface in front of
+    it; the rest is parted where the surface between inside and outside is smallest, as a soap film across the rims of
+    what was seen.
     """
     grid = field.grid
     stride = max(1, int(np.ceil((float(np.prod(grid.shape)) / CELLS) ** (1.0 / 3.0))))
-    blocks = -(-grid.shape // stride)
+    blocks, cell_m = -(-grid.shape // stride), stride * grid.voxel_m
+    empty, beside, hidden = closing.looked_through(
+        grid.origin_m, cell_m, blocks, tau_m, seen.free_m, seen.poses, seen.lenses, seen.planes
+    )
+    asked = np.maximum(empty + beside + hidden, 1)
+    open_to_view = empty > CONTRARY * asked
+    field = _without_voids(field, hidden >= (1.0 - CONTRARY) * asked, stride)
     pad = [(0, int(n)) for n in blocks * stride - grid.shape]
     known = np.pad((field.weights > 0.0).astype(np.float32), pad)
     values = np.pad(np.where(field.weights > 0.0, field.values_m, 0.0), pad)
     shares, sums = (_pooled(array, blocks, stride) for array in (known, values))
-    cell_m = stride * grid.voxel_m
     share = np.maximum(shares, 1e-6)
     level = np.clip(sums / share / cell_m, -1.0, 1.0).astype(np.float32)
-    empty = closing.looked_through(
-        grid.origin_m, cell_m, blocks, tau_m, seen.free_m, seen.poses, seen.lenses, seen.planes
-    )
     sure = shares > 0.5
-    outside = ~sure & ((empty > 0) | _shell(blocks))
+    outside = ~sure & (open_to_view | _shell(blocks))
     fixed = sure | outside | _shell(blocks)
     start = np.where(sure, level, np.where(outside, 1.0, -1.0)).astype(np.float32)
     start[_shell(blocks)] = 1.0
@@ -88,6 +92,20 @@ def tidied(
     shown = KDTree(shown_m).query(vertices_m, distance_upper_bound=voxel_m)[0] < voxel_m
     vertices_m = surface.fair(vertices_m, triangles, passes)
     return surface.spanned(vertices_m, triangles, ~shown, SPANNING), triangles, shown
+
+
+def _without_voids(field: Field, deep: BoolArray, stride: int) -> Field:
+    """Return the field that knows nothing of emptiness (values over 0) deep behind the surface.
+
+    Args:
+        field: of all that was measured.
+        deep: (x, y, z) cells of `stride` voxels that nearly all views have surface in front of.
+        stride: voxels along a cell.
+    """
+    inside = tuple(slice(int(n)) for n in field.grid.shape)
+    deep = deep.repeat(stride, 0).repeat(stride, 1).repeat(stride, 2)[inside]
+    weights = np.where(deep & (field.values_m > 0.0), np.float32(0.0), field.weights)
+    return Field(field.grid, field.values_m, weights, np.argwhere(weights > 0.0))
 
 
 def _pooled(array: npt.NDArray[np.floating], blocks: npt.NDArray[np.int64], stride: int) -> npt.NDArray[np.floating]:

@@ -10,37 +10,37 @@ from modeler.kernels.fusion import project
 
 @njit(cache=True, parallel=True)
 def looked_through(origin, cell_m, shape, margin_m, free_m, poses, lenses, planes):
-    """Return how many views know cells of a grid to be empty, (x, y, z) uint8.
+    """Return how many views find cells of a grid empty, at a surface and hidden behind one, (3, x, y, z) uint16.
 
-    A view knows it of what it looks through, and of what lies below the plane on which the object stands.
+    A cell is empty where a view looks through it, or it lies below the plane on which the object stands.
 
     Args:
         origin: (3,) lowest corner of the grid in m.
         cell_m: side of a cell; its centre is looked at.
         shape: (3,) cells along each axis.
-        margin_m: how far in front of the end of the empty space, and below the plane, a cell must lie.
+        margin_m: how far from the end of the empty space, and below the plane, a cell must lie.
         free_m: (f, h, w) float32 depth up to which the space along a pixel is empty.
         poses: (f, 3, 4) camera_from_object.
         lenses: (f, 4) fx, fy, cx, cy.
         planes: (f, 4) normal and offset in the object frame, NaN where no plane is seen.
     """
     frames, height, width = free_m.shape
-    counts = np.zeros((shape[0], shape[1], shape[2]), dtype=np.uint8)
+    counts = np.zeros((3, shape[0], shape[1], shape[2]), dtype=np.uint16)
     for i in prange(shape[0]):
         x = origin[0] + (i + 0.5) * cell_m
         for j in range(shape[1]):
             y = origin[1] + (j + 0.5) * cell_m
             for k in range(shape[2]):
                 z = origin[2] + (k + 0.5) * cell_m
-                count = 0
                 for f in range(frames):
                     if planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z + planes[f, 3] < -margin_m:
-                        count += 1
+                        counts[0, i, j, k] += 1
                         continue
                     u, v, depth = project(poses[f], lenses[f], x, y, z)
                     if depth > 0.0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
-                        count += depth < free_m[f, int(v + 0.5), int(u + 0.5)] - margin_m
-                counts[i, j, k] = min(count, 255)
+                        free = free_m[f, int(v + 0.5), int(u + 0.5)]
+                        if free > 0.0:
+                            counts[int(depth >= free - margin_m) + int(depth > free + margin_m), i, j, k] += 1
     return counts
 
 
