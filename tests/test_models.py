@@ -83,8 +83,13 @@ def test_refuses_what_cannot_be_compared(modelled: Modelled) -> None:
     with pytest.raises(InputError, match="true pose"):
         model_scores(replace(modelled, camera_from_model={77: np.eye(4)}), FUSER, 0)
     empty = replace(modelled.model, triangles=np.zeros((0, 3), dtype=np.int64))
-    with pytest.raises(InputError, match="no surface"):
-        model_scores(replace(modelled, model=empty), FUSER, 0)
+    flat = replace(modelled.model, vertices_m=0.0 * modelled.model.vertices_m)
+    for model in (empty, flat):
+        with pytest.raises(InputError, match="its model has no surface"):
+            model_scores(replace(modelled, model=model), FUSER, 0)
+    vertices_m, triangles = modelled.truth
+    with pytest.raises(InputError, match="true mesh of its object has no area"):
+        model_scores(replace(modelled, truth=(0.0 * vertices_m, triangles)), FUSER, 0)
 
 
 # the command

@@ -97,20 +97,25 @@ def model_scores(modelled: Modelled, fuser: Fuser, seed: int) -> list[ModelScore
         seed: of the points drawn on the surfaces.
 
     Raises:
-        InputError: where no view has a true pose or the run has no surface.
+        InputError: where no view has a true pose, or a model or the truth has no surface.
     """
     frames = [frame for frame in modelled.trajectory if frame in modelled.camera_from_model and frame in modelled.views]
     if not frames:
         raise InputError(f"{modelled.name}: none of its frames has a true pose; is scene_gt.json of another sequence?")
-    if not len(modelled.model.triangles):
-        raise InputError(f"{modelled.name}: its model has no surface; build it from more frames")
-    surface = TrueSurface.of(*modelled.truth, np.random.default_rng([seed, 0]))
+    try:
+        surface = TrueSurface.of(*modelled.truth, np.random.default_rng([seed, 0]))
+    except ValueError:
+        raise InputError(f"{modelled.name}: the true mesh of its object has no area; give that of a surface") from None
     seen = surface.seen((modelled.views[frame].frame, modelled.camera_from_model[frame]) for frame in frames)
     scores: list[ModelScore] = []
     for candidate in _candidates(modelled, frames, fuser):
         rng = np.random.default_rng([seed, 1])  # the same for both, so that their difference is that of the models
         vertices_m = se3.transform(candidate.model_from_object, candidate.model.vertices_m)
-        errors = surface_errors(vertices_m, candidate.model.triangles, surface, rng)
+        try:
+            errors = surface_errors(vertices_m, candidate.model.triangles, surface, rng)
+        except ValueError:
+            whose = "its model" if candidate.poses == "run" else "what its frames give with their true poses"
+            raise InputError(f"{modelled.name}: {whose} has no surface; build it from more frames") from None
         scores += [
             _score(modelled, candidate, "seen", errors.over(seen)),
             _score(modelled, candidate, "whole", errors),
