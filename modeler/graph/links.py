@@ -83,6 +83,8 @@ class Frames:
     """The rest; links that do not hang together with the root are in neither."""
     reached: frozenset[int] = frozenset()
     """The frames of the tree, and the root."""
+    last: int = 0
+    """Place among the kinds, from the preferred one on, of the last that the tree needed."""
 
     @classmethod
     def of(cls, links: Sequence[Link], root: int) -> Frames:
@@ -90,7 +92,7 @@ class Frames:
         tree: list[Link] = []
         loops: list[Link] = []
         group: dict[int, set[int]] = {}
-        for link in sorted(links, key=_preferred):  # stable: by arrival within a kind
+        for link in sorted(links, key=_place):  # stable: by arrival within a kind
             target, source = (group.setdefault(frame, {frame}) for frame in (link.target, link.source))
             if source is target:
                 loops.append(link)
@@ -101,25 +103,27 @@ class Frames:
             group.update(dict.fromkeys(smaller, larger))
         reached = frozenset(group.get(root, {root}))
         tree, loops = ([link for link in some if link.target in reached] for some in (tree, loops))
-        return cls(links, tree, loops, reached)
+        return cls(links, tree, loops, reached, max(map(_place, tree), default=0))
 
     def plus(self, links: Sequence[Link]) -> Frames | None:
         """Return it with more links; None where these would have connected other frames than the tree did."""
         if len(self.tree) + len(self.loops) < len(self.links):
             return None
-        tree, loops, reached = list(self.tree), list(self.loops), set(self.reached)
-        last = max(map(_preferred, tree), default=0)
-        for link in sorted(links, key=_preferred):
+        tree, loops, reached, last = list(self.tree), list(self.loops), set(self.reached), self.last
+        for link in sorted(links, key=_place):
             known = (link.target in reached) + (link.source in reached)
-            if known == 0 or (known == 2 and _preferred(link) < last):
+            if known == 0 or (known == 2 and _place(link) < last):
                 return None
-            (loops if known == 2 else tree).append(link)
+            if known == 2:
+                loops.append(link)
+                continue
+            tree.append(link)
             reached |= {link.target, link.source}
-            last = max(last, _preferred(link))
-        return Frames([*self.links, *links], tree, loops, frozenset(reached))
+            last = max(last, _place(link))
+        return Frames([*self.links, *links], tree, loops, frozenset(reached), last)
 
 
-def _preferred(link: Link) -> int:
+def _place(link: Link) -> int:
     return _FIRST.index(link.edge.kind)
 
 
@@ -144,8 +148,9 @@ def chain(tree: Sequence[Link], root: int, guess: Mapping[int, Array]) -> dict[i
     poses = {root: np.eye(4)}
     poses |= {frame: guess[frame] for link in tree for frame in (link.target, link.source) if frame in guess}
     poses[root] = np.eye(4)
-    open_links = [link for link in tree if link.target not in poses or link.source not in poses]
-    for frame, neighbour, link in walk(open_links, *poses):
+    left = [link for link in tree if link.target not in poses or link.source not in poses]
+    known = [frame for link in left for frame in (link.target, link.source) if frame in poses]
+    for frame, neighbour, link in walk(left, *known):
         target_from_source = link.pose.mean
         frame_from_neighbour = target_from_source if link.target == frame else se3.inverse(target_from_source)
         poses[neighbour] = poses[frame] @ frame_from_neighbour

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
+from scipy.linalg import get_blas_funcs
 
 from modeler import se3
 from modeler.graph.links import Link, inverse_right_jacobian
@@ -25,7 +25,7 @@ from modeler.types import Array
 
 _GAUGE_SIGMA = 1e-9  # rad and m: a pose relative to itself, as a covariance that is still positive definite
 _NEAR = 4e-3  # rad and m by which a pose may be off the place where its links were taken: a hundredth of a covariance
-(_solve_triangular,) = get_lapack_funcs(("trtrs",))  # without the checks that take ten times as long
+(_solved,) = get_blas_funcs(("trsm",))  # LAPACK's trtrs, and all that rests on it, wakes threads for the least system
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class RelativeCovariance:
             for place, frame in enumerate(clique.inner):
                 if frame in right:
                     inner[6 * place : 6 * place + 6] = right.pop(frame)
-            solved = _solve_triangular(clique.upper, inner, trans=1)[0]
+            solved = _solved(1.0, clique.upper, inner, trans_a=1)
             covariance = covariance + solved.T @ solved
             passed = clique.beside.T @ solved
             for place, frame in enumerate(clique.outer):
@@ -162,7 +162,7 @@ def _rows(links: Sequence[Link], trajectory: Mapping[int, Array], root: int) -> 
 
 def _spread(clique: Clique, outer: Array) -> Array:
     """Return L with LLᵀ the covariance of a clique's variables, from that of its outer ones."""
-    own = _solve_triangular(clique.upper, np.eye(len(clique.upper)))[0]
+    own = _solved(1.0, clique.upper, np.eye(len(clique.upper)))
     size, (more, columns) = len(own), outer.shape
     spread = np.zeros((size + more, columns + size))
     spread[:size, :columns] = -own @ (clique.beside @ outer)

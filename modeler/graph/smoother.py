@@ -97,7 +97,9 @@ class Smoother:
         weights, decided = self.state.weights, self.state.decided
         if closes:
             weights, decided = self._decided(tree, loops, root, grew=grew)
-        taken, closing = ([decided.get(link.edge, link) for link in some] for some in (tree, loops))
+        taken, closing = (
+            [decided.get(link.edge, link) for link in some] if decided else some for some in (tree, loops)
+        )
         jumped = _jumped(decided, self.state)
         start = chain(taken, root, {} if jumped else anchored(self.solution.trajectory, root))
         inlier, engine = self.state.inlier, self.state.engine

@@ -22,6 +22,7 @@ Rows = Mapping[int, Array]
 """By variable, blocks (m, 6) of whitened rows."""
 _DISSECTED = 8  # variables from which nested dissection orders them: ways to the roots are then short
 _DEEP = 40  # cliques on a way to a root from which it is eliminated again, that it be short
+_PANEL = 32  # columns that LAPACK reflects at once
 (_qr,) = get_lapack_funcs(("geqrf",))
 
 
@@ -209,7 +210,9 @@ def _clique(inner: tuple[int, ...], outer: tuple[int, ...], own: Sequence[Rows],
         for variable, block in some.items():
             matrix[row : row + height, column[variable] : column[variable] + 6] = block
         row += height
-    upper = np.triu(_qr(matrix, overwrite_a=1)[0][: min(matrix.shape)])
+    reflected, *_ = _qr(matrix, lwork=_PANEL * matrix.shape[1], overwrite_a=1)
+    upper = np.triu(reflected[: min(matrix.shape)])
     size = 6 * len(inner)
     rows = tuple(some for some in own if not isinstance(some, _Said))
-    return Clique(inner, outer, upper[:size, :size], upper[:size, size:], upper[size:, size:], rows)
+    own_part = np.asfortranarray(upper[:size, :size])  # as BLAS takes it
+    return Clique(inner, outer, own_part, upper[:size, size:], upper[size:, size:], rows)
