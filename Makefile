@@ -19,7 +19,8 @@ demo: setup
 	@echo
 	@echo "The mesh is runs/demo/model.ply (any mesh viewer opens it); in another format:"
 	@echo "    $(BIN)/modeler export runs/demo --out runs/demo/box.glb"
-	@echo "The recording is runs/demo/recording.rrd; look at it with:"
+	@echo "The recording is runs/demo/recording.rrd; look at the run with:"
+	@echo "    $(BIN)/modeler report runs/demo        (one page: runs/demo/report.html)"
 	@echo "    $(BIN)/modeler view runs/demo          (in a window)"
 	@echo "    $(BIN)/modeler view runs/demo --web    (in the browser)"
 
