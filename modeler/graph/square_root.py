@@ -119,24 +119,21 @@ class SquareRoot:
         taken = set(apart)
         hanging = [clique for parent in apart for clique in self.below.get(parent, ()) if clique not in taken]
         rows = [row for clique in apart for row in clique.rows if id(row) not in left_out]
-        rows += [*new, *(_Said(clique.said) for clique in hanging if len(clique.passed))]
-        order = _ordering(rows)
+        rows += new
+        said = [clique.said for clique in hanging if len(clique.passed)]
+        order = _ordering([*rows, *said])
         homes, rank, below = dict(self.homes), dict(self.rank), dict(self.below)
         for clique in apart:
             below.pop(clique, None)
         highest = max(rank.values(), default=0)
         rank.update((variable, highest + 1 + number) for number, variable in enumerate(order))
-        cliques = _cliques(rows, order)
+        cliques = _cliques(rows, order, said)
         homes.update((variable, clique) for clique in cliques for variable in clique.inner)
         for clique in (*hanging, *cliques):
             if clique.outer:
                 parent = homes[min(clique.outer, key=rank.__getitem__)]
                 below[parent] = (*below.get(parent, ()), clique)
         return SquareRoot(homes, rank, below)
-
-
-class _Said(dict[int, Array]):
-    """Rows that stand for the cliques below."""
 
 
 def _hangs(rows: Rows, count: Mapping[int, int]) -> bool:
@@ -159,15 +156,23 @@ def _ordering(rows: Sequence[Rows]) -> list[int]:
     return [found.at(number) for number in range(found.size())]
 
 
-def _cliques(rows: Sequence[Rows], order: Sequence[int]) -> list[Clique]:
-    """Return the cliques that rows leave when variables are eliminated in an order, children before parents."""
+def _cliques(rows: Sequence[Rows], order: Sequence[int], said: Sequence[Rows] = ()) -> list[Clique]:
+    """Return the cliques that rows leave when variables are eliminated in an order, children before parents.
+
+    Args:
+        rows: those that are the cliques' own.
+        order: the variables; others that are named are given.
+        said: rows that stand for cliques below.
+    """
     place = {variable: number for number, variable in enumerate(order)}
     first: list[list[Rows]] = [[] for _ in order]  # rows, by the variable that is eliminated first
+    heard: list[list[Rows]] = [[] for _ in order]  # those said, likewise
     named: list[set[int]] = [set() for _ in order]  # those a variable has in common with what is eliminated later
-    for some in rows:
-        number = min(place.get(variable, len(order)) for variable in some)
-        first[number].append(some)
-        named[number].update(some)
+    for lists, more in ((first, rows), (heard, said)):
+        for some in more:
+            number = min(place.get(variable, len(order)) for variable in some)
+            lists[number].append(some)
+            named[number].update(some)
     parent: list[int | None] = []
     for number, variable in enumerate(order):
         named[number].discard(variable)
@@ -186,16 +191,15 @@ def _cliques(rows: Sequence[Rows], order: Sequence[int]) -> list[Clique]:
     for number, last in enumerate(home):
         members.setdefault(last, []).append(number)
     cliques: list[Clique] = []
-    passed: dict[int, list[Rows]] = {}
     for last, numbers in sorted(members.items()):
         inner = tuple(order[number] for number in numbers)
         outer = tuple(sorted(named[last], key=lambda other: place.get(other, len(order))))
-        own = [some for number in numbers for some in first[number]]
-        clique = _clique(inner, outer, own, passed.pop(last, []))
+        own, below = ([some for number in numbers for some in lists[number]] for lists in (first, heard))
+        clique = _clique(inner, outer, own, below)
         cliques.append(clique)
         above = parent[last]
         if above is not None and len(clique.passed):
-            passed.setdefault(home[above], []).append(clique.said)
+            heard[above].append(clique.said)
     return cliques
 
 
@@ -213,6 +217,5 @@ def _clique(inner: tuple[int, ...], outer: tuple[int, ...], own: Sequence[Rows],
     reflected, *_ = _qr(matrix, lwork=_PANEL * matrix.shape[1], overwrite_a=1)
     upper = np.triu(reflected[: min(matrix.shape)])
     size = 6 * len(inner)
-    rows = tuple(some for some in own if not isinstance(some, _Said))
     own_part = np.asfortranarray(upper[:size, :size])  # as BLAS takes it
-    return Clique(inner, outer, own_part, upper[:size, size:], upper[size:, size:], rows)
+    return Clique(inner, outer, own_part, upper[:size, size:], upper[size:, size:], tuple(own))
