@@ -35,7 +35,9 @@ ODD_NAME = 'a <b> & "c"'
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = RunFolder.open(tmp_path_factory.mktemp("report") / "run")
     stream = open_stream("box", save=folder.path / "recording.rrd")
-    meta = RunMeta(sequence=ODD_NAME, seed=7, prior="table", settings={"max_shift_m": 0.05}, seconds={"total": 12.3})
+    meta = RunMeta(
+        sequence=ODD_NAME, seed=7, prior="table", settings={"max_shift_m": 0.05, "frames": ":"}, seconds={"total": 12.3}
+    )
     for step in steps(COUNT, lost=LOST):
         folder.write(step, meta)
         stream(step)
@@ -120,6 +122,7 @@ def test_settings_and_names_are_text_and_nothing_more(page: str) -> None:
     assert "<b> &" not in page
     assert "<th>max shift m</th><td>0.05</td>" in page
     assert "<th>seed</th><td>7</td>" in page
+    assert "<th>frames</th><td>all</td>" in page
 
 
 def unpacked(text: str, kind: str) -> Array:

@@ -178,6 +178,8 @@ def _settings(result: Result) -> str:
     """Return what the run was asked to do, with what, and what became of its frames."""
     report = result.report
     rows = {"sequence": report["sequence"], "seed": report["seed"], "prior": report["prior"], **report["settings"]}
+    if rows.get("frames") == ":":
+        rows["frames"] = "all"
     rows |= {f"seconds, {part}": f"{seconds:.1f}" for part, seconds in report["seconds"].items() if seconds is not None}
     rows |= {f"version of {name}": version for name, version in report["versions"].items()}
     lost = [frame for frame in report["frames"] if frame["outcome"] != ACCEPTED]
