@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
+import weakref
 from collections.abc import Sequence
 
 import numpy as np
@@ -202,3 +204,14 @@ def test_a_pose_that_is_asked_alone_is_worked_out_alone(monkeypatch: pytest.Monk
     np.testing.assert_array_equal(covariances[3], dict(covariances.items())[3])
     with pytest.raises(KeyError):
         covariances[COUNT]
+
+
+def test_a_solution_keeps_none_of_those_before_it() -> None:
+    growing, kept = Smoother(), []
+    for edges in _arrivals(np.random.default_rng(19)):
+        growing = growing.plus(edges)
+        assert growing.solution.relative_covariance(0, edges[0].source).shape == (6, 6)
+        kept.append(weakref.ref(growing.solution.relative_covariance))
+    assert kept[-1]() is growing.solution.relative_covariance
+    gc.collect()
+    assert [covariance() for covariance in kept[:-1]] == [None] * (len(kept) - 1)

@@ -69,12 +69,12 @@ class RelativeCovariance:
     """All that take part."""
     others: Sequence[Rows] = ()
     """What else is known, as rows of errors in object coordinates; more variables than frames may take part."""
-    before: RelativeCovariance | None = None
-    """Of an earlier solution with the same root, worked out and with nothing else known."""
+    before: _Taken = field(default_factory=_Taken)
+    """The links of an earlier solution with the same root, as far as these were asked for."""
 
     def to(self, trajectory: Mapping[int, Array], links: Sequence[Link]) -> RelativeCovariance:
         """Return that of a solution with the same root, which costs the less the more of it stayed."""
-        before = self if "_taken" in vars(self) and not self.others else self.before
+        before = self._taken if "_taken" in vars(self) and not self.others else self.before
         return RelativeCovariance(trajectory, self.root, links, before=before)
 
     def __call__(self, target: int, source: int) -> Array:
@@ -138,8 +138,7 @@ class RelativeCovariance:
 
     @cached_property
     def _taken(self) -> _Taken:
-        before = _Taken() if self.before is None else self.before._taken
-        taken = before.to(self.links, self.trajectory, self.root)
+        taken = self.before.to(self.links, self.trajectory, self.root)
         if not self.others:
             return taken
         others = [{frame: block for frame, block in rows.items() if frame != self.root} for rows in self.others]
