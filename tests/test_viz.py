@@ -44,6 +44,7 @@ from viz.stream import RerunStream, graph_due, open_stream
 
 Recording = dict[str, dict[int, dict[str, Any]]]
 COUNT, LOST = 6, 3
+MERGED = (entities.MERGED_BEFORE, entities.MERGED_AFTER)
 PAIR_CLOUDS = (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER)
 GHOSTS = (entities.GHOSTS, entities.GHOST_MEANS, entities.GHOST_TIPS)
 CAPTIONS = (
@@ -120,7 +121,7 @@ def test_every_promised_entity_is_recorded(recording: Recording) -> None:
     promised = {
         "blob": [entities.COLOUR, entities.DEPTH],
         "buffer": [entities.MASK, entities.VISIBILITY_AREAS],
-        "positions": [*PAIR_CLOUDS, entities.PAIR_DRAWS, entities.CLOUD, *GHOSTS, entities.VISIBILITY_AGREES],
+        "positions": [*PAIR_CLOUDS, entities.PAIR_DRAWS, entities.CLOUD, *GHOSTS, entities.VISIBILITY_AGREES, *MERGED],
         "vertex_positions": [entities.MESH],
         "strips": [entities.CAMERAS, entities.CURRENT, entities.CHAIN, entities.BEFORE_CAMERAS, *EDGES],
         "vectors": [entities.AXES, entities.PAIR_AXES],
@@ -165,10 +166,10 @@ def test_a_recording_opens_with_a_layout(tmp_path: Path, run: list[Step]) -> Non
     reader = rerun.chunk.RrdReader(tmp_path / "r.rrd")
     waiting, knowing = sorted((list(reader.stream(store=entry)) for entry in reader.blueprints()), key=len)
     views = [sum(str(chunk.entity_path).endswith("/ViewContents") for chunk in layout) for layout in (waiting, knowing)]
-    assert views == [19, 19]
+    assert views == [21, 21]
     eyes = [c.to_record_batch() for c in knowing if str(c.entity_path).endswith("/EyeControls3D")]
     targets = np.array([batch["EyeControls3D:look_target"][0].as_py()[0] for batch in eyes])
-    assert len(targets) == 7
+    assert len(targets) == 9
     assert np.linalg.norm(targets - CENTRE_M, axis=1).max() < HALF_M.max()
 
 
@@ -463,6 +464,20 @@ def test_the_model_grows_and_ends_as_a_mesh(run: list[Step], recording: Recordin
     assert run[-1].model is not None
     np.testing.assert_allclose(mesh["vertex_positions"], run[-1].model.vertices_m, atol=1e-6)
     np.testing.assert_array_equal(mesh["triangle_indices"], run[-1].model.triangles)
+
+
+def test_merged_points_lie_along_the_chain_before_closure_and_as_optimised_after(
+    run: list[Step], recording: Recording
+) -> None:
+    last = run[-1]
+    for entity, poses in zip(MERGED, (last.solution.odometry, last.solution.trajectory), strict=True):
+        ((frame, points),) = drawn(recording, entity, "positions").items()
+        assert frame == max(last.views)
+        own = [se3.transform(poses[k], last.views[k].points_m) for k in sorted(poses)]
+        assert len(points) == sum(map(len, own))
+        np.testing.assert_allclose(points, np.concatenate(own), atol=1e-5)
+        colours = np.unique(np.array(recording[entity][frame]["colors"]))
+        assert len(colours) == len(own)
 
 
 def test_a_coarsened_mesh_keeps_its_shape() -> None:

@@ -57,12 +57,15 @@ def _images(first: RayImage | None) -> rrb.Container:
     return rrb.Vertical(colour, depth, seen)
 
 
-def _object(first: RayImage | None) -> tuple[rrb.View, rrb.View]:
-    """Return the views of the model alone and among the cameras that saw it."""
+def _object(first: RayImage | None) -> tuple[rrb.Container, rrb.View]:
+    """Return the views of the model alone, with the merged points behind it, and among the cameras that saw it."""
     graph = [f"{entities.WORLD}/{part}/**" for part in ("model", "poses", "edges")]
     graph += [entities.EDGES_1_SIGMA, entities.EDGES_MAGNIFICATION]
+    near = _near(first, _ABOVE_LEFT, 4.0)
+    tabs = (("Object model", f"{entities.WORLD}/model/**"),)
+    tabs += (("Before closure", entities.MERGED_BEFORE), ("After closure", entities.MERGED_AFTER))
     return (
-        _spatial("Object model", entities.WORLD, [f"{entities.WORLD}/model/**"], _near(first, _ABOVE_LEFT, 4.0)),
+        rrb.Tabs(*(_spatial(name, entities.WORLD, [what], near) for name, what in tabs), active_tab=0),
         _spatial("Pose graph: cameras, edges and their uncertainty", entities.WORLD, graph, _far(first)),
     )
 

@@ -60,6 +60,8 @@ BEFORE_POSITION_1_SIGMA: Final = "world/before/position_1_sigma"
 BEFORE_POSITION_3_SIGMA: Final = "world/before/position_3_sigma"
 BEFORE_AXIS_TIPS_1_SIGMA: Final = "world/before/axis_tips_1_sigma"
 BEFORE_MAGNIFICATION: Final = "world/before/magnification"
+MERGED_BEFORE: Final = "world/merged/before_closure"
+MERGED_AFTER: Final = "world/merged/after_closure"
 
 # Readings over time. Each has the series `odometry` and `closure`; the first two also `pose`.
 ROTATION_SD: Final = "readings/rotation_sd_deg"
@@ -106,7 +108,9 @@ under the true motion.
 spread by the factor written there: the object at its mean, ghosts of it at samples, the ends of its axes as dots, its
 centre within 1 and 3 sd as yellow ellipsoids; other modes in other colours, with their share of the probability.
 
-**Model.** Pink surface is made up: nobody saw it, and it closes the mesh.
+**Model.** Pink surface is made up: nobody saw it, and it closes the mesh. The tabs beside it have, at the last frame,
+the points of all views laid together without closure and with it, a colour a frame from blue to yellow: where a loop
+was open, yellow points lie beside blue ones.
 
 **Graph.** A pyramid is the camera as the object saw it, the newest orange. Edges: odometry and spans white, closure
 green, rejected red, each with an ellipsoid of the shift it allows within 1 sd. Yellow: position of a camera within

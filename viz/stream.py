@@ -48,7 +48,7 @@ class RerunStream:
         if not self.recording.is_enabled():
             return
         # Rerun takes half a second to import: only runs that record pay for it.
-        from viz import blueprint, clouds, ghosts, images, poses, readings, spread, uncertainty, visibility
+        from viz import blueprint, clouds, ghosts, images, merged, poses, readings, spread, uncertainty, visibility
 
         # A frame that was lost is tried again when later ones are known: what that brings stands at the latest frame.
         self.recording.set_time(entities.FRAME, sequence=max([step.frame.index, *step.views]))
@@ -62,6 +62,7 @@ class RerunStream:
             ghosts.drawing(step),
             visibility.drawing(step),
             clouds.model_drawing(step),
+            merged.drawing(step),
             poses.newest_drawing(step),
             *((poses.drawing(step), uncertainty.drawing(step)) if graph_due(step) else ()),
             readings.drawing(step),
