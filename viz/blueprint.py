@@ -99,7 +99,7 @@ def _pair(first: RayImage | None) -> rrb.Container:
 def _words() -> rrb.Container:
     """Return what happened in words, with the run's facts, the history and the legend behind it."""
     return rrb.Tabs(
-        rrb.TextDocumentView(origin=entities.NOW, name="What happened"),
+        rrb.TextDocumentView(origin=entities.NOW, name="Now"),
         rrb.TextDocumentView(origin=entities.RUN, name="Run"),
         rrb.TextLogView(origin=entities.LOG, name="History"),
         rrb.TextDocumentView(origin=entities.LEGEND, name="Legend"),
