@@ -27,6 +27,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Rerun complains in its own way of a viewer that was closed, which is nobody's error, and of a disk that is full;
     # we tell what matters.
     os.environ.setdefault("RUST_LOG", "warn,re_sdk=off,re_grpc_client=off,re_log_encoding=off")
+    # Our matrices are small: to wake BLAS threads takes longer than what they would do.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be text
     try:
