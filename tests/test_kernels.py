@@ -286,7 +286,8 @@ def test_densities_of_a_mixture_leave_out_nothing_that_counts(rng, sigma_rad):
     """However far apart the Gaussians lie, and where no pose is near any of them."""
     centre_m = np.array([0.1, 0.0, 0.8])
     means, poses = (np.stack([random_pose(rng, sigma_rad) for _ in range(count)]) for count in (12, 50))
-    spreads = np.linalg.cholesky(np.stack([0.01 * np.cov(rng.normal(size=(6, 20))) for _ in means]))
+    scatter = np.stack([0.01 * np.cov(rng.normal(size=(6, 20))) for _ in means])
+    spreads = np.asarray(np.linalg.cholesky(scatter), dtype=np.float64)
     log_weights = rng.normal(0.0, 3.0, len(means))
     want = np.empty((len(means), len(poses)))
     for k, (mean, spread) in enumerate(zip(means, spreads, strict=True)):

@@ -17,6 +17,8 @@ from modeler import se3
 from modeler.graph.belief import separate
 from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian
 
+ROOT_SIGMA = 1e-9
+"""Of a pose relative to itself, in rad and m: nothing, as a covariance that is still positive definite."""
 _FIRST: tuple[EdgeKind, ...] = ("odometry", "span", "closure")  # what connects frames, if it can
 
 

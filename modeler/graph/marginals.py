@@ -19,11 +19,10 @@ import numpy as np
 from scipy.linalg import get_blas_funcs
 
 from modeler import se3
-from modeler.graph.links import Link, inverse_right_jacobian
+from modeler.graph.links import ROOT_SIGMA, Link, inverse_right_jacobian
 from modeler.graph.square_root import Clique, Rows, SquareRoot
 from modeler.types import Array
 
-_GAUGE_SIGMA = 1e-9  # rad and m: a pose relative to itself, as a covariance that is still positive definite
 _NEAR = 4e-3  # rad and m by which a pose may be off the place where its links were taken: a hundredth of a covariance
 (_solved,) = get_blas_funcs(("trsm",))  # LAPACK's trtrs, and all that rests on it, wakes threads for the least system
 
@@ -91,7 +90,7 @@ class RelativeCovariance:
                 right[frame] = right.get(frame, np.zeros((6, 6))) + sign * source_from_object.T
         if target not in self.trajectory:
             raise KeyError(target)
-        covariance = _GAUGE_SIGMA**2 * np.eye(6)
+        covariance = ROOT_SIGMA**2 * np.eye(6)
         for clique in taken.root.way(right):
             inner = np.zeros((len(clique.upper), 6))
             for place, frame in enumerate(clique.inner):
@@ -113,7 +112,7 @@ class RelativeCovariance:
     def _marginals(self) -> dict[int, Array]:
         poses = np.stack([self._taken.poses[frame] for frame in self.trajectory])
         local = se3.adjoint(se3.inverse(poses)) @ np.stack([self._spreads[frame] for frame in self.trajectory])
-        covariances = local @ np.swapaxes(local, 1, 2) + _GAUGE_SIGMA**2 * np.eye(6)
+        covariances = local @ np.swapaxes(local, 1, 2) + ROOT_SIGMA**2 * np.eye(6)
         return dict(zip(self.trajectory, covariances, strict=True))
 
     @cached_property

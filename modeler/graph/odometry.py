@@ -6,11 +6,9 @@ import numpy as np
 
 from modeler import se3
 from modeler.graph.belief import belief
-from modeler.graph.links import Frames, Link, walk
+from modeler.graph.links import ROOT_SIGMA, Frames, Link, walk
 from modeler.graph.pose_graph import PoseGraph
 from modeler.types import PoseGaussian
-
-_GAUGE_SIGMA = 1e-9  # rad and m: the first pose is where it is by definition
 
 
 def dead_reckoning(graph: PoseGraph) -> dict[int, PoseGaussian]:
@@ -22,7 +20,7 @@ def dead_reckoning(graph: PoseGraph) -> dict[int, PoseGaussian]:
     if root is None:
         return {}
     tree = Frames.of([Link(edge, belief(edge.posterior)) for edge in graph.accepted], root).tree
-    poses = {root: PoseGaussian(np.eye(4), _GAUGE_SIGMA**2 * np.eye(6))}
+    poses = {root: PoseGaussian(np.eye(4), ROOT_SIGMA**2 * np.eye(6))}
     for frame, neighbour, link in walk(tree, root):
         before = poses[frame]
         motion = link.pose if link.target == frame else link.pose.inverse()

@@ -11,7 +11,7 @@ import numpy as np
 from modeler.graph.links import Link
 from modeler.types import Array
 
-_GAUGE_SIGMA = 1e-6  # rad and m: far below any registration, so that it pins a pose without being seen
+_PIN_SIGMA = 1e-6  # rad and m: far below any registration, so that it pins a pose without being seen
 _ROUGH = 1e-4  # of the error, while annealing: what it chooses is then solved with care
 
 
@@ -73,7 +73,7 @@ def optimise(
 
 def anchor(root: int) -> gtsam.PriorFactorPose3:
     """Return the factor that pins the root's pose at the identity."""
-    return gtsam.PriorFactorPose3(root, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, _GAUGE_SIGMA))
+    return gtsam.PriorFactorPose3(root, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, _PIN_SIGMA))
 
 
 def values_of(poses: Mapping[int, Array]) -> gtsam.Values:
