@@ -75,12 +75,9 @@ def moved(pose: Array, xi: Array, about_m: Array) -> Array:
 
 def difference(first: Array, second: Array, about_m: Array) -> Array:
     """Return the ξ (..., 6) by which `moved` takes motions (..., 4, 4) to others, about a point (3,)."""
-    if np.ndim(first) == 2:
-        others = rows(np.asarray(second, dtype=np.float64))
-        xi = moves.differences(rows(first), others.reshape(-1, 12), np.asarray(about_m, dtype=np.float64))
-        return xi.reshape(*others.shape[:-1], 6)
-    centre = translation(about_m)
-    return log(inverse(first @ centre) @ second @ centre)
+    shape = np.broadcast_shapes(np.shape(first)[:-2], np.shape(second)[:-2])
+    one, other = (rows(np.broadcast_to(poses, (*shape, 4, 4))).reshape(-1, 12) for poses in (first, second))
+    return moves.differences(one, other, np.asarray(about_m, dtype=np.float64)).reshape(*shape, 6)
 
 
 def adjoint(pose: Array) -> Array:

@@ -116,12 +116,12 @@ def nearest(times_s: Sequence[float], others_s: Sequence[float], limit_s: float)
     """Return for each time the place of the nearest other time within a limit; None where there is none."""
     if not others_s:
         return [None] * len(times_s)
-    gaps = np.asarray(others_s, dtype=np.float64)
-    order = np.argsort(gaps, kind="stable")
-    right = np.searchsorted(gaps[order], times_s).clip(1, len(gaps)) if len(gaps) > 1 else np.ones(len(times_s), int)
+    all_s = np.asarray(others_s, dtype=np.float64)
+    order = np.argsort(all_s, kind="stable")
+    right = np.searchsorted(all_s[order], times_s).clip(1, len(all_s)) if len(all_s) > 1 else np.ones(len(times_s), int)
     found: list[int | None] = []
     for time_s, after in zip(times_s, right.tolist(), strict=True):
-        candidates = [int(order[place]) for place in (after - 1, after) if place < len(gaps)]
+        candidates = [int(order[place]) for place in (after - 1, after) if place < len(all_s)]
         best = min(candidates, key=lambda place: abs(others_s[place] - time_s))
         found.append(best if abs(others_s[best] - time_s) <= limit_s else None)
     return found

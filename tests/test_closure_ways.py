@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rings import edge
 
-from modeler.closure.ways import Network, Ways, ways
+from modeler.closure.ways import Network, Ways
 from modeler.types import Edge, PoseGaussian, Solution
 
 COUNT = 12
@@ -57,8 +57,8 @@ def test_ways_are_the_surest_and_lead_where_they_say(seed: int) -> None:
 
 
 def test_no_way_leads_where_nothing_hangs_together() -> None:
-    found = ways([edge(0, 2, PoseGaussian(np.eye(4), np.eye(6)))], Solution(), 0)
+    found = Network.of([edge(0, 2, PoseGaussian(np.eye(4), np.eye(6)))], Solution()).ways(0)
     assert 1 not in found
     assert found.along(1) == Ways().along(1) == []
-    assert ways([], Solution(), 7)[7].edges == 0
+    assert Network.of([], Solution()).ways(7)[7].edges == 0
     np.testing.assert_array_equal(found.to([1, 0])[0], [np.inf, 0.0])

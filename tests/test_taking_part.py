@@ -11,7 +11,7 @@ from rings import edge
 
 from modeler import se3
 from modeler.closure.verdict import standard
-from modeler.closure.ways import ways
+from modeler.closure.ways import Network
 from modeler.export import edge_record, edges_of
 from modeler.priors import TurntablePrior
 from modeler.types import Edge, EdgeKind, PoseGaussian, Solution
@@ -42,13 +42,13 @@ def test_an_edge_took_part_by_the_pose_that_the_solution_names() -> None:
 def test_no_way_leads_over_an_edge_that_was_left_out() -> None:
     chain = [edge(k, k + 1, SURE) for k in range(5)]
     loop = edge(0, 5, SURE, "closure")
-    assert ways([*chain, loop], Solution(), 5)[0].edges == 1
-    assert ways([*chain, loop], Solution(outliers=(loop,)), 5)[0].edges == 5
+    assert Network.of([*chain, loop], Solution()).ways(5)[0].edges == 1
+    assert Network.of([*chain, loop], Solution(outliers=(loop,))).ways(5)[0].edges == 5
 
 
 def test_a_way_is_as_sure_as_its_edges_took_part() -> None:
     vague = PoseGaussian(HERE, np.eye(6))
-    found = ways([edge(0, 1, vague)], Solution(edge_poses={(1, 0): SURE}), 0)
+    found = Network.of([edge(0, 1, vague)], Solution(edge_poses={(1, 0): SURE})).ways(0)
     assert found[1].variance_rad2 == pytest.approx(3e-6)
 
 

@@ -116,14 +116,3 @@ class Network:
         distances, before = csgraph.dijkstra(self.variances_rad2, indices=place, return_predecessors=True)
         own = np.arange(len(before))
         return Ways(self.places, distances, np.where(before < 0, own, before).astype(np.int64))
-
-
-def ways(edges: Sequence[Edge], solution: Solution, start: int) -> Ways:
-    """Return the surest way from a frame to every other that hangs together with it.
-
-    Args:
-        edges: as they were judged; those that take part lead on.
-        solution: the poses so far.
-        start: number of the frame.
-    """
-    return Network.of(edges, solution).ways(start)

@@ -10,11 +10,9 @@ from importlib import metadata
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from modeler.export.words import undetermined
-from modeler.types import ACCEPTED, Edge, Mode, RayImage, Solution, Step, loops_closed
+from modeler.types import ACCEPTED, Edge, Mode, RayImage, Solution, Step, joined_without, loops_closed
 
 _SCHEMA = 1
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
@@ -138,7 +136,7 @@ def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> l
         f"frames {edge.source} and {edge.target} share little surface (overlap {edge.posterior.overlap:.2f}), and no "
         "other edge confirms how they were joined"
         for edge in edges
-        if edge.posterior.overlap < _LITTLE_OVERLAP and not _joined_without(edge, edges)
+        if edge.posterior.overlap < _LITTLE_OVERLAP and not joined_without(edge, edges)
     ]
     return reasons + _unsure(step.solution)
 
@@ -155,15 +153,6 @@ def _unsure(solution: Solution) -> list[str]:
     count = sum(sigma_deg > _UNSURE_DEG for sigma_deg in sigmas_deg.values())
     others = f", {count - 1} more by over {_UNSURE_DEG:.0f}°" if count > 1 else ""
     return [f"frame {worst} may be turned by {sigmas_deg[worst]:.0f}° (one standard deviation){others}"]
-
-
-def _joined_without(edge: Edge, edges: list[Edge]) -> bool:
-    """Return whether the ends of an edge hang together by the others."""
-    numbers, ends = np.unique([(other.source, other.target) for other in edges], return_inverse=True)
-    ends = ends.reshape(-1, 2)[[other is not edge for other in edges]]
-    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(numbers), len(numbers)))
-    _, parts = connected_components(graph, directed=False)
-    return bool(np.ptp(parts[np.searchsorted(numbers, [edge.source, edge.target])]) == 0)
 
 
 def _taking_part(step: Step) -> list[Edge]:

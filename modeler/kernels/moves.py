@@ -144,11 +144,11 @@ def difference(first, second, centre):
 
 
 @numba.njit(cache=True)
-def differences(first, poses, centre):
-    """Return the `difference` (n, 6) of poses (n, 12) from one (12,)."""
-    xi = np.empty((len(poses), 6))
-    for i in range(len(poses)):
-        one = difference(first, poses[i], centre)
+def differences(first, second, centre):
+    """Return the `difference` (n, 6) of each two of poses (n, 12)."""
+    xi = np.empty((len(first), 6))
+    for i in range(len(first)):
+        one = difference(first[i], second[i], centre)
         for k in range(6):
             xi[i, k] = one[k]
     return xi

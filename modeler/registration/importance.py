@@ -11,10 +11,10 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.kernels import mixture
 from modeler.registration.mixture import Gaussians
+from modeler.registration.posterior import FLOOR
 from modeler.types import AbstractMotion, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
-_FLOOR = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)  # keeps the covariance of a few samples positive definite
 _PARAMETERS = 28.0  # of one Gaussian more: mean, covariance, share
 
 
@@ -171,7 +171,7 @@ class AdaptiveSampler:
 def _moments(xi: Array, weights: Array) -> tuple[float, Array, Array]:
     """Return the sum of weights (n,), and mean (6,) and covariance (6, 6) of ξ (n, 6)."""
     total, mean, covariance = mixture.moments(xi, weights)
-    return total, mean, covariance + _FLOOR
+    return total, mean, covariance + FLOOR
 
 
 def thinned(weights: Array, count: int, rng: np.random.Generator) -> tuple[npt.NDArray[np.int64], Array]:

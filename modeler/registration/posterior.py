@@ -5,6 +5,8 @@ import numpy as np
 from modeler import se3
 from modeler.types import AbstractMotion, Array, Outcome, PoseGaussian, Posterior, RayImage
 
+FLOOR = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
+"""Added to covariances (6, 6) of ξ (rad, m) that few samples tell, which would not be positive definite."""
 _SAMPLES = 500  # of a prior, enough for its mean and covariance
 
 
@@ -20,8 +22,7 @@ def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaus
         centre_m: (3,) point of the source.
     """
     mean, covariance = se3.mean(poses, weights, about_m=centre_m)
-    floor = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)  # keeps the covariance of a single sample positive definite
-    return PoseGaussian(mean, se3.covariance_about(covariance + floor, -centre_m))  # from the centre to the camera
+    return PoseGaussian(mean, se3.covariance_about(covariance + FLOOR, -centre_m))  # from the centre to the camera
 
 
 def share_at_limit(

@@ -16,6 +16,7 @@ from modeler import se3
 from modeler.kernels import matching, patches
 from modeler.registration.lookup import Lookup
 from modeler.registration.pair import Pair
+from modeler.registration.posterior import FLOOR
 from modeler.se3 import rows
 from modeler.types import Array
 
@@ -49,8 +50,7 @@ class Refiner:
         """
         centre_m = pair.centre_m
         mean, covariance = se3.mean(poses, weights, about_m=centre_m)
-        covariance = covariance + np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
-        spread = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+        spread = np.asarray(np.linalg.cholesky(covariance + FLOOR), dtype=np.float64)
         mode, noise_m = _mode(pair, mean, spread, centre_m, fine_m=fine_m)
         basis, information = self._information(pair, mode, noise_m, spread, centre_m)
         scales, axes = np.linalg.eigh(information)

@@ -7,6 +7,7 @@ Data meets them in this order: views, motions, posteriors, solution, model; prio
 from modeler.types.arrays import Array as Array
 from modeler.types.arrays import BoolArray as BoolArray
 from modeler.types.arrays import Float32Array as Float32Array
+from modeler.types.loops import joined_without as joined_without
 from modeler.types.loops import loops_closed as loops_closed
 from modeler.types.model import ACCEPTED as ACCEPTED
 from modeler.types.model import ObjectModel as ObjectModel

@@ -1,4 +1,4 @@
-"""How many loops the edges of a graph close."""
+"""How the edges of a graph hang together, and how many loops they close."""
 
 from __future__ import annotations
 
@@ -20,13 +20,18 @@ def loops_closed(edges: Sequence[Edge]) -> int:
     closures = [edge.kind == "closure" for edge in edges]
     if not any(closures):
         return 0
-    numbers, ends = np.unique([(edge.source, edge.target) for edge in edges], return_inverse=True)
-    ends = ends.reshape(-1, 2)
-    joined_without = _parts(ends[~np.array(closures)], len(numbers)) - _parts(ends, len(numbers))
-    return sum(closures) - joined_without
+    without = [edge for edge, closure in zip(edges, closures, strict=True) if not closure]
+    return sum(closures) - (_parts(without, edges) - _parts(edges, edges))
 
 
-def _parts(ends: np.ndarray, count: int) -> int:
-    """Return into how many parts so many nodes fall that are joined by pairs (n, 2) of their numbers."""
-    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+def joined_without(edge: Edge, edges: Sequence[Edge]) -> bool:
+    """Return whether the ends of one of some edges hang together by the others."""
+    return _parts([other for other in edges if other is not edge], edges) == _parts(edges, edges)
+
+
+def _parts(edges: Sequence[Edge], everything: Sequence[Edge]) -> int:
+    """Return into how many parts the frames of all edges fall that are joined by some of them."""
+    frames = np.unique([(edge.source, edge.target) for edge in everything])
+    ends = np.searchsorted(frames, np.reshape([(edge.source, edge.target) for edge in edges], (-1, 2)))
+    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(frames), len(frames)))
     return int(connected_components(graph, directed=False)[0])
