@@ -40,6 +40,9 @@ _RECIPES: Final[Mapping[Half, Mapping[Symmetry, tuple[str, ...]]]] = {
             "stapler",
             "boot",
             "vise",
+            "microscope",
+            "rubber_duck",
+            "hand_plane",
         ),
         "near-symmetric": (
             "flashlight",
@@ -51,6 +54,9 @@ _RECIPES: Final[Mapping[Half, Mapping[Symmetry, tuple[str, ...]]]] = {
             "jug",
             "pepper_mill",
             "oil_can",
+            "globe",
+            "mortar",
+            "cactus",
         ),
         "n-fold": (
             "box",
@@ -63,6 +69,9 @@ _RECIPES: Final[Mapping[Half, Mapping[Symmetry, tuple[str, ...]]]] = {
             "square_bottle",
             "toolbox",
             "lantern",
+            "padlock",
+            "bench_grinder",
+            "propeller",
         ),
         "revolution": (
             "tube",
@@ -76,13 +85,16 @@ _RECIPES: Final[Mapping[Half, Mapping[Symmetry, tuple[str, ...]]]] = {
             "soup_plate",
             "funnel",
             "jar",
+            "cart_wheel",
+            "light_bulb",
+            "plunger",
         ),
     },
     "held-out": {
-        "asymmetric": ("microscope", "rubber_duck", "hand_plane"),
-        "near-symmetric": ("globe", "mortar", "cactus"),
-        "n-fold": ("padlock", "bench_grinder", "propeller"),
-        "revolution": ("cart_wheel", "light_bulb", "plunger"),
+        "asymmetric": ("desk_lamp", "trowel", "locomotive"),
+        "near-symmetric": ("robot_vacuum", "fire_extinguisher", "pear"),
+        "n-fold": ("skateboard", "tripod", "stepper_motor"),
+        "revolution": ("stacking_rings", "cake_stand", "spinning_top"),
     },
 }
 
