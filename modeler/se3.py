@@ -109,15 +109,13 @@ def rotation_angle(pose: Array) -> Array:
 
 
 def inverse_covariance(pose: Array, covariance: Array) -> Array:
-    """Return the covariance (6, 6) of `inverse(pose)` where `pose` has `covariance`."""
-    matrix = adjoint(pose)
-    return matrix @ covariance @ matrix.T
+    """Return the covariances (..., 6, 6) of `inverse(pose)` where `pose` (..., 4, 4) has `covariance` (..., 6, 6)."""
+    return _carried(covariance, adjoint(pose))
 
 
 def composed_covariance(covariance_ab: Array, pose_bc: Array, covariance_bc: Array) -> Array:
-    """Return the first-order covariance (6, 6) of `pose_ab @ pose_bc` for independent errors."""
-    matrix = adjoint(inverse(pose_bc))
-    return matrix @ covariance_ab @ matrix.T + covariance_bc
+    """Return the first-order covariances (..., 6, 6) of `pose_ab @ pose_bc` for independent errors."""
+    return _carried(covariance_ab, adjoint(inverse(pose_bc))) + covariance_bc
 
 
 def covariance_about(covariance: Array, point_m: Array) -> Array:
@@ -130,9 +128,13 @@ def covariance_about(covariance: Array, point_m: Array) -> Array:
         covariance: (..., 6, 6) of ξ, which turns about the origin of what the pose moves.
         point_m: (3,) of what the pose moves.
     """
-    matrix = adjoint(translation(-np.asarray(point_m, dtype=np.float64)))
-    about = matrix @ covariance @ matrix.T
+    about = _carried(covariance, adjoint(translation(-np.asarray(point_m, dtype=np.float64))))
     return 0.5 * (about + np.swapaxes(about, -1, -2))  # rounding alone would leave it a little askew
+
+
+def _carried(covariance: Array, matrix: Array) -> Array:
+    """Return the covariances (..., 6, 6) of M ξ for matrices M (..., 6, 6)."""
+    return matrix @ covariance @ np.swapaxes(matrix, -1, -2)
 
 
 def mean(

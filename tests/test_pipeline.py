@@ -387,6 +387,19 @@ def test_lost_frames_join_after_all_where_later_views_place_them() -> None:
     assert trajectory_error(steps[-1]) < 1e-6
 
 
+def test_a_lost_frame_far_back_joins_across_another_that_is_lost_for_good() -> None:
+    """Where it should be follows from the views around it, not from the last ones, by now far round."""
+    registrar = Oracle(apart=frozenset({(2, 1), (2, 0)}), reach=9.0)
+    *_, last = run([*FRAMES[:3], blank(3), *FRAMES[4:]], registrar=registrar)
+    assert sorted(last.solution.trajectory) == [0, 1, 2, 4, 5, 6, 7, 8]
+    assert trajectory_error(last) < 1e-6
+
+
+def test_two_frames_of_one_number_are_refused() -> None:
+    with pytest.raises(InputError, match="frame 1 comes twice; give each"):
+        run([*FRAMES[:2], FRAMES[1]])
+
+
 def test_what_is_kept_of_a_frame_is_light_and_makes_the_same_view_again() -> None:
     steps = run()
     assert all(not view.layers for view in steps[-1].views.values())

@@ -186,6 +186,17 @@ def test_covariance_of_a_composition_against_monte_carlo(seed: int) -> None:
     _assert_same_covariance(_sample_covariance(first @ second, samples), expected, count)
 
 
+def test_covariances_of_many_motions_are_those_of_each() -> None:
+    rng = np.random.default_rng(0)
+    many = se3.exp(rng.normal(size=(2, 3, 6)))
+    one, other = (np.array([[_covariance(rng, 0.01, 0.003) for _ in range(3)] for _ in range(2)]) for _ in range(2))
+    inverse, composed = se3.inverse_covariance(many, one), se3.composed_covariance(one, many, other)
+    for place in np.ndindex(2, 3):
+        np.testing.assert_allclose(inverse[place], se3.inverse_covariance(many[place], one[place]), rtol=1e-12)
+        expected = se3.composed_covariance(one[place], many[place], other[place])
+        np.testing.assert_allclose(composed[place], expected, rtol=1e-12)
+
+
 @LAWS
 @given(poses(), tangents(), SEEDS)
 def test_covariance_about_a_point_is_that_of_the_step_about_it(pose: se3.Array, eta: se3.Array, seed: int) -> None:

@@ -1,7 +1,8 @@
-"""Where motions lead: on from the last two frames, along the graph, and back to where the object was."""
+"""Where motions lead: on from the nearest two frames, along the graph, and back to where the object was."""
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Sequence
 
 import numpy as np
@@ -35,10 +36,12 @@ def onwards(way: PoseGaussian, motion: PoseGaussian) -> PoseGaussian:
 
 
 def continued(solution: Solution, frames: Sequence[int], source: int) -> Array:
-    """Return object_from_camera (4, 4) of a new frame if the last motion between `frames` goes on at its pace."""
-    last = frames[-1]
-    if len(frames) < 2:
-        return solution.trajectory[last]
-    before = frames[-2]
-    pace = max((source - last) / (last - before), 0.0)
-    return solution.trajectory[last] @ se3.exp(pace * se3.log(solution.relative(before, last)))
+    """Return object_from_camera (4, 4) of a frame if the motion between the two of `frames` nearest to it is steady.
+
+    For a new frame these are the last two; one that was left out lies between two, or before the first.
+    """
+    near, *other = heapq.nsmallest(2, frames, key=lambda frame: abs(frame - source))
+    if not other:
+        return solution.trajectory[near]
+    pace = (source - near) / (near - other[0])
+    return solution.trajectory[near] @ se3.exp(pace * se3.log(solution.relative(other[0], near)))

@@ -38,8 +38,7 @@ class Trust:
             centroid_m: (3,) of the object in the camera at its end.
         """
         sigmas = length * np.repeat([np.radians(self.drift_deg), self.drift_m], 3)
-        camera_from_object = se3.adjoint(se3.translation(centroid_m))
-        return camera_from_object @ np.diag(sigmas**2) @ camera_from_object.T
+        return se3.covariance_about(np.diag(sigmas**2), -centroid_m)
 
     def agreement(
         self,

@@ -267,5 +267,4 @@ def _joined(pieces: Sequence[_Piece]) -> tuple[_Piece, ...]:
 
 def _composed(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
     """Return means (h, 4, 4) and covariances (h, 6, 6) of one motion after another, for independent errors."""
-    adjoint = se3.adjoint(se3.inverse(second[0]))
-    return first[0] @ second[0], adjoint @ first[1] @ np.swapaxes(adjoint, -1, -2) + second[1]
+    return first[0] @ second[0], se3.composed_covariance(first[1], *second)

@@ -51,9 +51,9 @@ class Smoother:
     """Solves a graph that grows, with as much work as the new edges ask for. A value: `plus` makes a new one.
 
     A frame that hangs on one edge is placed by it and moves no other. An edge that closes a loop moves those around it,
-    see `incremental`. Which loops to leave out, and which
-    modes to choose, is asked again only where the choice no longer stands. So each solution is that of the whole graph,
-    within the tolerance of the optimisation, however it grew.
+    see `incremental`. Which loops to leave out, and which modes to choose, is asked again only where the choice no
+    longer stands. So each solution is that of the whole graph, within the tolerance of the optimisation, however it
+    grew.
     """
 
     outlier_distance: float = 14.2

@@ -9,7 +9,7 @@ from functools import cached_property
 from modeler.closure import Past
 from modeler.fusion import Growing
 from modeler.graph import CommonAxis, PoseGraph, Smoother
-from modeler.types import Edge, Frame, ObjectModel, RayImage, Segmentation, Solution
+from modeler.types import Edge, Frame, InputError, ObjectModel, RayImage, Segmentation, Solution
 
 _READY = 8  # views kept ready for registration; of others the images that a likelihood looks up are made again
 _SPANNED = 3  # frames between a lost one and a view that followed it, at most, for it to be tried once more
@@ -66,7 +66,13 @@ class State:
         return 1 if other is None else abs(self.places[frame] - self.places[other])
 
     def read(self, frame: int) -> State:
-        """Return the state once one more frame is read."""
+        """Return the state once one more frame is read.
+
+        Raises:
+            InputError: where its number is that of an earlier one.
+        """
+        if frame in self.places:
+            raise InputError(f"frame {frame} comes twice; give each frame of the sequence a number of its own")
         return replace(self, places={**self.places, frame: len(self.places)})
 
     def joined(self, seen: Seen, edges: Sequence[Edge], *, accepted: bool) -> State:
