@@ -156,6 +156,8 @@ def test_steps_share_the_axis_as_far_as_no_edge_holds_it() -> None:
     assert replace(unknown, axis_direction=(0.0, -1.0, 0.0)).shared_axis(bare) == place_alone
     assert replace(unknown, axis_direction=(0.0, -1.0, 0.0), axis_sigma_deg=180.0).shared_axis(bare) is not None
     assert replace(unknown, axis_point_m=(0.0, 0.0, 0.8)).shared_axis(bare) is None
+    on_table = replace(unknown, needs_table=True)  # a pair of which one view shows the table was not refused
+    assert on_table.shared_axis([BARE_SOURCE, TARGET]) == place_alone
     for guess in (
         VelocityPrior(unknown),
         AxesPrior(unknown),
@@ -402,6 +404,14 @@ def test_every_poke_of_a_sequence_stands_at_its_frame() -> None:
     np.testing.assert_array_equal(several.between(frames[2], frames[0]).log_density(pose), on_table.log_density(pose))
     with pytest.raises(InputError, match="no poke is told between frames 2 and 3"):
         several.between(frames[3], frames[2])
+
+
+def test_a_poke_against_the_table_is_refused() -> None:
+    prior, _ = poked(np.zeros(3))
+    assert prior.poke is not None
+    pressed = PokePrior(replace(prior.poke, direction=told(-2.0 * NORMAL)))
+    with pytest.raises(InputError, match=r"between frames 0 and 1 presses on the table.*give its direction"):
+        pressed.between(at(1, TARGET), at(0, TARGET))
 
 
 # Guesses

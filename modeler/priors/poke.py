@@ -15,6 +15,7 @@ from modeler.types import AbstractMotion, AbstractPrior, Array, InputError, RayI
 _STEPS = 20  # into which a push is cut
 _PUSHES = 512  # of which the spread of outcomes is told
 _DIMENSIONS = 7
+_LEAST_WAY = 0.1  # along the table, of a direction: six degrees off its normal nobody means
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class PokePrior(AbstractPrior):
         """Return the density of target_from_source; after several pushes only that the object is on its table still.
 
         Raises:
-            InputError: where neither view shows a plane, or no push is told between them.
+            InputError: where neither view shows a plane, no push is told between them, or it presses on the plane.
         """
         earlier, later = sorted((source, target), key=lambda view: view.index)
         pokes = self._between(earlier.index, later.index)
@@ -75,6 +76,11 @@ class PokePrior(AbstractPrior):
             sigma_tilt_rad=np.radians(self.sigma_tilt_deg),
             sigma_lift_m=self.sigma_height_m,
         )
+        if np.linalg.norm(plane.axes[:2] @ pokes[0].direction) <= _LEAST_WAY * np.linalg.norm(pokes[0].direction):
+            raise InputError(
+                f"the poke between frames {earlier.index} and {later.index} presses on the table instead of along it; "
+                "give its direction in camera coordinates"
+            )
         outcomes = self._outcomes(pokes[0], earlier, plane)
         mean = outcomes.mean(axis=0)
         covariance = np.cov(outcomes.T) + np.diag([1e-4, 1e-5, 1e-5]) ** 2

@@ -15,7 +15,7 @@ from modeler.priors.general import GeneralPrior, grown_limits, turned_offset_m
 from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M, no_plane, support
 from modeler.priors.proposal import guided, reach_deg
 from modeler.priors.table import TablePrior
-from modeler.types import AbstractMotion, AbstractPrior, Edge, RayImage, SharedAxis, Solution
+from modeler.types import AbstractMotion, AbstractPrior, Edge, Plane, RayImage, SharedAxis, Solution
 
 _UP = (0.0, -1.0, 0.0)  # against gravity for a camera held upright: y points down
 _BROAD_DEG, _GIVEN_DEG = 30.0, 1.0
@@ -71,7 +71,10 @@ class TurntablePrior(AbstractPrior):
         Raises:
             InputError: where a table is needed and neither view shows one.
         """
-        axis = self._axis(source, target)
+        plane = support(source, target)
+        if plane is None and self.needs_table:
+            raise no_plane(source, target)
+        axis = self._axis(plane)
         motion = self._motion(source, target, axis)
         if self.learnt is not None or self.sense:
             told = replace(self, step_sign="known", step_deg=self.sense * abs(self.step_deg)) if self.sense else self
@@ -106,14 +109,11 @@ class TurntablePrior(AbstractPrior):
         """
         if self.axis_point_m is not None:
             return None
-        vague = all(self._axis(view, view).sigma_direction_rad >= np.radians(_VAGUE_DEG) for view in views)
+        vague = all(self._axis(view.plane).sigma_direction_rad >= np.radians(_VAGUE_DEG) for view in views)
         return SharedAxis(float(np.radians(self.wobble_deg)) if vague else np.inf, self.wobble_m)
 
-    def _axis(self, source: RayImage, target: RayImage) -> Axis:
-        """Return what is known of the axis without comparing the images."""
-        plane = support(source, target)
-        if plane is None and self.needs_table:
-            raise no_plane(source, target)
+    def _axis(self, plane: Plane | None) -> Axis:
+        """Return what is known of the axis without comparing the images, on a table if one is seen."""
         if self.axis_direction is not None:
             direction, sigma_rad = np.array(self.axis_direction), np.radians(_GIVEN_DEG)
         elif plane is not None:
@@ -127,7 +127,7 @@ class TurntablePrior(AbstractPrior):
 
     def _motion(self, source: RayImage, target: RayImage, axis: Axis) -> AboutAxis:
         """Return turns by the commanded steps about an axis."""
-        expected = self._axis(source, target).direction
+        expected = self._axis(support(source, target)).direction
         side = 1.0 if axis.direction @ expected >= 0.0 else -1.0  # a line that was learnt has no upper end
         steps = target.index - source.index
         turn = AxisTurn(
