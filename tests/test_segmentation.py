@@ -151,6 +151,37 @@ def test_a_moving_camera_is_noticed(rng):
     assert np.arccos(found[0].plane.normal @ found[3].plane.normal) > np.radians(10.0)
 
 
+def test_depth_that_is_noisier_than_expected_is_not_taken_for_a_moving_camera(rng):
+    frames, masks = [], []
+    for k in range(12):
+        frame, mask = (
+            World()
+            .table()
+            .box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
+            .frame(k, rng, sigma_m=0.0032)
+        )
+        frames.append(frame)
+        masks.append(mask)
+    segmenter = Segmenter()
+    assert np.all(segmenter.noise.sigma_m(np.float32([0.6, 0.9])) < 0.0015)
+    scene = segmenter.scene(frames)
+    assert scene.still
+    assert scene.noise is not None
+    judge(frames, masks, least=0.9)
+    half_round = [replace(frame, depth_m=frame.depth_m[::-1, ::-1]) for frame in frames]  # hung upside down
+    judge(half_round, [mask[::-1, ::-1] for mask in masks], least=0.9)
+
+
+@pytest.mark.parametrize("step_deg", [1.0, 5.0, 30.0])
+def test_a_camera_that_goes_round_is_not_taken_for_noisy_depth(rng, step_deg):
+    frames = [
+        World(turn_deg=step_deg * k).table().box((0.05, 0.0, 0.07), (0.06, 0.035, 0.07), label=OBJECT).frame(k, rng)[0]
+        for k in range(12)
+    ]
+    frames = [replace(frame, depth_m=frame.depth_m + np.float32(0.02 * k)) for k, frame in enumerate(frames)]
+    assert not Segmenter().scene(frames).still
+
+
 def test_a_camera_that_was_pushed_after_the_scene_was_learnt_is_noticed(rng):
     frames, _ = turned(4, rng)
     pushed, mask = World(tilt_deg=45.0).table().box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), label=OBJECT).frame(9, rng)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+import numpy.typing as npt
 from scipy import ndimage
 
 from modeler.segmentation.noise import DepthNoise
@@ -18,6 +19,7 @@ _FEW_FRAMES = 4  # with more, nothing is believed that only one frame says
 _STILL_SHARE = 0.7  # of the readings that agree, for a pixel to be called still
 _MOVED_SHARE = 0.15  # of the readings that lie in front of the backdrop, for a pixel to be called moved
 _MOVING_CAMERA_SHARE = 0.5  # of the image that changes: the camera moves, not the object
+_QUARTERS_APART = 1.35  # standard deviations from the lower to the upper quartile of a Gaussian
 
 
 @final
@@ -66,8 +68,8 @@ def point_image(
 def take_apart(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> Layers:
     """Take depth images (n of (h, w), NaN = no measurement) of a still camera apart."""
     stride = planning_stride(camera)
-    stack = np.sort(np.stack([depth[::stride, ::stride] for depth in depths_m]), axis=0)  # NaN comes last
-    frames, readings = len(stack), np.isfinite(stack).sum(axis=0)
+    stack, readings = _sorted(depths_m, stride)
+    frames = len(stack)
     spare = np.where(readings > 2, np.maximum(readings // _OUTLIERS_IN, 1), 0)
     reference = np.take_along_axis(stack, np.maximum(readings - 1 - spare, 0)[None], axis=0)[0]
     agree = np.abs(stack - reference) < noise.tolerance_m(reference)
@@ -84,3 +86,26 @@ def take_apart(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoi
     still = (agreeing >= np.maximum(believed, _STILL_SHARE * readings)) & ~moved
     back, front, rays = (point_image(depth, camera, stride=stride) for depth in (back, front, np.ones_like(back)))
     return Layers(back, front, rays, moved, still, share)
+
+
+def times_as_noisy(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> float:
+    """Return how many times as much as `noise` the depth at a pixel is spread over the frames: the median of all.
+
+    Args:
+        depths_m: (n of (h, w), NaN = no measurement) of a camera that may stand still.
+        camera: the camera.
+        noise: what is expected of it.
+    """
+    stack, readings = _sorted(depths_m, planning_stride(camera))
+    often = readings > _FEW_FRAMES
+    if not often.any():
+        return 1.0
+    quarters = [(np.float32(share) * (readings - 1)).round().astype(np.int64) for share in (0.25, 0.5, 0.75)]
+    low, middle, high = (np.take_along_axis(stack, place[None], axis=0)[0][often] for place in quarters)
+    return float(np.median((high - low) / (_QUARTERS_APART * noise.sigma_m(middle))))
+
+
+def _sorted(depths_m: Sequence[Float32Array], stride: int) -> tuple[Float32Array, npt.NDArray[np.int64]]:
+    """Return the readings (n, h, w) of each pixel, thinned, least first and NaN last, and how many there are."""
+    stack = np.sort(np.stack([depth[::stride, ::stride] for depth in depths_m]), axis=0)
+    return stack, np.isfinite(stack).sum(axis=0)

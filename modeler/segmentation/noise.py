@@ -29,3 +29,7 @@ class DepthNoise:
     def tolerance_m(self, depth_m: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return the difference beyond which two readings at `depth_m` are two surfaces: 3 sigma and a floor more."""
         return 3.0 * self.sigma_m(depth_m) + self.floor_m
+
+    def times(self, factor: float) -> DepthNoise:
+        """Return the noise of a camera so many times as noisy."""
+        return DepthNoise(factor * self.floor_m, factor * self.quadratic_per_m)

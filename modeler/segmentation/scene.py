@@ -43,6 +43,8 @@ class Scene:
     """Whether there is no doubt about which thing is the object and which plane its support."""
     still: bool = False
     """Whether camera and scenery stand still, so that the scene holds for other frames."""
+    noise: DepthNoise | None = None
+    """Noise of the depth camera, where the frames show more of it than was expected."""
 
 
 def telling(indices: Sequence[int], *, count: int = 15) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from modeler.segmentation.clusters import edge_of
 from modeler.segmentation.finder import Found, find
-from modeler.segmentation.layers import planning_stride, point_image, take_apart
+from modeler.segmentation.layers import planning_stride, point_image, take_apart, times_as_noisy
 from modeler.segmentation.noise import DepthNoise
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
 from modeler.segmentation.scene import Scene, learn
@@ -20,6 +20,7 @@ _RIVAL = 0.4  # of the best cluster's merit: from here on the choice is unsure
 _CUT_SHARE = 0.1  # of the mask's width; more on the edge of the image means that the object is cut off
 _AREA_FACTOR = 2.5  # by which the visible area may leave the range it had in the scene
 _AGREEING_SHARE = 0.5  # of what stood still, for the scene to hold in a frame
+_NOISIEST = 3.0  # times the noise that is expected; where depth changes more from frame to frame, the camera moves
 _PLANE_SHARE = 0.02  # of the surroundings of a masked object that a plane must cover
 
 
@@ -41,7 +42,7 @@ class Segmenter:
     gap_m: float = 0.012
     """Parts of the object that are this close in m belong together across holes in the image."""
     noise: DepthNoise = field(default_factory=DepthNoise)
-    """Noise of the depth camera."""
+    """Noise that is expected of the depth camera; up to three times as much is told from a camera that moves."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -101,20 +102,24 @@ class Segmenter:
 
     def _learn(self, frames: Sequence[Frame]) -> Scene:
         """Return what frames without masks say about the scene, if their camera stands still."""
-        camera = frames[0].camera
-        layers = take_apart([_measured(frame) for frame in frames], camera, self.noise)
+        camera, depths_m, noise = frames[0].camera, [_measured(frame) for frame in frames], self.noise
+        layers, noisier = take_apart(depths_m, camera, noise), None
+        if layers.camera_moves:  # or is its depth noisier than expected?
+            factor = times_as_noisy(depths_m, camera, noise)
+            noisier = noise = noise.times(factor)
+            layers = layers if factor > _NOISIEST else take_apart(depths_m, camera, noise)
         if layers.camera_moves:
             return Scene()
         stride = planning_stride(camera)
         allowed = self._allowed(layers.front_m[..., 2], stride)
-        scene = learn(layers, allowed, self.noise, least_points=self.min_points / stride**2)
-        return replace(scene, still=len(frames) > 1)
+        scene = learn(layers, allowed, noise, least_points=self.min_points / stride**2)
+        return replace(scene, still=len(frames) > 1, noise=noisier)
 
     def _find(self, frame: Frame, scene: Scene) -> Found:
         """Return the object in a frame without a mask."""
         depth = _measured(frame)
         depth[~self._allowed(depth)] = np.nan
-        return find(depth, frame.camera, scene, self.noise, gap_m=self.gap_m)
+        return find(depth, frame.camera, scene, scene.noise or self.noise, gap_m=self.gap_m)
 
     def _allowed(self, depth_m: Float32Array, stride: int = 1) -> BoolArray:
         """Return the pixels (h, w) of a thinned depth image that region and greatest depth leave."""
@@ -133,7 +138,7 @@ class Segmenter:
         if scene.still_m is None or scene.still_m.shape != depth.shape:
             return False
         off = depth - scene.still_m
-        agreeing = np.count_nonzero(np.abs(off) < 2.0 * self.noise.tolerance_m(depth))
+        agreeing = np.count_nonzero(np.abs(off) < 2.0 * (scene.noise or self.noise).tolerance_m(depth))
         return bool(agreeing >= _AGREEING_SHARE * np.count_nonzero(np.isfinite(off)))
 
     def _plane_beside(self, frame: Frame, mask: BoolArray) -> Plane | None:
