@@ -18,6 +18,7 @@ ROUNDS = 400
 SPANNING = 60  # steps towards the neighbours' mean that made-up vertices take
 CONTRARY = 0.1  # share of the views of a cell that may be wrong about it, for their poses are off
 OUTER = 3  # layers of voxels at the border that are outside
+SUNK = 0.01  # share of the points seen that may lie under a table; of more, it is not what the object stands on
 
 
 def without(field: Field, rejected_m: Array, kept_m: Array, reach_m: float) -> Field:
@@ -38,7 +39,7 @@ def enclosing(field: Field, seen: Stack, tau_m: float) -> Field:
 
     What views look through or know to be below the table is outside, unless nearly all others have surface in front of
     it; the rest is parted where the surface between inside and outside is smallest, as a soap film across the rims of
-    what was seen.
+    what was seen. Nothing reaches below a table on which the object stands.
     """
     grid = field.grid
     stride = max(1, int(np.ceil((float(np.prod(grid.shape)) / CELLS) ** (1.0 / 3.0))))
@@ -69,9 +70,33 @@ def enclosing(field: Field, seen: Stack, tau_m: float) -> Field:
         at = np.meshgrid([place], places[1], places[2], indexing="ij")
         made_up[x] = map_coordinates(smooth, at, order=1, mode="nearest")[0] * cell_m
     whole = np.where(field.weights > 0.0, field.values_m, made_up)
+    x, y, z = (grid.origin_m[axis] + (np.arange(int(n)) + 0.5) * grid.voxel_m for axis, n in enumerate(grid.shape))
+    for a, b, c, offset_m in tables(seen, grid.corners_m, tau_m).astype(np.float32):
+        # Behind what a view sees it supposes the object, under the table too where it looks down.
+        np.maximum(whole, -((a * x + offset_m)[:, None, None] + (b * y)[:, None] + c * z), out=whole, dtype=np.float32)
     whole[_shell(grid.shape, OUTER)] = tau_m
     whole[whole == 0.0] = FAINT * grid.voxel_m
     return Field(grid, whole, np.maximum(field.weights, np.float32(FAINT)), crossed(whole))
+
+
+def tables(seen: Stack, corners_m: Array, tau_m: float) -> Array:
+    """Return normals and offsets (k, 4) of the tables on which the object stands, in the object frame.
+
+    Planes that views see are one table where they are less than `tau_m` apart all over a box, given by its corners
+    (8, 3). A few views alone may err, and what reaches below a plane does not stand on it.
+    """
+    planes = seen.planes[np.isfinite(seen.planes).all(axis=1)]
+    heights_m = corners_m @ planes[:, :3].T + planes[:, 3]
+    found, left = [], np.arange(len(planes))
+    while len(left):
+        alike = np.abs(heights_m[:, left] - heights_m[:, left[:1]]).max(axis=0) < tau_m
+        plane = np.median(planes[left[alike]], axis=0)
+        plane /= np.linalg.norm(plane[:3])
+        sunk = float(np.mean(seen.points_m @ plane[:3] + plane[3] < -tau_m))
+        if np.count_nonzero(alike) > CONTRARY * len(seen.planes) and sunk < SUNK:
+            found.append(plane)
+        left = left[~alike]
+    return np.reshape(found, (-1, 4))
 
 
 def tidied(
