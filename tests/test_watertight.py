@@ -47,7 +47,7 @@ def test_a_watertight_model_stands_on_its_table(seed: int) -> None:
     under = (np.abs(vertices_m[:, :2]) < 0.04).all(axis=1) & (vertices_m[:, 2] < 0.0)
     assert (model.vertex_views[under] == 0).all()
     np.testing.assert_allclose(vertices_m[under, 2], -BRICK.half_m[2], atol=0.5 * VOXEL_M)
-    assert vertices_m[:, 2].min() > -BRICK.half_m[2] - 0.1 * VOXEL_M
+    assert vertices_m[:, 2].min() > -BRICK.half_m[2] - 0.25 * VOXEL_M  # smoothing rounds edges
 
 
 def test_planes_that_are_alike_are_one_table_and_one_view_makes_none() -> None:
