@@ -243,6 +243,37 @@ def test_intrinsics_are_read_in_each_spelling(tmp_path: Path, frames: list[Frame
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (143.75, 143.75, 79.875, 59.875)
 
 
+@pytest.mark.parametrize(("scale", "unit"), [(0.1, "0.1 mm"), (0.0001, "0.1 mm"), (5000, "0.2 mm"), (1, "1 mm")])
+def test_the_unit_of_depth_that_stands_beside_the_intrinsics_counts(
+    tmp_path: Path, frames: list[Frame], scale: float, unit: str
+) -> None:
+    """BOP's mm a unit, RealSense's m a unit, Open3D's units a m."""
+    write_open3d(tmp_path / "s", frames)
+    (tmp_path / "s" / "camera_intrinsic.json").unlink()
+    told = {"fx": 143.75, "fy": 143.75, "cx": 79.875, "cy": 59.875, "depth_scale": scale}
+    (tmp_path / "s" / "camera.json").write_text(json.dumps(told))
+    sequence = open_sequence(tmp_path / "s")
+    assert sequence.layout == "folder of pictures"
+    assert sequence.depth_unit == f"{unit} (camera.json)"
+    given = open_sequence(tmp_path / "s", Given(depth_scale_mm=3.0))
+    ratio = np.nanmedian(given.frame(0).depth_m / sequence.frame(0).depth_m)
+    assert ratio == pytest.approx(3.0 / float(unit.split()[0]), rel=1e-5)
+    (tmp_path / "s" / "camera.json").write_text(json.dumps({**told, "depth_scale": 30}))
+    with pytest.raises(InputError, match=r"camera\.json: \"depth_scale\" is 30; it must be millimetres"):
+        open_sequence(tmp_path / "s")
+
+
+def test_intrinsics_of_images_of_another_size_are_asked_about(tmp_path: Path, frames: list[Frame]) -> None:
+    write_open3d(tmp_path / "s", frames)
+    assert not open_sequence(tmp_path / "s").notes
+    path = tmp_path / "s" / "camera_intrinsic.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "width": 640, "height": 480}))
+    assert open_sequence(tmp_path / "s").notes == (
+        "camera_intrinsic.json is of images of 640 x 480 where the depth images are 160 x 120: are its intrinsics "
+        "theirs?",
+    )
+
+
 # BOP onboarding
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 import numpy as np
 
@@ -25,8 +27,43 @@ NAMES = (
 """Files that are looked for, in this order."""
 
 
-def find_intrinsics(folder: Path, given: Given) -> tuple[Intrinsics, str] | None:
-    """Return the intrinsics of a folder of pictures and who says so; None where nobody does.
+@final
+@dataclass(frozen=True)
+class Told:
+    """What is told of the camera of a folder of pictures."""
+
+    intrinsics: Intrinsics
+    """fx, fy, cx, cy in px."""
+    by: str
+    """The file, or the option, that tells it."""
+    unit_mm: float | None = None
+    """Millimetres per unit of depth, where the file says so."""
+    size: tuple[int, int] | None = None
+    """Width and height in px of the images that the file is of, where it says so."""
+
+    def unit(self, given: Given, usual: tuple[float, str]) -> tuple[float, str]:
+        """Return the millimetres per unit of depth, and who says so.
+
+        Args:
+            given: what counts more.
+            usual: what holds where nobody says anything.
+        """
+        if given.depth_scale_mm is not None:
+            return given.depth_scale_mm, "--depth-scale-mm"
+        return usual if self.unit_mm is None else (self.unit_mm, self.by)
+
+    def doubts(self, size: tuple[int, int]) -> list[str]:
+        """Return in words why it may not be the camera of images of some width and height; none where it may."""
+        if self.size in (None, size):
+            return []
+        return [
+            f"{self.by} is of images of {self.size[0]} x {self.size[1]} where the depth images are {size[0]} x "
+            f"{size[1]}: are its intrinsics theirs?"
+        ]
+
+
+def find_intrinsics(folder: Path, given: Given) -> Told | None:
+    """Return what is told of the camera of a folder of pictures; None where nobody tells its intrinsics.
 
     Args:
         folder: where to look.
@@ -36,12 +73,12 @@ def find_intrinsics(folder: Path, given: Given) -> tuple[Intrinsics, str] | None
         InputError: where a file of intrinsics cannot be read.
     """
     if given.intrinsics is not None:
-        return given.intrinsics, "--intrinsics"
+        return Told(given.intrinsics, "--intrinsics")
     for name in NAMES:
         path = folder / name
         if path.exists():
             inside(path, folder)
-            return (_from_json(read_tree(path)) if path.suffix == ".json" else _from_text(path)), name
+            return _from_json(read_tree(path), name) if path.suffix == ".json" else Told(_from_text(path), name)
     return None
 
 
@@ -65,10 +102,35 @@ def _from_text(path: Path) -> Intrinsics:
     return found
 
 
-def _from_json(node: Node) -> Intrinsics:
+def _from_json(node: Node, name: str) -> Told:
     """Read what Open3D writes (columns of the matrix in turn), a matrix in rows, or fx, fy, cx, cy by name."""
+    scale = node.get("depth_scale")
     if node.get("intrinsic") is not None:
         node = node.need("intrinsic")
+    width, height = node.get("width"), node.get("height")
+    size = None if width is None or height is None else (int(width.number(1.0, 1e5)), int(height.number(1.0, 1e5)))
+    return Told(_pinhole(node), name, None if scale is None else _unit_mm(scale), size)
+
+
+def _unit_mm(scale: Node) -> float:
+    """Return the millimetres per unit of depth of a `depth_scale`, which programs give in three ways.
+
+    BOP's files have millimetres per unit (1 or 0.1), RealSense's library metres per unit (0.001 or 0.0001), Open3D's
+    and others units per metre (1000 or 5000): the three lie far apart.
+    """
+    number = scale.number()
+    for low, high, unit_mm in (
+        (1e-6, 0.01, number * 1000.0),
+        (0.01, 10.0, number),
+        (100.0, 1e6, 1000.0 / (number or 1)),
+    ):
+        if low <= number <= high:
+            return unit_mm
+    raise scale.fault("millimetres per unit of depth, as in 1 or 0.1")
+
+
+def _pinhole(node: Node) -> Intrinsics:
+    """Return the intrinsics that an object of a JSON file holds, in whichever spelling."""
     names = next(
         (names for names in (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy")) if node.get(names[2])), None
     )

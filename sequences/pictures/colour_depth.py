@@ -11,6 +11,7 @@ import numpy as np
 from modeler import se3
 from modeler.types import Array, InputError
 from sequences.files.folders import entries, first_folder, frame_number, inside, pictures
+from sequences.files.images import picture_size
 from sequences.files.intrinsics import find_intrinsics
 from sequences.files.json_input import read_text
 from sequences.given import Given
@@ -18,6 +19,7 @@ from sequences.pictures.sequence import PictureSequence, Shot
 
 COLOUR_FOLDERS = ("color", "rgb", "colour", "image")
 MASK_FOLDERS = ("masks", "mask")
+POSES = "annotated_poses"
 FARTHEST_M = 1e6
 """No camera is farther away."""
 
@@ -25,12 +27,12 @@ FARTHEST_M = 1e6
 def open_colour_depth(path: Path, given: Given) -> PictureSequence:
     """Open a folder with `depth/` and intrinsics, and where they are there `color/` or `rgb/`, and `masks/`.
 
-    Depth is in mm unless it is said to be otherwise, as both programs have it.
+    Depth is in mm unless the file of intrinsics or somebody says otherwise, as both programs have it.
 
     Raises:
         InputError: where it is not readable as such.
     """
-    depth = pictures(path / "depth", (".png",), path)
+    depth = pictures(path / "depth", (".png", ".tif", ".tiff"), path)
     if not depth:
         raise InputError(f"{path / 'depth'}: holds no depth image; put 16-bit PNG pictures there.")
     found = find_intrinsics(path, given)
@@ -39,7 +41,8 @@ def open_colour_depth(path: Path, given: Given) -> PictureSequence:
             f"{path}: no intrinsics; add cam_K.txt (three rows of K), camera_intrinsic.json (Open3D's) or "
             "scene_camera.json (BOP's), or convert with --intrinsics FX FY CX CY."
         )
-    numbers, remarks = told_numbers(list(depth)) or {stem: place for place, stem in enumerate(depth)}, []
+    numbers = told_numbers(list(depth)) or {stem: place for place, stem in enumerate(depth)}
+    remarks = found.doubts(picture_size(next(iter(depth.values()))))
     colour = _partners(path, COLOUR_FOLDERS, (".png", ".jpg", ".jpeg"), depth)
     masks = _partners(path, MASK_FOLDERS, (".png",), depth)
     for what, partners in (("colour image", colour), ("mask", masks)):
@@ -50,17 +53,24 @@ def open_colour_depth(path: Path, given: Given) -> PictureSequence:
         numbers[stem]: Shot(_time_s(stem, numbers[stem]), picture, colour.get(stem), masks.get(stem))
         for stem, picture in depth.items()
     }
-    bundle = (path / "cam_K.txt").exists()
+    unit_mm, who = found.unit(given, (1.0, "nothing says otherwise"))
     return PictureSequence(
         path,
         shots=dict(sorted(shots.items())),
-        intrinsics=found[0],
-        depth_scale_mm=1.0 if given.depth_scale_mm is None else given.depth_scale_mm,
-        what="BundleSDF folder" if bundle else "Open3D folder",
-        unit_source="the layout's" if given.depth_scale_mm is None else "--depth-scale-mm",
+        intrinsics=found.intrinsics,
+        depth_scale_mm=unit_mm,
+        what=_layout(path),
+        unit_source=who,
         read_truth=lambda: _truth(path, numbers),
         remarks=tuple(remarks),
     )
+
+
+def _layout(path: Path) -> str:
+    """Return whose layout a folder has, in words."""
+    if (path / "cam_K.txt").exists() and first_folder(path, (*MASK_FOLDERS, POSES)) is not None:
+        return "BundleSDF folder"
+    return "Open3D folder" if (path / "camera_intrinsic.json").exists() else "folder of pictures"
 
 
 def told_numbers(stems: list[str]) -> dict[str, int] | None:
@@ -107,7 +117,7 @@ def _partners(
 
 def _truth(root: Path, numbers: Mapping[str, int]) -> dict[int, Array] | None:
     """Return camera_from_model by frame number as BundleSDF's or Open3D's files tell it; None without."""
-    posed = {path.stem: path for path in entries(root / "annotated_poses") if path.suffix == ".txt"}
+    posed = {path.stem: path for path in entries(root / POSES) if path.suffix == ".txt"}
     if posed:
         found = {number: _pose(inside(posed[stem], root)) for stem, number in numbers.items() if stem in posed}
         return dict(sorted(found.items())) or None

@@ -13,7 +13,7 @@ from modeler import se3
 from modeler.types import Array, InputError
 from sequences.files.folders import first_folder, inside, pictures
 from sequences.files.images import picture_size
-from sequences.files.intrinsics import find_intrinsics
+from sequences.files.intrinsics import Told, find_intrinsics
 from sequences.files.json_input import read_text
 from sequences.given import Given
 from sequences.pictures.sequence import PictureSequence, Shot
@@ -48,23 +48,24 @@ def open_tum(path: Path, given: Given) -> PictureSequence:
         shot_colour = None if pair.colour is None else _listed(path, "rgb.txt", pair.colour[0])
         mask = masks.get(picture.stem) or (None if shot_colour is None else masks.get(shot_colour.stem))
         shots[index] = Shot(pair.time_s, picture, shot_colour, mask)
-    found = find_intrinsics(path, given)
+    found, (width, height) = find_intrinsics(path, given), picture_size(shots[0].depth)
     if found is None:
-        width, height = picture_size(shots[0].depth)
         if (width, height) != (640, 480):
             raise InputError(
                 f"{path}: no intrinsics for images of {width} x {height}; write `fx fy cx cy` into calibration.txt "
                 "there, or convert with --intrinsics FX FY CX CY."
             )
-        found = CALIBRATION, "assumed"
+        found = Told(CALIBRATION, "the benchmark")
         remarks.append("no intrinsics: the benchmark's default of 525 525 319.5 239.5 px is assumed")
+    remarks += found.doubts((width, height))
+    unit_mm, who = found.unit(given, (UNIT_MM, "the benchmark's, 5000 per m"))
     return PictureSequence(
         path,
         shots=shots,
-        intrinsics=found[0],
-        depth_scale_mm=UNIT_MM if given.depth_scale_mm is None else given.depth_scale_mm,
+        intrinsics=found.intrinsics,
+        depth_scale_mm=unit_mm,
         what="TUM RGB-D folder",
-        unit_source="the benchmark's, 5000 per m" if given.depth_scale_mm is None else "--depth-scale-mm",
+        unit_source=who,
         read_truth=lambda: _truth(path / "groundtruth.txt", [time for time, _ in depth]),
         remarks=tuple(remarks),
     )
