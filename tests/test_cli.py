@@ -269,6 +269,24 @@ def test_a_reader_who_has_left_is_no_error(arguments: tuple[str, ...]) -> None:
     assert (ended.returncode, ended.stderr) == (1, "")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("info", BOX)])
+def test_a_full_disk_under_stdout_is_told_in_one_line(arguments: tuple[str, ...]) -> None:
+    command = [sys.executable, "-m", "modeler", *arguments]
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr == (
+        "modeler: output cannot be written (No space left on device); make room, or send it elsewhere\n"
+    )
+
+
+def test_the_version_is_told(run: Run) -> None:
+    ended = run("--version")
+    assert (ended.status, ended.err) == (0, "")
+    assert re.fullmatch(r"modeler \d+\.\d+\.\d+\n", ended.out)
+
+
 # register
 
 

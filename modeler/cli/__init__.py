@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from modeler.cli.interrupt import terminable
+from modeler.cli.saying import say
 from modeler.cli.usage import Command, parsed
 
 INTERRUPTED = 130
@@ -37,11 +38,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         finally:
             sys.stdout.flush()  # so that a reader who has left is noticed here
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # say nothing more, at exit either
+        _close_stdout()
         return 1
+    except OSError as error:
+        if error.filename is not None or error.errno is None:
+            raise
+        _close_stdout()
+        say(f"output cannot be written ({os.strerror(error.errno)}); make room, or send it elsewhere")
+        return 2
     except KeyboardInterrupt:
-        print("modeler: interrupted", file=sys.stderr)
+        say("interrupted")
         return INTERRUPTED
+
+
+def _close_stdout() -> None:
+    """Say nothing more there, at exit either."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _run(command: Command) -> int:
@@ -52,7 +64,5 @@ def _run(command: Command) -> int:
         with terminable():
             return command.run()
     except InputError as error:
-        words = " ".join(str(error).split()).removesuffix(".")
-        # Names in inputs shall not steer the terminal.
-        print("modeler:", "".join(c if c.isprintable() else ascii(c)[1:-1] for c in words), file=sys.stderr)
+        say(str(error).strip().removesuffix("."))
         return 2

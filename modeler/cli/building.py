@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,6 +13,7 @@ from modeler.cli.console import Console
 from modeler.cli.interrupt import Interrupt
 from modeler.cli.reading import while_it_lasts
 from modeler.cli.remembered import Remembered
+from modeler.cli.saying import say
 from modeler.cli.watching import watched
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.pipeline import Modeler
@@ -45,7 +45,7 @@ def build(options: Build) -> int:
         closure_expected=comes_back(frames, options.prior.step_deg, modeler.closer.max_angle_deg),
     )
     if options.resume and RunFolder(options.out).finished(meta):
-        print("modeler: the run had come to its end; --overwrite makes it anew", file=sys.stderr)
+        say("the run had come to its end; --overwrite makes it anew")
         return _told(RunFolder(options.out).report(), options)
     scene = compose.scene(modeler, whole)
     with alone(options.out):
@@ -53,14 +53,14 @@ def build(options: Build) -> int:
         folder = RunFolder.open(options.out, overwrite=options.overwrite, resume=options.resume)
         modeler = replace(modeler, registrar=Remembered(modeler.registrar, folder.pairs, meta.versions))
         if before:
-            print(f"modeler: was begun with {', '.join(before)}: pairs are registered anew", file=sys.stderr)
+            say(f"was begun with {', '.join(before)}: pairs are registered anew")
         if remark:
-            print(f"modeler: {remark}", file=sys.stderr)
+            say(remark)
         report = _run(options, modeler, (frames, scene), folder, meta, began_s=began_s)
         folder.finish()
     recording = folder.path / "recording.rrd"
     if not ends_whole(recording):
-        print(f"modeler: {recording}: is cut off (is the disk full?); the rest is whole", file=sys.stderr)
+        say(f"{recording}: is cut off (is the disk full?); the rest is whole")
     return _told(report, options)
 
 
@@ -90,7 +90,7 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     if not frames.live:
         for doubt in survey(frames, truth=False).doubts:
-            print(f"modeler: {doubt}", file=sys.stderr)
+            say(doubt)
     return whole, frames
 
 
@@ -158,11 +158,11 @@ def _told(report: Mapping[str, Any], options: Build) -> int:
     loop = "loop closed" if report["closed"] else "no loop closed"
     took = f"{report['seconds'].get('total', 0.0):.0f} s"
     frames = "1 frame" if len(report["frames"]) == 1 else f"{len(report['frames'])} frames"
-    print(f"modeler: {accepted} of {frames}, {loop}, {took}: {options.out}", file=sys.stderr)
+    say(f"{accepted} of {frames}, {loop}, {took}: {options.out}")
     if report["reasons"]:
         first, *others = sorted(
             report["reasons"], key=lambda reason: reason.startswith("frame ")
         )  # frames left out were told above
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
-        print(f"modeler: not to be trusted: {first}{more}", file=sys.stderr)
+        say(f"not to be trusted: {first}{more}")
     return 0 if report["trustworthy"] else 3

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import sys
 
 from modeler.cli.calibrate_sensor import CalibrateSensor
 from modeler.cli.reading import reading
+from modeler.cli.saying import say
 from modeler.export.files import write_atomically
 from sequences import open_sequence
 from sequences.noise.calibrate import Calibration, calibrate
@@ -26,10 +26,9 @@ def calibrate_sensor(options: CalibrateSensor) -> int:
     write_atomically(options.out, noise_text(found.model, _facts(sequence.name, found, distance_m)))
     print("\n".join(_table(found)))
     sigma_wh, sigma_r_m = found.model.at(distance_m)
-    print(
-        f"modeler: at {distance_m:.2f} m {1e3 * sigma_wh * distance_m:.2f} mm across and {1e3 * sigma_r_m:.2f} mm "
-        f"along the ray, from {found.frames} frames: {options.out}",
-        file=sys.stderr,
+    say(
+        f"at {distance_m:.2f} m {1e3 * sigma_wh * distance_m:.2f} mm across and {1e3 * sigma_r_m:.2f} mm "
+        f"along the ray, from {found.frames} frames: {options.out}"
     )
     return 0
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 
 from modeler import export as files
 from modeler.cli.export import Export
 from modeler.cli.reopened import reopened
+from modeler.cli.saying import say
 from modeler.export.mesh import TEXTURED
 from modeler.export.texture import TRIANGLES
 from modeler.fusion import Fuser, Scan
@@ -77,4 +76,4 @@ def _tell(model: ObjectModel, options: Export) -> None:
     made_up = ""
     if options.watertight and model.vertex_views is not None:
         made_up = f", {100.0 * float(np.mean(model.vertex_views == 0)):.0f} % of the vertices made up"
-    print(f"modeler: {len(model.triangles)} triangles{made_up}: {options.out}", file=sys.stderr)
+    say(f"{len(model.triangles)} triangles{made_up}: {options.out}")

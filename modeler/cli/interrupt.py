@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import sys
 from collections.abc import Iterable, Iterator
 from types import FrameType, TracebackType
 from typing import TypeVar
+
+from modeler.cli.saying import say
 
 T = TypeVar("T")
 
@@ -65,4 +66,4 @@ class Interrupt:
     def _note(self, number: int, frame: FrameType | None) -> None:
         self._asked = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        print("modeler: finishing with the frames so far; Ctrl-C again stops at once", file=sys.stderr)
+        say("finishing with the frames so far; Ctrl-C again stops at once")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol, final
 
 from modeler.cli.console import bar
+from modeler.cli.saying import say
 from modeler.types import Frame, InputError
 from sequences import AbstractSequence
 from sequences.base import AbstractDerived
@@ -42,7 +42,7 @@ def while_it_lasts(camera: AbstractSequence) -> Iterator[Frame]:
     try:
         yield from camera
     except InputError as error:
-        print(f"modeler: {str(error).rstrip('.')}: going on with the frames so far", file=sys.stderr)
+        say(f"{str(error).rstrip('.')}: going on with the frames so far")
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.cli.saying import say
 
 
 @dataclass(frozen=True)
@@ -55,5 +55,5 @@ class Register:
         print(json.dumps(record, allow_nan=False))
         _, remark = nonvisual.told(self.prior, sequence)
         said = [f"{posterior.outcome.label} after {posterior.seconds:.2f} s", *([remark] if remark else [])]
-        print(f"modeler: {'; '.join(said)}", file=sys.stderr)
+        say("; ".join(said))
         return 0 if posterior.usable else 3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from modeler.cli.options import IdleSeed, MovedOptions, default
+from modeler.cli.saying import say
 
 if TYPE_CHECKING:
     from modeler.types import Array
@@ -45,7 +45,7 @@ class Report:
                 raise
             truth = None
         write_page(self.run_folder, out, truth)
-        print(f"modeler: open {out} in a browser", file=sys.stderr)
+        say(f"open {out} in a browser")
         return 0
 
 

@@ -3,8 +3,8 @@
 import contextlib
 import io
 import re
-import sys
 from collections.abc import Sequence
+from importlib import metadata
 from itertools import groupby
 from typing import Annotated, Any, Union
 
@@ -20,6 +20,7 @@ from modeler.cli.join import Join
 from modeler.cli.register import Register
 from modeler.cli.render import Render
 from modeler.cli.report import Report
+from modeler.cli.saying import say
 from modeler.cli.view import View
 
 Command = Build | Info | Convert | CalibrateSensor | Register | Evaluate | Render | View | Report | Export | Join
@@ -64,15 +65,21 @@ _REWORDED = (
     (r"\bFLOAT\b", "a number"),
 )
 """From the parser's words to ours."""
-_DESCRIPTION = "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr."
+_DESCRIPTION = (
+    "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr. --version tells "
+    "which version this is."
+)
 
 
 def parsed(arguments: Sequence[str]) -> Command:
     """Return the command that the arguments (after the program's name) ask for.
 
     Raises:
-        SystemExit: with status 0 after help, with 2 and one line on stderr for arguments that are no command.
+        SystemExit: with status 0 after help or version, with 2 and one line on stderr for what is no command.
     """
+    if list(arguments) == ["--version"]:
+        print(f"modeler {metadata.version('modeler')}")
+        raise SystemExit(0)
     complaint = io.StringIO()
     asked = next((name for name in arguments[:1] if name in _COMMANDS), None)
     try:
@@ -83,7 +90,7 @@ def parsed(arguments: Sequence[str]) -> Command:
     except SystemExit as ending:
         if ending.code:
             named = "" if asked is None else f"{asked} "
-            print(f"modeler: {_one_line(complaint.getvalue(), named)}; see modeler {named}--help", file=sys.stderr)
+            say(f"{_one_line(complaint.getvalue(), named)}; see modeler {named}--help")
         raise
 
 

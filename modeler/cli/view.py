@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from modeler.cli.options import IdleSeed
+from modeler.cli.saying import say
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,6 @@ class View:
 
         opened = viewer.view(self.run_folder, web=self.web)
         if self.web:
-            print(f"modeler: open {opened.address} in a browser; Ctrl-C ends it", file=sys.stderr)
+            say(f"open {opened.address} in a browser; Ctrl-C ends it")
             opened.wait()
         return 0

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 
 import sequences
+from modeler.cli.saying import say
 from modeler.types import InputError
 from sequences import AbstractSequence
 
@@ -23,5 +23,5 @@ def watched(path: Path, idle_s: float) -> AbstractSequence:
     """
     if not 0.0 < idle_s < math.inf:
         raise InputError(f"--idle-s {idle_s:g} is out of range; give a positive number of seconds")
-    print(f"modeler: waiting for frames in {path}", file=sys.stderr)
+    say(f"waiting for frames in {path}")
     return sequences.watch(path, patience=sequences.Patience(idle_s))
