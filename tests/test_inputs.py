@@ -406,6 +406,9 @@ def test_poses_of_a_run_go_to_bop_and_tum(tmp_path: Path, rng: np.random.Generat
     np.testing.assert_allclose(rows[:, 0], [1.0, 2.5])
     np.testing.assert_allclose(rows[:, 1:4], [pose[:3, 3] for pose in poses.values()])
     assert main(["convert", str(run), "--out", str(tmp_path / "poses.csv")]) == 2
+    for option in (["--every", "2"], ["--frames", "2:"], ["--sensor", "x.json"], ["--depth-scale-mm", "1"]):
+        assert main(["convert", str(run), "--out", str(tmp_path / "part.txt"), *option]) == 2
+    assert not (tmp_path / "part.txt").exists()
     stray = {"id": 7, "object_from_camera": np.eye(4).ravel().tolist()} | covariance
     for broken in (
         {"schema": 1, "poses": [{"id": "x"}]},

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 from modeler import se3
 from modeler.cli.convert import Convert
+from modeler.cli.input_options import InputOptions
+from modeler.cli.options import FrameOptions
 from modeler.cli.reading import reading, while_it_lasts
+from modeler.cli.saying import say
 from modeler.export import RunFolder, poses_of
 from modeler.export.files import write_atomically
 from modeler.export.tum import tum_text
@@ -30,6 +32,8 @@ def convert(options: Convert) -> int:
         InputError: where the input cannot be used or the output cannot be written.
     """
     if (options.input / "report.json").is_file():
+        if options.sensor is not None or options.selection != FrameOptions() or options.given != InputOptions():
+            raise InputError(f"{options.input}: the poses of a run are written as they are; leave out other options")
         return _poses(options.input, options.out)
     if options.out.suffix in (".json", ".txt"):
         raise InputError(f"{options.input}: is no folder of a run, whose poses {options.out} could hold; give one")
@@ -53,9 +57,9 @@ def convert(options: Convert) -> int:
                 path.name: path.read_bytes() for path in (sequence.robot_path, sequence.model_path) if path is not None
             },
         )
-    print(f"modeler: {len(open_sequence(options.out))} frames ({sequence.layout}): {options.out}", file=sys.stderr)
+    say(f"{len(open_sequence(options.out))} frames ({sequence.layout}): {options.out}")
     for note in (*found.doubts, *sequence.notes):
-        print(f"modeler: {note}", file=sys.stderr)
+        say(note)
     return 0
 
 
@@ -85,5 +89,5 @@ def _poses(run: Path, out: Path) -> int:
         write_atomically(out, tum_text(poses, {frame["id"]: frame["timestamp"] for frame in report["frames"]}))
     else:
         raise InputError(f"{out}: poses are written as scene_gt.json (BOP) or .txt (TUM); give --out such a name.")
-    print(f"modeler: {len(poses)} poses: {out}", file=sys.stderr)
+    say(f"{len(poses)} poses: {out}")
     return 0
