@@ -13,7 +13,7 @@ import trimesh
 
 from modeler import se3
 from modeler.cli import main
-from modeler.export import RunFolder, RunMeta
+from modeler.export import RunFolder, RunMeta, alone
 from modeler.fusion import Fuser, Matcher
 from modeler.graph import PoseGraph, solve
 from modeler.rays import Sensor
@@ -222,6 +222,16 @@ def test_the_size_of_voxels_is_checked_before_a_build(tmp_path: Path, capfd: pyt
     assert main(["build", str(tmp_path), "--out", str(tmp_path / "run"), "--voxel-m", "0"]) == 2
     assert "--voxel-m 0 is out of range" in capfd.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+def test_nothing_is_joined_into_a_folder_that_another_program_writes_to(
+    runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "joined"
+    with alone(out):
+        assert main(["join", str(runs[0]), str(runs[1]), "--out", str(out)]) == 2
+    assert f"{out}: another run is writing to it" in capfd.readouterr().err
+    assert not list(out.iterdir())
 
 
 def test_joins_that_cannot_be_are_said_in_one_line(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,7 +13,8 @@ from modeler import se3
 from modeler.cli.join import Join
 from modeler.cli.parts import renumbered
 from modeler.cli.reopened import Reopened, reopened
-from modeler.export import RunFolder, RunMeta
+from modeler.cli.saying import say
+from modeler.export import RunFolder, RunMeta, alone
 from modeler.export.report import FrameRecord
 from modeler.fusion import Fuser, Match, Matcher, own_covariances
 from modeler.graph import PoseGraph, solve
@@ -36,7 +36,7 @@ def join(options: Join) -> int:
         InputError: where a run cannot be read, or no pair of their views can be registered.
     """
     _check(options)
-    began = time.perf_counter()
+    began_s = time.perf_counter()
     first, second = reopened(options.run_a), reopened(options.run_b)
     offset = max(record["id"] for record in first.report["frames"]) + 1
     second = _shifted(second, offset)
@@ -46,7 +46,7 @@ def join(options: Join) -> int:
             f"{options.run_a} and {options.run_b}: the models do not fit each other however they are laid; are they of "
             "the same object, and do they share enough surface?"
         )
-    _say(f"laid on each other, {100.0 * matches[0].score:.0f} % of the surface agree")
+    say(f"laid on each other, {100.0 * matches[0].score:.0f} % of the surface agree")
     edges = _edges(first, second, matches[0], options)
     count = sum(edge.accepted for edge in edges)
     if not count:
@@ -68,13 +68,14 @@ def join(options: Join) -> int:
             "pairs": options.pairs,
         },
         doubts=_doubts(matches),
-        seconds={"total": time.perf_counter() - began},
     )
-    folder = RunFolder.open(options.out, overwrite=options.overwrite)
-    report = _written(folder, (first, second), graph, solve(graph, guess), meta)
-    _say(f"{count} of {len(edges)} pairs registered, {len(report['poses'])} frames joined: {options.out}")
+    with alone(options.out):
+        folder = RunFolder.open(options.out, overwrite=options.overwrite)
+        report = _written(folder, (first, second), graph, solve(graph, guess), meta, began_s=began_s)
+        folder.finish()
+    say(f"{count} of {len(edges)} pairs registered, {len(report['poses'])} frames joined: {options.out}")
     if report["reasons"]:
-        _say(f"not to be trusted: {report['reasons'][0]}")
+        say(f"not to be trusted: {report['reasons'][0]}")
     return 0 if report["trustworthy"] else 3
 
 
@@ -194,7 +195,13 @@ def _shifted(run: Reopened, offset: int) -> Reopened:
 
 
 def _written(
-    folder: RunFolder, parts: tuple[Reopened, Reopened], graph: PoseGraph, solution: Solution, meta: RunMeta
+    folder: RunFolder,
+    parts: tuple[Reopened, Reopened],
+    graph: PoseGraph,
+    solution: Solution,
+    meta: RunMeta,
+    *,
+    began_s: float,
 ) -> Mapping[str, Any]:
     """Fuse the frames of both parts, write the run folder with its recording and return its report."""
     views = dict(parts[0].views) | dict(parts[1].views)
@@ -219,12 +226,8 @@ def _written(
     facts = {"sequence": meta.sequence, "seed": meta.seed, **meta.settings}
     stream = open_stream(parts[0].name, save=folder.path / "recording.rrd", facts=facts)
     try:
-        report = folder.write(step, meta)
+        report = folder.write(step, replace(meta, seconds={"total": time.perf_counter() - began_s}))
         stream(step)
     finally:
         stream.close()
     return report
-
-
-def _say(words: str) -> None:
-    print(f"modeler: {words}", file=sys.stderr)
