@@ -129,6 +129,29 @@ def test_evaluate_tells_how_good_the_model_of_a_run_is(
         assert [float(row["f_3mm"]) for row in csv.DictReader(file)] == [row["f_3mm"] for row in results["models"]]
 
 
+def test_a_run_that_cannot_be_judged_is_left_out_and_the_others_are_judged(
+    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence, run = _without(built, tmp_path)
+    (sequence / "model.ply").unlink()
+    out = tmp_path / "out"
+    status, said, err = _told(capsys, "evaluate", run, built, tmp_path / "none", "--out", out)
+    assert (status, said, err) == (2, "", f"modeler: {tmp_path / 'none'}: no such folder; give folders of runs\n")
+    status, said, err = _told(capsys, "evaluate", run, built, "--out", out)
+    assert status == 2
+    assert [line.split()[0] for line in said.splitlines()[1:]] == [str(built)] * 4
+    assert [row["run"] for row in json.loads((out / "models.json").read_bytes())["models"]] == [str(built)] * 4
+    assert err.startswith(f"modeler: {run} is left out: ")
+    assert "has no true surface to compare with; put model.ply" in err
+    assert err.count("\n") == 1
+    (out / "models.json").unlink()
+    for runs in ((run,), (run, run)):
+        status, said, err = _told(capsys, "evaluate", *runs, "--out", out)
+        assert (status, said, err.count("\n")) == (2, "", 1)
+        assert "has no true surface to compare with" in err
+    assert not (out / "models.json").exists()
+
+
 def test_another_sequence_is_not_taken_for_that_of_the_run(
     built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,7 +17,8 @@ class Evaluate:
 
     Writes results.json, results.csv and rotation_errors.png (box plots), and prints a table. Of run folders, the model
     is compared with the true surface instead (model.ply of a rendered sequence, BOP's models folder), and so is one
-    made of the same frames with their true poses: models.json, models.csv and a table.
+    made of the same frames with their true poses: models.json, models.csv and a table. Runs for which that is not known
+    are left out, and the status is 2.
     """
 
     sequences: Annotated[

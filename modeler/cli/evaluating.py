@@ -13,6 +13,7 @@ from modeler.cli.console import bar
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.evaluating_models import evaluate_models, is_run, models_table
 from modeler.cli.options import Method
+from modeler.cli.saying import say
 from modeler.experiment import Experiment, Pairing, Summary
 from modeler.types import AbstractRegistrar, InputError
 from sequences import AbstractSequence, frame_range, open_sequence
@@ -20,7 +21,9 @@ from viz import figures
 
 
 def evaluate(options: Evaluate) -> int:
-    """Run the experiment, write its results and print a table.
+    """Run the experiment, write its results, print a table and return the exit status.
+
+    Of several runs those that cannot be judged are left out, each with a line on stderr, and the status is 2.
 
     Raises:
         InputError: where an option, a sequence or the folder cannot be used.
@@ -32,9 +35,15 @@ def evaluate(options: Evaluate) -> int:
     runs = [path for path in options.sequences if is_run(path)]
     if runs:
         if len(runs) < len(options.sequences):
+            lacking = next((path for path in options.sequences if not path.exists()), None)
+            if lacking is not None:
+                raise InputError(f"{lacking}: no such folder; give folders of runs")
             raise InputError("sequences and run folders are evaluated apart; give one kind at a time")
-        print(columns(models_table(evaluate_models(runs, options.out, options.seed)), left=3))
-        return 0
+        scores, left_out = evaluate_models(runs, options.out, options.seed)
+        print(columns(models_table(scores), left=3))
+        for line in left_out:
+            say(line)
+        return 2 if left_out else 0
     kept = frame_range(options.selection.frames)
     recorded = [open_sequence(path).select(options.selection.every, kept) for path in options.sequences]
     for sequence in recorded:

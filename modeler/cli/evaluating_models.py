@@ -24,7 +24,7 @@ def is_run(path: Path) -> bool:
     return (path / "report.json").is_file()
 
 
-def evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> list[ModelScore]:
+def evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> tuple[list[ModelScore], list[str]]:
     """Judge the models of runs and write `models.json` and `models.csv` into a folder.
 
     Args:
@@ -32,29 +32,48 @@ def evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> list[ModelSco
         out: folder, made where there is none.
         seed: of the points drawn on the surfaces.
 
+    Returns:
+        The scores, and in a line each which runs could not be judged, and why.
+
     Raises:
-        InputError: where something cannot be read or written, or is not known.
+        InputError: where none can be judged, with the reason of the first, or the results cannot be written.
     """
-    scores = []
+    scores, left_out = [], []
     for path in runs:
-        run = reopened(path)
-        truth, mesh = _truth(path, run.parts)
-        modelled = Modelled(
-            name=str(path),
-            model=read_model(mesh_of(path)),
-            views=run.views,
-            trajectory=run.solution.trajectory,
-            camera_from_model=truth,
-            truth=(mesh.vertices_m, mesh.triangles),
-        )
-        scores += model_scores(modelled, Fuser(voxel_m=run.report["settings"].get("voxel_m")), seed)
+        try:
+            scores += _scores(path, seed)
+        except InputError as error:
+            if len(runs) == 1:
+                raise
+            left_out.append(f"{path} is left out: {error}")
+    if not scores:
+        raise InputError(left_out[0])
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{out}: cannot be made ({error.strerror}); choose another folder with --out") from error
     write_atomically(out / "models.json", models_json(scores, seed))
     write_atomically(out / "models.csv", models_csv(scores))
-    return scores
+    return scores, left_out
+
+
+def _scores(path: Path, seed: int) -> list[ModelScore]:
+    """Judge the model of one run.
+
+    Raises:
+        InputError: where something cannot be read, or is not known.
+    """
+    run = reopened(path)
+    truth, mesh = _truth(path, run.parts)
+    modelled = Modelled(
+        name=str(path),
+        model=read_model(mesh_of(path)),
+        views=run.views,
+        trajectory=run.solution.trajectory,
+        camera_from_model=truth,
+        truth=(mesh.vertices_m, mesh.triangles),
+    )
+    return model_scores(modelled, Fuser(voxel_m=run.report["settings"].get("voxel_m")), seed)
 
 
 def _truth(run: Path, parts: Sequence[Part]) -> tuple[dict[int, Array], Mesh]:

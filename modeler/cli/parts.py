@@ -61,7 +61,8 @@ class Part:
             if view is None or abs(len(view.points_m) - points[frame]) > _ALIKE * points[frame]:
                 raise InputError(
                     f"{self.sequence.name}: frame {frame} shows something else than the one that {self.run} was made "
-                    "from; say where that sequence is with --sequence, or build the run again"
+                    "from, or another version finds the object otherwise there; say where that sequence is with "
+                    "--sequence, or build the run again"
                 )
             views[frame + self.offset] = renumbered(view, self.offset)
         return views
