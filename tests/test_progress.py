@@ -63,6 +63,30 @@ def test_a_frame_left_out_is_told_once_and_so_is_that_it_was_placed(capfd: pytes
     )
 
 
+def test_what_to_do_about_frames_left_out_is_told_once(capfd: pytest.CaptureFixture[str]) -> None:
+    frame = next(iter(open_sequence(bundled("tube"))))
+    few, unsure = Outcome.TOO_FEW_POINTS, Outcome.UNSURE_MASK
+    nothing = Segmentation(np.zeros_like(frame.depth_m, dtype=bool), None, few)
+    lost = Step(frame, nothing, None, (), (), "", Solution(), None)
+    outcomes = [
+        f"{few.label}: {few.advice}",
+        f"{few.label}: {few.advice}",
+        f"{unsure.label}: {unsure.advice}",
+        "frames 3 and 2 show no plane; show it",
+        "frames 4 and 2 show no plane; show it",
+    ]
+    with Console(5, None) as console:
+        for number, outcome in enumerate(outcomes):
+            console(replace(lost, frame=replace(frame, index=number), outcome=outcome))
+    assert capfd.readouterr().err.splitlines() == [
+        f"modeler: frame 0 is left out: {outcomes[0]}",
+        f"modeler: frame 1 is left out: {few.label}",
+        f"modeler: frame 2 is left out: {outcomes[2]}",
+        f"modeler: frame 3 is left out: {outcomes[3]}",
+        "modeler: frame 4 is left out: frames 4 and 2 show no plane",
+    ]
+
+
 def on_a_terminal(command: list[str]) -> str:
     """Return what a command writes to a terminal that is its stderr."""
     ours, theirs = pty.openpty()

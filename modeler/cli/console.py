@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from types import TracebackType
 
 from rich.console import Console as Terminal
@@ -35,6 +36,7 @@ class Console:
         self._address = address
         self._placed: dict[int, bool] = {}  # a lost frame that later views place comes a second time
         self._unsure: set[int] = set()
+        self._advised: set[str] = set()
 
     def __enter__(self) -> Console:
         """Show the bar."""
@@ -64,7 +66,7 @@ class Console:
         description = f"{len(step.views)} joined, {loops} loops closed"
         self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=description)
         if not accepted and not again:
-            self._say(f"frame {frame} is left out: {step.outcome}")
+            self._say(f"frame {frame} is left out: {self._why(step.outcome)}")
         elif accepted and again:
             self._say(f"frame {frame} is placed after all")
 
@@ -74,6 +76,14 @@ class Console:
             self._stage = stage
             self._bar.reset(self._task)
         self._bar.update(self._task, completed=done, total=total, description=stage)
+
+    def _why(self, outcome: str) -> str:
+        """Return why a frame was left out, with what to do about it where that has not been said yet."""
+        what, *advice = re.split(": |; ", outcome, maxsplit=1)
+        if not advice or advice[0] not in self._advised:
+            self._advised.update(advice)
+            return outcome
+        return what
 
     def _say(self, text: str) -> None:
         self._bar.console.print(f"modeler: {text}", markup=False)

@@ -18,7 +18,8 @@ class Outcome(enum.Enum):
     NO_OVERLAP = "no overlap", "The views share too little surface; use a smaller step between frames."
     AT_LIMIT = (
         "at the prior's limit",
-        "The motion may be larger than the prior allows; raise --max-rotation-deg, --max-offset-m or --max-shift-m.",
+        "The motion may be larger than the prior allows; raise --max-rotation-deg (general, table), --max-offset-m "
+        "(general) or --max-shift-m (table, turntable).",
     )
     TOO_FEW_POINTS = "too few points", "The object covers too few pixels; check the mask, --roi and --max-depth-m."
     UNSURE_MASK = "unsure mask", "The object is hard to tell from its surroundings; give --roi, --max-depth-m or masks."
