@@ -17,9 +17,9 @@ from modeler import se3
 from modeler.cli import main
 from modeler.export import RunFolder, RunMeta
 from modeler.export.ply import mesh_ply
+from modeler.export.tints import MADE_UP_RGB
 from modeler.types import Array, InputError
 from sequences import bundled
-from viz import entities
 from viz.report import write_page
 from viz.report.mesh import read_mesh, scene
 from viz.report.recorded import recorded, surfaces
@@ -168,7 +168,7 @@ def test_the_viewer_shows_how_sure_each_vertex_is_and_what_is_made_up(tmp_path: 
     assert mesh.certainty is not None
     order = [int(np.argmin(np.linalg.norm(mesh.vertices_m - vertex, axis=1))) for vertex in model.vertices_m]
     painted = mesh.certainty[order].astype(int)
-    assert tuple(painted[0]) == entities.MADE_UP_RGB
+    assert tuple(painted[0]) == MADE_UP_RGB
     lightness = painted[1:4].sum(axis=1)
     assert (np.diff(lightness) > 100).all()
     np.testing.assert_array_equal(painted[3], painted[4])

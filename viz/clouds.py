@@ -10,6 +10,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from modeler import se3
+from modeler.export.tints import MADE_UP_RGB
 from modeler.types import Array, ObjectModel, Posterior, RayImage, Step
 from viz import entities
 from viz.drawings import CLEAR, Drawing
@@ -91,7 +92,7 @@ def _mesh(model: ObjectModel) -> rr.Mesh3D:
     colours = colours.astype(np.float64)
     if model.vertex_views is not None:
         made_up = model.vertex_views == 0
-        colours[made_up] = 0.5 * (colours[made_up] + entities.MADE_UP_RGB)
+        colours[made_up] = 0.5 * (colours[made_up] + MADE_UP_RGB)
     attributes = np.concatenate([model.vertices_m, model.vertex_normals, colours], axis=1)
     vertices, triangles = coarsened(attributes, model.triangles, _TRIANGLES)
     return rr.Mesh3D(

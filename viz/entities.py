@@ -93,7 +93,6 @@ AREAS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((0, 0, 0), (128, 128, 128), (45, 85, 1
 AGREES_RGB: Final[Rgb] = SOURCE_RGB
 HIDDEN_RGB: Final[Rgb] = (120, 80, 45)
 NO_SAY_RGB: Final[Rgb] = (70, 70, 70)
-MADE_UP_RGB: Final[Rgb] = (230, 90, 200)
 VIOLATION_RGB: Final[Rgb] = (255, 40, 160)
 UNCERTAINTY_RGB: Final[Rgb] = (255, 225, 90)
 AXIS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((230, 70, 70), (80, 200, 80), (90, 130, 255))

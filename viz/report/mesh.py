@@ -12,12 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.export import read_model
+from modeler.export.tints import sigma_rgb
 from modeler.types import Array, InputError
-from viz import entities
 from viz.clouds import coarsened
-
-MOST_SIGMA_M: Final = 2e-3
-"""Standard deviation of a vertex at the end of the scale of colours."""
 
 _TRIANGLES: Final = 60_000
 _STEPS: Final = 32767  # of a coordinate from the centre to the farthest vertex: 16-bit whole numbers
@@ -61,7 +58,7 @@ def read_mesh(path: Path) -> Mesh | None:
     if model.vertex_colours is not None:
         attributes.append(model.vertex_colours.astype(np.float64))
     if model.vertex_sigmas_m is not None:
-        attributes.append(_certainty(model.vertex_sigmas_m))
+        attributes.append(sigma_rgb(model.vertex_sigmas_m))
     vertices, kept = coarsened(np.concatenate(attributes, axis=1), model.triangles, _TRIANGLES)
     used, kept = np.unique(kept, return_inverse=True)
     vertices = vertices[used]
@@ -73,15 +70,6 @@ def read_mesh(path: Path) -> Mesh | None:
         certainty=None if model.vertex_sigmas_m is None else np.rint(vertices[:, -3:]).astype(np.uint8),
         total=len(model.triangles),
     )
-
-
-def _certainty(sigmas_m: Array) -> Array:
-    """Return colours (v, 3) from dark (0) to yellow (MOST_SIGMA_M and more); pink for what is made up."""
-    from matplotlib import colormaps
-
-    rgb = 255.0 * colormaps["cividis"](np.clip(sigmas_m / MOST_SIGMA_M, 0.0, 1.0))[:, :3]
-    rgb[np.isinf(sigmas_m)] = entities.MADE_UP_RGB
-    return rgb
 
 
 def scene(mesh: Mesh, strips_m: list[Array]) -> Mapping[str, Any]:

@@ -16,13 +16,14 @@ from PIL import Image
 
 from modeler import evaluation, se3
 from modeler.export import write_atomically
+from modeler.export.tints import MOST_SIGMA_M
 from modeler.types import ACCEPTED, Array, loops_closed
 from viz.pictures import look_at, shade
 from viz.report import plots
 from viz.report.cards import pair_cards
 from viz.report.elements import data_address, figure
 from viz.report.merged import merged_clouds
-from viz.report.mesh import MOST_SIGMA_M, Mesh, read_mesh, scene
+from viz.report.mesh import Mesh, read_mesh, scene
 from viz.report.pairs import thumbnails
 from viz.report.recorded import Row, recorded, surfaces
 from viz.report.result import Result
