@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from modeler.kernels.fusion import project
+from modeler.kernels.votes import project
 
 
 @njit(cache=True, parallel=True)

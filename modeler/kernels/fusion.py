@@ -11,8 +11,9 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from modeler.kernels.votes import AGREE, above, blend, facing, project
+
 SIDE = 4  # voxels along the side of a block
-AGREE = 0.3  # cosine between normals above which two votes speak of the same side of the object
 
 
 @njit(cache=True)
@@ -48,30 +49,6 @@ def blocks_near(points, origin, block_m, reach_m, shape):
 
 
 @njit(cache=True)
-def project(pose, lens, x, y, z):
-    """Return column, row (px) and depth (m) of a point of the object frame; depth <= 0 behind the camera."""
-    depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-    if depth <= 0.0:
-        return -1.0, -1.0, depth
-    u = lens[0] * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + lens[2]
-    v = lens[1] * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + lens[3]
-    return u, v, depth
-
-
-# `integrate` and `blend`, which do little else, write the next two out: calls would cost a fifth of their time.
-@njit(cache=True)
-def above(x, y, z, points, normals, n):
-    """Return how far a place lies above the surface at point `n`, along its normal."""
-    return normals[n, 0] * (x - points[n, 0]) + normals[n, 1] * (y - points[n, 1]) + normals[n, 2] * (z - points[n, 2])
-
-
-@njit(cache=True)
-def facing(first, i, second, k):
-    """Return the cosine between unit vector `i` of some and unit vector `k` of others."""
-    return first[i, 0] * second[k, 0] + first[i, 1] * second[k, 1] + first[i, 2] * second[k, 2]
-
-
-@njit(cache=True)
 def between(image, column, row, channel):
     """Return the value of an image (h, w, c) at a place between pixel centres, bilinearly; all four must be in it."""
     left, top = math.floor(column), math.floor(row)
@@ -79,44 +56,6 @@ def between(image, column, row, channel):
     upper = (1.0 - right) * image[top, left, channel] + right * image[top, left + 1, channel]
     lower = (1.0 - right) * image[top + 1, left, channel] + right * image[top + 1, left + 1, channel]
     return (1.0 - bottom) * upper + bottom * lower
-
-
-@njit(cache=True)
-def blend(seen, distance, weight, number, normals, emptiness, tau_m):
-    """Return signed distance and weight of a voxel from the votes of the views.
-
-    A view that sees a voxel in front of a surface knows that it is empty; one that sees it behind only supposes that it
-    is full. The nearest surface sets the side of the object that is spoken of, an opposing view that looks at the voxel
-    from the front takes over, and only votes for that side are averaged: so walls thinner than the band stay walls.
-    """
-    best, best_score = -1, 0.0
-    for k in range(seen):
-        score = weight[k] * (1.01 - abs(distance[k]) / tau_m)
-        if score > best_score:
-            best, best_score = k, score
-    if best < 0:
-        return tau_m, emptiness
-    if distance[best] < 0.0:
-        side, other, other_score = number[best], -1, 0.3 * best_score
-        for k in range(seen):
-            n = number[k]
-            cosine = (
-                normals[side, 0] * normals[n, 0] + normals[side, 1] * normals[n, 1] + normals[side, 2] * normals[n, 2]
-            )
-            score = weight[k] * (1.01 - abs(distance[k]) / tau_m)
-            if distance[k] > 0.0 and cosine < AGREE and score > other_score:
-                other, other_score = k, score
-        if other >= 0:
-            best = other
-    side = number[best]
-    total, value = emptiness, emptiness * tau_m
-    for k in range(seen):
-        n = number[k]
-        cosine = normals[side, 0] * normals[n, 0] + normals[side, 1] * normals[n, 1] + normals[side, 2] * normals[n, 2]
-        if cosine > AGREE:
-            total += weight[k]
-            value += weight[k] * distance[k]
-    return value / total, total
 
 
 @njit(cache=True, parallel=True)
@@ -148,14 +87,18 @@ def integrate(blocks, origin, voxel_m, tau_m, empty_weight, index, free_m, poses
         distance = np.empty((SIDE**3, frames))
         weight = np.empty((SIDE**3, frames))
         number = np.empty((SIDE**3, frames), dtype=np.int64)
+        view = np.empty((SIDE**3, frames), dtype=np.int64)
+        places = np.empty((SIDE**3, 3))
+        for voxel in range(SIDE**3):
+            places[voxel, 0] = origin[0] + (blocks[b, 0] * SIDE + voxel // (SIDE * SIDE) + 0.5) * voxel_m
+            places[voxel, 1] = origin[1] + (blocks[b, 1] * SIDE + voxel // SIDE % SIDE + 0.5) * voxel_m
+            places[voxel, 2] = origin[2] + (blocks[b, 2] * SIDE + voxel % SIDE + 0.5) * voxel_m
         seen = np.zeros(SIDE**3, dtype=np.int64)
         emptiness = np.zeros(SIDE**3)
         for f in range(frames):
             pose, lens = poses[f], lenses[f]
             for voxel in range(SIDE**3):
-                x = origin[0] + (blocks[b, 0] * SIDE + voxel // (SIDE * SIDE) + 0.5) * voxel_m
-                y = origin[1] + (blocks[b, 1] * SIDE + voxel // SIDE % SIDE + 0.5) * voxel_m
-                z = origin[2] + (blocks[b, 2] * SIDE + voxel % SIDE + 0.5) * voxel_m
+                x, y, z = places[voxel, 0], places[voxel, 1], places[voxel, 2]
                 u, v, depth = project(pose, lens, x, y, z)
                 if not (depth > 0.0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
                     continue
@@ -170,7 +113,7 @@ def integrate(blocks, origin, voxel_m, tau_m, empty_weight, index, free_m, poses
                     )
                 if abs(along) <= tau_m:
                     k = seen[voxel]
-                    distance[voxel, k], number[voxel, k] = along, n
+                    distance[voxel, k], number[voxel, k], view[voxel, k] = along, n, f
                     # What lies behind a surface is a guess that fades with depth.
                     weight[voxel, k] = weights[n] * min(1.0, 1.5 * (1.0 + along / tau_m) + 1e-3)
                     seen[voxel] = k + 1
@@ -179,7 +122,19 @@ def integrate(blocks, origin, voxel_m, tau_m, empty_weight, index, free_m, poses
         for voxel in range(SIDE**3):
             if seen[voxel] > 0 or emptiness[voxel] > 0.0:
                 values[b, voxel], totals[b, voxel] = blend(
-                    seen[voxel], distance[voxel], weight[voxel], number[voxel], normals, emptiness[voxel], tau_m
+                    places[voxel],
+                    seen[voxel],
+                    distance[voxel],
+                    weight[voxel],
+                    number[voxel],
+                    view[voxel],
+                    emptiness[voxel],
+                    tau_m,
+                    index,
+                    poses,
+                    lenses,
+                    points,
+                    normals,
                 )
     shape = (len(blocks), SIDE, SIDE, SIDE)
     return values.reshape(shape), totals.reshape(shape)
