@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import trimesh
 
 from modeler import se3
 from modeler.cli import main
+from modeler.cli.reopened import reopened
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.fusion import Fuser, Matcher
 from modeler.graph import PoseGraph, solve
@@ -23,6 +25,8 @@ from sequences.rendering.recipe import Recipe, Table, Viewpoint
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.shapes import Capsule, Compound, Cylinder, Part, Sphere
 from sequences.rendering.trajectory import Turntable
+from viz import entities
+from viz.report.recorded import cloud, recorded
 
 FIGURE = Compound(
     (
@@ -97,6 +101,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path, di
         true_run(sequence, folder / name, folder / f"{name}_run")
         poses |= {first + k: upright_from_model @ se3.inverse(pose) for k, pose in sequence.truth().items()}
     parts = folder / "upright_run", folder / "lying_run"
+    report = json.loads((parts[0] / "report.json").read_bytes())
+    report["frames"][1]["note"] = "what other programs add is nobody's business"
+    (parts[0] / "report.json").write_text(json.dumps(report))
     status = main(["join", *map(str, parts), "--out", str(folder / "joined"), "--pairs", "4"])
     assert status == 0
     return *parts, folder / "joined", poses
@@ -128,6 +135,26 @@ def test_a_joined_model_has_what_each_run_hid(runs: tuple[Path, Path, Path, dict
     bottom = se3.transform(se3.inverse(object_from_model), np.asarray(mesh.vertices))
     under = (np.abs(bottom[:, 2]) < 3e-3) & (np.hypot(bottom[:, 0] - 0.004, bottom[:, 1]) < 0.025)
     assert under.sum() > 50  # only the lying run shows it
+
+
+def test_the_recording_shows_a_pair_of_views_that_joins_the_runs(
+    runs: tuple[Path, Path, Path, dict[int, Array]],
+) -> None:
+    report = json.loads((runs[2] / "report.json").read_bytes())
+    overlaps = {
+        (edge["source"], edge["target"]): edge["overlap"]
+        for edge in report["edges"]
+        if edge["accepted"] and edge["source"] >= COUNT > edge["target"]
+    }
+    source, target = max(overlaps, key=overlaps.__getitem__)
+    pair = recorded(runs[2] / "recording.rrd")
+    (row,) = pair[entities.PAIR_AFTER].values()
+    moved = cloud(row)
+    assert moved is not None
+    edge = next(edge for edge in report["edges"] if (edge["source"], edge["target"]) == (source, target))
+    view = reopened(runs[2]).views[source]
+    expected = se3.transform(np.reshape(edge["target_from_source"], (4, 4)), view.points_m)
+    np.testing.assert_allclose(moved[0].mean(axis=0), expected.mean(axis=0), atol=1e-3)
 
 
 def test_exports_made_anew_from_the_frames(

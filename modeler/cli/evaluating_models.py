@@ -45,7 +45,7 @@ def evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> tuple[list[Mo
         except InputError as error:
             if len(runs) == 1:
                 raise
-            left_out.append(f"{path} is left out: {error}")
+            left_out.append(f"{path} is left out: {str(error).removesuffix('.')}")
     if not scores:
         raise InputError(left_out[0])
     try:

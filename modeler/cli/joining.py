@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from modeler.fusion import Fuser, Match, Matcher, own_covariances
 from modeler.graph import PoseGraph, solve
 from modeler.priors.bumps import Bumps
 from modeler.registration import VisibilityRegistrar
-from modeler.types import ACCEPTED, Array, Edge, InputError, Outcome, Posterior, Segmentation, Solution, Step
+from modeler.types import ACCEPTED, Array, Edge, InputError, Outcome, Posterior, RayImage, Segmentation, Solution, Step
 from viz.stream import open_stream
 
 _SIGMA_RAD, _SIGMA_M = 0.12, 0.01  # how far off the laid models may be
@@ -206,28 +206,42 @@ def _written(
     """Fuse the frames of both parts, write the run folder with its recording and return its report."""
     views = dict(parts[0].views) | dict(parts[1].views)
     model = Fuser().fuse(views, solution.trajectory, own_covariances(solution, graph.edges))
-    for part in parts:
-        folder.frames.update({record["id"]: FrameRecord(**record) for record in part.report["frames"]})
-    last = views[max(views)]
-    mask = last.frame.mask if last.frame.mask is not None else np.isfinite(last.frame.depth_m)
-    step = Step(
-        frame=last.frame,
-        segmentation=Segmentation(mask, last.plane, Outcome.CONVERGED),
-        view=last,
-        posteriors=(),
-        edges=(),
-        outcome=ACCEPTED,
-        solution=solution,
+    for record in (record for part in parts for record in part.report["frames"]):
+        folder.frames[record["id"]] = FrameRecord(**{field.name: record[field.name] for field in fields(FrameRecord)})
+    joining = tuple(edge for edge in graph.edges if edge.source in parts[1].views and edge.target in parts[0].views)
+    best = max((edge.posterior for edge in joining if edge.accepted), key=lambda posterior: posterior.overlap)
+    first, root = min(views), {min(views): np.eye(4)}
+    begun = _step(views[first], solution=Solution(root, odometry=root), views={first: views[first]})
+    step = replace(
+        _step(views[best.source], solution=solution, views=views),
+        posteriors=(best,),
+        edges=joining,
         model=model,
         edges_so_far=graph.edges,
-        views=views,
         last=True,
     )
     facts = {"sequence": meta.sequence, "seed": meta.seed, **meta.settings}
     stream = open_stream(parts[0].name, save=folder.path / "recording.rrd", facts=facts)
     try:
         report = folder.write(step, replace(meta, seconds={"total": time.perf_counter() - began_s}))
+        stream(begun)
         stream(step)
     finally:
         stream.close()
     return report
+
+
+def _step(view: RayImage, *, solution: Solution, views: Mapping[int, RayImage]) -> Step:
+    """Return a step of one view that is part of the model."""
+    mask = view.frame.mask if view.frame.mask is not None else np.isfinite(view.frame.depth_m)
+    return Step(
+        frame=view.frame,
+        segmentation=Segmentation(mask, view.plane, Outcome.CONVERGED),
+        view=view,
+        posteriors=(),
+        edges=(),
+        outcome=ACCEPTED,
+        solution=solution,
+        model=None,
+        views=views,
+    )
