@@ -40,6 +40,8 @@ class Survey:
     """Share (0..1) of the pixels with a measurement."""
     empty: tuple[int, ...]
     """Numbers of the frames without any measurement."""
+    repeated: tuple[int, ...]
+    """Numbers of the frames whose depth is that of the frame before, to the bit."""
     masks: int
     """Number of frames with a mask."""
     empty_masks: tuple[int, ...]
@@ -87,6 +89,11 @@ class Survey:
                     f"the principal point ({camera.cx:.0f}, {camera.cy:.0f}) lies {off_px:.0f} px off the middle of "
                     "the images: are cx and cy exchanged?"
                 )
+        if self.repeated:
+            doubts.append(
+                f"{len(self.repeated)} of {len(self.indices)} frames have the depth of the frame before, to the bit "
+                f"({_some(self.repeated)}): were they saved twice? If so, remove them"
+            )
         return tuple(doubts)
 
 
@@ -103,7 +110,8 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
     """
     cameras: dict[Camera, None] = {}
     times_s, ranges, shares, farthest_m = [], [], [], 0.0
-    empty, empty_masks, masks, colours = [], [], 0, 0
+    empty, empty_masks, repeated, masks, colours = [], [], [], 0, 0
+    before_m = None
     for frame in sequence:
         cameras.setdefault(frame.camera)
         times_s.append(frame.time_s)
@@ -114,6 +122,9 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
         if not measured.size:
             empty.append(frame.index)
             continue
+        if before_m is not None and np.array_equal(frame.depth_m, before_m, equal_nan=True):
+            repeated.append(frame.index)
+        before_m = frame.depth_m
         if frame.mask is not None and not (frame.mask & measured_pixels(frame)).any():
             empty_masks.append(frame.index)
         ranges.append(np.percentile(measured, (1.0, 50.0, 99.0)))
@@ -135,6 +146,7 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
         farthest_m=farthest_m,
         measured=float(np.mean(shares)),
         empty=tuple(empty),
+        repeated=tuple(repeated),
         masks=masks,
         empty_masks=tuple(empty_masks),
         colours=colours,

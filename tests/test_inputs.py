@@ -308,6 +308,12 @@ def test_onboarding_scenes_are_read(tmp_path: Path, frames: list[Frame], truth: 
 def test_what_may_be_meant_otherwise_is_asked(tmp_path: Path, frames: list[Frame]) -> None:
     write_bop(tmp_path / "right", frames, depth_scale_mm=1.0)
     assert survey(open_sequence(tmp_path / "right")).doubts == ()
+    doubled = [frames[0], replace(frames[0], index=1), frames[2], replace(frames[2], index=3)]
+    write_open3d(tmp_path / "twice", doubled)
+    (doubt,) = survey(open_sequence(tmp_path / "twice")).doubts
+    assert doubt == (
+        "2 of 4 frames have the depth of the frame before, to the bit (1, 3): were they saved twice? If so, remove them"
+    )
     write_bop(tmp_path / "unit", [replace(one, depth_m=10.0 * one.depth_m) for one in frames], depth_scale_mm=1.0)
     (doubt,) = survey(open_sequence(tmp_path / "unit")).doubts
     assert "very far for an object: is the unit right?" in doubt
