@@ -394,6 +394,14 @@ def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(run: Run, tmp_p
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"model.ply", "cloud.ply"}
 
 
+def test_a_table_that_turns_the_other_way_is_asked_about(run: Run, tmp_path: Path) -> None:
+    options = ("--prior", "turntable", "--step-deg", "-25", "--step-sigma-deg", "3", "--frames", "0:3")
+    ended = run("build", BOX, "--out", tmp_path / "run", *options)
+    assert ended.status == 3
+    assert ended.err.endswith("else give --step-sign unknown\n")
+    assert "--step-sign" not in run("build", BOX, "--out", tmp_path / "other", *options, "--step-sign", "unknown").err
+
+
 def test_ctrl_c_ends_the_frames_and_a_second_one_the_program() -> None:
     before = signal.getsignal(signal.SIGINT)
     seen = []

@@ -17,8 +17,9 @@ from modeler.cli.saying import say
 from modeler.cli.watching import watched
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.pipeline import Modeler
+from modeler.priors import TurntablePrior
 from modeler.segmentation import Scene
-from modeler.types import ACCEPTED, InputError
+from modeler.types import ACCEPTED, AbstractPrior, InputError
 from sequences import AbstractSequence, SensedSequence, frame_range, open_sequence, read_noise, survey
 from viz.ending import ends_whole
 from viz.stream import open_stream
@@ -46,7 +47,7 @@ def build(options: Build) -> int:
     )
     if options.resume and RunFolder(options.out).finished(meta):
         say("the run had come to its end; --overwrite makes it anew")
-        return _told(RunFolder(options.out).report(), options)
+        return _told(RunFolder(options.out).report(), options, modeler.prior)
     scene = compose.scene(modeler, whole)
     with alone(options.out):
         before = RunFolder(options.out).changed_versions(meta) if options.resume else ()
@@ -61,7 +62,7 @@ def build(options: Build) -> int:
     recording = folder.path / "recording.rrd"
     if not ends_whole(recording):
         say(f"{recording}: is cut off (is the disk full?); the rest is whole")
-    return _told(report, options)
+    return _told(report, options, modeler.prior)
 
 
 def _check(options: Build) -> None:
@@ -152,7 +153,7 @@ def comes_back(frames: AbstractSequence, given_deg: float | None, reach_deg: flo
     return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
 
 
-def _told(report: Mapping[str, Any], options: Build) -> int:
+def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
     """Say on stderr what came out, and return the exit status."""
     accepted = sum(frame["outcome"] == ACCEPTED for frame in report["frames"])
     loop = "loop closed" if report["closed"] else "no loop closed"
@@ -165,4 +166,7 @@ def _told(report: Mapping[str, Any], options: Build) -> int:
         )  # frames left out were told above
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
         say(f"not to be trusted: {first}{more}")
+        little = any(word in reason for reason in report["reasons"] for word in ("overlap", "little surface"))
+        if little and isinstance(prior, TurntablePrior) and prior.step_sign == "known":
+            say("that the table turns the way round that was told is taken for granted; else give --step-sign unknown")
     return 0 if report["trustworthy"] else 3
