@@ -283,8 +283,9 @@ def test_texture_shows_each_point_its_colour(tmp_path: Path, suffix: str) -> Non
         return np.rint(255.0 * ((points - [0.0, 0.0, 0.8]) / 0.1 + 0.5)).astype(np.uint8)
 
     model, texture = textured(_model(), paint, 1e-3)
-    out = tmp_path / f"ball.{suffix}"
+    out = tmp_path / f"a ball.{suffix}"  # other programs end names at spaces
     write_mesh(model, out, texture)
+    assert {path.name for path in tmp_path.iterdir()} - {out.name} <= {"a_ball.mtl", "a_ball.png"}
     assert {path.suffix for path in tmp_path.iterdir()} == ({".obj", ".mtl", ".png"} if suffix == "obj" else {".glb"})
     mesh = _loaded(out)
     assert {frozenset(map(tuple, t)) for t in np.round(mesh.triangles, 5)} == {

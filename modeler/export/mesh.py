@@ -60,10 +60,11 @@ def write_mesh(model: ObjectModel, out: Path, texture: Texture | None = None) ->
         case ".ply":
             write_atomically(out, mesh_ply(model))
         case ".obj":
+            beside = "_".join(out.stem.split())  # many programs take spaces for the end of a name
             if texture is not None:
-                write_atomically(out.with_suffix(".png"), _png(texture))
-                write_atomically(out.with_suffix(".mtl"), _material(out.with_suffix(".png").name))
-            write_atomically(out, _obj(model, out.stem, texture))
+                write_atomically(out.with_name(f"{beside}.png"), _png(texture))
+                write_atomically(out.with_name(f"{beside}.mtl"), _material(f"{beside}.png"))
+            write_atomically(out, _obj(model, beside, texture))
         case ".glb":
             write_atomically(out, _glb(model, texture))
         case _:
