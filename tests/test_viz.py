@@ -739,6 +739,11 @@ def test_a_wrong_address_is_refused(address: str) -> None:
         open_stream("box", save=None, connect=address)
 
 
+@pytest.mark.parametrize("place", [f"{'a' * 300}:9876", "localhost:99999", "no such host:9876"])
+def test_nobody_listens_where_nobody_can(place: str) -> None:
+    assert not viewer.reachable(f"rerun+http://{place}/proxy")
+
+
 def test_a_recording_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     with pytest.raises(viewer.InputError, match=r"r\.rrd"):
         open_stream("box", save=tmp_path / "missing" / "r.rrd")

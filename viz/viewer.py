@@ -153,5 +153,5 @@ def _listens(host: str, port: int, *, patience_s: float) -> bool:
     try:
         with socket.create_connection((host, port), timeout=patience_s):
             return True
-    except OSError:
+    except (OSError, UnicodeError):  # of names that cannot be those of a host
         return False

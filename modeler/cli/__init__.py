@@ -41,8 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _close_stdout()
         return 1
     except OSError as error:
-        if error.filename is not None or error.errno is None:
+        if error.errno is None:
             raise
+        if error.filename is not None:
+            say(f"{error.filename}: cannot be used ({error.strerror}); check the path and its permissions")
+            return 2
         _close_stdout()
         say(f"output cannot be written ({os.strerror(error.errno)}); make room, or send it elsewhere")
         return 2

@@ -221,7 +221,7 @@ def _written(
         last=True,
     )
     facts = {"sequence": meta.sequence, "seed": meta.seed, **meta.settings}
-    stream = open_stream(parts[0].name, save=folder.path / "recording.rrd", facts=facts)
+    stream = open_stream(" + ".join(part.name for part in parts), save=folder.path / "recording.rrd", facts=facts)
     try:
         report = folder.write(step, replace(meta, seconds={"total": time.perf_counter() - began_s}))
         stream(begun)

@@ -193,7 +193,10 @@ def _settings(result: Result) -> str:
 
 
 def _name(result: Result) -> str:
-    return Path(str(result.report["sequence"])).name or "model"
+    """Return what the sequence is called, of joined runs what each is."""
+    where = str(result.report["sequence"])
+    parts = where.split(" + ") if "joined" in result.report["settings"] else [where]
+    return " + ".join(Path(part).name for part in parts) or "model"
 
 
 def _pyramid(object_from_camera: Array) -> Array:
