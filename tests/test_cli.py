@@ -17,7 +17,7 @@ import pytest
 import trimesh
 
 from modeler import priors, se3
-from modeler.cli import main
+from modeler.cli import main, nonvisual
 from modeler.cli.building import comes_back
 from modeler.cli.interrupt import Interrupt
 from modeler.cli.options import PriorOptions
@@ -318,6 +318,14 @@ def test_the_sequence_says_what_is_known_and_the_user_is_told(run: Run, tmp_path
     ended = run("build", BOX, "--out", tmp_path / "run", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:2")
     assert ended.err.startswith("modeler: prior table, as sequence.json says\n")
     assert report(tmp_path / "run")["prior"] == "table"
+
+
+def test_a_step_between_numbers_that_leave_some_out_is_told_as_a_step_between_frames() -> None:
+    options, whole = PriorOptions(prior="turntable", step_deg=-10.0), open_sequence(BOX)
+    assert nonvisual.told(options, whole) == ("turntable", "")
+    _, remark = nonvisual.told(options, whole.select(every=3))
+    assert remark == "frame numbers go up by 3: -10° from one number to the next is -30° from frame to frame"
+    assert nonvisual.told(PriorOptions(prior="table"), whole.select(every=3)) == ("table", "")
 
 
 def test_register_gives_the_edge_that_build_finds(run: Run, built: Path) -> None:

@@ -263,6 +263,20 @@ def test_the_unit_of_depth_that_stands_beside_the_intrinsics_counts(
         open_sequence(tmp_path / "s")
 
 
+def test_numbers_within_names_tell_the_order(tmp_path: Path, frames: list[Frame]) -> None:
+    write_open3d(tmp_path / "s", frames)
+    for folder, prefix in (("depth", "depth_"), ("color", "colour-")):
+        for place, path in enumerate(sorted((tmp_path / "s" / folder).iterdir())):
+            path.rename(path.with_name(f"{prefix}{7 + 3 * place}_1{path.suffix}"))  # 7, 10, 13, 16
+    sequence = open_sequence(tmp_path / "s")
+    assert sequence.indices == (7, 10, 13, 16)
+    for read, wrote in zip(sequence, frames, strict=True):
+        np.testing.assert_allclose(read.depth_m, wrote.depth_m, rtol=0, atol=1e-6)
+        assert read.colour is not None
+        assert wrote.colour is not None
+        assert np.abs(read.colour.astype(float) - wrote.colour).mean() < 3.0
+
+
 def test_intrinsics_of_images_of_another_size_are_asked_about(tmp_path: Path, frames: list[Frame]) -> None:
     write_open3d(tmp_path / "s", frames)
     assert not open_sequence(tmp_path / "s").notes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -113,6 +114,13 @@ def told(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
     step_deg = _number((sequence.motion or {}).get("step_deg"))
     if "turntable" in name.split("+") and options.step_deg is None and step_deg is not None:
         said.append(f"step {step_deg:g}°, as sequence.json says")
+    step_deg = step_deg if options.step_deg is None else options.step_deg
+    apart = min((late - early for early, late in itertools.pairwise(sequence.indices)), default=1)
+    if "turntable" in name.split("+") and step_deg is not None and apart > 1:
+        said.append(
+            f"frame numbers go up by {apart}: {step_deg:g}° from one number to the next is {apart * step_deg:g}° from "
+            "frame to frame"
+        )
     return name, "; ".join((*said, *sequence.notes))
 
 

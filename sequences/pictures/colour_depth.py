@@ -74,13 +74,23 @@ def _layout(path: Path) -> str:
 
 
 def told_numbers(stems: list[str]) -> dict[str, int] | None:
-    """Return the frame numbers that names are, or begin with; None where they do not tell."""
-    for numbered in (stems, [re.split(r"[^0-9]", stem)[0] for stem in stems]):
+    """Return the frame numbers that names are, begin with, or differ by alone; None where they do not tell."""
+    for numbered in (stems, [re.split(r"[^0-9]", stem)[0] for stem in stems], _differences(stems)):
         numbers = [frame_number(stem) for stem in numbered]
         known = [number for number in numbers if number is not None]
         if len(set(known)) == len(stems):
             return dict(zip(stems, known, strict=True))
     return None
+
+
+def _differences(stems: list[str]) -> list[str]:
+    """Return the digits by which names such as `depth_9` and `depth_10` differ, where that is all; else nothing."""
+    rows = [re.split(r"([0-9]+)", stem) for stem in stems]
+    if len({len(row) for row in rows}) != 1:
+        return []
+    differ = [place for place, words in enumerate(zip(*rows, strict=True)) if len(set(words)) > 1]
+    counted = len(differ) == 1 and differ[0] % 2 == 1 and rows[0][differ[0] - 1] != "."  # which begins a fraction
+    return [row[differ[0]] for row in rows] if counted else []
 
 
 def _time_s(stem: str, number: int) -> float:
