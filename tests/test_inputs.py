@@ -243,6 +243,22 @@ def test_intrinsics_are_read_in_each_spelling(tmp_path: Path, frames: list[Frame
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (143.75, 143.75, 79.875, 59.875)
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        "143.75 143.75 79.875 59.875 0 0 0 0 0",
+        "# fx, fy, cx, cy\n143.75, 143.75, 79.875, 59.875\n",
+        "143.75 0 79.875\n0 143.75 59.875\n0 0 1\n",
+        "[[143.75   0.     79.875]\n [  0.   143.75   59.875]\n [  0.     0.      1.   ]]\n",
+    ],
+)
+def test_intrinsics_are_read_from_text_in_each_spelling(tmp_path: Path, frames: list[Frame], content: str) -> None:
+    write_open3d(tmp_path / "s", frames)
+    (tmp_path / "s" / "cam_K.txt").write_text(content)
+    camera = open_sequence(tmp_path / "s").frame(0).camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (143.75, 143.75, 79.875, 59.875)
+
+
 @pytest.mark.parametrize(("scale", "unit"), [(0.1, "0.1 mm"), (0.0001, "0.1 mm"), (5000, "0.2 mm"), (1, "1 mm")])
 def test_the_unit_of_depth_that_stands_beside_the_intrinsics_counts(
     tmp_path: Path, frames: list[Frame], scale: float, unit: str

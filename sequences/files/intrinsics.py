@@ -82,10 +82,14 @@ def find_intrinsics(folder: Path, given: Given) -> Told | None:
     return None
 
 
+_SPACE = str.maketrans(",;[]", "    ")
+
+
 def _from_text(path: Path) -> Intrinsics:
-    """Read a matrix (3, 3) or (4, 4) row by row, or `fx fy cx cy` with anything after it."""
+    """Read a matrix (3, 3) or (4, 4) by rows, or `fx fy cx cy` and anything after it; commas and brackets are space."""
     expected = "a matrix of 3 x 3 numbers (fx 0 cx, 0 fy cy, 0 0 1) or a line fx fy cx cy"
-    rows = [line.split() for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+    lines = [line for line in read_text(path).translate(_SPACE).splitlines() if not line.startswith("#")]
+    rows = [line.split() for line in lines if line.strip()]
     try:
         numbers = [[float(word) for word in row] for row in rows[:5]]
     except ValueError:
