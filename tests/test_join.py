@@ -276,6 +276,7 @@ def test_joins_that_cannot_be_are_said_in_one_line(
         ([str(runs[0]), str(runs[1]), "--out", str(tmp_path)], "not empty"),
         ([str(runs[0]), str(tmp_path / "none"), "--out", str(tmp_path / "new")], "there is no report"),
         ([str(runs[0]), str(runs[1]), "--out", str(tmp_path / "new"), "--pairs", "0"], "--pairs 0"),
+        ([str(runs[0]), f"{runs[0]}/../{runs[0].name}", "--out", str(tmp_path / "new")], "name two runs"),
     ):
         assert main(["join", *arguments]) == 2
         told = capfd.readouterr().err

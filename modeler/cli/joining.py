@@ -87,6 +87,8 @@ def _check(options: Join) -> None:
     """
     if options.pairs < 1:
         raise InputError(f"--pairs {options.pairs} leaves nothing to join by; give at least 1")
+    if options.run_a.resolve() == options.run_b.resolve():
+        raise InputError(f"RUN_A and RUN_B are both {options.run_a}; name two runs")
     if options.out.is_dir() and any(options.out.iterdir()) and not options.overwrite:
         raise InputError(f"{options.out}: not empty; choose another --out, or give --overwrite")
 

@@ -23,7 +23,6 @@ class Outcome(enum.Enum):
     )
     TOO_FEW_POINTS = "too few points", "The object covers too few pixels; check the mask, --roi and --max-depth-m."
     UNSURE_MASK = "unsure mask", "The object is hard to tell from its surroundings; give --roi, --max-depth-m or masks."
-    NO_PLANE = "no plane", "No support plane was found; use --prior general or show more of the table."
     NOT_KNOWN = (
         "prior does not apply",
         "These views lack what the prior goes by; show it to the camera, or use another.",
