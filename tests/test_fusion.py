@@ -387,6 +387,31 @@ def haunted(ghost_depth_m: float = 0.77) -> dict[int, RayImage]:
     return views | {0: tabletop.seen(ghostly, normals, views[0].sigma_r_m)}
 
 
+def test_what_nobody_saw_is_trimmed_where_it_curls_at_a_border_and_closes_gaps_however_it_lies():
+    """A sheet that rolls up along two sides, one seen and one not, with a bump in the middle that nobody saw."""
+    x, y = np.meshgrid(np.arange(-30.0, 31.0), np.arange(41.0), indexing="ij")
+    over = np.maximum(np.abs(x) - 20.0, 0.0) / 6.0  # rad of a roll of radius 6 beyond x = ±20
+    bump = np.maximum(4.0 - 2.0 * np.hypot(x, y - 20.0), 0.0)
+    vertices = np.stack(
+        [np.clip(x, -20.0, 20.0) + np.sign(x) * 6.0 * np.sin(over), y, bump - 6.0 * (1.0 - np.cos(over))], axis=-1
+    ).reshape(-1, 3)
+    corner = np.arange(len(vertices)).reshape(x.shape)
+    a, b, c, d = (corner[i : 60 + i, j : 40 + j].ravel() for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    normals = surface.normals_of(vertices, triangles)
+    x, bump = x.ravel(), bump.ravel()
+    seen = (x < 20.0) & (bump == 0.0)
+    loose = surface.curled(vertices, normals, seen, ~seen)
+    assert loose[(bump > 0.5) & (bump < 4.0)].all()
+    assert not loose[seen].any()
+    left = surface.trimmed(np.ones(len(x), dtype=bool), loose, triangles, 20)
+    assert left.all()  # no border of what is marked: the whole mesh is
+    left = surface.trimmed(x < 30.0, loose, triangles, 20)
+    assert left[x < 22.0].all()
+    assert not left[x > 25.0].any()
+    assert np.array_equal(surface.trimmed(x < 30.0, loose, triangles, 3)[x < 30.0], (left | (x < 27.0))[x < 30.0])
+
+
 def test_a_few_wrong_pixels_at_a_flat_angle_dig_no_pit():
     # One view sees the brick's top at a flat angle, and some of it as a patch that faces it and dives into the brick.
     poses = [*POSES, tabletop.turntable(1, tilt_deg=10.0)[0]]

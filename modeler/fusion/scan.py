@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from modeler.fusion.fuser import Fuser
 
 SOFT, SHARP = 4.0, 16.0  # how much more say a frontal view has in colours: cosine to this power
+CURL = 8  # rings of triangles along borders that may curl
 LONELY = 6  # a point of the cloud with fewer neighbours within a few voxels is an outlier
 
 
@@ -128,9 +129,13 @@ class Scan:
 
     def _kept(self, vertices: Array, triangles: surface.Triangles) -> BoolArray:
         """Return which vertices (v,) of the zero level are surface: supported, not seen through, and no frill."""
-        told = self._heard(vertices, surface.normals_of(vertices, triangles), np.zeros((len(self.seen.index), 4)))
+        normals = surface.normals_of(vertices, triangles)
+        told = self._heard(vertices, normals, np.zeros((len(self.seen.index), 4)))
         # Gaps in what is believed are closed, but not with what several views see through.
         empty = told.emptiness * self.how.empty_weight > told.support + self.how.empty_weight
-        marked = (told.support > self.how.min_support) & self._believed(told)
-        marked = surface.closed(marked, triangles, self.how.closing) & ~empty
+        seen = (told.support > self.how.min_support) & self._believed(told)
+        marked = surface.closed(seen, triangles, self.how.closing) & ~empty
+        # At silhouettes the zero level turns round, as far behind the surface as views suppose the object.
+        loose = surface.curled(vertices, normals, seen, marked & ~seen)
+        marked = surface.trimmed(marked, loose, triangles, CURL)
         return surface.opened(marked, triangles, self.how.opening)

@@ -17,6 +17,8 @@ Triangles = npt.NDArray[np.int64]
 
 PINCHES = 50  # rounds after which sheets that touch are left touching
 NEAREST = 6  # vertices that lend their colour to one that has none
+AROUND = 12  # vertices that tell how the surface lies beside them
+TURNED_RAD = 0.5  # a surface that turns away by more within a few voxels curls
 HAIR = 1e-2  # how far inside a voxel is put, in voxels
 
 
@@ -111,6 +113,27 @@ def closed(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
     for _ in range(rings):
         outside[triangles[np.any(outside[triangles], axis=1)]] = True
         outside &= ~marked
+    return ~outside
+
+
+def curled(vertices_m: Array, normals: Array, seen: BoolArray, added: BoolArray) -> BoolArray:
+    """Return which of the vertices (v,) that were added beside those seen do not go on as the surface does there."""
+    asked, found = np.flatnonzero(added), np.zeros(len(added), dtype=bool)
+    if np.count_nonzero(seen) < AROUND:
+        return found
+    near = KDTree(vertices_m[seen]).query(vertices_m[asked], k=AROUND)[1]
+    mean = normals[seen][near].mean(axis=1)
+    cosine = np.sum(mean * normals[asked], axis=1)
+    found[asked] = cosine < np.cos(TURNED_RAD) * np.linalg.norm(mean, axis=1)
+    return found
+
+
+def trimmed(marked: BoolArray, loose: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
+    """Return the marked vertices (v,) without the loose ones along the border, up to `rings` deep."""
+    outside = ~marked
+    for _ in range(rings):
+        outside[triangles[np.any(outside[triangles], axis=1)]] = True
+        outside &= ~marked | loose
     return ~outside
 
 
