@@ -103,10 +103,23 @@ def test_every_pair_is_told_with_its_pictures(page: str, run: Path) -> None:
 
 def test_merged_points_are_those_of_the_views(run: Path) -> None:
     views = next(step.views for step in steps(COUNT, lost=LOST) if step.last)
-    found = surfaces(recorded(run / "recording.rrd"), first=0)
+    found = surfaces(recorded(run / "recording.rrd"))
     assert found.keys() == {*views, LOST}
     for frame, view in views.items():
         np.testing.assert_allclose(found[frame], view.points_m, atol=1e-6)  # few enough that all are recorded
+
+
+def test_points_of_a_frame_that_is_tried_again_are_its_own(tmp_path: Path) -> None:
+    taken = list(steps(4))
+    again = replace(taken[2], views=taken[-1].views)  # which stands beside the latest frame on the timeline
+    stream = open_stream("box", save=tmp_path / "r.rrd")
+    for step in (*taken, again):
+        stream(step)
+    stream.close()
+    found = surfaces(recorded(tmp_path / "r.rrd"))
+    assert found.keys() == taken[-1].views.keys()
+    for frame, view in taken[-1].views.items():
+        np.testing.assert_allclose(found[frame], view.points_m, atol=1e-6)
 
 
 def test_without_a_closure_there_is_nothing_to_compare(run: Path, tmp_path: Path) -> None:

@@ -132,8 +132,9 @@ def _trajectory(result: Result, mesh: Mesh | None, centre_m: Array) -> Sequence[
 
 def _closure(result: Result, rows: Mapping[str, Mapping[int, Row]]) -> Sequence[str]:
     """Return what loop closure did to the merged points, where there was one and the recording has the points."""
-    surfaces_m = surfaces(rows, result.first)
-    if not surfaces_m or not any(edge.kind == "closure" and edge.accepted for edge in result.edges):
+    surfaces_m = surfaces(rows)
+    seen = sum(frame in surfaces_m for frame in result.poses)  # of joined runs the recording has one pair alone
+    if 2 * seen < len(result.poses) or not any(edge.kind == "closure" and edge.accepted for edge in result.edges):
         return []
     return [
         "<h2>Merged points</h2>",

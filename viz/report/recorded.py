@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,18 +16,37 @@ from modeler.types import Array
 from viz import entities
 
 FRAME_PATHS: Final = (entities.COLOUR, entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER)
-"""Entities that are read."""
+"""Entities that are shown."""
+_COMPONENTS: Final = ("blob", "positions", "colors", "labels")
+_READ: Final = (*FRAME_PATHS, entities.PAIR_CAPTION)
 
 Row = Mapping[str, Any]
 """Values of an entity by component."""
 
 
 def recorded(recording: Path) -> dict[str, dict[int, dict[str, Any]]]:
-    """Return the rows of the entities of `FRAME_PATHS` by frame; no frames where the recording cannot be read."""
+    """Return the rows of `FRAME_PATHS` and of the pairs' captions by frame; no frames where nothing can be read.
+
+    A frame is what a pair's caption calls the newer view, else what the timeline says: a frame that was tried again
+    later stands there beside the latest. Of a frame that was tried more than once the last attempt counts.
+    """
+    rows: dict[str, dict[int, dict[str, Any]]] = {path: {} for path in _READ}
     try:
-        return _read(recording)
+        steps = _steps(recording)
     except (OSError, ValueError, RuntimeError):
-        return {path: {} for path in FRAME_PATHS}
+        return rows
+    for _, step in sorted(steps.items()):
+        pair = registered(step.rows.get(entities.PAIR_CAPTION, {}))
+        for path, row in step.rows.items():
+            rows[path][step.frame if pair is None else pair[0]] = row
+    return rows
+
+
+def registered(caption: Row) -> tuple[int, int] | None:
+    """Return the numbers of a pair's frames, the newer first, as its caption names them; None where there is none."""
+    words = " ".join(map(str, caption["labels"].as_py())) if "labels" in caption else ""
+    numbers = re.findall(r"frame (\d+)", words)
+    return (int(numbers[0]), int(numbers[1])) if len(numbers) == 2 else None
 
 
 def cloud(row: Row) -> tuple[Array, npt.NDArray[np.uint8]] | None:
@@ -38,35 +59,49 @@ def cloud(row: Row) -> tuple[Array, npt.NDArray[np.uint8]] | None:
     return points, np.broadcast_to(colours, points.shape)
 
 
-def surfaces(rows: Mapping[str, Mapping[int, Row]], first: int) -> dict[int, Array]:
-    """Return the surface points (n, 3) of each frame that was registered, and of the first, in its own camera's frame.
+def surfaces(rows: Mapping[str, Mapping[int, Row]]) -> dict[int, Array]:
+    """Return the surface points (n, 3) of each frame that was registered, or registered to, in its own camera's frame.
 
     Args:
         rows: as `recorded` returns them.
-        first: number of the first accepted frame, which was registered to none.
     """
     found = {frame: cloud(row) for frame, row in rows[entities.PAIR_BEFORE].items()}
-    targets = rows[entities.PAIR_TARGET]
-    if targets:
-        found[first] = cloud(targets[min(targets)])
+    for frame, caption in rows[entities.PAIR_CAPTION].items():
+        pair, target = registered(caption), rows[entities.PAIR_TARGET].get(frame)
+        if pair is not None and target is not None and found.get(pair[1]) is None:
+            found[pair[1]] = cloud(target)
     return {frame: points_colours[0] for frame, points_colours in found.items() if points_colours is not None}
 
 
-def _read(recording: Path) -> dict[str, dict[int, dict[str, Any]]]:
+@dataclass
+class _Step:
+    """What was logged at once."""
+
+    frame: int
+    """On the timeline."""
+    rows: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """By entity."""
+
+
+def _steps(recording: Path) -> dict[int, _Step]:
+    """Return the steps of a run by the time, in ns since its start, at which they were drawn."""
     import rerun.chunk
 
-    rows: dict[str, dict[int, dict[str, Any]]] = {path: {} for path in FRAME_PATHS}
+    steps: dict[int, _Step] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a run that was killed leaves a recording without its last page
         for chunk in rerun.chunk.RrdReader(recording).stream():
-            entity = rows.get(str(chunk.entity_path).removeprefix("/"))
-            if entity is None or chunk.is_static:
+            path = str(chunk.entity_path).removeprefix("/")
+            if path not in _READ or chunk.is_static:
                 continue
             batch = chunk.to_record_batch()
             for name in batch.schema.names:
                 component = name.partition(":")[2]
-                if component in ("blob", "positions", "colors"):
-                    for frame, value in zip(batch[entities.FRAME].to_pylist(), batch[name], strict=True):
-                        if value.is_valid:
-                            entity.setdefault(frame, {})[component] = value
-    return rows
+                if component not in _COMPONENTS:
+                    continue
+                times = zip(batch[entities.ELAPSED], batch[entities.FRAME].to_pylist(), batch[name], strict=True)
+                for elapsed, frame, value in times:
+                    if value.is_valid:
+                        step = steps.setdefault(elapsed.value, _Step(frame))
+                        step.rows.setdefault(path, {})[component] = value
+    return steps
