@@ -94,4 +94,8 @@ def _advice(path: Path) -> str:
         return "holds colour but no depth images; only depth can be registered, put it into depth/."
     if path.absolute().name == "depth":
         return f"is the folder of the images alone; give the one it lies in, {path.absolute().parent}."
+    if any(entry.suffix.lower() == ".png" for folder in ("", *inner) for entry in entries(path / folder)):
+        return (
+            "holds pictures but no folder depth; put the depth images into one, and camera.json or cam_K.txt beside it."
+        )
     return f"holds no depth images where they are looked for; give {FORMATS}."

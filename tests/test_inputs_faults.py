@@ -279,6 +279,16 @@ def test_the_folder_of_a_run_is_no_sequence(tmp_path: Path, capsys: pytest.Captu
     assert "is the folder of a run" in capsys.readouterr().err
 
 
+def test_pictures_that_lie_elsewhere_are_seen(
+    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for place in (tmp_path / "flat", tmp_path / "deeper" / "images"):
+        shutil.copytree(written / "bop" / "depth", place)
+    for name in ("flat", "deeper"):
+        assert main(["info", str(tmp_path / name)]) == 2
+        assert "holds pictures but no folder depth; put the depth images into one" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["nowhere", "nowhere.bag", "", "file.txt"])
 def test_a_path_without_a_sequence_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
     (tmp_path / "file.txt").write_text("hello")
