@@ -525,8 +525,9 @@ def test_existing_run_is_not_written_over_unasked(tmp_path: Path) -> None:
         RunFolder.open(tmp_path)
     assert "\n" not in str(caught.value)
     assert (tmp_path / "report.json").read_bytes() == before
+    (tmp_path / "report.html").write_text("a page about this run")
     RunFolder.open(tmp_path, resume=True)
-    assert {path.name for path in tmp_path.iterdir()} == FILES | {"notes.txt"}
+    assert {path.name for path in tmp_path.iterdir()} == FILES | {"notes.txt", "report.html"}
     RunFolder.open(tmp_path, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 

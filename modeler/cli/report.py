@@ -33,10 +33,11 @@ class Report:
     def run(self) -> int:
         """Write the page."""
         from modeler.export import RunFolder
+        from modeler.export.run_folder import PAGE
         from modeler.types import InputError
         from viz.report import write_page
 
-        out = self.run_folder / "report.html" if self.out is None else self.out
+        out = self.run_folder / PAGE if self.out is None else self.out
         RunFolder(self.run_folder).result()  # without which there is nothing to tell
         try:
             truth = _truth(self.run_folder, self.moved.sequence)

@@ -20,6 +20,8 @@ from modeler.types import InputError, Step
 _REPORT = "report.json"
 _OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd")
 """The report, without which nothing is resumed, goes first."""
+PAGE = "report.html"
+"""What `modeler report` makes of a run; it goes with it."""
 _NO_TIME_S = 0.1
 
 
@@ -82,7 +84,7 @@ class RunFolder:
             resumes = resume and (path / _REPORT).exists()
             leftovers = [part for name in _OURS for part in path.glob(f".{name}.*{PART}")]
             links = [file for file in (path / _OURS[-1], cls(path).pairs.folder) if file.is_symlink()]
-            for file in [*leftovers, *links, *(path / name for name in _OURS if not resumes)]:
+            for file in [*leftovers, *links, *(path / name for name in (*_OURS, PAGE) if not resumes)]:
                 file.unlink(missing_ok=True)
             if not resumes:
                 cls(path).pairs.drop()
