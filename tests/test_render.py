@@ -290,3 +290,12 @@ def test_bundled_sequences_are_small_and_complete() -> None:
 def test_there_is_no_frame_beyond_the_last() -> None:
     with pytest.raises(InputError, match="0 to 13, 14 frames"):
         RenderedSequence(small("box")).frame(14)
+
+
+def test_a_folder_of_the_name_of_a_recipe_is_not_taken_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tube").mkdir()  # as `modeler render tube --out tube` makes it
+    assert load_recipe("tube").name == "tube"
+    (tmp_path / "teapott").mkdir()
+    with pytest.raises(InputError, match="teapott: no such file and no built-in recipe"):
+        load_recipe("teapott")

@@ -154,7 +154,7 @@ def load_recipe(recipe: str | Path) -> Recipe:
         InputError: where there is no such recipe or it is not understood.
     """
     path = Path(recipe)
-    if not path.exists() and path.name == str(recipe) and not path.suffix:
+    if not path.is_file() and path.name == str(recipe) and not path.suffix:
         if path.name not in builtin_recipes():
             raise InputError(
                 f"{recipe}: no such file and no built-in recipe; those are {', '.join(builtin_recipes())}."
