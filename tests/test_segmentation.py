@@ -182,6 +182,40 @@ def test_a_camera_that_goes_round_is_not_taken_for_noisy_depth(rng, step_deg):
     assert not Segmenter().scene(frames).still
 
 
+def island(k, rng, *, plate):
+    """Return a frame of a box on edge before nothing, on a plate that turns with it or not, and the true pixels."""
+    world = World().box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
+    world.box((0.07, 0.0, 0.03), (0.02, 0.02, 0.03), label=OBJECT)
+    return (world.box((0.0, 0.0, -0.01), (0.12, 0.12, 0.01)) if plate else world).frame(k, rng)
+
+
+def test_what_stands_before_nothing_is_all_the_object(rng):
+    views = [island(k, rng, plate=False) for k in range(8)]
+    frames, masks = [frame for frame, _ in views], [mask for _, mask in views]
+    for one in judge(frames, masks, least=0.9):
+        assert one.plane is None
+    segmenter = Segmenter()
+    scene = segmenter.scene(frames)
+    assert scene.alone
+    depth = frames[0].depth_m.copy()
+    depth[:, -40:] = 0.9  # somebody's sleeve
+    assert segmenter.segment(replace(frames[0], depth_m=depth), scene).outcome is Outcome.UNSURE_MASK
+    nothing = replace(frames[0], depth_m=np.full_like(depth, np.nan))
+    assert segmenter.segment(nothing, scene).outcome is Outcome.TOO_FEW_POINTS
+
+
+def test_a_plate_before_nothing_is_a_support(rng):
+    views = [island(k, rng, plate=True) for k in range(8)]
+    frames = [frame for frame, _ in views]
+    segmenter = Segmenter()
+    assert not segmenter.scene(frames).alone
+
+
+def test_a_region_of_a_scene_is_no_island(rng):
+    frames, _ = turned(6, rng, lambda world, k: world.box((0.0, 0.42, 0.3), (1.0, 0.01, 0.5)))
+    assert not Segmenter(roi=(80, 20, 160, 90)).scene(frames).alone
+
+
 def test_a_camera_that_was_pushed_after_the_scene_was_learnt_is_noticed(rng):
     frames, _ = turned(4, rng)
     pushed, mask = World(tilt_deg=45.0).table().box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), label=OBJECT).frame(9, rng)

@@ -43,6 +43,8 @@ class Scene:
     """Whether there is no doubt about which thing is the object and which plane its support."""
     still: bool = False
     """Whether camera and scenery stand still, so that the scene holds for other frames."""
+    alone: bool = False
+    """Whether the frames show the object and nothing else."""
     noise: DepthNoise | None = None
     """Noise of the depth camera, where the frames show more of it than was expected."""
 

@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 
+from modeler.segmentation.bare import clean, is_island, shows_object_alone
 from modeler.segmentation.clusters import edge_of
 from modeler.segmentation.finder import Found, find
 from modeler.segmentation.layers import planning_stride, point_image, take_apart, times_as_noisy
@@ -64,6 +65,8 @@ class Segmenter:
         shown = [frame for frame in shown if frame.depth_m.shape == shown[0].depth_m.shape]
         if not shown:
             return Scene()
+        if shows_object_alone([_measured(frame) for frame in shown], shown[0].camera, self.noise):
+            return Scene(alone=True)
         scene = self._learn(shown)
         if scene.zone_m is None or not scene.still:
             return scene
@@ -88,6 +91,12 @@ class Segmenter:
             few = np.count_nonzero(mask & (frame.depth_m > 0.0)) < self.min_points
             plane = None if few else self._plane_beside(frame, mask)
             return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else Outcome.CONVERGED)
+        if scene.alone:
+            mask = clean(self._kept(frame), frame.camera, self.noise)
+            few = np.count_nonzero(mask) < self.min_points
+            sure = is_island(_measured(frame))
+            outcome = Outcome.CONVERGED if sure else Outcome.UNSURE_MASK
+            return Segmentation(mask, None, Outcome.TOO_FEW_POINTS if few else outcome)
         if not (scene.still and self._holds(frame, scene)):
             scene = self._learn([frame])
         found = self._find(frame, scene)
@@ -117,9 +126,13 @@ class Segmenter:
 
     def _find(self, frame: Frame, scene: Scene) -> Found:
         """Return the object in a frame without a mask."""
+        return find(self._kept(frame), frame.camera, scene, scene.noise or self.noise, gap_m=self.gap_m)
+
+    def _kept(self, frame: Frame) -> Float32Array:
+        """Return the depth (h, w) within region and greatest depth, NaN elsewhere."""
         depth = _measured(frame)
         depth[~self._allowed(depth)] = np.nan
-        return find(depth, frame.camera, scene, scene.noise or self.noise, gap_m=self.gap_m)
+        return depth
 
     def _allowed(self, depth_m: Float32Array, stride: int = 1) -> BoolArray:
         """Return the pixels (h, w) of a thinned depth image that region and greatest depth leave."""
