@@ -196,7 +196,8 @@ def naive_integrate(voxels, tau_m, empty_weight, views):
 @pytest.mark.parametrize(("one_mind", "turned_rad"), [(0.0, 1.0), (0.9, 0.4)])
 def test_integration_is_its_twin(seed, one_mind, turned_rad, monkeypatch):
     rng = np.random.default_rng(seed)
-    frames, height, width, count = 12, 12, 14, 150
+    frames, height, width, count = 12, 12, 14, 156
+    own = count // frames  # points of a view
     poses = np.stack(
         [
             (se3.translation(np.array([0, 0, 0.5])) @ se3.exp(rng.normal(0, turned_rad, 6) * [1, 1, 1, 0, 0, 0]))[:3]
@@ -204,9 +205,14 @@ def test_integration_is_its_twin(seed, one_mind, turned_rad, monkeypatch):
         ]
     )
     normals = rng.normal(size=(count, 3))
-    normals[: int(one_mind * count)] = [0.1, 0.1, -1.0]
+    normals[rng.random(count) < one_mind] = [0.1, 0.1, -1.0]
     views = (
-        rng.integers(-1, count, (frames, height, width)).astype(np.int32),
+        np.stack(
+            [
+                np.where(rng.random((height, width)) < 0.1, -1, rng.integers(own * k, own * (k + 1), (height, width)))
+                for k in range(frames)
+            ]
+        ).astype(np.int32),
         rng.uniform(0.4, 0.7, (frames, height, width)).astype(np.float32),
         poses,
         np.tile([150.0, 160.0, 6.5, 5.5], (frames, 1)),
@@ -216,7 +222,7 @@ def test_integration_is_its_twin(seed, one_mind, turned_rad, monkeypatch):
     )
     blocks = rng.permutation(np.stack(np.meshgrid(*[np.arange(2)] * 3), axis=-1).reshape(-1, 3))
     origin, voxel_m, tau_m = np.full(3, -0.02), 0.04 / (2 * fusion.SIDE), 0.015
-    values, totals = fusion.integrate(blocks, origin, voxel_m, tau_m, 0.3, *views)
+    values, totals = fusion.integrate(blocks, origin, voxel_m, tau_m, 0.3, np.arange(count) // own, *views)
     inner = np.stack(np.meshgrid(*[np.arange(fusion.SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     voxels = origin + ((blocks[:, None] * fusion.SIDE + inner).reshape(-1, 3) + 0.5) * voxel_m
     expected_values, expected_totals = naive_integrate(voxels, tau_m, 0.3, views)

@@ -72,7 +72,9 @@ def measure(grid: Grid, views: Stack, *, tau_m: float, empty_weight: float) -> F
     """Return the signed distance that the views measure, within ±`tau_m` around the surface."""
     block_m = fusion.SIDE * grid.voxel_m
     blocks = fusion.blocks_near(views.points_m, grid.origin_m, block_m, tau_m, grid.blocks)
-    distance, weight = fusion.integrate(blocks, grid.origin_m, grid.voxel_m, tau_m, empty_weight, *views.lookup)
+    distance, weight = fusion.integrate(
+        blocks, grid.origin_m, grid.voxel_m, tau_m, empty_weight, views.views, *views.lookup
+    )
     x, y, z = (int(n) for n in grid.blocks)
     values, weights = (np.zeros((x, y, z, fusion.SIDE, fusion.SIDE, fusion.SIDE), dtype=np.float32) for _ in range(2))
     values[tuple(blocks.T)], weights[tuple(blocks.T)] = distance, weight

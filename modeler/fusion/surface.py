@@ -131,6 +131,7 @@ def curled(vertices_m: Array, normals: Array, seen: BoolArray, added: BoolArray)
 def trimmed(marked: BoolArray, loose: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
     """Return the marked vertices (v,) without the loose ones along the border, up to `rings` deep."""
     outside = ~marked
+    triangles = triangles[np.any(loose[triangles], axis=1)]
     for _ in range(rings):
         outside[triangles[np.any(outside[triangles], axis=1)]] = True
         outside &= ~marked | loose

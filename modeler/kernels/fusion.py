@@ -59,7 +59,9 @@ def between(image, column, row, channel):
 
 
 @njit(cache=True, parallel=True)
-def integrate(blocks, origin, voxel_m, tau_m, empty_weight, index, free_m, poses, lenses, points, normals, weights):
+def integrate(
+    blocks, origin, voxel_m, tau_m, empty_weight, views, index, free_m, poses, lenses, points, normals, weights
+):
     """Return signed distance and weight of the voxels of some blocks, each (b, SIDE, SIDE, SIDE) float32.
 
     The distance of a voxel to the surface a view sees along its ray is measured along the surface's normal, positive
@@ -72,6 +74,7 @@ def integrate(blocks, origin, voxel_m, tau_m, empty_weight, index, free_m, poses
         voxel_m: side of a voxel.
         tau_m: half width of the band.
         empty_weight: weight of a view that sees the voxel empty, against 1 for a surface seen head-on.
+        views: (n,) which view each surface point is of.
         index: (f, h, w) int32.
         free_m: (f, h, w) float32.
         poses: (f, 3, 4) camera_from_object.
@@ -80,56 +83,28 @@ def integrate(blocks, origin, voxel_m, tau_m, empty_weight, index, free_m, poses
         normals: (n, 3).
         weights: (n,).
     """
-    frames, height, width = index.shape
     values = np.zeros((len(blocks), SIDE**3), dtype=np.float32)
     totals = np.zeros((len(blocks), SIDE**3), dtype=np.float32)
     for b in prange(len(blocks)):
-        distance = np.empty((SIDE**3, frames))
-        weight = np.empty((SIDE**3, frames))
-        number = np.empty((SIDE**3, frames), dtype=np.int64)
-        view = np.empty((SIDE**3, frames), dtype=np.int64)
         places = np.empty((SIDE**3, 3))
         for voxel in range(SIDE**3):
             places[voxel, 0] = origin[0] + (blocks[b, 0] * SIDE + voxel // (SIDE * SIDE) + 0.5) * voxel_m
             places[voxel, 1] = origin[1] + (blocks[b, 1] * SIDE + voxel // SIDE % SIDE + 0.5) * voxel_m
             places[voxel, 2] = origin[2] + (blocks[b, 2] * SIDE + voxel % SIDE + 0.5) * voxel_m
-        seen = np.zeros(SIDE**3, dtype=np.int64)
-        emptiness = np.zeros(SIDE**3)
-        for f in range(frames):
-            pose, lens = poses[f], lenses[f]
-            for voxel in range(SIDE**3):
-                x, y, z = places[voxel, 0], places[voxel, 1], places[voxel, 2]
-                u, v, depth = project(pose, lens, x, y, z)
-                if not (depth > 0.0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
-                    continue
-                row, column = int(v + 0.5), int(u + 0.5)
-                n = index[f, row, column]
-                along = 2.0 * tau_m
-                if n >= 0:
-                    along = (
-                        normals[n, 0] * (x - points[n, 0])
-                        + normals[n, 1] * (y - points[n, 1])
-                        + normals[n, 2] * (z - points[n, 2])
-                    )
-                if abs(along) <= tau_m:
-                    k = seen[voxel]
-                    distance[voxel, k], number[voxel, k], view[voxel, k] = along, n, f
-                    # What lies behind a surface is a guess that fades with depth.
-                    weight[voxel, k] = weights[n] * min(1.0, 1.5 * (1.0 + along / tau_m) + 1e-3)
-                    seen[voxel] = k + 1
-                elif along > 0.0 and depth < free_m[f, row, column] - tau_m:
-                    emptiness[voxel] += empty_weight
+        seen, distance, weight, number, empty = asked(
+            places, tau_m, index, free_m, poses, lenses, points, normals, weights
+        )
         for voxel in range(SIDE**3):
-            if seen[voxel] > 0 or emptiness[voxel] > 0.0:
+            if seen[voxel] > 0 or empty[voxel] > 0:
                 values[b, voxel], totals[b, voxel] = blend(
                     places[voxel],
                     seen[voxel],
                     distance[voxel],
                     weight[voxel],
                     number[voxel],
-                    view[voxel],
-                    emptiness[voxel],
+                    empty_weight * empty[voxel],
                     tau_m,
+                    views,
                     index,
                     poses,
                     lenses,
@@ -138,6 +113,44 @@ def integrate(blocks, origin, voxel_m, tau_m, empty_weight, index, free_m, poses
                 )
     shape = (len(blocks), SIDE, SIDE, SIDE)
     return values.reshape(shape), totals.reshape(shape)
+
+
+@njit(cache=True)
+def asked(places, tau_m, index, free_m, poses, lenses, points, normals, weights):
+    """Return the votes of the views on places (m, 3), as `votes.blend` takes them, and how many see each empty.
+
+    These are how many votes there are (m,), and of each the distance, the weight and the surface point, all (m, f);
+    then (m,). Arguments as of `integrate`.
+    """
+    frames, height, width = index.shape
+    distance, weight = np.empty((len(places), frames)), np.empty((len(places), frames))
+    number = np.empty((len(places), frames), dtype=np.int64)
+    seen, empty = np.zeros(len(places), dtype=np.int64), np.zeros(len(places), dtype=np.int64)
+    for f in range(frames):
+        pose, lens = poses[f], lenses[f]
+        for voxel in range(len(places)):
+            x, y, z = places[voxel, 0], places[voxel, 1], places[voxel, 2]
+            u, v, depth = project(pose, lens, x, y, z)
+            if not (depth > 0.0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+                continue
+            row, column = int(v + 0.5), int(u + 0.5)
+            n = index[f, row, column]
+            along = 2.0 * tau_m
+            if n >= 0:
+                along = (
+                    normals[n, 0] * (x - points[n, 0])
+                    + normals[n, 1] * (y - points[n, 1])
+                    + normals[n, 2] * (z - points[n, 2])
+                )
+            if abs(along) <= tau_m:
+                k = seen[voxel]
+                distance[voxel, k], number[voxel, k] = along, n
+                # What lies behind a surface is a guess that fades with depth.
+                weight[voxel, k] = weights[n] * min(1.0, 1.5 * (1.0 + along / tau_m) + 1e-3)
+                seen[voxel] = k + 1
+            elif along > 0.0 and depth < free_m[f, row, column] - tau_m:
+                empty[voxel] += 1
+    return seen, distance, weight, number, empty
 
 
 @njit(cache=True, parallel=True)

@@ -1,8 +1,8 @@
 """Kernels that weigh what views say of one place: which side of the object they speak of, and whom not to believe.
 
 Each view that sees a surface within reach along the place's pixel has a vote: how far the place lies above that
-surface, along its normal; the vote's weight; the number of the surface point; and the number of the view. Views lie
-side by side as `fusion` has them.
+surface, along its normal; the vote's weight; and the number of the surface point. Views lie side by side as `fusion`
+has them.
 """
 
 from numba import njit
@@ -22,7 +22,7 @@ def project(pose, lens, x, y, z):
     return u, v, depth
 
 
-# `fusion.integrate`, `blend` and `spoken_of`, which do little else, write the next two out: calls would cost a fifth of
+# `fusion.asked`, `blend` and `spoken_of`, which do little else, write the next two out: calls would cost a fifth of
 # their time.
 @njit(cache=True)
 def above(x, y, z, points, normals, n):
@@ -37,7 +37,7 @@ def facing(first, i, second, k):
 
 
 @njit(cache=True)
-def blend(place, seen, distance, weight, number, view, emptiness, tau_m, index, poses, lenses, points, normals):
+def blend(place, seen, distance, weight, number, emptiness, tau_m, views, index, poses, lenses, points, normals):
     """Return signed distance and weight of a place from its votes. Weights of votes that are not heard become 0.
 
     Only votes for the side of the object that is spoken of are averaged, see `spoken_of`. A vote that many contradict
@@ -50,9 +50,9 @@ def blend(place, seen, distance, weight, number, view, emptiness, tau_m, index, 
         distance: (f,) of the place above the surface of each vote.
         weight: (f,) of each.
         number: (f,) surface point of each.
-        view: (f,) view of each.
         emptiness: weight with which views see the place empty.
         tau_m: half width of the band.
+        views: (n,) which view each surface point is of.
         index: (f, h, w) int32.
         poses: (f, 3, 4) camera_from_object.
         lenses: (f, 4).
@@ -77,7 +77,7 @@ def blend(place, seen, distance, weight, number, view, emptiness, tau_m, index, 
                 voices += 1
         if heard < (1 + MANY) * voices:
             return value / total, total
-        against = walled_off(best, place, seen, distance, weight, number, view, index, poses, lenses, points, normals)
+        against = walled_off(best, place, seen, distance, weight, number, views, index, poses, lenses, points, normals)
         if against < MANY * voices:
             return value / total, total
         for k in range(seen):
@@ -112,12 +112,13 @@ def spoken_of(seen, distance, weight, number, normals, tau_m):
 
 
 @njit(cache=True)
-def walled_off(best, place, seen, distance, weight, number, view, index, poses, lenses, points, normals):
+def walled_off(best, place, seen, distance, weight, number, views, index, poses, lenses, points, normals):
     """Return how many votes for other sides see surface on the way between a place and the view of the best vote.
 
     Whoever sees the back of a wall looks at it from behind. Arguments as of `blend`.
     """
-    pose, side = poses[view[best]], number[best]
+    side = number[best]
+    pose = poses[views[side]]
     x = -(pose[0, 0] * pose[0, 3] + pose[1, 0] * pose[1, 3] + pose[2, 0] * pose[2, 3])  # the camera's place
     y = -(pose[0, 1] * pose[0, 3] + pose[1, 1] * pose[1, 3] + pose[2, 1] * pose[2, 3])
     z = -(pose[0, 2] * pose[0, 3] + pose[1, 2] * pose[1, 3] + pose[2, 2] * pose[2, 3])
@@ -135,10 +136,10 @@ def walled_off(best, place, seen, distance, weight, number, view, index, poses, 
             place[1] + share * (y - place[1]),
             place[2] + share * (z - place[2]),
         )
-        u, v, depth = project(poses[view[k]], lenses[view[k]], a, b, c)
+        u, v, depth = project(poses[views[n]], lenses[views[n]], a, b, c)
         if depth <= 0.0 or not (-0.5 <= u < index.shape[2] - 0.5 and -0.5 <= v < index.shape[1] - 0.5):
             continue
-        m = index[view[k], int(v + 0.5), int(u + 0.5)]
+        m = index[views[n], int(v + 0.5), int(u + 0.5)]
         if m >= 0 and facing(normals, m, normals, n) > AGREE:
             count += abs(above(a, b, c, points, normals, m)) < -distance[k]
     return count
