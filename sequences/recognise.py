@@ -15,7 +15,8 @@ from sequences.pictures.colour_depth import COLOUR_FOLDERS, open_colour_depth
 from sequences.pictures.tum import open_tum
 
 FORMATS = (
-    "a BOP scene, a TUM RGB-D, Open3D or BundleSDF folder, organised clouds, a ROS bag, a RealSense recording, "
+    "a folder with depth/ (BOP, TUM RGB-D, Open3D, BundleSDF, your own), organised clouds, a ROS bag, a RealSense "
+    "recording, "
     "an Azure Kinect .mkv, or realsense:"
 )
 BAGS = (".bag", ".mcap", ".db3")

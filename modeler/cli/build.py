@@ -19,8 +19,8 @@ class Build:
     """
 
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SEQUENCE")]
-    """BOP scene, TUM RGB-D, Open3D or BundleSDF folder, organised clouds (PCD, PLY), ROS bag or MCAP, RealSense or
-    Azure Kinect recording, or realsense: for a camera that is plugged in."""
+    """Folder of pictures (BOP, TUM RGB-D, Open3D, BundleSDF, your own) or of organised clouds (PCD, PLY).
+    ROS bag, MCAP, RealSense or Azure Kinect recording; realsense: for a camera that is plugged in."""
     out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
     """Run folder to make: model.ply, cloud.ply, trajectory.txt, graph.g2o, report.json, recording.rrd and more."""
     overwrite: bool = False

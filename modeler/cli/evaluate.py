@@ -25,8 +25,7 @@ class Evaluate:
         tyro.conf.Positional[tuple[Path, ...]],
         tyro.conf.arg(metavar="SEQUENCE|RUN...", help_behavior_hint="(at least one)"),
     ]
-    """BOP scene folders with scene_gt.json, which those of a full turn need not have with --closed; or run folders
-    made of such."""
+    """Sequences with ground truth (scene_gt.json; none is needed with --closed), or run folders made of such."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder for the results; those of an earlier evaluation are replaced at the end."""
     methods: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ",".join(get_args(Method))
@@ -36,8 +35,8 @@ class Evaluate:
     both_ways: bool = False
     """Register each pair in both directions, not only the later frame to the earlier."""
     closed: bool = False
-    """Take the sequence for a full turn: its last frame is followed by its first. What all its steps together
-    leave, of how much they turn one by one, is told too: it judges a sequence without ground truth."""
+    """Take the sequence for a full turn, its last frame followed by its first.
+    What all its steps together leave, of how much they turn one by one, is told too: that needs no ground truth."""
     learn: bool = False
     """The prior learns from the pairs before, as in `build`: the axis and sense of a turntable that nobody tells."""
     points: Annotated[int | None, tyro.conf.arg(metavar="N"), default("all")] = None

@@ -87,10 +87,13 @@ class PriorOptions:
     prior: Annotated[
         str | None, tyro.conf.arg(metavar="NAME[+NAME]"), default("as sequence.json says, else general")
     ] = None
-    """general: any motion within limits of rotation and shift. table: the object stays on the table it stands on.
-    turntable: it turns by a commanded step about one axis. held: a robot's hand carries it (robot.txt). poke: somebody
-    pushes it along the table. Guesses that only tell where to look: velocity, the motion goes on; axes, long objects
-    stay aligned; features, matching shape. What is joined by + holds together: held+table, features+table."""
+    """general: any motion within limits of rotation and shift.
+    table: the object stays on the table it stands on.
+    turntable: it turns by a commanded step about one axis.
+    held: a robot's hand carries it (robot.txt).
+    poke: somebody pushes it along the table.
+    Guesses that only tell where to look: velocity (the motion goes on), axes (long objects stay aligned), features.
+    What is joined by + holds together: held+table, features+table."""
     max_rotation_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("50")] = None
     """Largest rotation between two frames (general, table)."""
     max_offset_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.04")] = None
