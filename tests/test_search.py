@@ -11,7 +11,7 @@ from modeler.priors import GeneralPrior
 from modeler.priors.general import GeneralMotion
 from modeler.rays import Sensor
 from modeler.registration.mixture import Gaussians, MixtureMotion
-from modeler.registration.modes import Place, separate, weighed
+from modeler.registration.modes import Place, by_place, weighed
 from modeler.registration.search import Candidates, Search
 from modeler.registration.visibility import VisibilityRegistrar
 from modeler.types import Outcome
@@ -80,15 +80,15 @@ def test_the_search_goes_on_along_the_ridge_of_a_roll(rng):
 
 def test_candidates_that_reach_each_other_share_a_place():
     near, far = turned(0.02), turned(1.5)
-    places = separate(candidates([np.eye(4), near, far], [0.01, 0.01, 0.01], [3, 2, 1]), np.zeros(3))
+    places = by_place(candidates([np.eye(4), near, far], [0.01, 0.01, 0.01], [3, 2, 1]), np.zeros(3))
     assert [len(place) for place in places] == [2, 1]
     np.testing.assert_array_equal(places[0].poses[0], np.eye(4))
 
 
 def test_a_blunt_candidate_joins_what_it_covers_and_is_no_place_itself():
     ends = [turned(-0.2), turned(0.2)]
-    alone = separate(candidates(ends, [0.01, 0.01], [2, 1]), np.zeros(3))
-    joined = separate(
+    alone = by_place(candidates(ends, [0.01, 0.01], [2, 1]), np.zeros(3))
+    joined = by_place(
         candidates([*ends, np.eye(4), turned(2.0)], [0.01, 0.01, 0.1, 0.1], [2, 1, 0, 0], [False, False, True, True]),
         np.zeros(3),
     )

@@ -32,7 +32,7 @@ class Place:
         return weighted_gaussian(self.poses, self.weights, centre_m)
 
 
-def separate(found: Candidates, centre_m: Array, *, apart: float = 3.5) -> list[Candidates]:
+def by_place(found: Candidates, centre_m: Array, *, apart: float = 3.5) -> list[Candidates]:
     """Return the candidates by place, the best place first.
 
     Two candidates share a place where a chain of candidates leads from one to the other, each link within `apart`

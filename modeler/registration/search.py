@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +10,7 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.kernels import mixture
 from modeler.kernels.matching import Pull
+from modeler.registration.climb import Climb
 from modeler.registration.pair import Pair
 from modeler.types import AbstractMotion, Array, BoolArray, PoseGaussian
 
@@ -29,6 +30,8 @@ class Candidates:
     """(k,) whether a candidate stands for the surroundings that surface, blurred, leaves open."""
     beyond: float = -np.inf
     """How much better (nats) than the best is what surface leads to beyond the prior's support."""
+    scarce: bool = False
+    """Whether so little surface matches that places were compared as `Search.scarce_points` says."""
 
     def __len__(self) -> int:
         """Return how many there are."""
@@ -49,12 +52,18 @@ class Candidates:
             np.concatenate([self.spreads, others.spreads]),
             np.concatenate([self.blunt, others.blunt]),
             self.beyond,
+            self.scarce,
         )
 
     def some(self, chosen: npt.NDArray[np.int64] | BoolArray) -> Candidates:
         """Return those chosen by number or by mask."""
         return Candidates(
-            self.poses[chosen], self.scores[chosen], self.spreads[chosen], self.blunt[chosen], self.beyond
+            self.poses[chosen],
+            self.scores[chosen],
+            self.spreads[chosen],
+            self.blunt[chosen],
+            self.beyond,
+            self.scarce,
         )
 
 
@@ -98,6 +107,15 @@ class Search:
     """Length of a walker's stride in standard deviations."""
     max_strides: int = 10
     """A walker takes at most so many."""
+    poor: float = -20.0
+    """Where the best place is worse than this (nats) even to somewhat blurred views, little surface matches."""
+    scarce_points: float = 120.0
+    """Number of independent measurements that all points are worth there, in a place and between places.
+
+    What matching surfaces have in common, the errors of smoothing and of the sensor, counts for little where few match.
+    """
+    climb: Climb = field(default_factory=Climb)
+    """How more places are found there."""
 
     def thorough(self) -> Search:
         """Return a search that looks four times as hard."""
@@ -127,19 +145,42 @@ class Search:
         sharp = self._ranked(pair, motion, poses, prior, fine_m)
         if not len(sharp):
             sharp = self._ranked(pair, motion, motion.sample(starts, rng), prior, fine_m)
-        sharp = self._along(pair, motion, sharp, prior)
+        search = self
+        if self.scores(pair, sharp.poses[:1], self.blurs[2] * pair.size_m)[0] < self.poor:
+            search, sharp = self._higher(pair, motion, sharp, prior, rng)
+        sharp = search._along(pair, motion, sharp, prior)
         blunt = replace(blunt, blunt=np.ones(len(blunt), dtype=np.bool_))
         outside = poses[~np.isfinite(motion.log_evidence(poses))]
-        beyond = self.scores(pair, outside, fine_m).max() - sharp.scores[0] if len(outside) else -np.inf
-        return replace(sharp.beside(blunt), beyond=float(beyond))
+        beyond = search.scores(pair, outside, fine_m).max() - sharp.scores[0] if len(outside) else -np.inf
+        return replace(sharp.beside(blunt), beyond=float(beyond), scarce=search is not self)
+
+    def _higher(
+        self, pair: Pair, motion: AbstractMotion, found: Candidates, prior: PoseGaussian, rng: np.random.Generator
+    ) -> tuple[Search, Candidates]:
+        """Return how places are compared, and those of what was found and of what is climbed that are good."""
+        fine_m, sparing = self.blurs[-1] * pair.size_m, self._where(scarce=True)
+        basin = self._basin(pair.size_m)
+        high = self.climb.places(pair, motion, basin, rng, effective_points=self.scarce_points)
+        poses = np.concatenate([found.poses, high])
+        best = sparing._ranked(pair, motion, poses, prior, fine_m)
+        _, share = pair.log_likelihoods(best.poses[:1], fine_m, stride=2)
+        if share[0] < pair.little_overlap:
+            return sparing, best
+        return self, self._ranked(pair, motion, poses, prior, fine_m)
 
     def onward(
         self, pair: Pair, motion: AbstractMotion, found: Candidates, poses: Array, rng: np.random.Generator
     ) -> Candidates:
         """Return what was found, better poses (n, 4, 4) that are possible, and what lies along their ridges."""
         prior, fine_m = _gaussian(motion.sample(500, rng), pair.centre_m), self.blurs[-1] * pair.size_m
-        sharp = self._ranked(pair, motion, np.concatenate([poses, found.poses[~found.blunt]]), prior, fine_m)
-        return self._along(pair, motion, sharp, prior).beside(found.some(found.blunt))
+        search = self._where(scarce=found.scarce)
+        sharp = search._ranked(pair, motion, np.concatenate([poses, found.poses[~found.blunt]]), prior, fine_m)
+        along = search._along(pair, motion, sharp, prior)
+        return replace(along.beside(found.some(found.blunt)), scarce=found.scarce)
+
+    def _where(self, *, scarce: bool) -> Search:
+        """Return how places are compared where little surface matches, or enough."""
+        return replace(self, effective_points=self.scarce_points) if scarce else self
 
     def _along(self, pair: Pair, motion: AbstractMotion, found: Candidates, prior: PoseGaussian) -> Candidates:
         """Return candidates and what lies along their ridges, best first."""

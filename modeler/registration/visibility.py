@@ -11,13 +11,23 @@ import numpy as np
 from modeler.registration.importance import AdaptiveSampler, Population
 from modeler.registration.lookup import Lookup
 from modeler.registration.mixture import Gaussians, MixtureMotion
-from modeler.registration.modes import Place, separate, weighed
+from modeler.registration.modes import Place, by_place, weighed
 from modeler.registration.pair import Pair
 from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
 from modeler.registration.refinement import Refiner
 from modeler.registration.search import Candidates, Search
 from modeler.registration.surface import measured_share, spread_points
-from modeler.types import AbstractMotion, AbstractRegistrar, Mode, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import (
+    AbstractMotion,
+    AbstractRegistrar,
+    Mode,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    as_one,
+    separate,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +40,8 @@ class _Sampled:
     """What a good match loses to its misfit (nats)."""
     rise: float
     """By how much (nats) the best of them is better than what the search had found."""
+    effective_points: float
+    """Number of independent measurements that all points were worth."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +56,7 @@ class VisibilityRegistrar(AbstractRegistrar):
     points: int = 600
     """Surface points taken from each view."""
     effective_points: float = 40.0
-    """Number of independent measurements that the points of both views together are worth."""
+    """Number of independent measurements that the points of both views together are worth where surface matches."""
     surface_noise: float = 0.1
     """Least error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
     surface_detail: float = 0.003
@@ -109,14 +121,16 @@ class VisibilityRegistrar(AbstractRegistrar):
         candidates = search.candidates(pair, motion, rng)
         sampled = [
             self._sampled_to_the_top(pair, motion, found, rng)
-            for found in separate(candidates, pair.centre_m)[: self.max_places]
+            for found in by_place(candidates, pair.centre_m)[: self.max_places]
         ]
         strict = min(sampled, key=lambda one: one.noise_m)
         places = weighed([self._place(pair, motion, one, strict, rng) for one in sampled])
         samples = np.concatenate([place.poses for _, place in places])
         weights = np.concatenate([share * place.weights for share, place in places])
         modes = tuple(Mode(share, place.gaussian(pair.centre_m)) for share, place in places)
-        pose = modes[0].pose if len(modes) == 1 else weighted_gaussian(samples, weights, pair.centre_m)
+        pose = (
+            as_one(modes) if len(modes) == 1 or separate(modes) else weighted_gaussian(samples, weights, pair.centre_m)
+        )
         overlap = pair.overlap(modes[0].pose.mean)
         effective = 1.0 / sum(share**2 / place.effective_samples for share, place in places)
         beyond = candidates.beyond > self.max_beyond
@@ -159,7 +173,8 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return samples around candidates."""
         noise_m = pair.surface_noise_m(found.poses[0], self.search.blurs[-1] * pair.size_m)
         typical = pair.typical_misfit(found.poses[0], noise_m)
-        likelihood = partial(pair.tempered, blur_m=noise_m, effective_points=self.effective_points, typical=typical)
+        worth = self.search.scarce_points if found.scarce else self.effective_points
+        likelihood = partial(pair.tempered, blur_m=noise_m, effective_points=worth, typical=typical)
         plain = likelihood(found.poses)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
         log_weights = np.where(found.blunt, found.scores, plain + volumes)
@@ -168,7 +183,8 @@ class VisibilityRegistrar(AbstractRegistrar):
                 log_weights[kind] += np.log(share) - np.logaddexp.reduce(log_weights[kind])
         gaussians = Gaussians(found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
         population = self.sampler.run(MixtureMotion(motion, gaussians), likelihood, pair.centre_m, rng)
-        return _Sampled(population, noise_m, typical, float(population.log_likelihoods.max() - plain[0]))
+        rise = float(population.log_likelihoods.max() - plain[0])
+        return _Sampled(population, noise_m, typical, rise, worth)
 
     def _place(
         self, pair: Pair, motion: AbstractMotion, one: _Sampled, strict: _Sampled, rng: np.random.Generator
@@ -187,7 +203,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         beside = pair.tempered(
             population.poses[best : best + 1],
             strict.noise_m,
-            effective_points=self.effective_points,
+            effective_points=one.effective_points,
             typical=strict.typical,
         )
         return Place(

@@ -12,6 +12,8 @@ from modeler.types.loops import loops_closed as loops_closed
 from modeler.types.model import ACCEPTED as ACCEPTED
 from modeler.types.model import ObjectModel as ObjectModel
 from modeler.types.model import Step as Step
+from modeler.types.modes import as_one as as_one
+from modeler.types.modes import separate as separate
 from modeler.types.motions import AbstractMotion as AbstractMotion
 from modeler.types.motions import EvenSpread as EvenSpread
 from modeler.types.outcomes import InputError as InputError

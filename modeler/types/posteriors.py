@@ -53,7 +53,7 @@ class Posterior:
     target: int
     """Frame number of the target view."""
     pose: PoseGaussian
-    """target_from_source: mean and covariance."""
+    """target_from_source: mean and covariance; where there are separate modes, at the heaviest, and as wide as all."""
     outcome: Outcome
     """How the attempt ended."""
     overlap: float
