@@ -31,7 +31,7 @@ class Refiner:
     """A patch holds at least so many matching points; with fewer in all, there are fewer patches."""
     min_patches: int = 16
     """With fewer patches than this nothing is refined: the scatter of six equations would not be known."""
-    caution: float = 2.0
+    caution: float = 1.5
     """By so many standard errors the sensitivity is lowered, so that noise does not pass for knowledge."""
 
     def refine(self, pair: Pair, poses: Array, weights: Array, rng: np.random.Generator, *, fine_m: float) -> Array:
