@@ -16,8 +16,7 @@ from sequences.pictures.tum import open_tum
 
 FORMATS = (
     "a folder with depth/ (BOP, TUM RGB-D, Open3D, BundleSDF, your own), organised clouds, a ROS bag, a RealSense "
-    "recording, "
-    "an Azure Kinect .mkv, or realsense:"
+    "recording, an Azure Kinect .mkv, or realsense:"
 )
 BAGS = (".bag", ".mcap", ".db3")
 

@@ -31,7 +31,8 @@ class Segmenter:
     """Tells the object from its support and surroundings in the frames of a depth camera.
 
     The camera is taken to stand still while the object turns or moves between frames. Where that is not so, or the
-    object does not move, a frame is judged by what stands at its centre.
+    object does not move, a frame is judged by what stands at its centre. Where nothing but an island on no support was
+    measured, all of it is the object.
     """
 
     roi: tuple[int, int, int, int] | None = None
