@@ -15,7 +15,7 @@ FARTHEST_M = 100.0
 """No depth camera for objects measures nearer or farther; a median beyond tells of a wrong unit."""
 
 
-LIKELY_M = (0.15, 5.0)
+LIKELY_M = (0.25, 5.0)
 """Half of what a camera that watches an object sees lies within these limits; elsewhere the unit may be wrong."""
 OFF_MIDDLE = 0.1
 """Principal points lie within such a share of an image's longer side of its middle."""
