@@ -198,6 +198,18 @@ def test_without_truth_recording_or_mesh_the_page_says_so(run: Path, tmp_path: P
     assert "left no mesh" in page
 
 
+def test_a_run_without_any_frame_is_said_to_have_none(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = json.loads((run / "report.json").read_bytes())
+    (tmp_path / "report.json").write_text(json.dumps(report | {"poses": [], "edges": []}))
+    for command in (["report"], ["export", "--out", str(tmp_path / "m.ply")]):
+        assert main([*command, str(tmp_path)]) == 2
+        assert capsys.readouterr().err == (
+            f"modeler: {tmp_path}: no frame of this run was accepted; report.json says why\n"
+        )
+
+
 def test_the_command_writes_the_page_and_says_where(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "pages" / "page.html"
     assert main(["report", str(run), "--out", str(out)]) == 0

@@ -21,7 +21,9 @@ def export(options: Export) -> None:
         InputError: where the options exclude each other, or something cannot be read or written.
     """
     _check(options)
-    files.RunFolder(options.run_folder).report()  # a sequence may hold a model.ply as well: the true one
+    report = files.RunFolder(options.run_folder).report()  # a sequence may hold a model.ply as well: the true one
+    if not report.get("poses"):
+        raise InputError(f"{options.run_folder}: no frame of this run was accepted; report.json says why")
     scan = _scan(options)
     if scan is None:
         model = files.read_model(files.mesh_of(options.run_folder))
