@@ -395,6 +395,16 @@ def test_a_lost_frame_far_back_joins_across_another_that_is_lost_for_good() -> N
     assert trajectory_error(last) < 1e-6
 
 
+def test_frames_tried_once_more_in_vain_are_told_of_too() -> None:
+    hopeless = frozenset((source, target) for source in (2, 3, 5) for target in range(9))
+    steps = run(FRAMES, registrar=Oracle(apart=hopeless, reach=9.0))
+    assert [step.frame.index for step in steps] == list(range(9))
+    told = {(edge.source, edge.target): edge.accepted for edge in steps[-1].edges_so_far}
+    assert [told[pair] for pair in ((2, 4), (3, 4), (5, 6))] == [False] * 3
+    assert len(told) == len(steps[-1].edges_so_far)
+    assert sorted(steps[-1].solution.trajectory) == [0, 1, 4, 6, 7, 8]
+
+
 def test_two_frames_of_one_number_are_refused() -> None:
     with pytest.raises(InputError, match="frame 1 comes twice; give each"):
         run([*FRAMES[:2], FRAMES[1]])

@@ -82,8 +82,10 @@ class Modeler:
             state, step = self._joined(state.read(frame.index), seen, state.latest, last=last)
             if last:
                 for later, found in self._caught_up(state):
-                    state = self._fused(replace(later, growing=state.growing), last=False)
-                    yield replace(found, model=state.model)
+                    state = replace(later, growing=state.growing, model=state.model)
+                    if found.accepted:
+                        state = self._fused(state, last=False)
+                        yield replace(found, model=state.model)
                 state, spans = (state, ()) if hurry() else self._spanned(state, hurry, ending)
                 state = self._solved(state)
                 ending("making the model", 0, 1)
@@ -153,7 +155,7 @@ class Modeler:
         return state, step
 
     def _caught_up(self, state: State) -> Iterator[tuple[State, Step]]:
-        """Yield states and steps of lost frames that a view which followed them places after all, newest first."""
+        """Yield states and steps of lost frames, newest first, tried once more against a view that followed them."""
         tried: set[tuple[int, int]] = set()
         waiting = list(state.overdue())
         while waiting:
@@ -162,8 +164,7 @@ class Modeler:
             if seen.view is not None:
                 seen = replace(seen, view=self._ready(state, seen.view))
             state, step = self._joined(state, seen, neighbour, again=True)
-            if step.accepted:
-                yield state, step
+            yield state, step
             waiting = [(seen, view) for seen, view in state.overdue() if (seen.frame.index, view) not in tried]
 
     def _spanned(
