@@ -56,14 +56,14 @@ class AbstractSequence(ABC):
         """What is known of the motion, `{"kind": "turntable", "step_deg": 25, …}`; None where nothing is."""
 
     @property
-    @abstractmethod
     def robot_path(self) -> Path | None:
         """The trajectory of the hand that holds the object; None where there is none."""
+        return None
 
     @property
-    @abstractmethod
     def model_path(self) -> Path | None:
         """The true surface as a mesh in m, in the model frame of `truth()`; None where it is not known."""
+        return None
 
     @property
     def layout(self) -> str:

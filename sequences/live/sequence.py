@@ -6,7 +6,6 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import final
 
 import numpy as np
@@ -124,16 +123,6 @@ class LiveSequence(AbstractSequence):
     @property
     def motion(self) -> None:
         """None: nothing is known."""
-        return None
-
-    @property
-    def robot_path(self) -> Path | None:
-        """None: there are no files."""
-        return None
-
-    @property
-    def model_path(self) -> Path | None:
-        """None: there are no files."""
         return None
 
     @property

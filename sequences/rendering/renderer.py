@@ -74,16 +74,6 @@ class RenderedSequence(AbstractSequence):
         """What the recipe says of the motion."""
         return self.recipe.trajectory.motion()
 
-    @property
-    def robot_path(self) -> Path | None:
-        """None: a rendered sequence has no files."""
-        return None
-
-    @property
-    def model_path(self) -> Path | None:
-        """None: a rendered sequence has no files."""
-        return None
-
     def model(self) -> Mesh:
         """Return the true outer surface in the model frame, in m."""
         return outer_surface(self._mesh)
