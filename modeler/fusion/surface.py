@@ -18,7 +18,7 @@ Triangles = npt.NDArray[np.int64]
 PINCHES = 50  # rounds after which sheets that touch are left touching
 NEAREST = 6  # vertices that lend their colour to one that has none
 AROUND = 12  # vertices that tell how the surface lies beside them
-TURNED_RAD = 0.5  # a surface that turns away by more within a few voxels curls
+TURNED_RAD = 0.7  # a surface that turns away by more within a few voxels curls
 HAIR = 1e-2  # how far inside a voxel is put, in voxels
 
 
