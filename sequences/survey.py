@@ -18,7 +18,10 @@ FARTHEST_M = 100.0
 LIKELY_M = (0.25, 5.0)
 """Half of what a camera that watches an object sees lies within these limits; elsewhere the unit may be wrong."""
 OFF_MIDDLE = 0.1
-"""Principal points lie within such a share of an image's longer side of its middle."""
+"""Principal points lie within such a share of an image's longer side of its middle; farther off, cx and cy may be
+exchanged."""
+FAR_OFF_MIDDLE = 0.3
+"""Beyond such a share no camera has it, but intrinsics of larger images do."""
 
 
 @final
@@ -84,10 +87,13 @@ class Survey:
                 float(np.hypot(x - camera.width / 2, y - camera.height / 2))
                 for x, y in ((camera.cx, camera.cy), (camera.cy, camera.cx))
             )
-            if swapped_px < off_px and off_px > OFF_MIDDLE * max(camera.width, camera.height):
+            longer_px = max(camera.width, camera.height)
+            exchanged = swapped_px < off_px and off_px > OFF_MIDDLE * longer_px
+            if exchanged or off_px > FAR_OFF_MIDDLE * longer_px:
+                question = "cx and cy exchanged" if exchanged else "the intrinsics those of images of another size"
                 doubts.append(
                     f"the principal point ({camera.cx:.0f}, {camera.cy:.0f}) lies {off_px:.0f} px off the middle of "
-                    "the images: are cx and cy exchanged?"
+                    f"the images: are {question}?"
                 )
         if self.repeated:
             doubts.append(
