@@ -18,10 +18,11 @@ import trimesh
 
 from modeler import priors, se3
 from modeler.cli import main, nonvisual
-from modeler.cli.building import comes_back
+from modeler.cli.building import comes_back, sense_in_doubt
 from modeler.cli.interrupt import Interrupt
 from modeler.cli.options import PriorOptions
 from modeler.cli.usage import parsed
+from modeler.types import Outcome
 from sequences import bundled, open_sequence
 
 BOX = str(bundled("box"))
@@ -402,12 +403,14 @@ def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(run: Run, tmp_p
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"model.ply", "cloud.ply"}
 
 
-def test_a_table_that_turns_the_other_way_is_asked_about(run: Run, tmp_path: Path) -> None:
-    options = ("--prior", "turntable", "--step-deg", "-25", "--step-sigma-deg", "3", "--frames", "0:3")
-    ended = run("build", BOX, "--out", tmp_path / "run", *options)
-    assert ended.status == 3
-    assert ended.err.endswith("else give --step-sign unknown\n")
-    assert "--step-sign" not in run("build", BOX, "--out", tmp_path / "other", *options, "--step-sign", "unknown").err
+def test_a_table_that_turns_the_other_way_is_asked_about() -> None:
+    lost = [f"frame 2 was left out: {Outcome.NO_OVERLAP.label}: {Outcome.NO_OVERLAP.advice}"]
+    known, unknown = (priors.TurntablePrior(-25.0, 3.0, step_sign=sign) for sign in ("known", "unknown"))
+    assert sense_in_doubt(lost, known)
+    assert sense_in_doubt(["frames 6 and 5 share little surface (overlap 0.47), and no other edge ..."], known)
+    assert not sense_in_doubt(lost, unknown)
+    assert not sense_in_doubt(lost, priors.TablePrior())
+    assert not sense_in_doubt(["the run was interrupted after frame 3"], known)
 
 
 def test_ctrl_c_ends_the_frames_and_a_second_one_the_program() -> None:

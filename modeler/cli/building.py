@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -153,6 +153,17 @@ def comes_back(frames: AbstractSequence, given_deg: float | None, reach_deg: flo
     return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
 
 
+def sense_in_doubt(reasons: Sequence[str], prior: AbstractPrior) -> bool:
+    """Return whether views overlap so little that a table may turn the other way round than its prior takes for known.
+
+    Args:
+        reasons: not to trust the model, as the report has them.
+        prior: of the run.
+    """
+    little = any(words in reason for reason in reasons for words in ("no overlap", "little surface"))
+    return little and isinstance(prior, TurntablePrior) and prior.step_sign == "known"
+
+
 def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
     """Say on stderr what came out, and return the exit status."""
     accepted = sum(frame["outcome"] == ACCEPTED for frame in report["frames"])
@@ -166,7 +177,6 @@ def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> in
         )  # frames left out were told above
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
         say(f"not to be trusted: {first}{more}")
-        little = any(word in reason for reason in report["reasons"] for word in ("overlap", "little surface"))
-        if little and isinstance(prior, TurntablePrior) and prior.step_sign == "known":
+        if sense_in_doubt(report["reasons"], prior):
             say("that the table turns the way round that was told is taken for granted; else give --step-sign unknown")
     return 0 if report["trustworthy"] else 3
