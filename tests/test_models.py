@@ -221,7 +221,8 @@ def test_a_joined_run_is_judged_where_its_parts_know_one_surface(
     built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     joined = tmp_path / "joined"
-    assert _told(capsys, "join", built, built, "--out", joined, "--pairs", "2")[0] in (0, 3)
+    shutil.copytree(built, tmp_path / "other")
+    assert _told(capsys, "join", built, tmp_path / "other", "--out", joined, "--pairs", "2")[0] in (0, 3)
     status, out, err = _told(capsys, "evaluate", joined, "--out", tmp_path / "scores")
     assert (status, err) == (0, "")
     assert [line.split()[3] for line in out.splitlines()[1:]] == ["6"] * 4
