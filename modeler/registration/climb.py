@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -25,6 +25,10 @@ class Stage:
     """Every so manieth point counts."""
     climbers: int
     """At most so many go on from here."""
+
+    def thinned(self, share: float) -> Stage:
+        """Return the stage with a share (0..1) of the climbers."""
+        return replace(self, climbers=int(np.ceil(share * self.climbers)))
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,15 @@ class Climb:
     """Of steps, after one that led up."""
     decay: float = 0.8
     """Of steps, after none did."""
+
+    def thinned(self, share: float) -> Climb:
+        """Return a climb with a share (0..1) of the looks and the climbers, for a prior that leaves less to look at."""
+        return replace(
+            self,
+            looks=int(np.ceil(share * self.looks)),
+            first=self.first.thinned(share),
+            stages=tuple(stage.thinned(share) for stage in self.stages),
+        )
 
     def places(
         self, pair: Pair, motion: AbstractMotion, basin: Array, rng: np.random.Generator, *, effective_points: float

@@ -160,7 +160,8 @@ class Search:
         """Return how places are compared, and those of what was found and of what is climbed that are good."""
         fine_m, sparing = self.blurs[-1] * pair.size_m, self._where(scarce=True)
         basin = self._basin(pair.size_m)
-        high = self.climb.places(pair, motion, basin, rng, effective_points=self.scarce_points)
+        climb = self.climb.thinned(self._starts(prior, pair.size_m) / self.max_starts)
+        high = climb.places(pair, motion, basin, rng, effective_points=self.scarce_points)
         poses = np.concatenate([found.poses, high])
         best = sparing._ranked(pair, motion, poses, prior, fine_m)
         _, share = pair.log_likelihoods(best.poses[:1], fine_m, stride=2)
