@@ -163,7 +163,7 @@ def test_depth_that_is_noisier_than_expected_is_not_taken_for_a_moving_camera(rn
         frames.append(frame)
         masks.append(mask)
     segmenter = Segmenter()
-    assert np.all(segmenter.noise.sigma_m(np.float32([0.6, 0.9])) < 0.0015)
+    assert np.all(segmenter.noise.sigma_m(np.array([0.6, 0.9])) < 0.0015)
     scene = segmenter.scene(frames)
     assert scene.still
     assert scene.noise is not None
