@@ -73,7 +73,7 @@ def coverage_curves(panels: Sequence[Sequence[Panel]]) -> bytes:
             handles, labels, loc="outside upper center", ncols=min(len(handles), 2 * columns), frameon=False, fontsize=9
         )
     picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=150, metadata={"Software": None})
+    figure.savefig(picture, format="png", dpi=150, bbox_inches="tight", metadata={"Software": None})
     return picture.getvalue()
 
 
