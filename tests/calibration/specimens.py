@@ -23,7 +23,7 @@ class Specimen:
     """Whether methods may be tuned on it."""
 
 
-FRAMES: Final[Mapping[Half, int]] = {"tuning": 2, "held-out": 5}
+FRAMES: Final[Mapping[Half, int]] = {"tuning": 2, "held-out": 3}
 """Frames of each shape under each condition, one more than pairs: the half with fewer shapes has more of each."""
 
 # A half that has been looked at may be tuned on from then on: its shapes move over, and new ones take their place.
@@ -43,6 +43,9 @@ _RECIPES: Final[Mapping[Half, Mapping[Symmetry, tuple[str, ...]]]] = {
             "microscope",
             "rubber_duck",
             "hand_plane",
+            "desk_lamp",
+            "trowel",
+            "locomotive",
         ),
         "near-symmetric": (
             "flashlight",
@@ -57,6 +60,9 @@ _RECIPES: Final[Mapping[Half, Mapping[Symmetry, tuple[str, ...]]]] = {
             "globe",
             "mortar",
             "cactus",
+            "robot_vacuum",
+            "fire_extinguisher",
+            "pear",
         ),
         "n-fold": (
             "box",
@@ -72,6 +78,9 @@ _RECIPES: Final[Mapping[Half, Mapping[Symmetry, tuple[str, ...]]]] = {
             "padlock",
             "bench_grinder",
             "propeller",
+            "skateboard",
+            "tripod",
+            "stepper_motor",
         ),
         "revolution": (
             "tube",
@@ -88,13 +97,16 @@ _RECIPES: Final[Mapping[Half, Mapping[Symmetry, tuple[str, ...]]]] = {
             "cart_wheel",
             "light_bulb",
             "plunger",
+            "stacking_rings",
+            "cake_stand",
+            "spinning_top",
         ),
     },
     "held-out": {
-        "asymmetric": ("desk_lamp", "trowel", "locomotive"),
-        "near-symmetric": ("robot_vacuum", "fire_extinguisher", "pear"),
-        "n-fold": ("skateboard", "tripod", "stepper_motor"),
-        "revolution": ("stacking_rings", "cake_stand", "spinning_top"),
+        "asymmetric": ("sewing_machine", "excavator", "telephone", "tape_dispenser", "computer_mouse", "dinosaur"),
+        "near-symmetric": ("beaker", "kitchen_timer", "thermos", "paint_tin", "rice_cooker", "camera_lens"),
+        "n-fold": ("muffin_tin", "cleat", "hourglass", "fidget_spinner", "table_lamp", "bundt_cake"),
+        "revolution": ("rolling_pin", "hat", "handbell", "yo_yo", "cocktail_shaker", "flower_pot"),
     },
 }
 
