@@ -13,7 +13,7 @@ from modeler.closure.placing import Placing
 from modeler.closure.prospects import Outlook
 from modeler.closure.reckoning import came_back, onwards
 from modeler.closure.trust import Trust
-from modeler.closure.verdict import Agreement, Standard, flaw, modes, standard
+from modeler.closure.verdict import Agreement, Standard, flaw, modes, open_deg, standard
 from modeler.closure.ways import Ways
 from modeler.types import Edge, EdgeKind, PoseGaussian, Posterior, Solution
 
@@ -51,6 +51,10 @@ class Closer:
     """Smallest overlap (0..1) of an edge to any but the previous view, predicted and found."""
     max_evidence_drop_nats: float = 40.0
     """How far the evidence of such an edge may lie below that of the others, a nat an effective point."""
+    max_open_deg: float = 5.0
+    """Largest standard deviation in degrees of the turn about any axis of such an edge. What leaves a turn open, about
+    the axis of a bottle, is bounded by the same limits as the edges that placed the frames, which hold these already;
+    and where that axis lies it knows too badly for a wide turn about it not to contradict the others."""
     trust: Trust = field(default_factory=Trust)
     """In covariances that edges state."""
 
@@ -153,8 +157,8 @@ class Closer:
                 edge = Edge(posterior, kind, accepted=True, reason=base_reason)
             elif (found := flaw(posterior, asked if number or steps > 1 else None)) is not None:
                 edge = Edge(posterior, kind, accepted=False, reason=found)
-            elif base is None:
-                edge = Edge(posterior, kind, accepted=False, reason=_NOWHERE)
+            elif base is None or (found := self._open(posterior)) is not None:
+                edge = Edge(posterior, kind, accepted=False, reason=found or _NOWHERE)
             else:
                 edge = _judged(posterior, kind, self.trust.agreement_by_way_of(base, posterior, past, reach))
             edges.append(edge)
@@ -164,11 +168,18 @@ class Closer:
         """Return the judged edge between two views of the graph, from a registration that it does not hold yet."""
         reach = past.ways(posterior.source)
         kind = "closure" if self._back(posterior.target, posterior.source, reach, past) else "span"
-        if (found := flaw(posterior, self._asked(past))) is not None:
+        if (found := flaw(posterior, self._asked(past)) or self._open(posterior)) is not None:
             return Edge(posterior, kind, accepted=False, reason=found)
         foretold = [(1.0, past.solution.relative_gaussian(posterior.target, posterior.source))]
         length, centroid_m = reach[posterior.target].edges, past.views[posterior.source].centroid_m
         return _judged(posterior, kind, self.trust.agreement(posterior, foretold, length=length, centroid_m=centroid_m))
+
+    def _open(self, posterior: Posterior) -> str | None:
+        """Return what keeps a registration out that tells too little of some turn; None: nothing."""
+        sigma_deg = open_deg(posterior)
+        if sigma_deg <= self.max_open_deg:
+            return None
+        return f"it leaves a turn open by ±{sigma_deg:.0f}°, of which the edges that placed the frames know as much"
 
     def _back(self, target: int, source: int, reach: Ways, past: Past) -> bool:
         return came_back(target, source, reach, past, away_deg=self.away_deg)

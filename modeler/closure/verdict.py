@@ -67,6 +67,15 @@ def flaw(posterior: Posterior, asked: Standard | None = None) -> str | None:
     return None
 
 
+def open_deg(posterior: Posterior) -> float:
+    """Return the standard deviation in degrees of the turn about the axis that a registration knows least of.
+
+    Of several modes the vaguest counts.
+    """
+    rotations = np.stack([pose.covariance[:3, :3] for _, pose in modes(posterior)])
+    return float(np.degrees(np.sqrt(np.linalg.eigvalsh(rotations).max())))
+
+
 def stands(posterior: Posterior, asked: Standard) -> bool:
     """Return whether a registration could place a frame without the previous view."""
     return posterior.outcome is Outcome.CONVERGED and flaw(posterior, asked) is None
