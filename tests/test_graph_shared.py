@@ -1,4 +1,4 @@
-"""Edges that share a frame's noise: covariances stay true where several edges use the same image."""
+"""Edges that share noise: covariances stay true where edges use the same image, and where all views err alike."""
 
 from __future__ import annotations
 
@@ -22,25 +22,32 @@ TRUTH = {k: se3.inverse(spin([0.0, 2.0 * np.pi * k / COUNT, 0.0])) for k in rang
 PAIRS = [(k - step, k) for step in (1, 2, 3) for k in range(step, COUNT)] + [(0, COUNT - 1), (0, COUNT - 2)]
 
 
-def _graph(rng: np.random.Generator, share: float) -> PoseGraph:
-    """Every frame has a noise of its own, in all its edges, and every edge another; shares of WHOLE, ends counted."""
+def _graph(rng: np.random.Generator, share: float, common: float = 0.0) -> PoseGraph:
+    """Every frame has a noise of its own, in all its edges, and every edge another; shares of WHOLE, ends counted.
+
+    Beside that all frames err alike, by a share of WHOLE.
+    """
 
     def noise(variance: float) -> Array:
         return np.sqrt(variance) * ABOUT @ (SIGMAS * rng.normal(size=6))
 
     seen = {k: pose @ se3.exp(noise(0.5 * share)) for k, pose in TRUTH.items()}
+    rest = [se3.exp(noise(1.0 - share)) for _ in PAIRS]
+    alike = se3.exp(noise(common))
     edges = []
-    for target, source in PAIRS:
-        mean = se3.inverse(seen[target]) @ seen[source] @ se3.exp(noise(1.0 - share))
+    for (target, source), own in zip(PAIRS, rest, strict=True):
+        mean = se3.inverse(seen[target] @ alike) @ seen[source] @ alike @ own
         edges.append(edge(target, source, PoseGaussian(mean, WHOLE), "odometry" if source - target == 1 else "closure"))
     return PoseGraph(tuple(edges))
 
 
-def _mean_nees(share: float, solved: Callable[[PoseGraph], Solution], seeds: int = 100) -> tuple[float, float, float]:
+def _mean_nees(
+    share: float, solved: Callable[[PoseGraph], Solution], seeds: int = 100, common: float = 0.0
+) -> tuple[float, float, float]:
     """Mean NEES of poses, and of motions between neighbours and between far frames."""
     poses, near, far = [], [], []
     for seed in range(seeds):
-        solution = solved(_graph(np.random.default_rng(seed), share))
+        solution = solved(_graph(np.random.default_rng(seed), share, common))
         k = 1 + seed % (COUNT - 1)
         poses.append(nees(PoseGaussian(solution.trajectory[k], solution.covariances[k]), TRUTH[k]))
         for pair, values in (((k - 1, k), near), ((k, (k + 6) % COUNT), far)):
@@ -55,6 +62,19 @@ TOLERANCE = 4.0 * np.sqrt(12.0 / 100)
 def test_poses_and_motions_are_calibrated_where_the_share_is_known(share: float) -> None:
     for mean in _mean_nees(share, lambda graph: solve(graph, {}, shared=share)):
         assert mean == pytest.approx(6.0, abs=TOLERANCE)
+
+
+@pytest.mark.parametrize(("share", "common"), [(0.0, 0.5), (0.6, 0.5)])
+def test_poses_and_motions_are_calibrated_where_all_views_err_alike(share: float, common: float) -> None:
+    for mean in _mean_nees(share, lambda graph: solve(graph, {}, shared=share, common=common), common=common):
+        assert mean == pytest.approx(6.0, abs=TOLERANCE)
+    poses, _, far = _mean_nees(share, lambda graph: solve(graph, {}, shared=share), common=common)
+    assert min(poses, far) > 6.0 + 2.0 * TOLERANCE
+
+
+def test_no_loop_tells_what_all_views_err_by() -> None:
+    alone, alike = (_graph(np.random.default_rng(2), 0.5, common) for common in (0.0, 4.0))
+    assert shared_noise(alike, solve(alike, {})) == pytest.approx(shared_noise(alone, solve(alone, {})), abs=0.01)
 
 
 def test_edges_taken_for_independent_are_too_sure() -> None:
@@ -80,6 +100,9 @@ def test_one_edge_alone_keeps_its_covariance() -> None:
     solution = solve(PoseGraph((alone,)), {}, shared=0.7)
     np.testing.assert_allclose(solution.covariances[1], WHOLE, atol=1e-12)
     np.testing.assert_allclose(solution.relative_covariance(0, 1), WHOLE, atol=1e-12)
+    apart = np.eye(6) - se3.adjoint(se3.inverse(TRUTH[1]) @ TRUTH[0])
+    alike = solve(PoseGraph((alone,)), {}, shared=0.7, common=0.5).covariances[1]
+    np.testing.assert_allclose(alike, WHOLE + 0.5 * apart @ WHOLE @ apart.T, atol=1e-12)
 
 
 def test_share_moves_no_pose_and_none_changes_nothing() -> None:

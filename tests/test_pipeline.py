@@ -14,7 +14,7 @@ import tabletop
 from modeler import se3
 from modeler.closure import Closer
 from modeler.fusion import Fuser
-from modeler.graph import CommonAxis, PoseGraph, solve
+from modeler.graph import CommonAxis, PoseGraph, shared_noise, solve
 from modeler.pipeline import ACCEPTED, Modeler
 from modeler.priors.bumps import Bumps
 from modeler.priors.proposal import Guided
@@ -253,12 +253,16 @@ def test_the_end_tells_how_far_it_is_and_can_be_cut_short() -> None:
 
 
 def test_covariances_account_for_the_noise_of_a_frame_in_all_its_edges() -> None:
-    """The Oracle's edges err less around loops than they say, as if their images' noise cancelled there."""
+    """The Oracle's edges err less around loops than they say, as if their images' noise cancelled there.
+
+    What all images err by alike comes on top.
+    """
     last = run(registrar=Oracle(noise=0.3))[-1]
-    alone = solve(PoseGraph(last.edges_so_far, first=0), {})
+    graph = PoseGraph(last.edges_so_far, first=0)
+    alone = solve(graph, {})
     for frame, pose in alone.trajectory.items():
         np.testing.assert_allclose(last.solution.trajectory[frame], pose, atol=1e-6)
-    shared = solve(PoseGraph(last.edges_so_far, first=0), {}, shared=0.5)  # of more, little is left for drift
+    shared = solve(graph, {}, shared=shared_noise(graph, alone), common=Modeler.common_noise)
     for frame in range(1, 9):
         found, wanted = (solution.covariances[frame] for solution in (last.solution, shared))
         np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-10)

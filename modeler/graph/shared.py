@@ -1,4 +1,4 @@
-"""Edges that share a frame share its noise: what that makes of the uncertainty of a solution.
+"""Edges share noise, of their frames and of all views: what that makes of the uncertainty of a solution.
 
 Of an edge's covariance Σ a share ρ is its two images' own: noise of their pixels, which moves an image as a whole and
 does so in every edge that the image has. Then frame k does not look as if it stood at T_k but at T_k exp(η_k), with one
@@ -9,6 +9,12 @@ seem to stand. These places are solved for as ever, as one factor for all covari
 
 An edge alone keeps the covariance that it came with. Several edges between two frames and their neighbours make it no
 smaller than the images allow; along a chain the images' own noise cancels from edge to edge.
+
+Beside that all views may err alike: one camera sees one object from one height, and puts it too near, say. Every frame
+then seems to stand at T_k exp(β), with one β ~ N(0, B) in camera coordinates for all. Every loop closes as it should,
+so that no graph tells β; it cancels between frames to which the object shows the same side, and adds to the covariance
+
+    (1 - Ad(source_from_target)) B (1 - Ad(source_from_target))ᵀ.
 """
 
 from __future__ import annotations
@@ -40,6 +46,8 @@ class SharedCovariance:
     """All that take part."""
     share: float
     """That is the frames' own, 0 to 1."""
+    common: float = 0.0
+    """B, as a share of an edge's covariance: of those of all edges in their source cameras the harmonic mean."""
 
     def __call__(self, target: int, source: int) -> Array:
         """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
@@ -64,6 +72,9 @@ class SharedCovariance:
         source_from_target = se3.inverse(self.independent.trajectory[source]) @ self.independent.trajectory[target]
         of_target = se3.inverse_covariance(source_from_target, self._own.get(target, np.zeros((6, 6))))
         covariance = (1.0 - self.share) * alone + self._own.get(source, np.zeros((6, 6))) + of_target
+        if self.common:
+            left = np.eye(6) - se3.adjoint(source_from_target)
+            covariance = covariance + left @ self._alike @ left.T
         return 0.5 * (covariance + covariance.T)
 
     @cached_property
@@ -79,6 +90,12 @@ class SharedCovariance:
             frame: np.asarray(0.5 * self.share * np.linalg.inv(np.mean(some, axis=0)), dtype=np.float64)
             for frame, some in informations.items()
         }
+
+    @cached_property
+    def _alike(self) -> Array:
+        """B (6, 6)."""
+        informations = [link.root_information.T @ link.root_information for link in self.links]
+        return np.asarray(self.common * np.linalg.inv(np.mean(informations, axis=0)), dtype=np.float64)
 
 
 def shared_noise(graph: PoseGraph, solution: Solution) -> float:

@@ -62,8 +62,10 @@ class Smoother:
     shared: float = 0.0
     """Share (0..1) of edges' covariances that is their images' own noise, the same in all edges of an image; see
     `shared_noise`, which tells it."""
+    common: float = 0.0
+    """Covariance of what all views err by alike, as a share of an edge's; see `SharedCovariance`."""
     axis: CommonAxis | None = None
-    """The turntable, where there is one. Each solution is then made afresh; not together with `shared`."""
+    """The turntable, where there is one. Each solution is then made afresh; not together with noise that is shared."""
     graph: PoseGraph = field(default_factory=PoseGraph)
     """What is solved."""
     solution: Solution = field(default_factory=Solution)
@@ -84,7 +86,7 @@ class Smoother:
         Raises:
             ValueError: where an accepted edge's covariance is not positive definite, or with an axis and shared noise.
         """
-        if self.axis is not None and self.shared:
+        if self.axis is not None and (self.shared or self.common):
             raise ValueError("an axis and shared noise were given: the noise of frames is not told apart from slip yet")
         root = graph.root
         if root is None:
@@ -162,7 +164,9 @@ class Smoother:
             found = before.to(trajectory, links)
         else:
             found = RelativeCovariance(trajectory, root, links, () if turned is None else turned.rows)
-        return SharedCovariance(found, links, self.shared) if self.shared else found
+        if not (links and (self.shared or self.common)):
+            return found
+        return SharedCovariance(found, links, self.shared, self.common)
 
     def _closed(
         self, tree: Sequence[Link], loops: Sequence[Link], start: Mapping[int, Array], *, root: int, afresh: bool
@@ -264,6 +268,7 @@ def solve(
     *,
     outlier_distance: float = 14.2,
     shared: float = 0.0,
+    common: float = 0.0,
     axis: CommonAxis | None = None,
 ) -> Solution:
     """Optimise the poses of all frames that accepted edges connect with the first.
@@ -277,9 +282,10 @@ def solve(
         guess: object_from_camera (4, 4) by frame number, to start from; frames without one start on the chain.
         outlier_distance: see `Smoother`.
         shared: see `Smoother`.
+        common: see `Smoother`.
         axis: the turntable, where there is one.
 
     Raises:
         ValueError: where an accepted edge's covariance is not positive definite.
     """
-    return Smoother(outlier_distance, shared, axis, solution=Solution(guess)).to(graph).solution
+    return Smoother(outlier_distance, shared, common, axis, solution=Solution(guess)).to(graph).solution

@@ -97,9 +97,9 @@ class State:
         graph = self.graph.plus(edges)
         return replace(self, graph=graph, smoother=self.smoother.to(graph))
 
-    def solved(self, *, axis: CommonAxis | None, shared: float) -> State:
-        """Return the state solved with an axis that all steps share and a share of noise that edges have in common."""
-        return replace(self, smoother=replace(self.smoother, axis=axis, shared=shared).to(self.graph))
+    def solved(self, *, axis: CommonAxis | None, shared: float = 0.0, common: float = 0.0) -> State:
+        """Return the state solved with an axis that all steps share, or the noise that edges do; see `Smoother`."""
+        return replace(self, smoother=replace(self.smoother, axis=axis, shared=shared, common=common).to(self.graph))
 
     def overdue(self) -> Iterator[tuple[Seen, int]]:
         """Yield lost frames, newest first, each with the view that followed it soonest, if that was soon."""
