@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
@@ -30,9 +29,9 @@ QUICK = ("--prior", "table", "--method", "icp", "--frames", "0:3")
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("whole") / "run"
-    assert main(["build", BOX, "--out", str(folder), *QUICK]) == 0
+    assert main(["build", str(scene), "--out", str(folder), *QUICK]) == 0
     return folder
 
 
@@ -59,41 +58,53 @@ def pairs_of(run: Path) -> set[tuple[int, int]]:
     return {(edge["source"], edge["target"]) for edge in RunFolder(run).report()["edges"]}
 
 
-def test_a_killed_run_is_taken_up(whole: Path, tmp_path: Path, asked: list[tuple[int, int]]) -> None:
+KILLED_AT_THE_FIRST_PAIR = """
+import os, signal, sys
+from modeler.cli import main
+from modeler.export import Pairs
+
+def kept(pairs, *what, keep=Pairs.keep):
+    keep(pairs, *what)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+Pairs.keep = kept
+main(sys.argv[1:])
+"""
+
+
+def test_a_killed_run_is_taken_up(scene: Path, whole: Path, tmp_path: Path, asked: list[tuple[int, int]]) -> None:
     folder, kept = tmp_path / "run", tmp_path / "run" / ".pairs"
-    process = subprocess.Popen([sys.executable, "-m", "modeler", "build", BOX, "--out", str(folder), *QUICK])
-    while process.poll() is None and not (kept.is_dir() and len(list(kept.glob("*.npz"))) == 1):
-        time.sleep(0.005)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
+    command = ["build", str(scene), "--out", str(folder), *QUICK]
+    ended = subprocess.run([sys.executable, "-c", KILLED_AT_THE_FIRST_PAIR, *command], check=False)
+    assert ended.returncode == -signal.SIGKILL
     assert not json.loads((folder / "report.json").read_bytes())["complete"]
-    known = {tuple(map(int, path.name.split("-")[:2])) for path in kept.glob("*.npz")}
-    assert main(["build", BOX, "--out", str(folder), *QUICK]) == 2  # neither --resume nor --overwrite
-    assert main(["build", BOX, "--out", str(folder), *QUICK, "--resume", "--seed", "1"]) == 2
+    (known,) = (tuple(map(int, path.name.split("-")[:2])) for path in kept.glob("*.npz"))
+    assert main(command) == 2  # neither --resume nor --overwrite
+    assert main([*command, "--resume", "--seed", "1"]) == 2
     assert asked == []
-    assert main(["build", BOX, "--out", str(folder), *QUICK, "--resume"]) == 0
-    assert sorted(asked) == sorted(pairs_of(whole) - known)
+    assert main([*command, "--resume"]) == 0
+    assert sorted(asked) == sorted(pairs_of(whole) - {known})
     assert contents(folder) == contents(whole)
     assert {path.name for path in folder.iterdir()} == {path.name for path in whole.iterdir()}
 
 
 def test_a_run_that_had_ended_is_not_made_again(
-    whole: Path, asked: list[tuple[int, int]], capsys: pytest.CaptureFixture[str]
+    scene: Path, whole: Path, asked: list[tuple[int, int]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {path.name: path.stat().st_mtime_ns for path in whole.iterdir()}
-    assert main(["build", BOX, "--out", str(whole), *QUICK, "--resume"]) == 0
+    assert main(["build", str(scene), "--out", str(whole), *QUICK, "--resume"]) == 0
     assert "had come to its end; --overwrite makes it anew" in capsys.readouterr().err
     assert ({path.name: path.stat().st_mtime_ns for path in whole.iterdir()}, asked) == (before, [])
 
 
 @pytest.mark.parametrize("missing", ["frames", "reasons", "poses"])
 def test_a_run_whose_report_is_damaged_is_not_resumed(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: str
+    scene: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: str
 ) -> None:
     report = RunFolder(whole).report()
     del report[missing]
     (tmp_path / "report.json").write_text(json.dumps(report))
-    assert main(["build", BOX, "--out", str(tmp_path), *QUICK, "--resume"]) == 2
+    assert main(["build", str(scene), "--out", str(tmp_path), *QUICK, "--resume"]) == 2
     assert capsys.readouterr().err == (
         f"modeler: {tmp_path / 'report.json'}: {missing!r} is missing or is not what it should be; build again with "
         "--overwrite\n"
@@ -101,7 +112,7 @@ def test_a_run_whose_report_is_damaged_is_not_resumed(
 
 
 def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(
-    whole: Path, tmp_path: Path, asked: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
+    scene: Path, whole: Path, tmp_path: Path, asked: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, write = tmp_path / "run", RunFolder.write
 
@@ -112,7 +123,7 @@ def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(
 
     with monkeypatch.context() as patch:
         patch.setattr(RunFolder, "write", pressed)
-        assert main(["build", BOX, "--out", str(folder), *QUICK]) == 3
+        assert main(["build", str(scene), "--out", str(folder), *QUICK]) == 3
     report = RunFolder(folder).report()
     assert not report["complete"]
     assert "the run was interrupted after frame" in report["reasons"][0]
@@ -120,12 +131,13 @@ def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(
     count = len(asked)
     before = set(asked)
     assert count >= 1
-    assert main(["build", BOX, "--out", str(folder), *QUICK, "--resume"]) == 0
+    assert main(["build", str(scene), "--out", str(folder), *QUICK, "--resume"]) == 0
     assert sorted(asked[count:]) == sorted(pairs_of(whole) - before)
     assert contents(folder) == contents(whole)
 
 
 def test_a_run_that_other_versions_began_is_registered_anew(
+    scene: Path,
     whole: Path,
     tmp_path: Path,
     asked: list[tuple[int, int]],
@@ -136,17 +148,19 @@ def test_a_run_that_other_versions_began_is_registered_anew(
     with monkeypatch.context() as patch:
         patch.setattr(Pairs, "drop", lambda pairs: None if pairs.folder.is_dir() else drop(pairs))
         patch.setattr(metadata, "version", lambda name: "0.0.1" if name in ("modeler", "numpy") else version(name))
-        assert main(["build", BOX, "--out", str(folder), *QUICK]) == 0
+        assert main(["build", str(scene), "--out", str(folder), *QUICK]) == 0
     assert len(list((folder / ".pairs").iterdir())) == len(pairs_of(whole))
     asked.clear()
     capsys.readouterr()
-    assert main(["build", BOX, "--out", str(folder), *QUICK, "--resume"]) == 0
+    assert main(["build", str(scene), "--out", str(folder), *QUICK, "--resume"]) == 0
     assert "modeler: was begun with modeler 0.0.1, numpy 0.0.1: pairs are registered anew\n" in capsys.readouterr().err
     assert set(asked) == pairs_of(whole)
     assert contents(folder) == contents(whole)
 
 
-def test_what_is_said_to_be_saved_is_on_the_disk(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_said_to_be_saved_is_on_the_disk(
+    scene: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each file is brought to the disk before it takes its place, and the folder's list of names after that."""
     done: list[tuple[str, str]] = []
     fsync, swap = os.fsync, os.replace
@@ -161,7 +175,7 @@ def test_what_is_said_to_be_saved_is_on_the_disk(whole: Path, tmp_path: Path, mo
 
     monkeypatch.setattr(os, "fsync", synced)
     monkeypatch.setattr(os, "replace", replaced)
-    assert main(["build", BOX, "--out", str(tmp_path / "run"), *QUICK]) == 0
+    assert main(["build", str(scene), "--out", str(tmp_path / "run"), *QUICK]) == 0
     monkeypatch.undo()
     final = done[done.index(("replaced", "cloud.ply")) - 20 :]
     order = [name for what, name in final if what == "replaced"][-6:]
@@ -176,7 +190,9 @@ def test_what_is_said_to_be_saved_is_on_the_disk(whole: Path, tmp_path: Path, mo
     assert {("synced", name) for name in kept} <= set(done)
 
 
-def test_ctrl_c_before_the_first_frame_ends_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_before_the_first_frame_ends_the_program(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Pressed(building.Interrupt):
         @property
         def asked(self) -> bool:
@@ -186,13 +202,13 @@ def test_ctrl_c_before_the_first_frame_ends_the_program(tmp_path: Path, monkeypa
             return iter(())
 
     monkeypatch.setattr(building, "Interrupt", Pressed)
-    assert main(["build", BOX, "--out", str(tmp_path / "run"), *QUICK]) == 130
+    assert main(["build", str(scene), "--out", str(tmp_path / "run"), *QUICK]) == 130
 
 
-def test_two_runs_do_not_write_into_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_runs_do_not_write_into_one_folder(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with alone(tmp_path / "run"):
         for flag in ("--resume", "--overwrite"):
-            assert main(["build", BOX, "--out", str(tmp_path / "run"), *QUICK, flag]) == 2
+            assert main(["build", str(scene), "--out", str(tmp_path / "run"), *QUICK, flag]) == 2
             assert "another run is writing to it" in capsys.readouterr().err
     with alone(tmp_path / "run"):
         assert list((tmp_path / "run").iterdir()) == []

@@ -83,7 +83,7 @@ def _check(options: Join) -> None:
     """Refuse options that nobody can mean, and a folder that holds something.
 
     Raises:
-        InputError: where they are such.
+        InputError: where they are such, or another program is writing to the folder.
     """
     if options.pairs < 1:
         raise InputError(f"--pairs {options.pairs} leaves nothing to join by; give at least 1")
@@ -91,6 +91,9 @@ def _check(options: Join) -> None:
         raise InputError(f"RUN_A and RUN_B are both {options.run_a}; name two runs")
     if options.out.is_dir() and any(options.out.iterdir()) and not options.overwrite:
         raise InputError(f"{options.out}: not empty; choose another --out, or give --overwrite")
+    if options.out.is_dir():
+        with alone(options.out):  # asked now, not only when the work is done
+            pass
 
 
 def _matches(first: Reopened, second: Reopened) -> list[Match]:
