@@ -153,8 +153,9 @@ def test_frames_of_different_size_are_one_model(
     capsys.readouterr()
     assert main(["info", str(tmp_path / "in")]) == 0
     assert "resolution    320 x 240, 160 x 120\n" in capsys.readouterr().out
-    assert main(["report", str(tmp_path / "run")]) == 0
-    assert main(["export", str(tmp_path / "run"), "--out", str(tmp_path / "m.obj"), "--texture"]) == 0
+    if masked:  # what is made of a run does not know where its masks come from
+        assert main(["report", str(tmp_path / "run")]) == 0
+        assert main(["export", str(tmp_path / "run"), "--out", str(tmp_path / "m.obj"), "--texture"]) == 0
 
 
 def test_frames_of_different_size_need_different_intrinsics(

@@ -8,15 +8,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sources import ROOT, SOURCES, nodes
 
-ROOT = Path(__file__).parent.parent
-SOURCES = [path for package in ("modeler", "sequences", "viz") for path in sorted((ROOT / package).rglob("*.py"))]
 HOMES = {"gtsam": "modeler/graph/", "numba": "modeler/kernels/", "rerun": "viz/", "tyro": "modeler/cli/"}
 
 
 def imported(path: Path) -> Iterator[str]:
     """Yield the top-level names that a file imports anywhere in it."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             yield from (name.name.partition(".")[0] for name in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:

@@ -8,21 +8,19 @@ from pathlib import Path
 
 import pytest
 from recordings import small_frames, small_truth, write_open3d
+from sources import SOURCES, nodes
 
 from modeler.cli import main
 from sequences import open_sequence, write_bop
 
-PACKAGES = [Path(__file__).parent.parent / name for name in ("modeler", "sequences", "viz")]
 EVIL = "../../../../evil <script>alert(1)</script>"
 QUICK = ("--prior", "table", "--method", "icp")
 RUNS_CODE = {"pickle", "cPickle", "dill", "joblib", "marshal", "shelve", "torch", "yaml", "runpy", "code"}
 
 
-@pytest.mark.parametrize(
-    "path", [path for root in PACKAGES for path in sorted(root.rglob("*.py"))], ids=lambda p: p.stem
-)
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)
 def test_nothing_is_unpickled_and_no_text_is_run(path: Path) -> None:
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             assert not {alias.name.split(".")[0] for alias in node.names} & RUNS_CODE
         if isinstance(node, ast.ImportFrom):

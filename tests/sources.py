@@ -1,0 +1,20 @@
+"""The program's own source files, each parsed once."""
+
+from __future__ import annotations
+
+import ast
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+SOURCES = [path for package in ("modeler", "sequences", "viz") for path in sorted((ROOT / package).rglob("*.py"))]
+
+
+@cache
+def nodes(path: Path) -> list[ast.AST]:
+    """Return all nodes of a file that tests of layers and of security look at: imports and calls."""
+    return [
+        node
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Import | ast.ImportFrom | ast.Call)
+    ]
