@@ -362,16 +362,38 @@ def test_specks_go():
 
 
 def test_the_edge_of_what_is_seen():
-    seen = np.zeros((30, 40), dtype=np.bool_)
-    seen[10:, 8:] = True  # a band that the sensor leaves blind, and a table before nothing
-    seen[5:10, 20:25] = True  # something on the table that rises over its end
+    seen = np.zeros((60, 80), dtype=np.bool_)
+    seen[20:, 16:] = True  # a band that the sensor leaves blind, and a table before nothing
     edge = edge_of(seen)
-    assert edge[10:, 8].all()
-    assert edge[10, 9:20].all()
-    assert edge[-1, 8:].all()
-    assert not edge[10, 20:25].any()
-    assert not edge[5:10].any()
-    assert not edge[11:-1, 9:-1].any()
+    assert edge[20:, 16].all()
+    assert edge[20, 16:].all()
+    assert edge[-1, 16:].all()
+    assert not edge[21:-1, 17:-1].any()
+    seen[10:20, 40:50] = True  # something on the table that rises over its end: there the camera sees on
+    edge = edge_of(seen)
+    assert edge[20:, 16].all()
+    assert not edge[:-1, 17:-1].any()
+
+
+def test_the_side_of_what_rises_over_the_end_of_a_table_is_no_edge():
+    seen = np.zeros((60, 80), dtype=np.bool_)
+    seen[38:58, 8:72] = True  # a table that covers a third of each column
+    seen[24:38, 30:50] = True  # with what stands there it is more than half
+    assert not edge_of(seen)[:57, 9:71].any()
+
+
+def test_what_rises_over_the_end_of_its_table_is_sure(rng):
+    """A table before nothing, in a part of the image: what is taller than its far end is not cut off."""
+    frames = [
+        World()
+        .box((0.0, 0.0, -0.01), (0.32, 0.2, 0.01))
+        .box((0.0, 0.05, 0.12), (0.05, 0.04, 0.12), turn_deg=20.0 * k)
+        .frame(k, rng)[0]
+        for k in range(5)
+    ]
+    segmenter = Segmenter()
+    scene = segmenter.scene(frames)
+    assert {segmenter.segment(frame, scene).outcome for frame in frames} == {Outcome.CONVERGED}
 
 
 @pytest.mark.parametrize("name", ["box", "flashlight", "tube"])

@@ -14,6 +14,8 @@ _JUMP_SHARE = 0.03  # of the depth; neighbours of a thinned image that lie farth
 _GRID_CELLS = 80  # most voxels along a side
 _GRAZING = np.tan(np.radians(85.0))  # surfaces seen at a flatter angle cannot be told from mixed pixels
 _SEEN_SHARE = 0.4  # of a row or column with measurements, for it not to be blind
+_BLIND_SHARE = 0.01  # of the measurements in a band that is blind
+_RAGGED_SHARE = 0.02  # of the image, by which the edge of a blind band may bend where a lens was straightened
 _EVERYWHERE = np.ones((3, 3, 3), dtype=np.bool_)
 
 
@@ -74,8 +76,8 @@ def without_specks(mask: BoolArray, least_share: float) -> BoolArray:
 def edge_of(seen: BoolArray) -> BoolArray:
     """Return the pixels (h, w) at the edge of what the camera sees, at which things may be cut off.
 
-    That is the edge of the image and of bands that the sensor leaves blind. Where a background without measurements
-    begins is another such line, but what reaches over it is not cut off.
+    That is the edge of the image and of bands that the sensor leaves blind: beyond such a line there is nothing. Where
+    a background without measurements begins is another, but what reaches over it is not cut off.
     """
     return _outermost(seen) | _outermost(seen.T).T
 
@@ -85,11 +87,19 @@ def _outermost(seen: BoolArray) -> BoolArray:
     edge = np.zeros_like(seen)
     rows = np.flatnonzero(seen.mean(axis=1) > _SEEN_SHARE)
     if len(rows):
+        first, last, ragged = int(rows[0]), int(rows[-1]), round(_RAGGED_SHARE * len(seen))
         beyond = np.pad(seen, ((1, 1), (0, 0)))
-        edge[rows[0]] = ~beyond[rows[0]]
-        edge[rows[-1]] |= ~beyond[rows[-1] + 2]
+        if _blind(seen[: max(first - ragged, 0)]):
+            edge[first] = ~beyond[first]
+        if _blind(seen[last + 1 + ragged :]):
+            edge[last] |= ~beyond[last + 2]
     edge[[0, -1]] = True
     return edge & seen
+
+
+def _blind(rows: BoolArray) -> bool:
+    """Return whether rows (h, w) hold nothing but specks: where a table ends, an object may be seen beyond."""
+    return not rows.size or bool(rows.mean() < _BLIND_SHARE)
 
 
 def _label(mask: BoolArray, structure: BoolArray | None = None) -> Labels:
