@@ -16,6 +16,8 @@ from modeler.types import Array, BoolArray
 CELLS = 80**3  # the unseen is decided on a grid of no more cells
 ROUNDS = 400
 SPANNING = 60  # steps towards the neighbours' mean that made-up vertices take
+SETTLING = 4  # and vertices along the seam with what views show
+SEAM = 4  # rings of vertices beside it that are smoothed like those that are known badly
 CONTRARY = 0.1  # share of the views of a cell that may be wrong about it, for their poses are off
 OUTER = 3  # layers of voxels at the border that are outside
 SUNK = 0.01  # share of the points seen that may lie under a table; of more, it is not what the object stands on
@@ -100,7 +102,7 @@ def tables(seen: Stack, corners_m: Array, tau_m: float) -> Array:
 
 
 def tidied(
-    vertices_m: Array, triangles: surface.Triangles, shown_m: Array, voxel_m: float, passes: int
+    vertices_m: Array, triangles: surface.Triangles, shown_m: Array, weak: BoolArray, *, voxel_m: float, passes: int
 ) -> tuple[Array, surface.Triangles, BoolArray]:
     """Return vertices (v, 3) and triangles (t, 3) without bubbles, smoothed, and which vertices (v,) views show.
 
@@ -108,15 +110,22 @@ def tidied(
         vertices_m: (v, 3) of closed surfaces.
         triangles: (t, 3).
         shown_m: (n, 3) vertices of what the views show.
+        weak: (n,) which of these are known badly.
         voxel_m: side of a voxel.
         passes: of smoothing what is shown; the rest is smoothed until it spans its rims.
     """
     triangles = triangles[surface.solid_pieces(vertices_m, triangles)]
     used, triangles = surface.compacted(triangles, len(vertices_m))
     vertices_m = vertices_m[used]
-    shown = KDTree(shown_m).query(vertices_m, distance_upper_bound=voxel_m)[0] < voxel_m
+    away_m, nearest = KDTree(shown_m).query(vertices_m, distance_upper_bound=voxel_m)
+    shown = away_m < voxel_m
     vertices_m = surface.fair(vertices_m, triangles, passes)
-    return surface.spanned(vertices_m, triangles, ~shown, SPANNING), triangles, shown
+    vertices_m = surface.spanned(vertices_m, triangles, ~shown, SPANNING)
+    # Where views stop to see the surface they know it badly, and what is made up meets crumbs.
+    seam = surface.grown(shown, triangles, 1) & surface.grown(~shown, triangles, 1)
+    vertices_m = surface.spanned(vertices_m, triangles, seam, SETTLING)
+    rough = surface.grown(seam, triangles, SEAM) | (shown & np.append(weak, False)[nearest])
+    return surface.fair(vertices_m, triangles, surface.ROUGH, rough), triangles, shown
 
 
 def _without_voids(field: Field, deep: BoolArray, stride: int) -> Field:

@@ -115,20 +115,26 @@ class Scan:
         for _ in range(self.how.closing):
             field = grid.filled(field)
         vertices, triangles = surface.extracted(field)
-        kept = self._kept(vertices, triangles)
+        kept, weak = self._kept(vertices, triangles)
         shown = triangles[np.all(kept[triangles], axis=1)]
         shown = shown[surface.large_pieces(vertices, shown, self.how.min_piece)]
         used, compact = surface.compacted(shown, len(vertices))
         if not watertight:
-            return surface.fair(vertices[used], compact, self.how.fairing), compact, np.ones(len(used), dtype=bool)
+            smooth = surface.fair(vertices[used], compact, self.how.fairing)
+            return surface.fair(smooth, compact, surface.ROUGH, weak[used]), compact, np.ones(len(used), dtype=bool)
         unused = np.ones(len(vertices), dtype=bool)
         unused[used] = False
         field = closing.without(field, vertices[unused], vertices[used], self.tau_m)
         whole = closing.enclosing(field, self.seen, self.tau_m)
-        return closing.tidied(*surface.extracted(whole), vertices[used], self.box.voxel_m, self.how.fairing)
+        return closing.tidied(
+            *surface.extracted(whole), vertices[used], weak[used], voxel_m=self.box.voxel_m, passes=self.how.fairing
+        )
 
-    def _kept(self, vertices: Array, triangles: surface.Triangles) -> BoolArray:
-        """Return which vertices (v,) of the zero level are surface: supported, not seen through, and no frill."""
+    def _kept(self, vertices: Array, triangles: surface.Triangles) -> tuple[BoolArray, BoolArray]:
+        """Return which vertices (v,) of the zero level are surface: supported, not seen through, and no frill.
+
+        And which of all (v,) are known badly, so that much of their place is noise.
+        """
         normals = surface.normals_of(vertices, triangles)
         told = self._heard(vertices, normals, np.zeros((len(self.seen.index), 4)))
         # Gaps in what is believed are closed, but not with what several views see through.
@@ -138,4 +144,5 @@ class Scan:
         # At silhouettes the zero level turns round, as far behind the surface as views suppose the object.
         loose = surface.curled(vertices, normals, seen, marked & ~seen)
         marked = surface.trimmed(marked, loose, triangles, CURL)
-        return surface.opened(marked, triangles, self.how.opening)
+        usual = float(np.median(told.support[marked])) if marked.any() else 0.0
+        return surface.opened(marked, triangles, self.how.opening), told.support < surface.WEAK * usual

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array, diags_array
+from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
@@ -19,6 +19,8 @@ PINCHES = 50  # rounds after which sheets that touch are left touching
 NEAREST = 6  # vertices that lend their colour to one that has none
 AROUND = 12  # vertices that tell how the surface lies beside them
 TURNED_RAD = 0.7  # a surface that turns away by more within a few voxels curls
+WEAK = 0.2  # of the median support: a vertex with less is known badly
+ROUGH = 40  # passes of smoothing there
 HAIR = 1e-2  # how far inside a voxel is put, in voxels
 
 
@@ -101,13 +103,18 @@ def rim(triangles: Triangles) -> npt.NDArray[np.int64]:
     return edges[first[uses == 1]]
 
 
+def grown(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
+    """Return which vertices (v,) are marked, or within `rings` edges of one that is."""
+    found = marked.copy()
+    for _ in range(rings):
+        found[triangles[np.any(found[triangles], axis=1)]] = True
+    return found
+
+
 def closed(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
     """Return which vertices (v,) are marked, or lie in gaps between marked ones up to twice `rings` wide."""
-    grown = marked.copy()
-    for _ in range(rings):
-        grown[triangles[np.any(grown[triangles], axis=1)]] = True
     # What has grown towards an open border is taken back: the border counts as unmarked.
-    outside = ~grown
+    outside = ~grown(marked, triangles, rings)
     outside[rim(triangles)] = True
     outside &= ~marked
     for _ in range(rings):
@@ -142,48 +149,57 @@ def opened(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
     """Return the marked vertices (v,) without spikes and strips along the border narrower than about twice `rings`."""
     outside = ~marked
     outside[rim(triangles[np.all(marked[triangles], axis=1)])] = True
-    for _ in range(rings - 1):
-        outside[triangles[np.any(outside[triangles], axis=1)]] = True
-    core = ~outside
+    core = ~grown(outside, triangles, rings - 1)
     for _ in range(rings):
         core[triangles[np.any(core[triangles], axis=1)]] = True
         core &= marked
     return core
 
 
-def fair(vertices_m: Array, triangles: Triangles, passes: int) -> Array:
+def fair(vertices_m: Array, triangles: Triangles, passes: int, only: BoolArray | None = None) -> Array:
     """Return vertices (v, 3) with ripples of a few edges' length taken out, without shrinking the mesh.
 
     Each pass is a step towards the neighbours' mean and a slightly longer one back (Taubin 1995, "A signal processing
     approach to fair surface design"). Vertices on open borders follow their neighbours on the border alone.
+
+    Args:
+        vertices_m: (v, 3).
+        triangles: (t, 3).
+        passes: how many.
+        only: which vertices (v,) move; None: all.
     """
-    count = len(vertices_m)
     border = rim(triangles)
-    on_border = np.zeros(count, dtype=bool)
+    on_border = np.zeros(len(vertices_m), dtype=bool)
     on_border[border] = True
-    pairs = np.concatenate([triangles[:, :2], triangles[:, 1:], triangles[:, [2, 0]]])
-    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    pairs = _neighbours(triangles)
     pairs = np.concatenate([pairs[~on_border[pairs[:, 0]]], border, border[:, ::-1]])
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
-    links.data[:] = 1.0
-    mean = diags_array(1.0 / np.maximum(links.sum(axis=1), 1.0)) @ links
+    moving = np.arange(len(vertices_m)) if only is None else np.flatnonzero(only)
+    mean, vertices_m = _means(pairs, len(vertices_m))[moving], vertices_m.copy()
     for step in [0.5, -0.53] * passes:
-        vertices_m = vertices_m + step * (mean @ vertices_m - vertices_m)
+        vertices_m[moving] += step * (mean @ vertices_m - vertices_m[moving])
     return vertices_m
 
 
 def spanned(vertices_m: Array, triangles: Triangles, free: BoolArray, passes: int) -> Array:
     """Return vertices (v, 3) of which the free ones have moved towards the mean of their neighbours."""
-    count = len(vertices_m)
+    moving = np.flatnonzero(free)
+    mean, vertices_m = _means(_neighbours(triangles), len(vertices_m))[moving], vertices_m.copy()
+    for _ in range(passes):
+        vertices_m[moving] = mean @ vertices_m
+    return vertices_m
+
+
+def _neighbours(triangles: Triangles) -> Triangles:
+    """Return pairs (p, 2) of vertices with each of their neighbours, some twice."""
     pairs = np.concatenate([triangles[:, :2], triangles[:, 1:], triangles[:, [2, 0]]])
-    pairs = np.concatenate([pairs, pairs[:, ::-1]])
-    pairs = pairs[free[pairs[:, 0]]]
+    return np.concatenate([pairs, pairs[:, ::-1]])
+
+
+def _means(pairs: Triangles, count: int) -> csr_array:
+    """Return what makes of vertices (v, 3) the means of their neighbours, (v, v)."""
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
     links.data[:] = 1.0
-    mean = diags_array(1.0 / np.maximum(links.sum(axis=1), 1.0)) @ links
-    for _ in range(passes):
-        vertices_m = np.where(free[:, None], mean @ vertices_m, vertices_m)
-    return vertices_m
+    return csr_array(diags_array(1.0 / np.maximum(links.sum(axis=1), 1.0)) @ links)
 
 
 def spread_colours(colours: npt.NDArray[np.uint8], known: BoolArray, vertices_m: Array) -> npt.NDArray[np.uint8]:

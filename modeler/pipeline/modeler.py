@@ -49,7 +49,7 @@ class Modeler:
     """Chooses the pairs and judges the results."""
     fuser: Fuser
     """Makes the model."""
-    common_noise: float = 0.2
+    common_noise: float = 0.1
     """Covariance of what all views of a run err by alike, as a share of an edge's. No loop tells it: over many rendered
     runs, whose truth is known, the covariances of poses come out true with this."""
     seed: int = 0
