@@ -5,4 +5,4 @@ from modeler.graph.odometry import dead_reckoning as dead_reckoning
 from modeler.graph.pose_graph import PoseGraph as PoseGraph
 from modeler.graph.shared import shared_noise as shared_noise
 from modeler.graph.smoother import Smoother as Smoother
-from modeler.graph.smoother import solve as solve
+from modeler.graph.solving import solve as solve

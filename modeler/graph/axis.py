@@ -74,44 +74,28 @@ class CommonAxis:
         if start is None:
             return None
         known = _Known(self, links, list(trajectory), root, start)
-        poses = {**trajectory, _AXIS: start}
-        rows = known.rows(poses)
-        alone = _half_square(rows[: len(links)])
-        for _ in range(_ITERATIONS):
-            linear = gtsam.GaussianFactorGraph()
-            for blocks, error in rows:
-                linear.add(_gaussian_factor(blocks, -error))
-            step = linear.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR).optimize()
-            moved, moved_rows = poses, rows
-            for halvings in range(_HALVINGS):
-                moved = {
-                    key: pose if key == root else pose @ se3.exp(0.5**halvings * step.at(key))
-                    for key, pose in poses.items()
-                }
-                moved_rows = known.rows(moved)
-                if _half_square(moved_rows) <= _half_square(rows):
-                    break
-            fallen = _half_square(rows) - _half_square(moved_rows)
-            if fallen < 0.0:
-                break
-            poses, rows = moved, moved_rows
-            if fallen <= _TOLERANCE:
-                break
+        alone = _half_square(known.rows({**trajectory, _AXIS: start})[: len(links)])
+        poses, rows = known.minimised({**trajectory, _AXIS: start})
+        if not self._fits(rows[len(links) + 1 :], 2.0 * (_half_square(rows) - alone)):
+            return None
         to_object = {key: se3.adjoint(se3.inverse(pose)) for key, pose in poses.items() if key != _AXIS}
         said: list[Rows] = [
             {key: block @ to_object[key] if key in to_object else block for key, block in blocks.items()}
             for blocks, _ in rows[len(links) :]
         ]
-        # What the axis costs, twice over, is chi² with as many degrees of freedom as it says more than has to be found:
-        # two numbers of its direction, two of its place.
-        told = np.isfinite([self.sigma_tilt_rad, self.sigma_shift_m])
-        steps = [np.hstack(list(blocks.values())) for blocks, _ in rows[len(links) + 1 :]]
-        conditions = sum(int(np.count_nonzero(step.any(axis=1))) for step in steps)
-        conditions -= 2 * int(np.count_nonzero(told))
-        cost = 2.0 * (_half_square(rows) - alone)
-        if conditions > 0 and cost > stats.chi2(conditions).ppf(_FITS):
-            return None
         return Turned({frame: poses[frame] for frame in trajectory}, said, poses[_AXIS])
+
+    def _fits(self, steps: Sequence[tuple[Rows, Array]], cost: float) -> bool:
+        """Return whether steps may share an axis that adds `cost` to the squared distance of links from poses.
+
+        That is chi² with as many degrees of freedom as the axis says more than has to be found: two numbers of its
+        direction, two of its place.
+        """
+        told = np.isfinite([self.sigma_tilt_rad, self.sigma_shift_m])
+        stacked = [np.hstack(list(blocks.values())) for blocks, _ in steps]
+        conditions = sum(int(np.count_nonzero(step.any(axis=1))) for step in stacked)
+        conditions -= 2 * int(np.count_nonzero(told))
+        return conditions <= 0 or cost <= float(stats.chi2(conditions).ppf(_FITS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +136,31 @@ class _Known:
         for (target, source), error, *blocks in zip(steps, *self._slips(poses, np.array(steps)), strict=True):
             rows.append((self._free({target: blocks[0], source: blocks[1], _AXIS: blocks[2]}), error))
         return rows
+
+    def minimised(self, poses: dict[int, Array]) -> tuple[dict[int, Array], list[tuple[Rows, Array]]]:
+        """Return poses and axis that meet all best, and what `rows` says there: Gauss and Newton, from not far off."""
+        rows = self.rows(poses)
+        for _ in range(_ITERATIONS):
+            linear = gtsam.GaussianFactorGraph()
+            for blocks, error in rows:
+                linear.add(_gaussian_factor(blocks, -error))
+            step = linear.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR).optimize()
+            moved, moved_rows = poses, rows
+            for halvings in range(_HALVINGS):
+                moved = {
+                    key: pose if key == self.root else pose @ se3.exp(0.5**halvings * step.at(key))
+                    for key, pose in poses.items()
+                }
+                moved_rows = self.rows(moved)
+                if _half_square(moved_rows) <= _half_square(rows):
+                    break
+            fallen = _half_square(rows) - _half_square(moved_rows)
+            if fallen < 0.0:
+                break
+            poses, rows = moved, moved_rows
+            if fallen <= _TOLERANCE:
+                break
+        return poses, rows
 
     def _free(self, blocks: Rows) -> Rows:
         return {key: block for key, block in blocks.items() if key != self.root}

@@ -113,29 +113,44 @@ class Smoother:
             again = replace(self, state=_State()).to(graph)  # it may be that other modes make fewer loops lie
             if len(again.solution.outliers) < inlier.count(False):
                 return again
+        solution = self._solution(state, (taken, closing), trajectory, grew=grew and graph is not self.graph)
+        return replace(self, graph=graph, solution=replace(solution, odometry=odometry), state=state)
+
+    def _solution(
+        self,
+        state: _State,
+        links: tuple[Sequence[Link], Sequence[Link]],
+        trajectory: Mapping[int, Array],
+        *,
+        grew: bool,
+    ) -> Solution:
+        """Return the solution but for its odometry.
+
+        Args:
+            state: what it rests on.
+            links: tree and loops, of several modes as loops have decided.
+            trajectory: object_from_camera (4, 4) by frame number, as all but an axis has it.
+            grew: whether the graph grew from that of the solution before.
+        """
+        root, (taken, closing), inlier = state.root or 0, links, state.inlier
         turned: Turned | None = None
         if self.axis is not None:
             inlier, turned = self._turned(self.axis, taken, closing, trajectory, state)
         trajectory = trajectory if turned is None else turned.poses
-        links_taking_part = [*taken, *_taking_part(closing, inlier)]
-        relative_covariance = self._covariance(
-            links_taking_part, trajectory, turned, root=root, grew=grew and graph is not self.graph
-        )
+        taking_part = [*taken, *_taking_part(closing, inlier)]
+        relative_covariance = self._covariance(taking_part, trajectory, turned, root=root, grew=grew)
         several = [link for link in (*taken, *closing) if link.modes]
-        own = {link.edge: [mode.weight for mode in link.modes] for link in several}
-        solution = Solution(
+        return Solution(
             trajectory=trajectory,
             covariances=PoseCovariances(
                 trajectory, functools.partial(relative_covariance, root), relative_covariance.marginals
             ),
-            odometry=odometry,
             outliers=tuple(loop.edge for loop, good in zip(closing, inlier, strict=True) if not good),
             relative_covariance=relative_covariance,
             edge_poses={(link.source, link.target): link.pose for link in several},
-            mode_weights={(e.source, e.target): weights.get(e, np.array(prior)) for e, prior in own.items()},
+            mode_weights={(link.source, link.target): _weights(link, state.weights) for link in several},
             camera_from_axis=None if turned is None else turned.camera_from_axis,
         )
-        return replace(self, graph=graph, solution=solution, state=state)
 
     def _frames(self, links: list[Link], root: int) -> tuple[Frames, bool]:
         """Return how links hang together, and whether those before hung together so and have but grown."""
@@ -256,36 +271,12 @@ def _taking_part(loops: Sequence[Link], inlier: Sequence[bool]) -> list[Link]:
     return [loop for loop, good in zip(loops, inlier, strict=True) if good]
 
 
+def _weights(link: Link, decided: Mapping[Edge, Array]) -> Array:
+    """Return the weights of a link's modes: as loops have decided, or else the posterior's own."""
+    return decided.get(link.edge, np.array([mode.weight for mode in link.modes]))
+
+
 def _jumped(decided: Mapping[Edge, Link], state: _State) -> bool:
     """Return whether another mode was chosen than the one that the poses so far rest on."""
     before = ((link, state.decided.get(edge) or state.links.get(edge)) for edge, link in decided.items())
     return any(old is not None and not np.array_equal(link.pose.mean, old.pose.mean) for link, old in before)
-
-
-def solve(
-    graph: PoseGraph,
-    guess: Mapping[int, Array],
-    *,
-    outlier_distance: float = 14.2,
-    shared: float = 0.0,
-    common: float = 0.0,
-    axis: CommonAxis | None = None,
-) -> Solution:
-    """Optimise the poses of all frames that accepted edges connect with the first.
-
-    Edges that reach a frame nothing else has reached, odometry before closures, cannot be contradicted and are trusted.
-    The others close loops; those that the rest contradicts are left out, see `optimise`. Of an edge whose posterior has
-    several modes the loops choose one, see `modes`. A graph that grows is solved faster by `Smoother`.
-
-    Args:
-        graph: the edges.
-        guess: object_from_camera (4, 4) by frame number, to start from; frames without one start on the chain.
-        outlier_distance: see `Smoother`.
-        shared: see `Smoother`.
-        common: see `Smoother`.
-        axis: the turntable, where there is one.
-
-    Raises:
-        ValueError: where an accepted edge's covariance is not positive definite.
-    """
-    return Smoother(outlier_distance, shared, common, axis, solution=Solution(guess)).to(graph).solution
