@@ -17,8 +17,13 @@ class Sensor:
     """Lateral noise in (w, h); the paper's value for the first Kinect."""
     sigma_r_m: float = 0.002
     """Noise along the ray in m, for a surface that faces the camera."""
-    smoothing: float = 0.025
-    """Radius of the ball in which planes are fitted, as a share of the object's extent."""
+    smoothing: float = 0.28
+    """Radius of the ball in which planes are fitted, as a share of the geometric mean of noise and object's extent.
+
+    In a ball of radius r a surface that curves as the object does, with radius of about the extent, sinks by some r² /
+    extent, away from the camera where it is thin: as the object turns, its image drags behind. So the ball is such that
+    surface sinks by the same share of the noise, whatever the noise.
+    """
     min_neighbours: float = 25.0
     """The ball grows until it holds about so many pixels of a surface that faces the camera."""
     min_cosine: float = 0.35
@@ -78,7 +83,7 @@ class Sensor:
         extent_m = metres_per_px * float(np.hypot(np.ptp(rows), np.ptp(columns)))
         density = rows.size / max(float(frame.mask.sum()) if frame.mask is not None else rows.size, 1.0)
         sparse_px = np.sqrt(self.min_neighbours / (np.pi * max(density, 0.01)))
-        radius_m = max(self.smoothing * extent_m, sparse_px * metres_per_px)
+        radius_m = max(self.smoothing * np.sqrt(self.sigma_r_m * extent_m), sparse_px * metres_per_px)
         reach_px = int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, 16))
         # Every second pixel in a row is enough where a wide window holds many.
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibration.study import Condition, rendered_views, staged
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
@@ -16,6 +17,8 @@ from modeler.registration.search import Candidates, Search
 from modeler.registration.visibility import VisibilityRegistrar
 from modeler.types import Outcome
 from sequences import bundled, open_sequence
+from sequences.rendering.recipe import load_recipe
+from sequences.rendering.renderer import RenderedSequence
 
 
 def views(name, source, target):
@@ -61,6 +64,21 @@ def test_a_turn_beyond_the_prior_shows(rng):
     wide = GeneralPrior(max_rotation_deg=60.0, max_offset_m=0.08).between(source, target)
     assert Search().candidates(pair, wide, rng).beyond < VisibilityRegistrar().max_beyond
     assert VisibilityRegistrar().register(source, target, narrow, rng=rng).outcome is Outcome.AT_LIMIT
+
+
+def test_a_stool_may_have_turned_either_way():
+    """Four legs: 40° on and 50° back look alike, and both are found, however near downhill leads to either."""
+    sequence = RenderedSequence(staged(load_recipe("stool"), Condition(step_deg=40.0), frames=2, seed=3660532166))
+    made, truth = rendered_views(sequence), sequence.truth()
+    target, source = (made[index] for index in sequence.indices)
+    right = true_motion(truth, target.index, source.index)
+    motion = GeneralPrior().between(source, target)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        found = Search().candidates(VisibilityRegistrar().pair(source, target, rng), motion, rng)
+        turned_deg = np.array([rotation_error_deg(pose, right) for pose in found.poses[~found.blunt]])
+        assert (turned_deg < 3.0).any()
+        assert (np.abs(turned_deg - 90.0) < 3.0).any()
 
 
 def test_the_search_goes_on_along_the_ridge_of_a_roll(rng):

@@ -92,6 +92,21 @@ class Climb:
             poses = self._up(pair, poses, self._spreads(pair, poses, basin, stage.blur), partial(height, stage), rng)
         return self._ahead(pair, poses, height(stage, poses), basin, stage.climbers)
 
+    def onward(
+        self,
+        pair: Pair,
+        motion: AbstractMotion,
+        poses: Array,
+        basin: Array,
+        rng: np.random.Generator,
+        *,
+        effective_points: float,
+    ) -> Array:
+        """Return where climbers arrive that set out from places (n, 4, 4) already found; as `places`."""
+        stage = self.stages[-1]
+        height = partial(_height, pair, motion, effective_points, stage)
+        return self._up(pair, poses, self._spreads(pair, poses, basin, stage.blur), height, rng)
+
     def _ahead(self, pair: Pair, poses: Array, heights: Array, basin: Array, most: int) -> Array:
         """Return the highest of poses (n, 4, 4), one of each neighbourhood."""
         ordered = poses[np.argsort(-heights, kind="stable")]

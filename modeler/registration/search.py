@@ -99,6 +99,10 @@ class Search:
     """Number of independent measurements that all points are worth when separate places are compared."""
     negligible: float = 20.0
     """A candidate so many nats below the best is dropped."""
+    lifted: int = 6
+    """The best of at most so many basins are brought to where they are best before any is dropped,"""
+    valley: float = 5.0
+    """unless no valley so deep (nats) parts it from the best of all: then it is but a place on the same ridge."""
     reach: float = 0.5
     """Of candidates nearer to each other than so many standard deviations one is kept."""
     walkers: int = 3
@@ -142,17 +146,51 @@ class Search:
         for blur in self.blurs[2:]:
             poses = self._led(pair, poses, prior, blur * pair.size_m)
         fine_m = self.blurs[-1] * pair.size_m
-        sharp = self._ranked(pair, motion, poses, prior, fine_m)
-        if not len(sharp):
-            sharp = self._ranked(pair, motion, motion.sample(starts, rng), prior, fine_m)
+        outside = ~np.isfinite(motion.log_evidence(poses))
+        beyond = poses[outside]
+        poses = motion.sample(starts, rng) if outside.all() else poses[~outside]
+        poses, scores = self._ordered(pair, poses, fine_m)
+        lifted = self._lifted(pair, motion, poses, scores, rng)
+        if len(lifted):
+            poses, scores = self._ordered(pair, np.concatenate([poses, lifted]), fine_m)
+        sharp = self._kept(pair, poses, scores, prior, fine_m)
         search = self
         if self.scores(pair, sharp.poses[:1], self.blurs[2] * pair.size_m)[0] < self.poor:
             search, sharp = self._higher(pair, motion, sharp, prior, rng)
         sharp = search._along(pair, motion, sharp, prior)
         blunt = replace(blunt, blunt=np.ones(len(blunt), dtype=np.bool_))
-        outside = poses[~np.isfinite(motion.log_evidence(poses))]
-        beyond = search.scores(pair, outside, fine_m).max() - sharp.scores[0] if len(outside) else -np.inf
-        return replace(sharp.beside(blunt), beyond=float(beyond), scarce=search is not self)
+        better = search.scores(pair, beyond, fine_m).max() - sharp.scores[0] if len(beyond) else -np.inf
+        return replace(sharp.beside(blunt), beyond=float(better), scarce=search is not self)
+
+    def _lifted(
+        self, pair: Pair, motion: AbstractMotion, poses: Array, scores: Array, rng: np.random.Generator
+    ) -> Array:
+        """Return better poses for basins that are about to be dropped, though blurred views do not tell them apart.
+
+        Matching surface leads to the right turn of a stool and leaves it a few millimetres aside, which the outlines of
+        its legs do not forgive: before one place is dropped for another, it is brought to where it is best.
+
+        Args:
+            pair: the two views.
+            motion: what is possible.
+            poses: (n, 4, 4), best first.
+            scores: (n,) how good they are.
+            rng: source of all randomness.
+        """
+        heads = mixture.uncrowded(se3.rows(poses), self._basin(pair.size_m), pair.centre_m, 1, self.lifted)
+        dropped = heads[scores[heads] < scores[:1] - self.negligible]
+        if not len(dropped):
+            return poses[:0]
+        ways = se3.difference(poses[0], poses[dropped], pair.centre_m)
+        shares = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+        along = se3.moved(poses[0], (shares[:, None, None] * ways).reshape(-1, 6), pair.centre_m)
+        blurred = self.scores(pair, along, self.blurs[2] * pair.size_m).reshape(len(shares), -1)
+        apart = blurred[1:-1].min(axis=0) < np.minimum(blurred[0], blurred[-1]) - self.valley
+        chosen = poses[dropped[apart & (blurred[-1] > blurred[0] - 2.0 * self.negligible)]]
+        if not len(chosen):
+            return chosen
+        basin = self._basin(pair.size_m)
+        return self.climb.onward(pair, motion, chosen, basin, rng, effective_points=self.effective_points)
 
     def _higher(
         self, pair: Pair, motion: AbstractMotion, found: Candidates, prior: PoseGaussian, rng: np.random.Generator
@@ -230,11 +268,19 @@ class Search:
         self, pair: Pair, motion: AbstractMotion, poses: Array, prior: PoseGaussian, blur_m: float
     ) -> Candidates:
         """Return those of some poses (n, 4, 4) that are possible, good and distinct, best first."""
-        poses = poses[np.isfinite(motion.log_evidence(poses))]
+        ordered, scores = self._ordered(pair, poses[np.isfinite(motion.log_evidence(poses))], blur_m)
+        return self._kept(pair, ordered, scores, prior, blur_m)
+
+    def _ordered(self, pair: Pair, poses: Array, blur_m: float) -> tuple[Array, Array]:
+        """Return poses (n, 4, 4) and their scores (n,), best first."""
         scores = self.scores(pair, poses, blur_m)
         order = np.argsort(-scores, kind="stable")
-        order = order[scores[order] > scores[order[:1]] - self.negligible]
-        poses, scores = poses[order], scores[order]
+        return poses[order], scores[order]
+
+    def _kept(self, pair: Pair, poses: Array, scores: Array, prior: PoseGaussian, blur_m: float) -> Candidates:
+        """Return those of some poses (n, 4, 4) with scores (n,), best first, that are good and distinct."""
+        good = scores > scores[:1] - self.negligible
+        poses, scores = poses[good], scores[good]
         _, matrices = pair.normal_equations(poses, blur_m, stride=2)
         weight = self.local_points / pair.points
         spreads = np.linalg.cholesky(np.linalg.inv(weight * matrices + np.linalg.inv(prior.covariance)))
