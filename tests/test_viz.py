@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from turning_box import CENTRE_M, COVARIANCE, HALF_M, object_from_camera, steps
 
 from modeler import se3
-from modeler.types import Array, Mode, Outcome, PoseGaussian, Segmentation, Solution, Step
+from modeler.types import Array, Mode, Outcome, Plane, PoseGaussian, Segmentation, Solution, Step
 from viz import (
     blueprint,
     clouds,
@@ -40,6 +40,7 @@ from viz import (
     viewer,
     visibility,
 )
+from viz.standing import upright
 from viz.stream import RerunStream, graph_due, open_stream
 
 Recording = dict[str, dict[int, dict[str, Any]]]
@@ -171,6 +172,19 @@ def test_a_recording_opens_with_a_layout(tmp_path: Path, run: list[Step]) -> Non
     targets = np.array([batch["EyeControls3D:look_target"][0].as_py()[0] for batch in eyes])
     assert len(targets) == 9
     assert np.linalg.norm(targets - CENTRE_M, axis=1).max() < HALF_M.max()
+
+
+def test_a_support_that_is_seen_lies_level_in_the_layout(run: list[Step]) -> None:
+    view = run[0].view
+    assert view is not None
+    normal = np.array([0.0, -np.cos(0.6), -np.sin(0.6)])
+    right, down, forward = upright(replace(view, plane=Plane(normal, 0.5, 0.01, 0.001))).T
+    np.testing.assert_allclose(down, -normal, atol=1e-9)
+    np.testing.assert_allclose(right, [1.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(np.cross(right, down), forward, atol=1e-9)
+    above = replace(view, plane=Plane(np.array([0.0, 0.0, -1.0]), 0.5, 0.01, 0.001))
+    for without in (above, replace(view, plane=None)):
+        assert np.array_equal(upright(without), np.eye(3))
 
 
 def test_images_survive_compression(run: list[Step], recording: Recording) -> None:

@@ -9,9 +9,10 @@ import rerun.blueprint as rrb
 
 from modeler.types import Array, RayImage
 from viz import entities, images, poses
+from viz.standing import upright
 
 _BACKGROUND: Final = (24, 26, 30)
-_ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object towards the eye; the camera is at -z, up is -y
+_ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object to the eye; the camera is towards -z, up is -y
 FROM_THE_SIDE: Final = np.array([-0.8, -0.35, -0.5])  # errors along the camera's own axis show from here
 
 
@@ -144,22 +145,28 @@ def _spatial(name: str, origin: str, contents: list[str], eye: rrb.EyeControls3D
     )
 
 
-def _eye(target: Array, distance_m: float, direction: Array) -> rrb.EyeControls3D:
-    """Return an eye that looks at `target` (3,) from `distance_m` in `direction` (3,), with the camera's up."""
-    position = target + distance_m * direction / np.linalg.norm(direction)
-    return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=target, eye_up=(0.0, -1.0, 0.0))
+def _eye(first: RayImage, distance_m: float, direction: Array) -> rrb.EyeControls3D:
+    """Return an eye that looks at the object from a distance in a direction (3,); its support, if seen, lies level."""
+    object_from_upright = upright(first)
+    away = object_from_upright @ direction / np.linalg.norm(direction)
+    return rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=first.centroid_m + distance_m * away,
+        look_target=first.centroid_m,
+        eye_up=-object_from_upright[:, 1],
+    )
 
 
 def _near(first: RayImage | None, direction: Array, radii: float) -> rrb.EyeControls3D | None:
     """Return an eye on the object from so many of its radii away; None before there is one."""
-    return None if first is None else _eye(first.centroid_m, radii * _radius_m(first), direction)
+    return None if first is None else _eye(first, radii * _radius_m(first), direction)
 
 
 def _far(first: RayImage | None) -> rrb.EyeControls3D | None:
     """Return an eye on the whole graph; None before there is an object."""
     if first is None:
         return None
-    return _eye(first.centroid_m, 2.8 * float(np.linalg.norm(first.centroid_m)), poses.OVER_THE_RING)
+    return _eye(first, 2.8 * float(np.linalg.norm(first.centroid_m)), poses.OVER_THE_RING)
 
 
 def _radius_m(view: RayImage) -> float:

@@ -13,6 +13,7 @@ from modeler import se3
 from modeler.types import Array, Camera, Edge, Step
 from viz import entities
 from viz.drawings import CLEAR, Drawing
+from viz.standing import upright
 
 OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
 """From the object towards the eye that looks at the whole graph."""
@@ -72,9 +73,10 @@ def distance_m(step: Step) -> float:
 
 def below_ring_m(step: Step) -> Array:
     """Return a point (3,) that the eye over the whole graph sees below it: where a caption has room."""
+    first = step.views[min(step.views)]
     towards_eye = OVER_THE_RING / np.linalg.norm(OVER_THE_RING)
     down = np.array([0.0, 1.0, 0.0]) - towards_eye[1] * towards_eye
-    return step.views[min(step.views)].centroid_m + _CAPTION * distance_m(step) * down / np.linalg.norm(down)
+    return first.centroid_m + upright(first) @ down * (_CAPTION * distance_m(step) / np.linalg.norm(down))
 
 
 def _edges(step: Step) -> Drawing:

@@ -56,14 +56,13 @@
   attribute(wires, "place", strokes, gl.FLOAT, false);
 
   // Column by column. `turn` takes object axes (y down, z forward in the first image) to the eye's (y up, z back).
-  const START = [1, 0, 0, 0, -1, 0, 0, 0, -1];
   let turn, distance, shift, plain;
   const multiplied = (a, b) => a.map((_, k) => [0, 1, 2].reduce((s, j) => s + a[3 * j + (k % 3)] * b[3 * ((k / 3) | 0) + j], 0));
   const about = (axis, angle) => {
     const c = Math.cos(angle), s = Math.sin(angle);
     return axis === "x" ? [1, 0, 0, 0, c, s, 0, -s, c] : [c, 0, -s, 0, 1, 0, s, 0, c];
   };
-  const home = () => { turn = multiplied(about("x", 0.45), multiplied(about("y", 0.6), START)); distance = 3.4; shift = [0, 0]; };
+  const home = () => { turn = multiplied(about("x", 0.45), multiplied(about("y", 0.6), scene.upright)); distance = 3.4; shift = [0, 0]; };
   // What the surface is painted with: colour as seen, how sure each vertex is, or plain grey.
   const chooser = document.getElementById("paint");
   const repaint = () => {

@@ -91,14 +91,15 @@ def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
     if mesh is None:
         return ["<h2>Model</h2><p>The run left no mesh.</p>"]
     cameras = [_pyramid(pose.mean) for pose in result.poses.values()]
-    data = json.dumps(scene(mesh, cameras))
+    object_from_upright = plots.ring_upright(np.array([pose.mean[:3, 3] for pose in result.poses.values()]))
+    data = json.dumps(scene(mesh, cameras, object_from_upright))
     paints = {"colours": "colour", "certainty": "certainty", "plain": "plain"}
     known = [name for name in paints if name == "plain" or getattr(mesh, name) is not None]
     options = "".join(f"<option value='{name}'>{paints[name]}</option>" for name in known)
     made_coarser = "" if len(mesh.triangles) == mesh.total else f", shown with {len(mesh.triangles):,}"
     return [
         "<h2>Model</h2><figure><div class='stage'>"
-        f"<canvas id='mesh' style='background-image:url({_poster(mesh)})'></canvas>"
+        f"<canvas id='mesh' style='background-image:url({_poster(mesh, object_from_upright)})'></canvas>"
         f"<div class='switches'><span id='scale' hidden>sd {_scale()} {1000.0 * MOST_SIGMA_M:g} mm, "
         f"<span class='pink'>pink: made up</span></span><select id='paint'>{options}</select>"
         "<label><input type='checkbox' id='cameras'> cameras</label></div></div>"
@@ -209,9 +210,10 @@ def _pyramid(object_from_camera: Array) -> Array:
     return se3.transform(object_from_camera, np.array(outline))
 
 
-def _poster(mesh: Mesh) -> str:
+def _poster(mesh: Mesh, object_from_upright: Array) -> str:
     """Return a picture of the mesh that stands still, as a data address."""
-    camera = look_at(mesh.centre_m, _ABOVE_LEFT, 4.2 * mesh.radius_m, np.array([0.0, -1.0, 0.0]))
+    away = object_from_upright @ _ABOVE_LEFT
+    camera = look_at(mesh.centre_m, away, 4.2 * mesh.radius_m, -object_from_upright[:, 1])
     picture = shade(mesh.vertices_m, mesh.triangles, mesh.colours, camera, (460, 1048))
     content = io.BytesIO()
     Image.fromarray(picture).save(content, "JPEG", quality=85)

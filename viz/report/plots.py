@@ -13,6 +13,7 @@ from modeler.types import Array, PoseGaussian
 from viz.calibration import Curve, Panel, coverage_curves
 from viz.certainty import Sd, sd_of
 from viz.report.result import Result
+from viz.standing import standing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,6 +26,7 @@ ODOMETRY: Final = "#7a828c"
 CLOSURE: Final = "#2f9e58"
 REJECTED: Final = "#c8453f"
 _SHAPE: Final = "#c9ced4"
+_WIDE, _FLAT = 0.1, 0.3  # a ring is no line, and all but plane
 _CIRCLE: Final = np.stack([np.cos(np.linspace(0, 2 * np.pi, 49)), np.sin(np.linspace(0, 2 * np.pi, 49))])
 
 
@@ -66,6 +68,18 @@ def ring_axes(centres_m: Array) -> tuple[Array, Array]:
     across = spread[0] * (np.sign(spread[0, 0]) or 1.0)
     up = np.cross(spread[0], spread[1])
     return across, -up if up[1] > 0 else up  # y is down
+
+
+def ring_upright(centres_m: Array) -> Array:
+    """Return right, down and forward (3, 3), as columns, of a view in which a ring of cameras lies level.
+
+    The identity, which is the view of the first frame's camera, where they make no ring.
+
+    Args:
+        centres_m: (n, 3) where the cameras are, in the object frame.
+    """
+    long, wide, high = np.pad(np.linalg.svd(centres_m - centres_m.mean(axis=0), compute_uv=False), (0, 3))[:3]
+    return standing(ring_axes(centres_m)[1]) if wide > _WIDE * long and high < _FLAT * wide else np.eye(3)
 
 
 def _cameras(axis: Axes, result: Result, axes: Array, middle: Array) -> None:
