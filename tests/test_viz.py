@@ -178,7 +178,9 @@ def test_a_support_that_is_seen_lies_level_in_the_layout(run: list[Step]) -> Non
     view = run[0].view
     assert view is not None
     normal = np.array([0.0, -np.cos(0.6), -np.sin(0.6)])
-    right, down, forward = upright(replace(view, plane=Plane(normal, 0.5, 0.01, 0.001))).T
+    on_table = replace(view, plane=Plane(normal, 0.5, 0.01, 0.001))
+    right, down, forward = upright(on_table).T
+    np.testing.assert_allclose(np.cross(clouds.below_m(on_table) - view.centroid_m, normal), 0.0, atol=1e-9)
     np.testing.assert_allclose(down, -normal, atol=1e-9)
     np.testing.assert_allclose(right, [1.0, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(np.cross(right, down), forward, atol=1e-9)

@@ -14,6 +14,7 @@ from modeler.export.tints import MADE_UP_RGB
 from modeler.types import Array, ObjectModel, Posterior, RayImage, Step
 from viz import entities
 from viz.drawings import CLEAR, Drawing
+from viz.standing import upright
 
 _PAIR_POINTS: Final = 6_000
 _MODEL_POINTS: Final = 15_000
@@ -51,7 +52,7 @@ def shown_posterior(step: Step) -> Posterior | None:
 def below_m(view: RayImage) -> Array:
     """Return a point (3,) below what a view saw of the object, where a caption has room."""
     centre = view.centroid_m
-    return centre + np.array([0.0, 1.2 * float(np.linalg.norm(view.points_m - centre, axis=1).max()), 0.0])
+    return centre + 1.2 * float(np.linalg.norm(view.points_m - centre, axis=1).max()) * upright(view)[:, 1]
 
 
 def caption(at_m: Array, words: str, rgb: entities.Rgb) -> rr.Points3D:

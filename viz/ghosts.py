@@ -15,6 +15,7 @@ from modeler import se3
 from modeler.types import Array, Mode, Posterior, RayImage, Step
 from viz import certainty, clouds, entities, spread, uncertainty
 from viz.drawings import CLEAR, Drawing
+from viz.standing import upright
 
 _GHOSTS: Final = 20
 _GHOST_POINTS: Final = 200
@@ -151,7 +152,7 @@ def _centres(view: RayImage, ghosts: Ghosts, colours: npt.NDArray[np.int64]) -> 
         )
     # The heaviest mode's caption stands below the object, the others' one over another above it.
     down = 1.1 * spread.axes_length_m(view) * np.array([1.0, *(-1.0 - 0.25 * np.arange(len(centres) - 1))])
-    places = centres[0] + down[:, None] * np.array([0.0, 1.0, 0.0])
+    places = centres[0] + down[:, None] * upright(view)[:, 1]
     scale = f"spread {uncertainty.scale_words(ghosts.factor)}"
     shares = [f"mode {k + 1}: {100.0 * mode.weight:.0f} %" for k, mode in enumerate(ghosts.modes)]
     labels = [scale] if len(shares) == 1 else [f"{shares[0]}, {scale}", *shares[1:]]
