@@ -7,6 +7,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 from modeler.closure import Closer
+from modeler.pipeline.limits import believed
 from modeler.pipeline.state import State
 from modeler.priors import ForeseenPrior
 from modeler.registration.posterior import failed
@@ -83,7 +84,9 @@ class Pairing:
         grown = prior.grown(max(steps, 2))
         if steps == 1 and odometry.outcome in _BEYOND:  # the motion may be larger than the prior allows for one step
             wider = self._pair(state, view, odometry.target, grown)
-            odometry = replace(wider, seconds=odometry.seconds + wider.seconds)
+            seconds = odometry.seconds + wider.seconds
+            known = prior.between(view, state.views[odometry.target])
+            odometry = replace(believed(odometry, wider, known), seconds=seconds)
         posteriors = (odometry,)
         while not again and self.closer.base(posteriors, state.past, steps=steps)[0] is None:
             target = self.closer.relocation(posteriors, state.past)

@@ -1,0 +1,122 @@
+"""A view that the prior's limits seem to cut off is sought beyond them, and believed there only for a reason."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+import pytest
+from closing import ABOUT_OBJECT, COVARIANCE, turned, view
+
+from modeler import se3
+from modeler.closure import Closer
+from modeler.pipeline.limits import believed
+from modeler.pipeline.pairing import Pairing
+from modeler.pipeline.state import State
+from modeler.types import (
+    AbstractMotion,
+    AbstractPrior,
+    Array,
+    Edge,
+    Mode,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    Solution,
+    as_one,
+)
+
+TRUE_DEG, LIMIT_DEG = 25.0, 50.0
+
+
+@final
+@dataclass(frozen=True)
+class Limited(AbstractMotion):
+    limit_deg: float
+    evidence = True
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        return np.broadcast_to(np.eye(4), (count, 4, 4))
+
+    def log_density(self, target_from_source: Array) -> Array:
+        return np.where(np.degrees(se3.rotation_angle(target_from_source)) <= self.limit_deg, 0.0, -np.inf)
+
+
+@final
+@dataclass(frozen=True)
+class Limits(AbstractPrior):
+    limit_deg: float = LIMIT_DEG
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+        return Limited(self.limit_deg)
+
+    def grown(self, steps: float) -> AbstractPrior:
+        return replace(self, limit_deg=steps * self.limit_deg)
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
+        return self
+
+
+def found(outcome: Outcome, wider_deg: float, gain_nats: float) -> float:
+    """Return how far in degrees a view is taken to have turned that one registration leaves at 25°, a wider one not."""
+
+    def register(source: RayImage, target: RayImage, prior: AbstractPrior) -> Posterior:
+        assert isinstance(prior, Limits)
+        wide = prior.limit_deg > LIMIT_DEG
+        pose = PoseGaussian(turned(wider_deg if wide else TRUE_DEG), COVARIANCE)
+        nats = -20.0 + gain_nats if wide else -20.0
+        told = Outcome.CONVERGED if wide else outcome
+        return Posterior(source.index, target.index, pose, told, overlap=0.8, log_evidence=nats, seconds=1.0)
+
+    state = State(views={0: view(0)}, places={0: 0, 1: 1})
+    pairing = Pairing(Limits(), Closer(), register, lambda state, view: view, None)
+    (posterior,) = pairing.placed(state, view(1), 0, last=False, again=False)
+    assert posterior.usable
+    assert posterior.seconds == (1.0 if outcome is Outcome.CONVERGED else 2.0)
+    sense = np.sign((se3.inverse(ABOUT_OBJECT) @ posterior.pose.mean @ ABOUT_OBJECT)[0, 2] * turned(1.0)[0, 2])
+    return float(sense * np.degrees(se3.rotation_angle(posterior.pose.mean)))
+
+
+@pytest.mark.parametrize(
+    ("outcome", "wider_deg", "gain_nats", "wanted_deg"),
+    [
+        (Outcome.CONVERGED, -65.0, 100.0, TRUE_DEG),  # nothing was cut off
+        (Outcome.AT_LIMIT, -65.0, 0.5, TRUE_DEG),  # a quarter turn on four sides alike match as well
+        (Outcome.AT_LIMIT, -65.0, 30.0, -65.0),  # by far better: it did turn so far
+        (Outcome.AT_LIMIT, 65.0, 30.0, 65.0),
+        (Outcome.AT_LIMIT, 35.0, 0.5, 35.0),  # the same place, no longer cut off
+        (Outcome.AT_LIMIT, -40.0, 0.5, -40.0),  # within what is known too
+        (Outcome.AT_LIMIT, -65.0, np.nan, -65.0),  # methods without evidence
+        (Outcome.NO_OVERLAP, -65.0, 0.5, -65.0),  # nothing was found within
+    ],
+)
+def test_beyond_the_limits_only_what_matches_far_better_is_believed(
+    outcome: Outcome, wider_deg: float, gain_nats: float, wanted_deg: float
+) -> None:
+    assert found(outcome, wider_deg, gain_nats) == pytest.approx(wanted_deg, abs=0.1)
+
+
+def of_modes(*modes: tuple[float, float]) -> Posterior:
+    """Return a posterior of modes: weights, and turns in degrees."""
+    poses = [turned(deg) for _, deg in modes]
+    told = tuple(Mode(weight, PoseGaussian(pose, COVARIANCE)) for (weight, _), pose in zip(modes, poses, strict=True))
+    shares = np.array([weight for weight, _ in modes])
+    return Posterior(1, 0, as_one(told), Outcome.AMBIGUOUS, 0.8, np.stack(poses), shares, told, log_evidence=-20.0)
+
+
+def test_modes_beyond_the_limits_count_as_little_as_motions_beyond_do() -> None:
+    """Whatever loops say later, they cannot choose a mode that is not there."""
+    cut_off = Posterior(1, 0, PoseGaussian(turned(50.0), COVARIANCE), Outcome.NO_OVERLAP, overlap=0.0)
+    both = believed(cut_off, of_modes((0.6, -65.0), (0.4, 25.0)), Limited(LIMIT_DEG))
+    assert both.modes == ()
+    np.testing.assert_allclose(both.pose.mean, turned(25.0), atol=1e-12)
+    np.testing.assert_allclose(both.pose.covariance, COVARIANCE, atol=1e-12)
+    np.testing.assert_array_equal(both.samples, turned(25.0)[None])
+    assert both.weights.sum() == pytest.approx(1.0)
+    three = believed(cut_off, of_modes((0.6, -65.0), (0.3, 25.0), (0.1, -20.0)), Limited(LIMIT_DEG))
+    assert [mode.weight for mode in three.modes] == pytest.approx([0.75, 0.25])
+    far = believed(cut_off, of_modes((0.9997, -65.0), (0.0003, 25.0)), Limited(LIMIT_DEG))
+    assert [mode.weight for mode in far.modes] == pytest.approx([0.752, 0.248], abs=1e-3)
+    for wide in (of_modes((0.6, -65.0), (0.4, 65.0)), of_modes((0.6, 25.0), (0.4, -40.0)), of_modes((1.0, -65.0))):
+        assert believed(cut_off, wide, Limited(LIMIT_DEG)) is wide
