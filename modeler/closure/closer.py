@@ -13,12 +13,13 @@ from modeler.closure.placing import Placing
 from modeler.closure.prospects import Outlook
 from modeler.closure.reckoning import came_back, onwards
 from modeler.closure.trust import Trust
-from modeler.closure.verdict import Agreement, Standard, flaw, modes, open_deg, standard
+from modeler.closure.verdict import Agreement, Standard, flaw, modes, open_turn, standard
 from modeler.closure.ways import Ways
 from modeler.types import Edge, EdgeKind, PoseGaussian, Posterior, Solution
 
 _NOWHERE = "neither the previous view nor another one places the frame with certainty"
 _LEAST_CHANCE = 0.02  # that a view is in reach: one that comes back after a turn that nothing told tells very much
+_NO_NEWS = 0.5  # of a sigma: who knows a turn better learns little of it, and what else an edge tells is welcome
 _SPAN_POWER = 6.0  # an edge over 25° tells half as much as one over none, over 50° a fourteenth
 
 
@@ -52,9 +53,10 @@ class Closer:
     max_evidence_drop_nats: float = 40.0
     """How far the evidence of such an edge may lie below that of the others, a nat an effective point."""
     max_open_deg: float = 5.0
-    """Largest standard deviation in degrees of the turn about any axis of such an edge. What leaves a turn open, about
-    the axis of a bottle, is bounded by the same limits as the edges that placed the frames, which hold these already;
-    and where that axis lies it knows too badly for a wide turn about it not to contradict the others."""
+    """Largest standard deviation in degrees of the turn about any axis of such an edge, where the graph knows that turn
+    as badly. What leaves a turn open, about the axis of a bottle, is bounded by the same limits as the edges that
+    placed the frames, which hold these already; and where that axis lies it knows too badly for a wide turn about it
+    not to contradict the others."""
     trust: Trust = field(default_factory=Trust)
     """In covariances that edges state."""
 
@@ -157,8 +159,10 @@ class Closer:
                 edge = Edge(posterior, kind, accepted=True, reason=base_reason)
             elif (found := flaw(posterior, asked if number or steps > 1 else None)) is not None:
                 edge = Edge(posterior, kind, accepted=False, reason=found)
-            elif base is None or (found := self._open(posterior)) is not None:
-                edge = Edge(posterior, kind, accepted=False, reason=found or _NOWHERE)
+            elif base is None:
+                edge = Edge(posterior, kind, accepted=False, reason=_NOWHERE)
+            elif (found := self._open(posterior, self.foreseen(base, posterior.target, past.solution))) is not None:
+                edge = Edge(posterior, kind, accepted=False, reason=found)
             else:
                 edge = _judged(posterior, kind, self.trust.agreement_by_way_of(base, posterior, past, reach))
             edges.append(edge)
@@ -168,17 +172,20 @@ class Closer:
         """Return the judged edge between two views of the graph, from a registration that it does not hold yet."""
         reach = past.ways(posterior.source)
         kind = "closure" if self._back(posterior.target, posterior.source, reach, past) else "span"
-        if (found := flaw(posterior, self._asked(past)) or self._open(posterior)) is not None:
+        foretold = past.solution.relative_gaussian(posterior.target, posterior.source)
+        if (found := flaw(posterior, self._asked(past)) or self._open(posterior, foretold)) is not None:
             return Edge(posterior, kind, accepted=False, reason=found)
-        foretold = [(1.0, past.solution.relative_gaussian(posterior.target, posterior.source))]
         length, centroid_m = reach[posterior.target].edges, past.views[posterior.source].centroid_m
-        return _judged(posterior, kind, self.trust.agreement(posterior, foretold, length=length, centroid_m=centroid_m))
+        agreed = self.trust.agreement(posterior, [(1.0, foretold)], length=length, centroid_m=centroid_m)
+        return _judged(posterior, kind, agreed)
 
-    def _open(self, posterior: Posterior) -> str | None:
-        """Return what keeps a registration out that tells too little of some turn; None: nothing."""
-        sigma_deg = open_deg(posterior)
-        if sigma_deg <= self.max_open_deg:
+    def _open(self, posterior: Posterior, foretold: PoseGaussian) -> str | None:
+        """Return what keeps a registration out that tells too little of a turn nobody else tells of; None: nothing."""
+        sigma_rad, axis = open_turn(posterior)
+        known_rad = float(np.sqrt(axis @ foretold.covariance[:3, :3] @ axis))
+        if np.degrees(sigma_rad) <= self.max_open_deg or known_rad <= _NO_NEWS * sigma_rad:
             return None
+        sigma_deg = np.degrees(sigma_rad)
         return f"it leaves a turn open by ±{sigma_deg:.0f}°, of which the edges that placed the frames know as much"
 
     def _back(self, target: int, source: int, reach: Ways, past: Past) -> bool:

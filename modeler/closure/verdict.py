@@ -67,13 +67,14 @@ def flaw(posterior: Posterior, asked: Standard | None = None) -> str | None:
     return None
 
 
-def open_deg(posterior: Posterior) -> float:
-    """Return the standard deviation in degrees of the turn about the axis that a registration knows least of.
+def open_turn(posterior: Posterior) -> tuple[float, Array]:
+    """Return the standard deviation in rad of the turn that a registration knows least, and its axis (3,).
 
-    Of several modes the vaguest counts.
+    The axis is told in the camera of the source. Of several modes the vaguest counts.
     """
-    rotations = np.stack([pose.covariance[:3, :3] for _, pose in modes(posterior)])
-    return float(np.degrees(np.sqrt(np.linalg.eigvalsh(rotations).max())))
+    variances, axes = np.linalg.eigh(np.stack([pose.covariance[:3, :3] for _, pose in modes(posterior)]))
+    vaguest = int(np.argmax(variances[:, -1]))
+    return float(np.sqrt(variances[vaguest, -1])), axes[vaguest, :, -1]
 
 
 def stands(posterior: Posterior, asked: Standard) -> bool:
