@@ -18,7 +18,7 @@ import trimesh
 
 from modeler import priors, se3
 from modeler.cli import main, nonvisual
-from modeler.cli.building import comes_back, sense_in_doubt
+from modeler.cli.building import comes_back, other_step, sense_in_doubt
 from modeler.cli.interrupt import Interrupt
 from modeler.cli.options import PriorOptions
 from modeler.cli.usage import parsed
@@ -411,6 +411,23 @@ def test_a_table_that_turns_the_other_way_is_asked_about() -> None:
     assert not sense_in_doubt(lost, unknown)
     assert not sense_in_doubt(lost, priors.TablePrior())
     assert not sense_in_doubt(["the run was interrupted after frame 3"], known)
+
+
+def test_a_step_that_the_views_contradict_is_told() -> None:
+    def steps(turn_deg: float, count: int = 4, gap: int = 1) -> list[dict]:
+        turn = se3.exp(np.array([0.0, np.radians(turn_deg), 0.0, 0.0, 0.0, 0.0]))
+        edge = {"accepted": True, "kind": "odometry", "target_from_source": turn.ravel().tolist()}
+        return [edge | {"source": gap * (k + 1), "target": gap * k} for k in range(count)]
+
+    prior = priors.TurntablePrior(-30.0, 2.0)
+    said = other_step(steps(15.0), prior)
+    assert "turned by 15.0° from one frame number to the next, not by the 30° ± 2° that was told" in said
+    assert said.endswith("is --step-deg -15.0 meant?")
+    assert "turned by 15.0°" in other_step(steps(45.0, gap=3), prior)
+    lost = {"accepted": False, "kind": "odometry", "source": 9, "target": 8, "target_from_source": np.eye(4).tolist()}
+    for edges in (steps(25.0), steps(90.0, gap=3), steps(15.0, count=2), [lost] * 5, []):
+        assert other_step(edges, prior) == ""
+    assert other_step(steps(15.0), priors.TablePrior()) == ""
 
 
 def test_ctrl_c_ends_the_frames_and_a_second_one_the_program() -> None:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
+import numpy as np
+
+from modeler import se3
 from modeler.cli import compose, nonvisual
 from modeler.cli.build import Build
 from modeler.cli.console import Console
@@ -24,6 +27,9 @@ from sequences import AbstractSequence, SensedSequence, frame_range, open_sequen
 from viz.ending import ends_whole
 from viz.stream import open_stream
 from viz.viewer import reachable
+
+_SURE_STEPS: Final = 3  # pairs that tell a step
+_FAR_SDS: Final = 3.0  # of the told step, from which on another one is meant
 
 
 def build(options: Build) -> int:
@@ -164,6 +170,31 @@ def sense_in_doubt(reasons: Sequence[str], prior: AbstractPrior) -> bool:
     return little and isinstance(prior, TurntablePrior) and prior.step_sign == "known"
 
 
+def other_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
+    """Return in words by what step the views turned where that is not the one that the prior was told, else "".
+
+    Args:
+        edges: of the report.
+        prior: of the run.
+    """
+    odometry = [edge for edge in edges if edge["accepted"] and edge["kind"] == "odometry"]
+    gap = min((edge["source"] - edge["target"] for edge in odometry), default=1)
+    turns = [
+        np.degrees(se3.rotation_angle(np.reshape(edge["target_from_source"], (4, 4)))) / gap
+        for edge in odometry
+        if edge["source"] - edge["target"] == gap
+    ]
+    if not isinstance(prior, TurntablePrior) or len(turns) < _SURE_STEPS:
+        return ""
+    found_deg, told_deg = float(np.median(turns)), abs(prior.step_deg)
+    if abs(found_deg - told_deg) <= _FAR_SDS * prior.step_sigma_deg:
+        return ""
+    return (
+        f"the views turned by {found_deg:.1f}° from one frame number to the next, not by the {told_deg:g}° ± "
+        f"{prior.step_sigma_deg:g}° that was told; is --step-deg {np.copysign(found_deg, prior.step_deg):.1f} meant?"
+    )
+
+
 def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
     """Say on stderr what came out, and return the exit status."""
     accepted = sum(frame["outcome"] == ACCEPTED for frame in report["frames"])
@@ -179,4 +210,6 @@ def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> in
         say(f"not to be trusted: {first}{more}")
         if sense_in_doubt(report["reasons"], prior):
             say("that the table turns the way round that was told is taken for granted; else give --step-sign unknown")
+    if remark := other_step(report["edges"], prior):
+        say(remark)
     return 0 if report["trustworthy"] else 3
