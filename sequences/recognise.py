@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import difflib
 from pathlib import Path
 
 from modeler.types import InputError
@@ -42,9 +44,18 @@ def open_sequence(path: str | Path, given: Given | None = None) -> AbstractSeque
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
 
 
+def _meant(path: Path) -> str:
+    """Return a question after what lies there under nearly that name, "" where nothing does."""
+    with contextlib.suppress(OSError):  # whatever is wrong with the folder is told of the path
+        beside = [other.name for other in path.parent.iterdir()]
+        if near := difflib.get_close_matches(path.name, beside, n=1, cutoff=0.75):
+            return f"did you mean {path.parent / near[0]}? Else "
+    return ""
+
+
 def _open(path: Path, given: Given) -> AbstractSequence:
     if not path.exists():
-        raise InputError(f"{path}: no such folder or file; give {FORMATS}.")
+        raise InputError(f"{path}: no such folder or file; {_meant(path)}give {FORMATS}.")
     if path.suffix.lower() in BAGS or (path / "metadata.yaml").exists():
         from sequences.ros.sequence import open_ros
 

@@ -63,7 +63,7 @@ class Survey:
             lacks.append(f"{what}: the object is segmented by the program")
         if self.colours < total:
             what = "no colour" if self.colours == 0 else f"no colour in {total - self.colours} frames"
-            lacks.append(f"{what}: the model is uncoloured there" if self.colours else f"{what}: so is the model")
+            lacks.append(f"{what}: nor will the model have any{' there' if self.colours else ''}")
         if self.truths == 0:
             lacks.append("no ground truth: nothing to evaluate against")
         if self.empty:

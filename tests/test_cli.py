@@ -101,6 +101,12 @@ def test_help_of_the_program_tells_each_command_in_a_sentence_and_a_command_tell
     assert "Ctrl-C" not in overall
 
 
+def test_help_may_be_asked_for_in_a_word(run: Run) -> None:
+    assert run("help") == run("--help")
+    assert run("help", "build") == run("build", "--help")
+    assert run("help", "nonsense") == run("--help")
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_takes_a_seed(run: Run, command: str) -> None:
     # Enough for every command, too much for none: names of files that are never opened.
@@ -190,6 +196,7 @@ def test_the_readme_names_every_file_of_a_run_folder() -> None:
         (("build", BOX, "--out", "OUT", "--prio", "table"), "perhaps you meant --prior NAME[+NAME]; see"),
         (("build", BOX, "--out", "OUT", "--intrinsics", "9", "9", "9", "9"), "(calibrate-sensor, convert, info); see"),
         (("build", BOX, "--out"), "--out lacks its value"),
+        (("--verson",), "unknown before a command: --verson; commands are build, "),
         (("build", BOX, "--out", "OUT", "--step-deg", "0.3rad"), "--step-deg takes a number, not '0.3rad'"),
         (("build", BOX, "--out", "OUT", "--max-offset-m", "40"), "give a positive number of metres, at most 5\n"),
         (("build", BOX, "--out", "OUT", "--method", "magic"), "'fpfh-icp', not 'magic'"),

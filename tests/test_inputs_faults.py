@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from PIL import Image
 from recordings import png_claiming, save, small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
+from refusal import refused
 
 from modeler.cli import main
-from sequences import write_bop
+from sequences import open_sequence, write_bop
 
 Damage = Callable[[Path], object]
 
@@ -287,6 +288,16 @@ def test_pictures_that_lie_elsewhere_are_seen(
     for name in ("flat", "deeper"):
         assert main(["info", str(tmp_path / name)]) == 2
         assert "holds pictures but no folder depth; put the depth images into one" in capsys.readouterr().err
+
+
+def test_a_path_that_is_misspelt_is_asked_about(tmp_path: Path) -> None:
+    (tmp_path / "scans").mkdir()
+    with refused(f"no such folder or file; did you mean {tmp_path / 'scans'}? Else give a folder with depth/"):
+        open_sequence(tmp_path / "scan")
+    with refused("no such folder or file; give a folder with depth/"):
+        open_sequence(tmp_path / "elsewhere")
+    with refused("no such folder or file; give a folder with depth/"):
+        open_sequence(tmp_path / "nowhere" / "scans")
 
 
 @pytest.mark.parametrize("name", ["nowhere", "nowhere.bag", "", "file.txt"])

@@ -49,6 +49,7 @@ _REWORDED = (
     (r" \(applied to modeler [a-z-]+\)", ""),
     (r" Arguments are applied to the directly preceding subcommand, so ordering can matter", ""),
     (r"; For full helptext, .*", ""),
+    (r"Unrecognized options: (-[^,;]+).*; Available subcommands: ", r"unknown before a command: \1; commands are "),
     (r"Unrecognized options: ([^,;]+).*; Available subcommands: ", r"there is no command '\1'; there are "),
     (r"Unrecognized (?:or misplaced )?options: ([^;]*)", lambda found: f"unknown: {found[1].strip().replace(',', '')}"),
     (r"Perhaps you meant: ([^;]*)", r"perhaps you meant \1"),
@@ -77,6 +78,8 @@ def parsed(arguments: Sequence[str]) -> Command:
     Raises:
         SystemExit: with status 0 after help or version, with 2 and one line on stderr for what is no command.
     """
+    if list(arguments[:1]) == ["help"]:
+        arguments = [*(name for name in arguments[1:2] if name in _COMMANDS), "--help"]
     if list(arguments) == ["--version"]:
         print(f"modeler {metadata.version('modeler')}")
         raise SystemExit(0)
