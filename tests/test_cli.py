@@ -258,7 +258,7 @@ def test_unusable_input_gives_status_2_and_one_line(
 
 def test_the_console_script_ends_with_the_status() -> None:
     ended = subprocess.run(
-        [sys.executable, "-m", "modeler", "build", "/nowhere", "--out", "/nowhere/run"],
+        [sys.executable, "-m", "modeler", "view", "/nowhere"],
         capture_output=True,
         text=True,
         check=False,
