@@ -47,7 +47,7 @@ class Sensor:
         outline = mask if frame.mask is None else frame.mask
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         rows, columns = _places(mask)
-        ball, sigma_inverse = self._smoothing(frame, rows, columns)
+        ball, sigma_inverse, sharing = self._smoothing(frame, rows, columns)
         cells = planes.local_planes(
             depth_m,
             mask,
@@ -66,17 +66,20 @@ class Sensor:
             normals=normals,
             pixels=pixels,
             layers={"cells": cells, "variance_m2": variance_m2},
+            sharing=sharing,
         )
 
-    def _smoothing(self, frame: Frame, rows: np.ndarray, columns: np.ndarray) -> tuple[tuple[float, int, int], float]:
+    def _smoothing(
+        self, frame: Frame, rows: np.ndarray, columns: np.ndarray
+    ) -> tuple[tuple[float, int, int], float, float]:
         """Return how the object at some pixels is smoothed.
 
         Returns:
-            Radius in m of the ball, in px at the nearest point, and the step between its pixels; and the least noise of
-            inverse depth (1/m) that a plane's residuals are taken to show.
+            Radius in m of the ball, in px at the nearest point, and the step between its pixels; the least noise of
+            inverse depth (1/m) that a plane's residuals are taken to show; and how many points share a pixel's noise.
         """
         if rows.size == 0:  # nothing to smooth
-            return (0.0, 1, 1), 0.0
+            return (0.0, 1, 1), 0.0, 1.0
         depth_m = frame.depth_m[rows, columns]
         nearest_m, middle_m = (float(value) for value in np.percentile(depth_m, [2, 50]))
         metres_per_px = middle_m / frame.camera.fx
@@ -88,7 +91,9 @@ class Sensor:
         # Every second pixel in a row is enough where a wide window holds many.
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours
         # A tenth of the sensor's noise: neighbouring pixels may agree better than they are true.
-        return (radius_m, reach_px, 2 if reach_px > 4 and enough else 1), 0.1 * self.sigma_r_m / middle_m**2
+        sharing = max(density * np.pi * (radius_m / metres_per_px) ** 2, 1.0)
+        ball = (radius_m, reach_px, 2 if reach_px > 4 and enough else 1)
+        return ball, 0.1 * self.sigma_r_m / middle_m**2, float(sharing)
 
 
 def _places(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

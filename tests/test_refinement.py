@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 from naive import point_to_plane_equations
+from scipy import ndimage
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.kernels import matching
 from modeler.rays import Sensor
 from modeler.registration.posterior import weighted_gaussian
-from modeler.registration.refinement import Refiner
+from modeler.registration.refinement import Refiner, seen_alone
 from modeler.registration.visibility import VisibilityRegistrar
 from modeler.se3 import rows
 from sequences import bundled, open_sequence
@@ -100,6 +101,16 @@ def test_too_few_matches_leave_the_samples_alone(rng):
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
     refined = Refiner(min_patches=10_000).refine(pair, poses, np.ones(len(poses)), rng, fine_m=0.001)
     np.testing.assert_allclose(refined, poses, atol=1e-9)
+
+
+@pytest.mark.parametrize("width", [3, 5, 10, 20])
+def test_the_scatter_of_patches_leaves_out_what_neighbours_share(width, rng):
+    """Squares of noise that a square of 5 × 5 has smoothed: their own scatter beside that of all together."""
+    ball, side = 5, 20 * width
+    noise = rng.normal(size=(60, side, side))
+    smooth = ndimage.uniform_filter(noise, ball, mode="wrap", axes=(1, 2))
+    sums = smooth.reshape(60, 20, width, 20, width).sum(axis=(2, 4))
+    assert np.mean(sums**2) / width**2 == pytest.approx(seen_alone((width / ball) ** 2), rel=0.1)  # pixels, not areas
 
 
 @pytest.mark.parametrize("fields", [{"caution": 0.0}, {"caution": 4.0}])

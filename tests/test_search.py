@@ -11,9 +11,10 @@ from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior
 from modeler.priors.general import GeneralMotion
 from modeler.rays import Sensor
+from modeler.registration.candidates import Candidates
 from modeler.registration.mixture import Gaussians, MixtureMotion
 from modeler.registration.modes import Place, by_place, weighed
-from modeler.registration.search import Candidates, Search
+from modeler.registration.search import Search
 from modeler.registration.visibility import VisibilityRegistrar
 from modeler.types import Outcome
 from sequences import bundled, open_sequence

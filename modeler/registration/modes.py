@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from modeler.registration.candidates import Candidates
 from modeler.registration.posterior import weighted_gaussian
-from modeler.registration.search import Candidates
 from modeler.types import Array, PoseGaussian
 
 

@@ -41,6 +41,11 @@ class Pair:
         """Number of points of both views."""
         return len(self.forward.points) + len(self.backward.points)
 
+    @property
+    def patches(self) -> float:
+        """Number of patches of the surface of a view, on average, whose errors have nothing to do with each other."""
+        return 0.5 * (self.forward.image.patches + self.backward.image.patches)
+
     def log_likelihoods(
         self, poses: Array, blur_m: float, *, stride: int = 1, typical: float = 0.5
     ) -> tuple[Array, Array]:

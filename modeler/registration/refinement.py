@@ -31,7 +31,7 @@ class Refiner:
     """A patch holds at least so many matching points; with fewer in all, there are fewer patches."""
     min_patches: int = 16
     """With fewer patches than this nothing is refined: the scatter of six equations would not be known."""
-    caution: float = 1.5
+    caution: float = 1.0
     """By so many standard errors the sensitivity is lowered, so that noise does not pass for knowledge."""
 
     def refine(self, pair: Pair, poses: Array, weights: Array, rng: np.random.Generator, *, fine_m: float) -> Array:
@@ -82,8 +82,20 @@ class Refiner:
         error = np.std(parts, axis=0, ddof=1) * np.sqrt(count)
         sure = np.diag(np.maximum(sensitivity - self.caution * error, 0.0))
         variability += 1e-9 * max(np.trace(variability), 1e-300) * np.eye(6)
-        information = sure @ np.linalg.solve(variability, sure)
+        information = seen_alone(pair.patches / count) * sure @ np.linalg.solve(variability, sure)
         return spread @ axes, np.asarray(0.5 * (information + information.T), dtype=np.float64)
+
+
+def seen_alone(size: float) -> float:
+    """Return how much of the variability patches show by their own scatter, each as large as so many balls.
+
+    Smoothing spreads a pixel's noise over a ball, across the border of a patch, and what neighbours err by alike their
+    scatter leaves out. Take both for squares, w and d wide: in each direction the patch's sum is a trapezoid of the
+    noise, whose square holds 1 - w / 3d of what the whole surface's does; and (1 - d / 3w) d / w where d < w.
+    """
+    width = np.sqrt(size)  # of a patch, in those of a ball
+    share = 1.0 - 1.0 / (3.0 * width) if width >= 1.0 else width * (1.0 - width / 3.0)
+    return float(share**2)
 
 
 def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: float) -> tuple[Array, float]:

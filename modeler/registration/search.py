@@ -5,66 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from modeler import se3
 from modeler.kernels import mixture
 from modeler.kernels.matching import Pull
+from modeler.registration.candidates import Candidates
 from modeler.registration.climb import Climb
 from modeler.registration.pair import Pair
-from modeler.types import AbstractMotion, Array, BoolArray, PoseGaussian
-
-
-@dataclass(frozen=True, eq=False)
-class Candidates:
-    """Motions to which matching surface leads, each with a Gaussian for its surroundings."""
-
-    poses: Array
-    """(k, 4, 4) target_from_source, best first, blunt ones last."""
-    scores: Array
-    """(k,) how good they are beside each other (nats)."""
-    spreads: Array
-    """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid."""
-
-    blunt: BoolArray
-    """(k,) whether a candidate stands for the surroundings that surface, blurred, leaves open."""
-    beyond: float = -np.inf
-    """How much better (nats) than the best is what surface leads to beyond the prior's support."""
-    scarce: bool = False
-    """Whether so little surface matches that places were compared as `Search.scarce_points` says."""
-
-    def __len__(self) -> int:
-        """Return how many there are."""
-        return len(self.poses)
-
-    def distances(self, centre_m: Array) -> Array:
-        """Return how far they are from each other (k, k), row i in standard deviations of the i-th one's surroundings.
-
-        The distances are of ξ about a point (3,) of the source.
-        """
-        return mixture.distances(se3.rows(self.poses), self.spreads, centre_m)
-
-    def beside(self, others: Candidates) -> Candidates:
-        """Return them and others, in this order."""
-        return Candidates(
-            np.concatenate([self.poses, others.poses]),
-            np.concatenate([self.scores, others.scores]),
-            np.concatenate([self.spreads, others.spreads]),
-            np.concatenate([self.blunt, others.blunt]),
-            self.beyond,
-            self.scarce,
-        )
-
-    def some(self, chosen: npt.NDArray[np.int64] | BoolArray) -> Candidates:
-        """Return those chosen by number or by mask."""
-        return Candidates(
-            self.poses[chosen],
-            self.scores[chosen],
-            self.spreads[chosen],
-            self.blunt[chosen],
-            self.beyond,
-            self.scarce,
-        )
+from modeler.types import AbstractMotion, Array, PoseGaussian
 
 
 @dataclass(frozen=True)
@@ -285,7 +233,7 @@ class Search:
         weight = self.local_points / pair.points
         spreads = np.linalg.cholesky(np.linalg.inv(weight * matrices + np.linalg.inv(prior.covariance)))
         found = Candidates(poses, scores, np.asarray(spreads, dtype=np.float64), np.zeros(len(poses), dtype=np.bool_))
-        return self._distinct(found, pair.centre_m)
+        return found.distinct(pair.centre_m, self.reach)
 
     def scores(self, pair: Pair, poses: Array, blur_m: float) -> Array:
         """Return how good (n,) places are beside each other (nats)."""
@@ -300,16 +248,6 @@ class Search:
         hold = np.asarray(np.linalg.inv(self.local_points / pair.points * prior.covariance), dtype=np.float64)
         damping = np.repeat([1.0 / self.max_step_rad, 1.0 / (self.max_step_rad * pair.size_m)], 3) ** 2
         return Pull(se3.rows(prior.mean), hold, 0.0025 * pair.points * damping, self.max_step_rad)
-
-    def _distinct(self, found: Candidates, centre_m: Array) -> Candidates:
-        """Return one of each group of candidates that lie within each other's reach."""
-        kept: list[int] = []
-        left, near = np.ones(len(found), dtype=bool), found.distances(centre_m) <= self.reach
-        for number in range(len(found)):
-            if left[number]:
-                kept.append(number)
-                left &= ~near[number]
-        return found.some(np.array(kept, dtype=np.int64))
 
 
 def _gaussian(poses: Array, centre_m: Array) -> PoseGaussian:

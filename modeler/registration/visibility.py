@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from modeler.registration.candidates import Candidates
 from modeler.registration.importance import AdaptiveSampler, Population
 from modeler.registration.lookup import Lookup
 from modeler.registration.mixture import Gaussians, MixtureMotion
@@ -15,7 +16,7 @@ from modeler.registration.modes import Place, by_place, weighed
 from modeler.registration.pair import Pair
 from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
 from modeler.registration.refinement import Refiner
-from modeler.registration.search import Candidates, Search
+from modeler.registration.search import Search
 from modeler.registration.surface import measured_share, spread_points
 from modeler.types import (
     AbstractMotion,
@@ -55,8 +56,12 @@ class VisibilityRegistrar(AbstractRegistrar):
 
     points: int = 600
     """Surface points taken from each view."""
-    effective_points: float = 40.0
-    """Number of independent measurements that the points of both views together are worth where surface matches."""
+    effective_points: float = 60.0
+    """Number of independent measurements that the points of both views together are worth where surface matches.
+
+    So many they are on an object that covers much of the image, for what even far points err by alike; on a small one
+    they are no more than the patches that smoothing leaves apart.
+    """
     surface_noise: float = 0.1
     """Least error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
     surface_detail: float = 0.003
@@ -173,7 +178,8 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return samples around candidates."""
         noise_m = pair.surface_noise_m(found.poses[0], self.search.blurs[-1] * pair.size_m)
         typical = pair.typical_misfit(found.poses[0], noise_m)
-        worth = self.search.scarce_points if found.scarce else self.effective_points
+        independent = 1.0 / (1.0 / self.effective_points + 1.0 / pair.patches)
+        worth = self.search.scarce_points if found.scarce else independent
         likelihood = partial(pair.tempered, blur_m=noise_m, effective_points=worth, typical=typical)
         plain = likelihood(found.poses)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)

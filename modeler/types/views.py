@@ -108,11 +108,18 @@ class RayImage:
     """(n, 2) row and column of each point."""
     layers: Mapping[str, npt.NDArray[np.float64] | npt.NDArray[np.float32]] = field(default_factory=dict)
     """Images a likelihood looks up, made by `rays`."""
+    sharing: float = 1.0
+    """Number of surface points over which smoothing spreads the noise of a pixel."""
 
     @property
     def index(self) -> int:
         """Number of the frame in its sequence."""
         return self.frame.index
+
+    @property
+    def patches(self) -> float:
+        """Number of patches of the surface whose errors have nothing to do with each other."""
+        return len(self.points_m) / self.sharing
 
     @cached_property
     def centroid_m(self) -> Array:
