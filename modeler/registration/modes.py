@@ -48,7 +48,7 @@ def by_place(found: Candidates, centre_m: Array, *, apart: float = 3.5) -> list[
     return [found.some(place == name) for name in np.unique(place[~found.blunt])]
 
 
-def weighed(places: Sequence[Place], *, least: float = 0.02) -> list[tuple[float, Place]]:
+def weighed(places: Sequence[Place], *, least: float = 0.005) -> list[tuple[float, Place]]:
     """Return the places with their shares of the mass, heaviest first; without those that hold less than the least."""
     log_mass = np.array([place.log_mass for place in places])
     mass = np.exp(log_mass - log_mass.max())

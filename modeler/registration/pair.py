@@ -46,6 +46,14 @@ class Pair:
         """Number of patches of the surface of a view, on average, whose errors have nothing to do with each other."""
         return 0.5 * (self.forward.image.patches + self.backward.image.patches)
 
+    def independent(self, most: float) -> float:
+        """Return how many independent measurements all points are worth.
+
+        On an object that covers much of the image they are worth `most`, for what even far points err by alike; on a
+        small one no more than the patches that smoothing leaves apart.
+        """
+        return 1.0 / (1.0 / most + 1.0 / self.patches)
+
     def log_likelihoods(
         self, poses: Array, blur_m: float, *, stride: int = 1, typical: float = 0.5
     ) -> tuple[Array, Array]:

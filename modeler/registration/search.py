@@ -43,8 +43,9 @@ class Search:
     """A step turns the object no further."""
     local_points: float = 40.0
     """Number of independent measurements that all points are worth around a candidate."""
-    effective_points: float = 80.0
-    """Number of independent measurements that all points are worth when separate places are compared."""
+    effective_points: float = 120.0
+    """Most independent measurements that all points are worth when separate places are compared; see
+    `Pair.independent`."""
     negligible: float = 20.0
     """A candidate so many nats below the best is dropped."""
     lifted: int = 6
@@ -61,8 +62,8 @@ class Search:
     """A walker takes at most so many."""
     poor: float = -20.0
     """Where the best place is worse than this (nats) even to somewhat blurred views, little surface matches."""
-    scarce_points: float = 120.0
-    """Number of independent measurements that all points are worth there, in a place and between places.
+    scarce_points: float = 150.0
+    """Most independent measurements that all points are worth there, in a place and between places.
 
     What matching surfaces have in common, the errors of smoothing and of the sensor, counts for little where few match.
     """
@@ -138,7 +139,9 @@ class Search:
         if not len(chosen):
             return chosen
         basin = self._basin(pair.size_m)
-        return self.climb.onward(pair, motion, chosen, basin, rng, effective_points=self.effective_points)
+        return self.climb.onward(
+            pair, motion, chosen, basin, rng, effective_points=pair.independent(self.effective_points)
+        )
 
     def _higher(
         self, pair: Pair, motion: AbstractMotion, found: Candidates, prior: PoseGaussian, rng: np.random.Generator
@@ -147,7 +150,7 @@ class Search:
         fine_m, sparing = self.blurs[-1] * pair.size_m, self._where(scarce=True)
         basin = self._basin(pair.size_m)
         climb = self.climb.thinned(self._starts(prior, pair.size_m) / self.max_starts)
-        high = climb.places(pair, motion, basin, rng, effective_points=self.scarce_points)
+        high = climb.places(pair, motion, basin, rng, effective_points=pair.independent(self.scarce_points))
         poses = np.concatenate([found.poses, high])
         best = sparing._ranked(pair, motion, poses, prior, fine_m)
         _, share = pair.log_likelihoods(best.poses[:1], fine_m, stride=2)
@@ -195,7 +198,7 @@ class Search:
             np.concatenate([axes, -axes]),
             blur_m=self.blurs[-1] * pair.size_m,
             pull=self._pull(pair, prior),
-            effective_points=self.effective_points,
+            effective_points=pair.independent(self.effective_points),
             floor=found.scores[0] - self.negligible,
             stride=self.stride,
             max_strides=self.max_strides,
@@ -237,7 +240,7 @@ class Search:
 
     def scores(self, pair: Pair, poses: Array, blur_m: float) -> Array:
         """Return how good (n,) places are beside each other (nats)."""
-        return pair.tempered(poses, blur_m, effective_points=self.effective_points)
+        return pair.tempered(poses, blur_m, effective_points=pair.independent(self.effective_points))
 
     def _led(self, pair: Pair, poses: Array, prior: PoseGaussian, blur_m: float) -> Array:
         """Return motions led downhill on matching surface, held by what the prior says of them."""

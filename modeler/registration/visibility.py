@@ -41,8 +41,8 @@ class _Sampled:
     """What a good match loses to its misfit (nats)."""
     rise: float
     """By how much (nats) the best of them is better than what the search had found."""
-    effective_points: float
-    """Number of independent measurements that all points were worth."""
+    compared_points: float
+    """Number of independent measurements that all points are worth beside other places."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class VisibilityRegistrar(AbstractRegistrar):
 
     points: int = 600
     """Surface points taken from each view."""
-    effective_points: float = 60.0
-    """Number of independent measurements that the points of both views together are worth where surface matches.
-
-    So many they are on an object that covers much of the image, for what even far points err by alike; on a small one
-    they are no more than the patches that smoothing leaves apart.
-    """
+    effective_points: float = 80.0
+    """Most independent measurements that the points of both views together are worth where surface matches; see
+    `Pair.independent`."""
+    compared_points: float = 40.0
+    """Likewise where separate places are weighed against each other: sides that are alike differ by what all points of
+    one side err by, which averages out in none."""
     surface_noise: float = 0.1
     """Least error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
     surface_detail: float = 0.003
@@ -178,8 +178,10 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return samples around candidates."""
         noise_m = pair.surface_noise_m(found.poses[0], self.search.blurs[-1] * pair.size_m)
         typical = pair.typical_misfit(found.poses[0], noise_m)
-        independent = 1.0 / (1.0 / self.effective_points + 1.0 / pair.patches)
-        worth = self.search.scarce_points if found.scarce else independent
+        within, beside = self.effective_points, self.compared_points
+        if found.scarce:
+            within = beside = self.search.scarce_points
+        worth = pair.independent(within)
         likelihood = partial(pair.tempered, blur_m=noise_m, effective_points=worth, typical=typical)
         plain = likelihood(found.poses)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
@@ -190,7 +192,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         gaussians = Gaussians(found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
         population = self.sampler.run(MixtureMotion(motion, gaussians), likelihood, pair.centre_m, rng)
         rise = float(population.log_likelihoods.max() - plain[0])
-        return _Sampled(population, noise_m, typical, rise, worth)
+        return _Sampled(population, noise_m, typical, rise, pair.independent(beside))
 
     def _place(
         self, pair: Pair, motion: AbstractMotion, one: _Sampled, strict: _Sampled, rng: np.random.Generator
@@ -209,7 +211,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         beside = pair.tempered(
             population.poses[best : best + 1],
             strict.noise_m,
-            effective_points=one.effective_points,
+            effective_points=one.compared_points,
             typical=strict.typical,
         )
         return Place(

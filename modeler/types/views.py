@@ -109,7 +109,7 @@ class RayImage:
     layers: Mapping[str, npt.NDArray[np.float64] | npt.NDArray[np.float32]] = field(default_factory=dict)
     """Images a likelihood looks up, made by `rays`."""
     sharing: float = 1.0
-    """Number of surface points over which smoothing spreads the noise of a pixel."""
+    """Number of surface points that share the noise of a pixel, in the sensor and by smoothing."""
 
     @property
     def index(self) -> int:
