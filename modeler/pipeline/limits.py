@@ -29,7 +29,9 @@ def believed(within: Posterior, wider: Posterior, known: AbstractMotion) -> Post
     if within.outcome is Outcome.AT_LIMIT and wider.usable:
         elsewhere = se3.rotation_angle(se3.inverse(within.pose.mean) @ wider.pose.mean) > _ELSEWHERE_RAD
         better_nats = wider.log_evidence - within.log_evidence
-        if elsewhere and not _inside(known, wider.pose.mean[None])[0] and better_nats < _SURPRISE_NATS:
+        # A mean between places may lie inside, and is at none of them.
+        plain = wider.outcome is not Outcome.AMBIGUOUS and _inside(known, wider.pose.mean[None])[0]
+        if elsewhere and not plain and better_nats < _SURPRISE_NATS:
             return replace(within, outcome=Outcome.AMBIGUOUS)
     return _discounted(wider, known)
 
