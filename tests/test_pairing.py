@@ -58,7 +58,7 @@ class Limits(AbstractPrior):
         return self
 
 
-def found(outcome: Outcome, wider_deg: float, gain_nats: float) -> float:
+def found(outcome: Outcome, wider_deg: float, gain_nats: float, overlap: float = 0.8) -> float:
     """Return how far in degrees a view is taken to have turned that one registration leaves at 25°, a wider one not."""
 
     def register(source: RayImage, target: RayImage, prior: AbstractPrior) -> Posterior:
@@ -67,7 +67,8 @@ def found(outcome: Outcome, wider_deg: float, gain_nats: float) -> float:
         pose = PoseGaussian(turned(wider_deg if wide else TRUE_DEG), COVARIANCE)
         nats = -20.0 + gain_nats if wide else -20.0
         told = Outcome.CONVERGED if wide else outcome
-        return Posterior(source.index, target.index, pose, told, overlap=0.8, log_evidence=nats, seconds=1.0)
+        share = 0.8 if wide else overlap
+        return Posterior(source.index, target.index, pose, told, overlap=share, log_evidence=nats, seconds=1.0)
 
     state = State(views={0: view(0)}, places={0: 0, 1: 1})
     pairing = Pairing(Limits(), Closer(), register, lambda state, view: view, None)
@@ -95,6 +96,10 @@ def test_beyond_the_limits_only_what_matches_far_better_is_believed(
     outcome: Outcome, wider_deg: float, gain_nats: float, wanted_deg: float
 ) -> None:
     assert found(outcome, wider_deg, gain_nats) == pytest.approx(wanted_deg, abs=0.1)
+
+
+def test_a_place_within_the_limits_that_hardly_matches_does_not_count() -> None:
+    assert found(Outcome.AT_LIMIT, -65.0, 4.0, overlap=0.27) == pytest.approx(-65.0, abs=0.1)
 
 
 def of_modes(*modes: tuple[float, float]) -> Posterior:
