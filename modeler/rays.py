@@ -92,9 +92,9 @@ class Sensor:
         reach_px = int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, 16))
         # Every second pixel in a row is enough where a wide window holds many.
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours
-        # A tenth of the sensor's noise: neighbouring pixels may agree better than they are true.
-        sharing = max(density * np.pi * (radius_m / metres_per_px + self.correlation_px) ** 2, 1.0)
         ball = (radius_m, reach_px, 2 if reach_px > 4 and enough else 1)
+        sharing = max(density * np.pi * (radius_m / metres_per_px + self.correlation_px) ** 2, 1.0)
+        # A tenth of the sensor's noise: neighbouring pixels may agree better than they are true.
         return ball, 0.1 * self.sigma_r_m / middle_m**2, float(sharing)
 
 

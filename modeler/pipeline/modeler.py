@@ -51,7 +51,7 @@ class Modeler:
     """Makes the model."""
     common_noise: float = 0.1
     """Covariance of what all views of a run err by alike, as a share of an edge's. No loop tells it: over many rendered
-    runs, whose truth is known, the covariances of poses come out true with this."""
+    runs, whose truth is known, the covariances of poses come out no smaller than they may be with this."""
     seed: int = 0
     """Each pair draws from a generator of its own, made from this and the two frame numbers."""
     executor: Executor | None = None

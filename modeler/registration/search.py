@@ -126,7 +126,8 @@ class Search:
             scores: (n,) how good they are.
             rng: source of all randomness.
         """
-        heads = mixture.uncrowded(se3.rows(poses), self._basin(pair.size_m), pair.centre_m, 1, self.lifted)
+        basin = self._basin(pair.size_m)
+        heads = mixture.uncrowded(se3.rows(poses), basin, pair.centre_m, 1, self.lifted)
         dropped = heads[scores[heads] < scores[:1] - self.negligible]
         if not len(dropped):
             return poses[:0]
@@ -138,7 +139,6 @@ class Search:
         chosen = poses[dropped[apart & (blurred[-1] > blurred[0] - 2.0 * self.negligible)]]
         if not len(chosen):
             return chosen
-        basin = self._basin(pair.size_m)
         return self.climb.onward(
             pair, motion, chosen, basin, rng, effective_points=pair.independent(self.effective_points)
         )
