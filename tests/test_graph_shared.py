@@ -6,10 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rings import OBJECT_M, edge, nees, ring, spin
+from scipy import stats
 
 from modeler import se3
 from modeler.graph import PoseGraph, Smoother, shared_noise, solve
+from modeler.graph.chi_square import chi_square_quantile
 from modeler.types import Array, PoseGaussian, Solution
 
 COUNT = 14
@@ -122,3 +126,8 @@ def test_graph_without_loops_tells_nothing() -> None:
     graph, _ = ring(6, np.random.default_rng(0), [])
     assert shared_noise(graph, solve(graph, {})) == 0.0
     assert shared_noise(PoseGraph(), Solution()) == 0.0
+
+
+@given(probability=st.floats(1e-6, 1.0 - 1e-6), degrees=st.integers(1, 3000))
+def test_quantiles_are_those_of_scipy(probability: float, degrees: int) -> None:
+    assert chi_square_quantile(probability, degrees) == pytest.approx(stats.chi2(degrees).ppf(probability), rel=1e-12)

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from modeler import se3
+from modeler.graph.chi_square import chi_square_quantile
 from modeler.graph.links import Link, inverse_right_jacobian
 from modeler.graph.square_root import Rows
 from modeler.types import Array
@@ -95,7 +95,7 @@ class CommonAxis:
         stacked = [np.hstack(list(blocks.values())) for blocks, _ in steps]
         conditions = sum(int(np.count_nonzero(step.any(axis=1))) for step in stacked)
         conditions -= 2 * int(np.count_nonzero(told))
-        return conditions <= 0 or cost <= float(stats.chi2(conditions).ppf(_FITS))
+        return conditions <= 0 or cost <= chi_square_quantile(_FITS, conditions)
 
 
 @dataclass(frozen=True, eq=False)

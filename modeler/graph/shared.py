@@ -24,9 +24,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
 
 from modeler import se3
+from modeler.graph.chi_square import chi_square_quantile
 from modeler.graph.links import Link
 from modeler.graph.marginals import RelativeCovariance
 from modeler.graph.pose_graph import PoseGraph
@@ -122,4 +122,4 @@ def shared_noise(graph: PoseGraph, solution: Solution) -> float:
     conditions = 6 * (count - len(solution.trajectory) + 1)
     if not count or conditions <= 0:
         return 0.0
-    return float(np.clip(1.0 - distance / stats.chi2(conditions).ppf(_CAUTION), 0.0, _MOST))
+    return float(np.clip(1.0 - distance / chi_square_quantile(_CAUTION, conditions), 0.0, _MOST))
