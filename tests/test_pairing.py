@@ -67,8 +67,8 @@ def found(outcome: Outcome, wider_deg: float, gain_nats: float, overlap: float =
         pose = PoseGaussian(turned(wider_deg if wide else TRUE_DEG), COVARIANCE)
         nats = -20.0 + gain_nats if wide else -20.0
         told = Outcome.CONVERGED if wide else outcome
-        share = 0.8 if wide else overlap
-        return Posterior(source.index, target.index, pose, told, overlap=share, log_evidence=nats, seconds=1.0)
+        posterior = Posterior(source.index, target.index, pose, told, 0.8 if wide else overlap, seconds=1.0)
+        return replace(posterior, least_overlap=0.35, log_evidence=nats)
 
     state = State(views={0: view(0)}, places={0: 0, 1: 1})
     pairing = Pairing(Limits(), Closer(), register, lambda state, view: view, None)

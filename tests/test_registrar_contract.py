@@ -165,6 +165,7 @@ def test_states_a_proper_gaussian(method: AbstractRegistrar) -> None:
     assert np.linalg.eigvalsh(covariance)[0] > 0.0
     np.testing.assert_allclose(se3.inverse(found.pose.mean) @ found.pose.mean, np.eye(4), atol=1e-9)
     assert 0.0 <= found.overlap <= 1.0
+    assert found.matches
     assert found.seconds > 0.0
     if found.information is not None:
         surplus = np.linalg.inv(covariance) - found.information
@@ -180,6 +181,7 @@ def test_says_so_where_there_is_nothing_to_register(method: AbstractRegistrar, m
     found = method.register(source, target, motion, rng=np.random.default_rng(5))
     assert found.outcome in (Outcome.TOO_FEW_POINTS, Outcome.NO_OVERLAP)
     assert found.overlap == 0.0
+    assert not found.matches
     assert np.all(np.isfinite(found.pose.mean))
     assert np.linalg.eigvalsh(found.pose.covariance)[0] > 0.0
 

@@ -15,7 +15,6 @@ from modeler.types import AbstractMotion, Array, BoolArray, Mode, Outcome, Poste
 
 _SURPRISE_NATS = 7.0  # one motion of a thousand goes beyond what is known
 _ELSEWHERE_RAD = 0.26  # two registrations turned against each other by more are at two places
-_LEAST_OVERLAP = 0.35  # with less of the surface that both views should see, no motion within the limits explains them
 _LEAST_WEIGHT = 0.01  # of a mode that is kept
 
 
@@ -27,12 +26,12 @@ def believed(within: Posterior, wider: Posterior, known: AbstractMotion) -> Post
         wider: that in wider ones.
         known: the motion that is known, with its limits.
     """
-    if within.outcome is Outcome.AT_LIMIT and within.overlap >= _LEAST_OVERLAP and wider.usable:
+    if within.outcome is Outcome.AT_LIMIT and within.matches and wider.usable:
         elsewhere = se3.rotation_angle(se3.inverse(within.pose.mean) @ wider.pose.mean) > _ELSEWHERE_RAD
+        # Unless it is one bump: a mean between places may lie inside, and is at none of them.
+        possible = wider.outcome is Outcome.CONVERGED and _inside(known, wider.pose.mean[None])[0]
         better_nats = wider.log_evidence - within.log_evidence
-        # A mean between places may lie inside, and is at none of them.
-        plain = wider.outcome is not Outcome.AMBIGUOUS and _inside(known, wider.pose.mean[None])[0]
-        if elsewhere and not plain and better_nats < _SURPRISE_NATS:
+        if elsewhere and not possible and better_nats < _SURPRISE_NATS:
             return replace(within, outcome=Outcome.AMBIGUOUS)
     return _discounted(wider, known)
 

@@ -148,6 +148,7 @@ class VisibilityRegistrar(AbstractRegistrar):
             pose=pose,
             outcome=self._outcome(effective, pose, overlap, at_limit=at_limit),
             overlap=overlap,
+            least_overlap=self.min_overlap,
             samples=samples,
             weights=weights,
             modes=modes if len(modes) > 1 else (),

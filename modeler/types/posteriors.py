@@ -58,6 +58,8 @@ class Posterior:
     """How the attempt ended."""
     overlap: float
     """Share (0..1) of the surface that should be seen by both cameras at the mean and is."""
+    least_overlap: float = field(default=0.0, kw_only=True)
+    """Overlap with less of which the method takes the surfaces not to match, whatever else the outcome tells."""
     samples: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """(n, 4, 4) samples of target_from_source; empty where the method draws none."""
     weights: Array = field(default_factory=lambda: np.zeros(0))
@@ -79,6 +81,11 @@ class Posterior:
     def usable(self) -> bool:
         """Whether the posterior may become an edge."""
         return self.outcome in (Outcome.CONVERGED, Outcome.AMBIGUOUS)
+
+    @property
+    def matches(self) -> bool:
+        """Whether there is enough surface in common at the mean: at a prior's limit a posterior may find none."""
+        return self.outcome is not Outcome.NO_OVERLAP and self.overlap > 0.0 and self.overlap >= self.least_overlap
 
     def without_samples(self) -> Posterior:
         """Return the posterior as it is kept once it is judged: nothing asks for its samples, which are most of it."""
