@@ -63,11 +63,11 @@ def test_what_is_added_and_taken_back_leaves_nothing():
     normals = np.tile([0.0, 0.0, -1.0], (360, 1))
     told = (index, np.full((20, 20), 0.6, dtype=np.float32), points, normals, rng.uniform(0.1, 1.0, 360))
     sums = np.zeros((12, 12, 24, 6), dtype=np.float32)
-    low, high = np.array([2, 0, 0]), np.array([12, 11, 24])
-    origin, pose, lens = np.array([-0.06, -0.06, 0.35]), np.eye(4)[:3], np.array([60.0, 60.0, 9.5, 9.5])
+    box = sums[2:, :11]
+    origin, pose, lens = np.array([-0.04, -0.06, 0.35]), np.eye(4)[:3], np.array([60.0, 60.0, 9.5, 9.5])
     colours = np.concatenate([rng.integers(0, 256, (360, 3)), np.ones((360, 1))], axis=1).astype(np.float64)
     for sign in (1.0, -1.0):
-        preview.tell(sums, low, high, origin, 0.01, 0.03, 0.3, sign, pose, lens, *told, colours)
+        preview.tell(box, origin, 0.01, 0.03, 0.3, sign, pose, lens, *told, colours)
         if sign > 0.0:
             assert np.count_nonzero(sums[..., 0]) > 1000
             assert not sums[:2].any()
@@ -80,9 +80,9 @@ def test_distances_are_those_along_the_normal_within_the_band():
     normal = np.array([[0.0, -0.6, -0.8]])
     sums = np.zeros((1, 1, 40, 6), dtype=np.float32)
     told = (index, np.full((1, 1), 0.5, dtype=np.float32), np.array([[0.0, 0.0, 0.5]]), normal, np.ones(1))
-    low, high, origin = np.zeros(3, dtype=np.int64), np.array([1, 1, 40]), np.array([-0.0025, -0.0025, 0.4])
-    pose, lens, colours = np.eye(4)[:3], np.array([1.0, 1.0, 0.0, 0.0]), np.array([[10.0, 20.0, 30.0, 1.0]])
-    preview.tell(sums, low, high, origin, 0.005, 0.02, 0.3, 1.0, pose, lens, *told, colours)
+    origin, pose = np.array([-0.0025, -0.0025, 0.4]), np.eye(4)[:3]
+    lens, colours = np.array([1.0, 1.0, 0.0, 0.0]), np.array([[10.0, 20.0, 30.0, 1.0]])
+    preview.tell(sums, origin, 0.005, 0.02, 0.3, 1.0, pose, lens, *told, colours)
     along = 0.8 * (0.5 - (0.4 + 0.005 * (np.arange(40) + 0.5)))
     inside = np.abs(along) <= 0.02
     expected = np.where(inside, np.minimum(1.0, 1.5 * (1.0 + along / 0.02) + 1e-3), np.where(along > 0.02, 0.3, 0.0))

@@ -155,11 +155,10 @@ class Growing:
         colours = np.ones((len(view.points_m), 4))
         colours[:, :3] = colours_at(view)
         colours[:, 3] = view.frame.colour is not None
+        box = tuple(slice(*ends) for ends in np.subtract((place.low, place.high), self.low).T)
         preview.tell(
-            self.sums,
-            np.subtract(place.low, self.low),
-            np.subtract(place.high, self.low),
-            np.array(self.low) * self.voxel_m,
+            self.sums[box],
+            np.array(place.low) * self.voxel_m,
             self.voxel_m,
             self.tau_m,
             self.how.empty_weight,
@@ -168,8 +167,8 @@ class Growing:
             lens,
             index,
             free_m,
-            view.points_m,
-            view.normals,
+            se3.transform(place.object_from_camera, view.points_m),
+            view.normals @ place.object_from_camera[:3, :3].T,
             np.where(cosine >= self.how.min_cosine, cosine, 0.0),
             colours,
         )
