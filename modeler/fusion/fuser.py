@@ -9,9 +9,10 @@ import numpy as np
 
 from modeler import se3
 from modeler.fusion import grid
+from modeler.fusion.cut import SMOOTHED
 from modeler.fusion.growing import Growing
 from modeler.fusion.scan import Scan
-from modeler.fusion.stack import SMOOTHED, posed, spread, stack
+from modeler.fusion.stack import posed, spread, stack
 from modeler.types import Array, InputError, ObjectModel, RayImage
 
 

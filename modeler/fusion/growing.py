@@ -12,7 +12,8 @@ from scipy.ndimage import minimum_filter
 
 from modeler import se3
 from modeler.fusion import surface
-from modeler.fusion.stack import GREY, colours_at, posed
+from modeler.fusion.cut import GREY, colours_at
+from modeler.fusion.stack import posed
 from modeler.kernels import isosurface, preview
 from modeler.types import Array, ObjectModel, RayImage
 

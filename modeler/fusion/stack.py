@@ -7,19 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from modeler import se3
+from modeler.fusion.cut import Cut, cut, pose_variances, window
 from modeler.kernels import fusion
-from modeler.kernels.surfels import surfels
 from modeler.types import Array, BoolArray, InputError, RayImage
 
 WITNESSES = 20000  # points asked for how well the views agree
 LOOKS = 10_000_000  # witnesses times views, at most
 AT_ONCE = 1_000_000  # of these, for the memory it takes
-GREY = 128  # colour of what no view with colour sees
-SMOOTHED = 0.5  # noise of a surface point, smoothed over its neighbours, against that of its pixel
-STEEPEST_RAD = 1.40  # a step between neighbouring pixels steeper than this (80°) is an edge, not a surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,114 +76,6 @@ def posed(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> lis
     return pairs
 
 
-def colours_at(view: RayImage) -> npt.NDArray[np.uint8]:
-    """Return the RGB (n, 3) of a view's surface points, grey where the view has no colour."""
-    return _sampled(view.frame.colour, view.pixels)
-
-
-def _sampled(colour: npt.NDArray[np.uint8] | None, pixels: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
-    """Return the RGB (n, 3) of pixels (n, 2), grey without an image."""
-    if colour is None:
-        return np.full((len(pixels), 3), GREY, dtype=np.uint8)
-    return colour[pixels[:, 0], pixels[:, 1]]
-
-
-def _window(view: RayImage, camera_from_object: Array, corners_m: Array) -> tuple[slice, slice]:
-    """Return the rows and columns in which a box, given by its corners, is seen."""
-    camera = view.frame.camera
-    x, y, z = se3.transform(camera_from_object, corners_m).T
-    if np.any(z <= 0.0):  # the box reaches behind the camera
-        return slice(0, camera.height), slice(0, camera.width)
-    columns, rows = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    top, bottom = (int(n) for n in np.clip([np.floor(rows.min()), np.ceil(rows.max()) + 1.0], 0, camera.height))
-    left, right = (int(n) for n in np.clip([np.floor(columns.min()), np.ceil(columns.max()) + 1.0], 0, camera.width))
-    return slice(top, bottom), slice(left, right)
-
-
-@dataclass(frozen=True, eq=False)
-class _Cut:
-    """One view cut to a window: images of the window, and all that was seen of the surface there."""
-
-    index: npt.NDArray[np.int32]
-    free_m: npt.NDArray[np.float32]
-    beside_m: npt.NDArray[np.float32]
-    colour: npt.NDArray[np.uint8] | None
-    lens: Array
-    points_m: Array
-    normals: Array
-    pixels: npt.NDArray[np.int64]
-    weights: Array
-
-
-def _cut(view: RayImage, window: tuple[slice, slice], *, margin_px: int, min_cosine: float, edge_weight: float) -> _Cut:
-    """Cut a view to a window.
-
-    Where the view has no surface point, at silhouettes, on thin parts and at flat angles, small planes through the
-    measured depth stand in.
-    """
-    frame, camera = view.frame, view.frame.camera
-    corner = np.array([window[0].start, window[1].start])
-    depth_m = frame.depth_m[window]
-    measured = np.isfinite(depth_m) & (depth_m > 0.0)
-    mask = measured if frame.mask is None else measured & frame.mask[window]
-    lens = np.array([camera.fx, camera.fy, camera.cx - corner[1], camera.cy - corner[0]])
-
-    pixels = view.pixels - corner
-    inside = np.all((pixels >= 0) & (pixels < depth_m.shape), axis=1)
-    rest = mask.copy()
-    rest[tuple(pixels[inside].T)] = False
-    others = np.argwhere(rest)
-    points_m, normals = surfels(depth_m, others, mask, lens, view.sigma_r_m, np.tan(STEEPEST_RAD))
-    found = np.any(normals != 0.0, axis=1)
-    pixels = np.concatenate([pixels[inside], others[found]])
-    points_m = np.concatenate([view.points_m[inside], points_m[found]])
-    normals = np.concatenate([view.normals[inside], normals[found]])
-
-    # An edge is where a neighbour is no part of the object, or too far away for a surface in between.
-    far = maximum_filter(np.where(mask, depth_m, -np.inf), size=3)
-    near = minimum_filter(np.where(mask, depth_m, np.inf), size=3)
-    with np.errstate(invalid="ignore"):
-        step = far - near > 2.0 * depth_m / camera.fx * np.tan(STEEPEST_RAD) + 4.0 * view.sigma_r_m
-    edges = step | np.logical_not(minimum_filter(mask, size=3))
-    cosine = -np.sum(points_m * normals, axis=1) / np.linalg.norm(points_m, axis=1)
-    weights = cosine * np.where(edges[tuple(pixels.T)], edge_weight, 1.0)
-    kept = cosine >= min_cosine
-    pixels = pixels[kept]
-    index = np.full(depth_m.shape, -1, dtype=np.int32)
-    index[tuple(pixels.T)] = np.arange(len(pixels))
-    around = np.asarray(maximum_filter(mask, size=2 * margin_px + 1, mode="nearest"), dtype=bool)
-    reach_m = minimum_filter(np.where(measured, depth_m, np.inf), size=2 * margin_px + 1, mode="nearest")
-    return _Cut(
-        index=index,
-        free_m=np.where(measured, reach_m, 0.0).astype(np.float32),
-        beside_m=np.where(measured & ~around, depth_m, 0.0).astype(np.float32),
-        colour=None if frame.colour is None else frame.colour[window],
-        lens=lens,
-        points_m=points_m[kept],
-        normals=normals[kept],
-        pixels=pixels,
-        weights=weights[kept],
-    )
-
-
-def _plane(view: RayImage, object_from_camera: Array) -> Array:
-    """Return normal and offset (4,) of a view's support plane in the object frame, NaN where there is none."""
-    if view.plane is None:
-        return np.full(4, np.nan)
-    normal = object_from_camera[:3, :3] @ view.plane.normal
-    return np.append(normal, view.plane.offset_m - normal @ object_from_camera[:3, 3])
-
-
-def _pose_variances(cut: _Cut, view: RayImage, covariances: Mapping[int, Array] | None) -> Array:
-    """Return the variances (n,) of points along their normals that the pose's error makes, against a pixel's own."""
-    covariance = None if covariances is None else covariances.get(view.index)
-    if covariance is None:
-        return np.zeros(len(cut.points_m))
-    # A pose moved by ξ = (ω, v) moves a point p along its normal n by ω · (p × n) + v · n.
-    rows = np.concatenate([np.cross(cut.points_m, cut.normals), cut.normals], axis=1)
-    return np.einsum("ni,ij,nj->n", rows, covariance, rows) / (SMOOTHED * view.sigma_r_m) ** 2
-
-
 def stack(
     pairs: list[tuple[RayImage, Array]],
     corners_m: Array,
@@ -210,22 +98,22 @@ def stack(
     Raises:
         InputError: where no view sees anything of the object in the box.
     """
-    windows = [_window(view, se3.inverse(pose), corners_m) for view, pose in pairs]
-    size = (len(pairs), *(max(window[axis].stop - window[axis].start for window in windows) for axis in range(2)))
+    windows = [window(view, se3.inverse(pose), corners_m) for view, pose in pairs]
+    size = (len(pairs), *(max(where[axis].stop - where[axis].start for where in windows) for axis in range(2)))
     index = np.full(size, -1, dtype=np.int32)
     free_m, beside_m = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.float32)
     colour = np.zeros((*size, 3), dtype=np.uint8)
     lenses, told, counts = [], [], []
-    for number, ((view, pose), window) in enumerate(zip(pairs, windows, strict=True)):
-        cut = _cut(view, window, margin_px=margin_px, min_cosine=min_cosine, edge_weight=edge_weight)
-        here = number, *map(slice, cut.index.shape)
-        index[here] = np.where(cut.index >= 0, cut.index + sum(counts), -1)
-        free_m[here], beside_m[here] = cut.free_m, cut.beside_m
-        if cut.colour is not None:
-            colour[here] = cut.colour
-        lenses.append(cut.lens)
-        told.append(_told(cut, view, pose, covariances))  # its images need not be kept
-        counts.append(len(cut.points_m))
+    for number, ((view, pose), where) in enumerate(zip(pairs, windows, strict=True)):
+        part = cut(view, where, margin_px=margin_px, min_cosine=min_cosine, edge_weight=edge_weight)
+        here = number, *map(slice, part.index.shape)
+        index[here] = np.where(part.index >= 0, part.index + sum(counts), -1)
+        free_m[here], beside_m[here] = part.free_m, part.beside_m
+        if part.colour is not None:
+            colour[here] = part.colour
+        lenses.append(part.lens)
+        told.append(_told(part, pose, None if covariances is None else covariances.get(view.index), view.sigma_r_m))
+        counts.append(len(part.points_m))
     if sum(counts) == 0:
         raise InputError("nothing to fuse: the object is seen at flat angles only; check the masks and the trajectory")
     points_m, normals, depth_m, weights, noise, colours = (np.concatenate(some) for some in zip(*told, strict=True))
@@ -249,17 +137,25 @@ def stack(
     )
 
 
+def _plane(view: RayImage, object_from_camera: Array) -> Array:
+    """Return normal and offset (4,) of a view's support plane in the object frame, NaN where there is none."""
+    if view.plane is None:
+        return np.full(4, np.nan)
+    normal = object_from_camera[:3, :3] @ view.plane.normal
+    return np.append(normal, view.plane.offset_m - normal @ object_from_camera[:3, 3])
+
+
 def _told(
-    cut: _Cut, view: RayImage, object_from_camera: Array, covariances: Mapping[int, Array] | None
+    part: Cut, object_from_camera: Array, covariance: Array | None, sigma_r_m: float
 ) -> tuple[Array, Array, Array, Array, Array, npt.NDArray[np.uint8]]:
     """Return points and normals (n, 3) in the object frame, their depths, weights and pose variances (n,), and RGB."""
     return (
-        se3.transform(object_from_camera, cut.points_m),
-        cut.normals @ object_from_camera[:3, :3].T,
-        cut.points_m[:, 2].copy(),
-        cut.weights,
-        _pose_variances(cut, view, covariances),
-        _sampled(cut.colour, cut.pixels),
+        se3.transform(object_from_camera, part.points_m),
+        part.normals @ object_from_camera[:3, :3].T,
+        part.points_m[:, 2].copy(),  # so that the rest of the cut need not be kept
+        part.weights,
+        pose_variances(part, covariance, sigma_r_m),
+        part.colours,
     )
 
 

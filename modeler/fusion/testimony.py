@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from modeler.fusion.stack import GREY, Stack
+from modeler.fusion.cut import GREY
+from modeler.fusion.stack import Stack
 from modeler.kernels import fusion
 from modeler.types import Array
 
