@@ -22,6 +22,7 @@ from modeler.cli.building import comes_back, other_step, sense_in_doubt
 from modeler.cli.interrupt import Interrupt
 from modeler.cli.options import PriorOptions
 from modeler.cli.usage import parsed
+from modeler.export import RunFolder, model_upright
 from modeler.types import Outcome
 from sequences import bundled, open_sequence
 
@@ -478,8 +479,10 @@ def test_export_keeps_the_mesh(run: Run, built: Path, tmp_path: Path, suffix: st
     assert (ended.status, ended.out) == (0, "")
     assert re.fullmatch(rf"modeler: \d+ triangles: \S+/box\.{suffix}\n", ended.err)
     mesh, original = (trimesh.load_mesh(path) for path in (tmp_path / f"box.{suffix}", built / "model.ply"))
-    if suffix == "glb":  # whose y is up
-        original.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))
+    if suffix == "glb":  # which stands upright, seen from the camera's side
+        turn = np.diag([1.0, -1.0, -1.0, 1.0])
+        turn[:3, :3] @= model_upright(RunFolder(built).report()).T
+        original.apply_transform(turn)
     assert len(mesh.faces) == len(original.faces)
     assert np.allclose(mesh.bounds, original.bounds, atol=1e-5)
 

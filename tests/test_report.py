@@ -22,7 +22,6 @@ from modeler.types import Array, InputError
 from sequences import bundled
 from viz.report import write_page
 from viz.report.mesh import read_mesh, scene
-from viz.report.plots import ring_upright
 from viz.report.recorded import recorded, surfaces
 from viz.report.result import Result
 from viz.stream import open_stream
@@ -186,20 +185,6 @@ def test_the_viewer_shows_how_sure_each_vertex_is_and_what_is_made_up(tmp_path: 
     lightness = painted[1:4].sum(axis=1)
     assert (np.diff(lightness) > 100).all()
     np.testing.assert_array_equal(painted[3], painted[4])
-
-
-@pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 60.0])
-def test_what_turned_on_a_table_stands_upright_in_the_page(tilt_deg: float) -> None:
-    """The camera looks down on the ring that it makes around the object, by so many degrees."""
-    up = np.array([0.0, -np.cos(np.radians(tilt_deg)), -np.sin(np.radians(tilt_deg))])
-    turns = [se3.exp(np.concatenate([angle * up, np.zeros(3)])) for angle in np.linspace(0.0, 5.0, 8)]
-    centres_m = np.array([turn[:3, :3] @ [0.0, 0.0, -0.7] for turn in turns])
-    right, down, forward = ring_upright(centres_m).T
-    np.testing.assert_allclose(down, -up, atol=1e-9)
-    np.testing.assert_allclose(right, [1.0, 0.0, 0.0], atol=1e-9)  # as the first camera sees it
-    np.testing.assert_allclose(np.cross(right, down), forward, atol=1e-9)
-    for few in (1, 2):
-        assert np.array_equal(ring_upright(centres_m[:few]), np.eye(3))
 
 
 def test_without_truth_recording_or_mesh_the_page_says_so(run: Path, tmp_path: Path) -> None:

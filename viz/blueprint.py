@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 import rerun.blueprint as rrb
 
+from modeler.export.standing import upright
 from modeler.types import Array, RayImage
 from viz import entities, images, poses
-from viz.standing import upright
 
 _BACKGROUND: Final = (24, 26, 30)
 _ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object to the eye; the camera is towards -z, up is -y

@@ -10,11 +10,11 @@ import numpy.typing as npt
 import rerun as rr
 
 from modeler import se3
+from modeler.export.standing import upright
 from modeler.export.tints import MADE_UP_RGB
 from modeler.types import Array, ObjectModel, Posterior, RayImage, Step
 from viz import entities
 from viz.drawings import CLEAR, Drawing
-from viz.standing import upright
 
 _PAIR_POINTS: Final = 6_000
 _MODEL_POINTS: Final = 15_000

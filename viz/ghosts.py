@@ -12,10 +12,10 @@ import numpy.typing as npt
 import rerun as rr
 
 from modeler import se3
+from modeler.export.standing import upright
 from modeler.types import Array, Mode, Posterior, RayImage, Step
 from viz import certainty, clouds, entities, spread, uncertainty
 from viz.drawings import CLEAR, Drawing
-from viz.standing import upright
 
 _GHOSTS: Final = 20
 _GHOST_POINTS: Final = 200

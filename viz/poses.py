@@ -10,10 +10,10 @@ import numpy as np
 import rerun as rr
 
 from modeler import se3
+from modeler.export.standing import upright
 from modeler.types import Array, Camera, Edge, Step
 from viz import entities
 from viz.drawings import CLEAR, Drawing
-from viz.standing import upright
 
 OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
 """From the object towards the eye that looks at the whole graph."""

@@ -21,7 +21,7 @@ def export(options: Export) -> None:
         InputError: where the options exclude each other, or something cannot be read or written.
     """
     _check(options)
-    report = files.RunFolder(options.run_folder).report()  # a sequence may hold a model.ply as well: the true one
+    report = files.RunFolder(options.run_folder).result()  # a sequence may hold a model.ply as well: the true one
     if not report.get("poses"):
         raise InputError(f"{options.run_folder}: no frame of this run was accepted; report.json says why")
     scan = _scan(options)
@@ -44,7 +44,7 @@ def export(options: Export) -> None:
     if options.bop:
         files.write_bop(model, options.out)
     else:
-        files.write_mesh(model, options.out, texture)
+        files.write_mesh(model, options.out, texture, object_from_upright=files.model_upright(report))
     _tell(model, options)
 
 

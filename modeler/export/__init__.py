@@ -17,6 +17,7 @@ from modeler.export.report import edge_record as edge_record
 from modeler.export.report import report_of as report_of
 from modeler.export.run_folder import RunFolder as RunFolder
 from modeler.export.simplify import simplified as simplified
+from modeler.export.standing import model_upright as model_upright
 from modeler.export.texture import textured as textured
 from modeler.export.tints import tinted as tinted
 from modeler.export.tum import tum_text as tum_text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -97,6 +98,10 @@ def _numbers(count: int) -> Test:
     return lambda value: isinstance(value, list) and len(value) == count and all(map(_known, value))
 
 
+def _direction(value: Any) -> bool:
+    return _numbers(3)(value) and None not in value and abs(math.hypot(*value) - 1.0) < _ROUND
+
+
 def _modes(value: Any) -> bool:
     return isinstance(value, list) and all(_wrong(mode, _MODE) is None for mode in value)
 
@@ -111,6 +116,7 @@ _WHOLE: dict[str, Test] = {
     "trustworthy": _is(bool),
     "reasons": lambda value: isinstance(value, list) and all(map(_is(str), value)),
     "seconds": lambda value: isinstance(value, dict) and all(map(_number, value.values())),
+    "up": _null_or(_direction),
 }
 _FRAME: dict[str, Test] = {"id": _whole, "timestamp": _number, "points": _whole, "outcome": _is(str)}
 _POSE: dict[str, Test] = {"id": _whole, "object_from_camera": _numbers(16), "covariance": _numbers(36)}

@@ -10,7 +10,7 @@ import numpy as np
 from modeler.export.files import write_atomically
 from modeler.export.ply import mesh_ply
 from modeler.export.texture import Texture
-from modeler.types import InputError, ObjectModel
+from modeler.types import Array, InputError, ObjectModel
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 TEXTURED = (".obj", ".glb")
@@ -34,17 +34,20 @@ def format_of(out: Path) -> str:
     return suffix
 
 
-def write_mesh(model: ObjectModel, out: Path, texture: Texture | None = None) -> None:
+def write_mesh(
+    model: ObjectModel, out: Path, texture: Texture | None = None, *, object_from_upright: Array | None = None
+) -> None:
     """Write a mesh; the ending of `out` selects the format.
 
     Coordinates stay as they are in every format: metres, in the object frame, x right, y down, z forward in the first
-    image. In glTF y is up, so that the node of a GLB turns the mesh half round x: viewers show it upright. PLY, OBJ
-    and GLB keep normals and colours, PLY alone what is known of the vertices; STL holds neither.
+    image. In glTF y is up, so that the node of a GLB turns the mesh: viewers show it as it stood, from the camera's
+    side. PLY, OBJ and GLB keep normals and colours, PLY alone what is known of the vertices; STL holds neither.
 
     Args:
         model: the mesh.
         out: file to write; folders on the way are made. A textured OBJ has an MTL and a PNG file beside it.
         texture: for OBJ and GLB, in place of vertex colours.
+        object_from_upright: (3, 3) right, down and forward of the view in which a GLB is shown; None: the camera's own.
 
     Raises:
         InputError: where the ending is unknown or a file cannot be written.
@@ -66,7 +69,7 @@ def write_mesh(model: ObjectModel, out: Path, texture: Texture | None = None) ->
                 write_atomically(out.with_name(f"{beside}.mtl"), _material(f"{beside}.png"))
             write_atomically(out, _obj(model, beside, texture))
         case ".glb":
-            write_atomically(out, _glb(model, texture))
+            write_atomically(out, _glb(model, texture, object_from_upright))
         case _:
             write_atomically(out, _stl(model))
 
@@ -102,7 +105,7 @@ def _obj(model: ObjectModel, name: str, texture: Texture | None) -> str:
     return "\n".join([*lines, ""])
 
 
-def _glb(model: ObjectModel, texture: Texture | None) -> bytes:
+def _glb(model: ObjectModel, texture: Texture | None, object_from_upright: Array | None) -> bytes:
     import trimesh
     from PIL import Image
     from trimesh.exchange import gltf
@@ -122,7 +125,10 @@ def _glb(model: ObjectModel, texture: Texture | None) -> bytes:
         )
         mesh.visual = TextureVisuals(uv=texture.uv, material=material)
     scene = trimesh.Scene()
-    scene.add_geometry(mesh, transform=np.diag([1.0, -1.0, -1.0, 1.0]))  # glTF: y up, and the front towards +z
+    turn = np.diag([1.0, -1.0, -1.0, 1.0])  # glTF: y up, and the front towards +z
+    if object_from_upright is not None:
+        turn[:3, :3] @= object_from_upright.T
+    scene.add_geometry(mesh, transform=turn)
     data = gltf.export_glb(scene, include_normals=True)
     assert isinstance(data, bytes)
     return data

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from modeler.export.words import undetermined
-from modeler.types import ACCEPTED, Edge, Mode, RayImage, Solution, Step, joined_without, loops_closed
+from modeler.types import ACCEPTED, Array, Edge, Mode, RayImage, Solution, Step, joined_without, loops_closed
 
 _SCHEMA = 1
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
@@ -98,6 +98,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "closed": loops_closed(_taking_part(step)) > 0,
         "trustworthy": not reasons,
         "reasons": reasons,
+        "up": _up(solution, views),
         "frames": [vars(frame) for frame in frames],
     }
     poses = [
@@ -106,6 +107,12 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
     ]
     edges = [edge_record(edge, solution, views.get(edge.source)) for edge in step.edges_so_far]
     return {**_json(report), "edges": edges, "poses": _json(poses)}
+
+
+def _up(solution: Solution, views: Mapping[int, RayImage]) -> Array | None:
+    """Return the normal of what the object stood on in the first frame, whose camera frame is the object's."""
+    first = views.get(min(solution.trajectory, default=-1))
+    return None if first is None or first.plane is None else first.plane.normal
 
 
 def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> list[str]:

@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
+from modeler.export.standing import ring_axes
 from modeler.types import Array, PoseGaussian
-from viz.report.plots import new_figure, ring_axes
+from viz.report.plots import new_figure
 from viz.report.result import Result
 
 if TYPE_CHECKING:

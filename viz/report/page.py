@@ -16,6 +16,7 @@ from PIL import Image
 
 from modeler import evaluation, se3
 from modeler.export import write_atomically
+from modeler.export.standing import model_upright
 from modeler.export.tints import MOST_SIGMA_M
 from modeler.types import ACCEPTED, Array, loops_closed
 from viz.pictures import look_at, shade
@@ -91,7 +92,7 @@ def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
     if mesh is None:
         return ["<h2>Model</h2><p>The run left no mesh.</p>"]
     cameras = [_pyramid(pose.mean) for pose in result.poses.values()]
-    object_from_upright = plots.ring_upright(np.array([pose.mean[:3, 3] for pose in result.poses.values()]))
+    object_from_upright = model_upright(result.report)
     data = json.dumps(scene(mesh, cameras, object_from_upright))
     paints = {"colours": "colour", "certainty": "certainty", "plain": "plain"}
     known = [name for name in paints if name == "plain" or getattr(mesh, name) is not None]

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from modeler import evaluation, se3
+from modeler.export.standing import ring_axes
 from modeler.types import Array, PoseGaussian
 from viz.calibration import Curve, Panel, coverage_curves
 from viz.certainty import Sd, sd_of
 from viz.report.result import Result
-from viz.standing import standing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,7 +26,6 @@ ODOMETRY: Final = "#7a828c"
 CLOSURE: Final = "#2f9e58"
 REJECTED: Final = "#c8453f"
 _SHAPE: Final = "#c9ced4"
-_WIDE, _FLAT = 0.1, 0.3  # a ring is no line, and all but plane
 _CIRCLE: Final = np.stack([np.cos(np.linspace(0, 2 * np.pi, 49)), np.sin(np.linspace(0, 2 * np.pi, 49))])
 
 
@@ -53,33 +52,6 @@ def trajectory(result: Result, shape_m: Array) -> bytes:
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=8, frameon=False, loc="outside upper center", ncols=4)
     return _svg(figure)
-
-
-def ring_axes(centres_m: Array) -> tuple[Array, Array]:
-    """Return what is across (3,) and what is up (3,) in pictures of a ring of cameras.
-
-    From above the first camera's left is on the left; from the side, its up is up.
-
-    Args:
-        centres_m: (n, 3) where the cameras are, in the object frame.
-    """
-    middle = centres_m.mean(axis=0)
-    spread = np.linalg.svd(centres_m - middle)[2] if len(centres_m) > 2 else np.eye(3)[[0, 2, 1]]
-    across = spread[0] * (np.sign(spread[0, 0]) or 1.0)
-    up = np.cross(spread[0], spread[1])
-    return across, -up if up[1] > 0 else up  # y is down
-
-
-def ring_upright(centres_m: Array) -> Array:
-    """Return right, down and forward (3, 3), as columns, of a view in which a ring of cameras lies level.
-
-    The identity, which is the view of the first frame's camera, where they make no ring.
-
-    Args:
-        centres_m: (n, 3) where the cameras are, in the object frame.
-    """
-    long, wide, high = np.pad(np.linalg.svd(centres_m - centres_m.mean(axis=0), compute_uv=False), (0, 3))[:3]
-    return standing(ring_axes(centres_m)[1]) if wide > _WIDE * long and high < _FLAT * wide else np.eye(3)
 
 
 def _cameras(axis: Axes, result: Result, axes: Array, middle: Array) -> None:

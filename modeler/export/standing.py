@@ -1,0 +1,82 @@
+"""Upright views of what stands on a support that the camera looks down on, or turned in front of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from modeler.export.reading import poses_of
+from modeler.types import Array, RayImage
+
+_LEAST_BACK = 0.3  # of the way to the camera that lies across what is up: else it looks down from right above
+_WIDE, _FLAT = 0.1, 0.3  # a ring is no line, and all but plane
+
+
+def standing(up: Array) -> Array:
+    """Return right, down and forward (3, 3), as columns, of a view from the camera's side in which `up` is up.
+
+    Args:
+        up: (3,) unit, in camera coordinates.
+
+    Returns:
+        The identity, which is the camera's own view, where the camera looks along `up`.
+    """
+    back = np.array([0.0, 0.0, -1.0])
+    back = back - up * (up @ back)
+    length = float(np.linalg.norm(back))
+    if length < _LEAST_BACK:
+        return np.eye(3)
+    forward = -back / length
+    return np.stack([np.cross(forward, up), -up, forward], axis=1)
+
+
+def upright(view: RayImage) -> Array:
+    """Return right, down and forward (3, 3), as columns, of a view in which the support of an object lies level.
+
+    The identity, which is the camera's own view, where no support is seen.
+    """
+    return np.eye(3) if view.plane is None else standing(view.plane.normal)
+
+
+def model_upright(report: Mapping[str, Any]) -> Array:
+    """Return right, down and forward (3, 3), as columns, of a view in which the model of a run stands upright.
+
+    What it stood on lies level in it; where none was seen, the ring that the cameras make around it; where they make
+    none, it is the view of the first frame's camera.
+
+    Args:
+        report: of a run in which frames were accepted.
+    """
+    up = report.get("up")  # which reports of earlier versions have not
+    if up is not None:
+        return standing(np.array(up, dtype=np.float64))
+    return ring_upright(np.array([pose.mean[:3, 3] for pose in poses_of(report).values()]))
+
+
+def ring_upright(centres_m: Array) -> Array:
+    """Return right, down and forward (3, 3), as columns, of a view in which a ring of cameras lies level.
+
+    The identity, which is the view of the first frame's camera, where they make no ring.
+
+    Args:
+        centres_m: (n, 3) where the cameras are, in the object frame.
+    """
+    long, wide, high = np.pad(np.linalg.svd(centres_m - centres_m.mean(axis=0), compute_uv=False), (0, 3))[:3]
+    return standing(ring_axes(centres_m)[1]) if wide > _WIDE * long and high < _FLAT * wide else np.eye(3)
+
+
+def ring_axes(centres_m: Array) -> tuple[Array, Array]:
+    """Return what is across (3,) and what is up (3,) in pictures of a ring of cameras.
+
+    From above the first camera's left is on the left; from the side, its up is up.
+
+    Args:
+        centres_m: (n, 3) where the cameras are, in the object frame.
+    """
+    middle = centres_m.mean(axis=0)
+    spread = np.linalg.svd(centres_m - middle)[2] if len(centres_m) > 2 else np.eye(3)[[0, 2, 1]]
+    across = spread[0] * (np.sign(spread[0, 0]) or 1.0)
+    up = np.cross(spread[0], spread[1])
+    return across, -up if up[1] > 0 else up  # y is down
