@@ -111,8 +111,9 @@ class Matcher:
         share = 0.0
         for reach_m in extent_m * np.geomspace(0.33, 0.02, self.steps):
             moved, turned = se3.transform(pose, points_m), normals @ pose[:3, :3].T
-            off_m, nearest = (np.atleast_1d(found) for found in tree.query(moved))
-            kept = (off_m < reach_m) & (np.sum(turned * target_normals[nearest], axis=1) > 0.4)
+            off_m, nearest = (np.atleast_1d(found) for found in tree.query(moved, distance_upper_bound=reach_m))
+            kept = np.isfinite(off_m)
+            kept[kept] = np.sum(turned[kept] * target_normals[nearest[kept]], axis=1) > 0.4
             share = float(np.mean(kept))
             if np.count_nonzero(kept) < 12:
                 return pose, 0.0
