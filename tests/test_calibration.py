@@ -161,7 +161,7 @@ def test_a_study_runs_and_repeats_itself(tmp_path: Path, capsys: pytest.CaptureF
     small = Study(
         specimens=(box,),
         conditions=(Condition(),),
-        frames={"tuning": 3},
+        frames=3,
         priors={"table": TablePrior()},
         methods={OURS: VisibilityRegistrar(points=100, sampler=quick), CONTROL: IcpRegistrar()},
     )
@@ -176,4 +176,4 @@ def test_a_study_runs_and_repeats_itself(tmp_path: Path, capsys: pytest.CaptureF
     with (tmp_path / "calibration.csv").open() as file:
         written = list(csv.DictReader(file))
     assert [float(line["nees_pose"]) for line in written] == [trial.nees["pose"] for trial in trials]
-    assert list(replace(small, frames={"tuning": 2}).trials(box)) == trials[:2]
+    assert list(replace(small, frames=2).trials(box)) == trials[:2]

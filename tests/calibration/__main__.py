@@ -16,7 +16,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from calibration.specimens import FRAMES, SPECIMENS
+from calibration.specimens import SPECIMENS
 from calibration.study import CONTROL, MEASURES, OURS, Study, Trial
 from calibration.tables import degrees, results_csv, results_json, rows, text
 from modeler.export import write_atomically
@@ -32,7 +32,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--half", choices=("tuning", "held-out", "both"), default="tuning", help="which shapes")
     parser.add_argument("--shapes", nargs="+", metavar="NAME", help="only these of them")
     parser.add_argument(
-        "--frames", type=int, metavar="N", help="of each shape under each condition, one more than pairs"
+        "--frames",
+        type=int,
+        default=Study.frames,
+        metavar="N",
+        help="of each shape under each condition, one more than pairs",
     )
     parser.add_argument("--seed", type=int, default=Study.seed, help="of poses, noise and registration")
     parser.add_argument("--out", type=Path, default=Path("runs/calibration"), help="folder of the results")
@@ -42,12 +46,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for specimen in SPECIMENS
         if options.half in ("both", specimen.half) and (not options.shapes or specimen.recipe in options.shapes)
     )
-    frames = FRAMES if options.frames is None else dict.fromkeys(FRAMES, int(options.frames))
-    if not chosen or min(frames.values()) < 2 or options.seed < 0:
+    if not chosen or options.frames < 2 or options.seed < 0:
         parser.error("no pair is left; check --shapes, --half, --frames (2 or more) and --seed (not negative)")
     try:
         options.out.mkdir(parents=True, exist_ok=True)
-        trials = run(Study(specimens=chosen, frames=frames, seed=options.seed), options.out)
+        trials = run(Study(specimens=chosen, frames=options.frames, seed=options.seed), options.out)
     except (InputError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

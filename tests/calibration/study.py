@@ -126,8 +126,8 @@ class Study:
     """The shapes."""
     conditions: tuple[Condition, ...] = CONDITIONS
     """How each is seen."""
-    frames: Mapping[Half, int] = field(default_factory=lambda: FRAMES)
-    """Frames of each shape under each condition, by half: one more than pairs."""
+    frames: int = FRAMES
+    """Frames of each shape under each condition: one more than pairs."""
     seed: int = 0
     """Of poses, noise and registration."""
     priors: Mapping[str, AbstractPrior] = field(
@@ -142,14 +142,14 @@ class Study:
     @property
     def pairs(self) -> int:
         """Number of pairs rendered."""
-        return len(self.conditions) * sum(self.frames[specimen.half] - 1 for specimen in self.specimens)
+        return len(self.conditions) * len(self.specimens) * (self.frames - 1)
 
     def trials(self, specimen: Specimen) -> Iterator[Trial]:
         """Yield what every method makes of every pair of a shape with every prior."""
-        recipe, frames = load_recipe(specimen.recipe), self.frames[specimen.half]
+        recipe = load_recipe(specimen.recipe)
         for number, condition in enumerate(self.conditions):
             seed = int(np.random.SeedSequence([self.seed, recipe.seed, number]).generate_state(1)[0])
-            sequence = RenderedSequence(staged(recipe, condition, frames=frames, seed=seed))
+            sequence = RenderedSequence(staged(recipe, condition, frames=self.frames, seed=seed))
             views, truth = rendered_views(sequence), sequence.truth()
             for source, target in zip(sequence.indices[1:], sequence.indices[:-1], strict=True):
                 motion = true_motion(truth, target, source)

@@ -159,7 +159,7 @@ def results_json(study: Study, trials: Sequence[Trial]) -> str:
     results = {
         "schema": 2,
         "seed": study.seed,
-        "frames": dict(study.frames),
+        "frames": study.frames,
         "pairs": study.pairs,
         "specimens": [asdict(specimen) for specimen in study.specimens],
         "conditions": [asdict(condition) for condition in study.conditions],
