@@ -82,7 +82,7 @@ class Climb:
             motion: where to climb.
             basin: (6,) standard deviations of the basin of a place, beyond which no step is drawn.
             rng: source of all randomness.
-            effective_points: number of independent measurements that all points are worth.
+            effective_points: most independent measurements that all points are worth, see `Pair.independent`.
         """
         poses, stage = motion.sample(self.looks, rng), self.first
         height = partial(_height, pair, motion, effective_points)

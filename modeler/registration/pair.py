@@ -47,7 +47,7 @@ class Pair:
         return 0.5 * (self.forward.image.patches + self.backward.image.patches)
 
     def independent(self, most: float) -> float:
-        """Return how many independent measurements all points are worth.
+        """Return how many independent measurements all points are worth, where at most so many are.
 
         On an object that covers much of the image they are worth `most`, for what even far points err by alike; on a
         small one no more than the patches that smoothing leaves apart.
@@ -73,14 +73,21 @@ class Pair:
     def tempered(
         self, poses: Array, blur_m: float, *, effective_points: float, stride: int = 2, typical: float = 0.5
     ) -> Array:
-        """Return the log-likelihoods (n,) of poses (n, 4, 4) as if so many points were independent, and overlap.
+        """Return the log-likelihoods (n,) of poses (n, 4, 4) as if few points were independent, and overlap.
 
         Two views that are to be registered have surface in common. A likelihood does not know: poses that hide every
         point contradict nothing, and are many. Those under which next to nothing matches are all but excluded; between
         others, with more or less in common, the likelihood alone decides.
+
+        Args:
+            poses: target_from_source.
+            blur_m: blur of the surfaces in m.
+            effective_points: most independent measurements that all points are worth, see `independent`.
+            stride: every so manieth point stands for the others.
+            typical: what a good match loses to its misfit (nats), see `typical_misfit`.
         """
         plain, share = self.log_likelihoods(poses, blur_m, stride=stride, typical=typical)
-        return effective_points / self.points * plain - self.no_overlap * np.exp(-share / self.little_overlap)
+        return self.independent(effective_points) / self.points * plain - self.no_overlap * np.exp(-share / self.little_overlap)
 
     def typical_misfit(self, pose: Array, blur_m: float) -> float:
         """Return what matches under a good pose (4, 4) lose to their misfit (nats), so that they count 0 on average.
@@ -155,7 +162,7 @@ class Pair:
             judging_backward=self.backward.sight(fine),
             forward_model=self.forward.model(blur_m),
             backward_model=self.backward.model(blur_m),
-            per_point=fine * effective_points / self.points,
+            per_point=fine * self.independent(effective_points) / self.points,
             no_overlap=self.no_overlap,
             per_explained=fine / (self.points * self.little_overlap),
             floor=float(floor),

@@ -139,9 +139,7 @@ class Search:
         chosen = poses[dropped[apart & (blurred[-1] > blurred[0] - 2.0 * self.negligible)]]
         if not len(chosen):
             return chosen
-        return self.climb.onward(
-            pair, motion, chosen, basin, rng, effective_points=pair.independent(self.effective_points)
-        )
+        return self.climb.onward(pair, motion, chosen, basin, rng, effective_points=self.effective_points)
 
     def _higher(
         self, pair: Pair, motion: AbstractMotion, found: Candidates, prior: PoseGaussian, rng: np.random.Generator
@@ -150,7 +148,7 @@ class Search:
         fine_m, sparing = self.blurs[-1] * pair.size_m, self._where(scarce=True)
         basin = self._basin(pair.size_m)
         climb = self.climb.thinned(self._starts(prior, pair.size_m) / self.max_starts)
-        high = climb.places(pair, motion, basin, rng, effective_points=pair.independent(self.scarce_points))
+        high = climb.places(pair, motion, basin, rng, effective_points=self.scarce_points)
         poses = np.concatenate([found.poses, high])
         best = sparing._ranked(pair, motion, poses, prior, fine_m)
         _, share = pair.log_likelihoods(best.poses[:1], fine_m, stride=2)
@@ -198,7 +196,7 @@ class Search:
             np.concatenate([axes, -axes]),
             blur_m=self.blurs[-1] * pair.size_m,
             pull=self._pull(pair, prior),
-            effective_points=pair.independent(self.effective_points),
+            effective_points=self.effective_points,
             floor=found.scores[0] - self.negligible,
             stride=self.stride,
             max_strides=self.max_strides,
@@ -240,7 +238,7 @@ class Search:
 
     def scores(self, pair: Pair, poses: Array, blur_m: float) -> Array:
         """Return how good (n,) places are beside each other (nats)."""
-        return pair.tempered(poses, blur_m, effective_points=pair.independent(self.effective_points))
+        return pair.tempered(poses, blur_m, effective_points=self.effective_points)
 
     def _led(self, pair: Pair, poses: Array, prior: PoseGaussian, blur_m: float) -> Array:
         """Return motions led downhill on matching surface, held by what the prior says of them."""

@@ -42,7 +42,7 @@ class _Sampled:
     rise: float
     """By how much (nats) the best of them is better than what the search had found."""
     compared_points: float
-    """Number of independent measurements that all points are worth beside other places."""
+    """Most independent measurements that all points are worth beside other places."""
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         within, beside = self.effective_points, self.compared_points
         if found.scarce:
             within = beside = self.search.scarce_points
-        worth = pair.independent(within)
-        likelihood = partial(pair.tempered, blur_m=noise_m, effective_points=worth, typical=typical)
+        likelihood = partial(pair.tempered, blur_m=noise_m, effective_points=within, typical=typical)
         plain = likelihood(found.poses)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
         log_weights = np.where(found.blunt, found.scores, plain + volumes)
@@ -193,7 +192,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         gaussians = Gaussians(found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
         population = self.sampler.run(MixtureMotion(motion, gaussians), likelihood, pair.centre_m, rng)
         rise = float(population.log_likelihoods.max() - plain[0])
-        return _Sampled(population, noise_m, typical, rise, pair.independent(beside))
+        return _Sampled(population, noise_m, typical, rise, beside)
 
     def _place(
         self, pair: Pair, motion: AbstractMotion, one: _Sampled, strict: _Sampled, rng: np.random.Generator
