@@ -18,6 +18,7 @@ from modeler.fusion.grid import Field, Grid
 from modeler.fusion.stack import posed, spread, stack
 from modeler.kernels import closing, fusion, isosurface, thinning
 from modeler.kernels import votes as voting
+from modeler.kernels.pieces import PIECES
 from modeler.kernels.surfels import surfels
 from modeler.rays import Sensor
 from modeler.types import (
@@ -240,11 +241,11 @@ def test_integration_is_its_twin(seed, one_mind, turned_rad, monkeypatch):
 def level_of(values):
     weights = np.zeros(values.shape, dtype=np.float32)
     weights[1:-1, 1:-1, 1:-1] = 1.0
-    return isosurface.extract(values.astype(np.float32), weights, np.argwhere(weights > 0), isosurface.PIECES)
+    return isosurface.extract(values.astype(np.float32), weights, np.argwhere(weights > 0), PIECES)
 
 
 def test_every_crossed_edge_of_a_cell_belongs_to_one_piece_of_at_least_three():
-    for case, pieces in enumerate(isosurface.PIECES):
+    for case, pieces in enumerate(PIECES):
         for edge, piece in enumerate(pieces):
             axis, a, b = edge // 4, edge >> 1 & 1, edge & 1
             start = int(np.insert([a, b], axis, 0) @ [4, 2, 1])
@@ -278,7 +279,7 @@ def test_the_zero_level_stays_open_where_nothing_is_known():
     values = np.broadcast_to(np.arange(16.0) - 7.5, (16, 16, 16)).astype(np.float32)
     weights = np.zeros(values.shape, dtype=np.float32)
     weights[2:9, 3:13, 1:15] = 1.0
-    vertices, triangles = isosurface.extract(values, weights, np.argwhere(weights > 0), isosurface.PIECES)
+    vertices, triangles = isosurface.extract(values, weights, np.argwhere(weights > 0), PIECES)
     assert np.allclose(vertices[:, 2], 7.5)
     used = vertices[np.unique(triangles)]
     assert np.array_equal(used.min(axis=0), [2.5, 3.5, 7.5])
@@ -712,7 +713,7 @@ def test_no_edge_of_a_zero_level_has_more_than_two_triangles(seed):
     weights = np.zeros(values.shape, dtype=np.float32)
     weights[1:-1, 1:-1, 1:-1] = 1.0
     field = Field(Grid(np.zeros(3), 1.0, np.array([6, 6, 6])), values, weights, np.argwhere(weights > 0.0))
-    _, torn = isosurface.extract(values, weights, field.known, isosurface.PIECES)
+    _, torn = isosurface.extract(values, weights, field.known, PIECES)
     assert edge_uses(torn).max() > 1
     _, triangles = surface.extracted(field)
     assert edge_uses(triangles).max() == 1

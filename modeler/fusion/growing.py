@@ -15,6 +15,7 @@ from modeler.fusion import surface
 from modeler.fusion.cut import GREY, colours_at
 from modeler.fusion.stack import posed
 from modeler.kernels import isosurface, preview
+from modeler.kernels.pieces import PIECES
 from modeler.types import Array, ObjectModel, RayImage
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ class Growing:
             np.moveaxis(weights, axis, 0)[[0, -1]] = 0.0
         known = weights > 0.0
         values = np.where(known, self.sums[..., 1] / np.where(known, weights, 1.0), 0.0).astype(np.float32)
-        places, triangles = isosurface.extract(values, weights, np.argwhere(known), isosurface.PIECES)
+        places, triangles = isosurface.extract(values, weights, np.argwhere(known), PIECES)
         shown = triangles[surface.large_pieces(places, triangles, self.how.min_piece)]
         used, shown = surface.compacted(shown, len(places))
         places = places[used]

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from modeler.fusion.grid import Field
 from modeler.kernels import isosurface
+from modeler.kernels.pieces import PIECES
 from modeler.types import Array, BoolArray
 
 Triangles = npt.NDArray[np.int64]
@@ -28,7 +29,7 @@ def parted(field: Field) -> Field:
     """Return the field with the gap closed between sheets of the zero level that touch along an edge."""
     values, known = field.values_m, field.known
     for _ in range(PINCHES):
-        voxels = isosurface.pinched(values, field.weights, known, isosurface.PIECES)
+        voxels = isosurface.pinched(values, field.weights, known, PIECES)
         if not len(voxels):
             break
         if values is field.values_m:
@@ -44,7 +45,7 @@ def parted(field: Field) -> Field:
 def extracted(field: Field) -> tuple[Array, Triangles]:
     """Return vertices (v, 3) in m and triangles (t, 3) of the zero level; no edge has more than two triangles."""
     field = parted(field)
-    vertices, triangles = isosurface.extract(field.values_m, field.weights, field.known, isosurface.PIECES)
+    vertices, triangles = isosurface.extract(field.values_m, field.weights, field.known, PIECES)
     return field.grid.origin_m + (vertices + 0.5) * field.grid.voxel_m, triangles
 
 

@@ -2,63 +2,12 @@
 
 A vertex lies in every cell for each piece of surface that crosses it, a quad around every grid edge that changes sign
 (Nielson 2004, "Dual marching cubes"). Quads need all four cells around their edge known, so the surface stays open
-where nobody looked. Corners of a cell are numbered 4 dx + 2 dy + dz; its edges 4 axis + 2 a + b, with a and b the
-offsets along the two other axes in ascending order.
+where nobody looked. Which piece crosses which edge is told by a table, `pieces.PIECES`, as are the numbers of corners
+and edges.
 """
 
 import numpy as np
 from numba import njit
-
-
-def _edge(first: int, second: int) -> int:
-    """Return the number of the edge between two neighbouring corners."""
-    axis = {4: 0, 2: 1, 1: 2}[first ^ second]
-    offsets = [(first >> 2) & 1, (first >> 1) & 1, first & 1]
-    del offsets[axis]
-    return 4 * axis + 2 * offsets[0] + offsets[1]
-
-
-def _pieces() -> np.ndarray:
-    """Return (256, 12) int8: which piece of surface crosses each edge of a cell, by its corners' signs; -1 = none.
-
-    Bit c of the case is set where corner c is inside. Two pieces meet in a face whose diagonals differ; there the
-    inside corners are joined, which keeps thin parts whole, and the choice rests on the face alone: neighbours agree.
-    """
-    faces = []
-    for axis in range(3):
-        one, two = 4 >> ((axis + 1) % 3), 4 >> ((axis + 2) % 3)
-        for level in (0, 4 >> axis):
-            faces.append([level, level | one, level | one | two, level | two])
-    table = np.full((256, 12), -1, dtype=np.int8)
-    for case in range(256):
-        links: dict[int, list[int]] = {}
-        for face in faces:
-            inside = [bool(case >> corner & 1) for corner in face]
-            edges = [_edge(face[k], face[(k + 1) % 4]) for k in range(4)]
-            crossed = [edges[k] for k in range(4) if inside[k] != inside[(k + 1) % 4]]
-            if len(crossed) == 4:
-                # Join the inside: cut off the outside corners, each with the two edges that meet there.
-                pairs = [(edges[k - 1], edges[k]) for k in range(4) if not inside[k]]
-            else:
-                pairs = [(crossed[0], crossed[1])] if crossed else []
-            for a, b in pairs:
-                links.setdefault(a, []).append(b)
-                links.setdefault(b, []).append(a)
-        piece = 0
-        for start in sorted(links):
-            if table[case, start] >= 0:
-                continue
-            waiting = [start]
-            while waiting:
-                edge = waiting.pop()
-                if table[case, edge] < 0:
-                    table[case, edge] = piece
-                    waiting.extend(links[edge])
-            piece += 1
-    return table
-
-
-PIECES = _pieces()
 
 
 @njit(cache=True)
@@ -104,7 +53,7 @@ def extract(values, totals, cells, pieces):
         values: (x, y, z) float32, negative inside.
         totals: (x, y, z) float32, 0 = unknown; the outermost voxels are unknown.
         cells: (n, 3) known voxels, in ascending order.
-        pieces: `PIECES`.
+        pieces: `pieces.PIECES`.
     """
     first, cases, count = _numbered(values, totals, cells, pieces)
     vertices, quads = _vertices(values, cells, pieces, first, cases, count)
@@ -226,7 +175,7 @@ def pinched(values, totals, cells, pieces):
         values: (x, y, z) float32, negative inside.
         totals: (x, y, z) float32, 0 = unknown.
         cells: (n, 3) voxels that are the lowest corner of a cell to look at.
-        pieces: `PIECES`.
+        pieces: `pieces.PIECES`.
     """
     found = np.empty((3 * len(cells), 3), dtype=np.int64)
     count = 0
