@@ -87,7 +87,8 @@ class Pair:
             typical: what a good match loses to its misfit (nats), see `typical_misfit`.
         """
         plain, share = self.log_likelihoods(poses, blur_m, stride=stride, typical=typical)
-        return self.independent(effective_points) / self.points * plain - self.no_overlap * np.exp(-share / self.little_overlap)
+        worth = self.independent(effective_points) / self.points
+        return worth * plain - self.no_overlap * np.exp(-share / self.little_overlap)
 
     def typical_misfit(self, pose: Array, blur_m: float) -> float:
         """Return what matches under a good pose (4, 4) lose to their misfit (nats), so that they count 0 on average.
