@@ -8,8 +8,8 @@ from rings import OBJECT_M, covariance, edge, nees, ring, rotation_error, spin
 
 from modeler import se3
 from modeler.graph import CommonAxis, PoseGraph, solve
-from modeler.graph.axis import estimated_axis, slip, surest_point
 from modeler.graph.links import Link
+from modeler.graph.turning import estimated_axis, slip, surest_point
 from modeler.types import Array, Edge, PoseGaussian
 
 COUNT, STEP_RAD, SIGMA_STEP_RAD = 14, np.radians(25.0), np.radians(1.0)
