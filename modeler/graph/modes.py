@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from modeler import se3
-from modeler.graph.links import Link, chain, walk
+from modeler.graph.cycles import Cycle, cycles
+from modeler.graph.links import Link, chain
 from modeler.graph.marginals import RelativeCovariance
 from modeler.graph.optimise import optimise
 from modeler.types import Array, Edge
@@ -31,38 +31,6 @@ _MARGIN = 15.0  # nats below the best at which a hypothesis is no longer worth s
 _DECIDED = 0.9999  # weight from which a mode is taken for the only one, unless a loop then contradicts it
 _REFUTED = 1.5  # false loops more than the best hypothesis has, and one is dropped: two, for one may lie
 _PAIRS = 16  # edges up to which the modes of two of them are changed at once
-
-
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """A stretch of a loop: a motion with one or several modes, from one end of the stretch to the other."""
-
-    edge: int | None
-    """Column of the hypotheses that says which mode; None: there is but one."""
-    means: Array
-    """(m, 4, 4)."""
-    covariances: Array
-    """(m, 6, 6)."""
-
-    def of(self, hypotheses: npt.NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return mean and covariance for each hypothesis (h, edges), or one for all (1, …)."""
-        if self.edge is None:
-            return self.means, self.covariances
-        modes = hypotheses[:, self.edge]
-        return self.means[modes], self.covariances[modes]
-
-
-@dataclass(frozen=True, eq=False)
-class _Loop:
-    """The way along the tree from a loop's target to its source, and the loop's own motion."""
-
-    way: tuple[_Piece, ...]
-    own: _Piece
-
-    @property
-    def edges(self) -> tuple[int, ...]:
-        """Columns on which the loop depends."""
-        return tuple(piece.edge for piece in (*self.way, self.own) if piece.edge is not None)
 
 
 def decide(
@@ -96,9 +64,8 @@ def decide(
         near = scores >= scores[0] - _MARGIN
         hypotheses, scores = hypotheses[near][:_SOLVED], scores[near][:_SOLVED]
         if len(hypotheses) > 1:
-            solved = [search.evidence(tree, loops, root, dict(zip(search.edges, row, strict=True)), settled)
-                      for row in hypotheses]  # fmt: skip
-            scores = np.array(solved)
+            chosen = (dict(zip(search.edges, row, strict=True)) for row in hypotheses)
+            scores = np.array([search.evidence(tree, loops, root, modes, settled) for modes in chosen])
         shares = np.exp(scores - scores.max())
         shares = shares / shares.sum()
         for column, edge in enumerate(search.edges):
@@ -115,7 +82,7 @@ class _Search:
 
     edges: tuple[Edge, ...]
     """Whose mode is open, by column."""
-    loops: tuple[_Loop, ...]
+    cycles: tuple[Cycle, ...]
     """That depend on them, those with the fewest open edges first."""
     threshold: float
     """Half the squared Mahalanobis distance at which a loop is taken to be false."""
@@ -125,38 +92,17 @@ class _Search:
         cls, tree: Sequence[Link], loops: Sequence[Link], root: int, settled: Mapping[Edge, Array], threshold: float
     ) -> _Search:
         """Return the search for the modes of all edges on loops that are not settled."""
-        above = {neighbour: (frame, link) for frame, neighbour, link in walk(tree, root)}
-        depth = {root: 0}
-        for neighbour, (frame, _) in above.items():  # outwards
-            depth[neighbour] = depth[frame] + 1
-        columns: dict[Edge, int] = {}
-        found = []
-        for loop in loops:
-            ahead: list[tuple[Link, bool]] = []  # each with whether the way goes from its target to its source
-            back: list[tuple[Link, bool]] = []
-            target, source = loop.target, loop.source
-            while target != source:
-                if depth[target] >= depth[source]:
-                    target, link = above[target]
-                    ahead.append((link, link.source == target))
-                else:
-                    source, link = above[source]
-                    back.append((link, link.target == source))
-            way = [*ahead, *reversed(back), (loop, True)]
-            if any(link.modes and link.edge not in settled for link, _ in way):
-                *pieces, own = (_piece(link, settled, columns, forwards=forwards) for link, forwards in way)
-                found.append(_Loop(_joined(pieces), own))
-        open_loops = sorted(found, key=lambda loop: len(loop.edges))
-        return cls(tuple(columns), tuple(open_loops), threshold)
+        edges, found = cycles(tree, loops, root, settled)
+        return cls(edges, tuple(sorted(found, key=lambda cycle: len(cycle.columns))), threshold)
 
     def best(self) -> tuple[npt.NDArray[np.int64], Array]:
         """Return hypotheses (h, edges), best first, and their scores (h,)."""
         hypotheses, scores = np.full((1, len(self.edges)), -1), np.zeros(1)
-        for loop in self.loops:
-            for column in loop.edges:
+        for cycle in self.cycles:
+            for column in cycle.columns:
                 if hypotheses[0, column] < 0:
                     hypotheses, scores = self._grown(hypotheses, scores, column)
-            scores = scores + self._closes(loop, hypotheses)[0]
+            scores = scores + self._closes(cycle, hypotheses)[0]
             alive = scores >= scores.max() - _REFUTED * self.threshold
             hypotheses, scores = hypotheses[alive], scores[alive]
         hypotheses = hypotheses[np.argsort(-scores, kind="stable")[:_SOLVED]]
@@ -170,7 +116,7 @@ class _Search:
 
     def contradicted(self, hypothesis: npt.NDArray[np.int64]) -> bool:
         """Return whether a loop is false under a hypothesis (1, edges)."""
-        return any(bool(self._closes(loop, hypothesis)[1][0]) for loop in self.loops)
+        return any(bool(self._closes(cycle, hypothesis)[1][0]) for cycle in self.cycles)
 
     def evidence(
         self,
@@ -223,48 +169,14 @@ class _Search:
         scores = np.zeros(len(hypotheses))
         for column in range(len(self.edges)):
             scores = scores + self._weights(column)[hypotheses[:, column]]
-        return scores + np.sum([self._closes(loop, hypotheses)[0] for loop in self.loops], axis=0)
+        return scores + np.sum([self._closes(cycle, hypotheses)[0] for cycle in self.cycles], axis=0)
 
-    def _closes(self, loop: _Loop, hypotheses: npt.NDArray[np.int64]) -> tuple[Array, npt.NDArray[np.bool_]]:
+    def _closes(self, cycle: Cycle, hypotheses: npt.NDArray[np.int64]) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Return how well a loop closes (h,), as a log density that is cut off where it is false, and where it is."""
-        mean, covariance = np.eye(4)[None], np.zeros((1, 6, 6))
-        for piece in loop.way:
-            mean, covariance = _composed((mean, covariance), piece.of(hypotheses))
-        own, own_covariance = loop.own.of(hypotheses)
-        spread = covariance + own_covariance
-        xi = se3.log(se3.inverse(own) @ mean)
-        error = 0.5 * np.sum(xi * np.linalg.solve(spread, xi[..., None])[..., 0], axis=-1)
-        return -np.minimum(error, self.threshold) - 0.5 * np.linalg.slogdet(spread)[1], error > self.threshold
+        error, log_volume = cycle.gap(hypotheses)
+        return -np.minimum(error, self.threshold) - log_volume, error > self.threshold
 
 
 def _chosen(link: Link, modes: Mapping[Edge, int]) -> Link:
     """Return a link with the mode that is named for it."""
     return Link(link.edge, link.edge.posterior.modes[modes[link.edge]].pose) if link.edge in modes else link
-
-
-def _piece(link: Link, settled: Mapping[Edge, Array], columns: dict[Edge, int], *, forwards: bool) -> _Piece:
-    """Return a link as a stretch of a loop, along it or against it; an open edge is given a column."""
-    edge, poses, column = link.edge, [link.pose], None
-    if link.modes:
-        if edge in settled:
-            poses = [link.modes[int(np.argmax(settled[edge]))].pose]
-        else:
-            poses, column = [mode.pose for mode in link.modes], columns.setdefault(edge, len(columns))
-    poses = poses if forwards else [pose.inverse() for pose in poses]
-    return _Piece(column, np.stack([pose.mean for pose in poses]), np.stack([pose.covariance for pose in poses]))
-
-
-def _joined(pieces: Sequence[_Piece]) -> tuple[_Piece, ...]:
-    """Return the stretches with neighbours of one mode made one."""
-    joined: list[_Piece] = []
-    for piece in pieces:
-        if joined and piece.edge is None and joined[-1].edge is None:
-            last = joined.pop()
-            piece = _Piece(None, *_composed((last.means, last.covariances), (piece.means, piece.covariances)))
-        joined.append(piece)
-    return tuple(joined)
-
-
-def _composed(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return means (h, 4, 4) and covariances (h, 6, 6) of one motion after another, for independent errors."""
-    return first[0] @ second[0], se3.composed_covariance(first[1], *second)
