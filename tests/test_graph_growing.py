@@ -12,7 +12,7 @@ import pytest
 from rings import edge, measured, spin, spun, turntable
 
 from modeler import se3
-from modeler.graph import PoseGraph, Smoother, marginals, smoother, solve
+from modeler.graph import PoseGraph, Smoother, closing, marginals, solve
 from modeler.types import Edge, Mode, PoseGaussian, Solution
 
 COUNT, PER_TURN = 40, 12
@@ -106,8 +106,8 @@ def test_the_whole_graph_is_solved_but_once(monkeypatch: pytest.MonkeyPatch) -> 
         calls.append(len(tree))
         return optimise(tree, *args, **options)  # pyright: ignore[reportArgumentType]
 
-    optimise = smoother.optimise
-    monkeypatch.setattr(smoother, "optimise", counted)
+    optimise = closing.optimise
+    monkeypatch.setattr(closing, "optimise", counted)
     growing = Smoother()
     arrivals = _arrivals(np.random.default_rng(7))
     for edges in arrivals[:-1]:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from modeler.graph.cycles import Cycle, cycles
 from modeler.graph.links import Link, chain
 from modeler.graph.marginals import RelativeCovariance
-from modeler.graph.optimise import optimise
+from modeler.graph.optimise import joining, optimise
 from modeler.types import Array, Edge
 
 _BEAM = 4096  # hypotheses kept while loops are taken one by one: all of twelve edges with two modes
@@ -131,7 +131,7 @@ class _Search:
         of |= {edge: int(np.argmax(weights)) for edge, weights in settled.items()}
         tree, loops = ([_chosen(link, of) for link in some] for some in (tree, loops))
         optimum = optimise(tree, loops, chain(tree, root, {}), root=root, threshold=self.threshold)
-        chosen = [loop for loop, good in zip(loops, optimum.inlier, strict=True) if good]
+        chosen = joining(loops, optimum.inlier)
         evidence = -optimum.error - RelativeCovariance(optimum.poses, root, (*tree, *chosen)).log_determinant
         for edge, mode in hypothesis.items():
             chosen_mode = edge.posterior.modes[int(mode)]

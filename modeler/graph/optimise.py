@@ -52,7 +52,7 @@ def optimise(
     """
     initial = values_of(start)
     taking_part = (*inlier, *[True] * (len(loops) - len(inlier)))
-    chosen = [loop for loop, good in zip(loops, taking_part, strict=True) if good]
+    chosen = joining(loops, taking_part)
     found = _least_squares(factors_of([*tree, *chosen], root), initial)
     if agree(loops, found, threshold) != taking_part:
         factors = factors_of([*tree, *loops], root)
@@ -64,7 +64,7 @@ def optimise(
         annealing.setInlierCostThresholds(threshold)
         found = annealing.optimize()
         taking_part = tuple(bool(weight > 0.5) for weight in annealing.getWeights()[trusted:])
-        chosen = [loop for loop, good in zip(loops, taking_part, strict=True) if good]
+        chosen = joining(loops, taking_part)
         # At full weight, where annealing ended between.
         found = _least_squares(factors_of([*tree, *chosen], root), found)
     error = factors_of([*tree, *chosen], root).error(found) + threshold * taking_part.count(False)
@@ -96,6 +96,11 @@ def poses_of(values: gtsam.Values, frames: Iterable[int], root: int) -> dict[int
 def agree(loops: Iterable[Link], values: gtsam.Values, threshold: float) -> tuple[bool, ...]:
     """Return which loops stay below the threshold: where that is which take part, the choice stands."""
     return tuple(loop.factor.error(values) <= threshold for loop in loops)
+
+
+def joining(loops: Sequence[Link], taking_part: Sequence[bool]) -> list[Link]:
+    """Return the loops that take part."""
+    return [loop for loop, good in zip(loops, taking_part, strict=True) if good]
 
 
 def factors_of(links: Iterable[Link], root: int) -> gtsam.NonlinearFactorGraph:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,17 +11,15 @@ import numpy as np
 
 from modeler.graph.axis import CommonAxis, Turned
 from modeler.graph.belief import belief
+from modeler.graph.closing import closed
 from modeler.graph.incremental import Incremental
 from modeler.graph.links import Frames, Link, anchored, chain
 from modeler.graph.marginals import PoseCovariances, RelativeCovariance
 from modeler.graph.modes import decide
-from modeler.graph.optimise import agree, optimise, poses_of, values_of
+from modeler.graph.optimise import agree, joining, values_of
 from modeler.graph.pose_graph import PoseGraph
 from modeler.graph.shared import SharedCovariance
 from modeler.types import Array, Edge, Solution
-
-_QUORUM = 3  # loops that agree with each other before new ones are judged by them alone
-_JUDGED = 3  # new loops that may be judged so at once
 
 _ROUNDS = 5  # in which an axis may change which loops agree
 
@@ -104,10 +101,11 @@ class Smoother:
         )
         jumped = _jumped(decided, self.state)
         start = chain(taken, root, {} if jumped else anchored(self.solution.trajectory, root))
-        inlier, engine = self.state.inlier, self.state.engine
+        threshold, inlier, engine = 0.5 * self.outlier_distance**2, self.state.inlier, self.state.engine
         trajectory: Mapping[int, Array] = start if grew or loops else chain(taken, root, {})
         if closes:  # otherwise the new frames hang on one edge each
-            trajectory, inlier, engine = self._closed(taken, closing, start, root=root, afresh=jumped or not grew)
+            before = ((), None) if jumped or not grew else (inlier, engine)
+            trajectory, inlier, engine = closed(taken, closing, start, root=root, threshold=threshold, before=before)
         state = _State(root, links, frames, decided, weights, inlier, engine)
         if grew and decided and inlier.count(False) > self.state.inlier.count(False):
             again = replace(self, state=_State()).to(graph)  # it may be that other modes make fewer loops lie
@@ -137,7 +135,7 @@ class Smoother:
         if self.axis is not None:
             inlier, turned = self._turned(self.axis, taken, closing, trajectory, state)
         trajectory = trajectory if turned is None else turned.poses
-        taking_part = [*taken, *_taking_part(closing, inlier)]
+        taking_part = [*taken, *joining(closing, inlier)]
         relative_covariance = self._covariance(taking_part, trajectory, turned, root=root, grew=grew)
         several = [link for link in (*taken, *closing) if link.modes]
         return Solution(
@@ -183,25 +181,6 @@ class Smoother:
             return found
         return SharedCovariance(found, links, self.shared, self.common)
 
-    def _closed(
-        self, tree: Sequence[Link], loops: Sequence[Link], start: Mapping[int, Array], *, root: int, afresh: bool
-    ) -> tuple[Mapping[int, Array], tuple[bool, ...], Incremental | None]:
-        """Return the poses under all loops, which loops take part, and the engine that can go on from there."""
-        threshold = 0.5 * self.outlier_distance**2
-        inlier = () if afresh else self.state.inlier
-        engine = None if afresh else self.state.engine
-        if engine is not None:
-            found = self._went_on(engine, tree, loops, start, threshold)
-            if found is not None:
-                return poses_of(found[1].values, start, root), *found
-        if not loops:
-            return chain(tree, root, {}), (), None
-        optimum = optimise(tree, loops, start, root=root, threshold=threshold, inlier=inlier)
-        chosen = _taking_part(loops, optimum.inlier)
-        if not chosen:  # dead reckoning meets every edge exactly
-            return chain(tree, root, {}), optimum.inlier, None
-        return optimum.poses, optimum.inlier, Incremental.of([*tree, *chosen], optimum.poses, root)
-
     def _turned(
         self,
         axis: CommonAxis,
@@ -213,7 +192,7 @@ class Smoother:
         """Return which loops take part where steps share an axis, and the solution then; None: they do not."""
         inlier, turned = state.inlier, None
         for _ in range(_ROUNDS):
-            found = axis.solved([*tree, *_taking_part(loops, inlier)], trajectory, state.root or 0)
+            found = axis.solved([*tree, *joining(loops, inlier)], trajectory, state.root or 0)
             if found is None:
                 return state.inlier, None
             agreeing, turned = agree(loops, values_of(found.poses), 0.5 * self.outlier_distance**2), found
@@ -221,36 +200,6 @@ class Smoother:
                 break
             inlier = agreeing
         return inlier, turned
-
-    def _went_on(
-        self,
-        engine: Incremental,
-        tree: Sequence[Link],
-        loops: Sequence[Link],
-        start: Mapping[int, Array],
-        threshold: float,
-    ) -> tuple[tuple[bool, ...], Incremental] | None:
-        """Return which loops take part and their solution, from where the engine is; None: all is to be asked again.
-
-        Some of the new loops may be left out, if enough of the others agree to judge them by: the choice is the one
-        that costs least of those that stand.
-        """
-        before = self.state.inlier
-        new = len(loops) - len(before)
-        choices = [(True,) * new]
-        if sum(before) >= max(_QUORUM, 2 * before.count(False)) and new <= _JUDGED:
-            choices = sorted(itertools.product((True, False), repeat=new), key=lambda choice: choice.count(False))
-        best: tuple[float, tuple[bool, ...], Incremental] | None = None
-        for choice in choices:
-            inlier = (*before, *choice)
-            found = engine.plus([*tree, *_taking_part(loops, inlier)], start)
-            if found is not None and agree(loops, found.values, threshold) == inlier:
-                if all(choice):
-                    return inlier, found
-                cost = found.error + threshold * inlier.count(False)
-                if best is None or cost < best[0]:
-                    best = cost, inlier, found
-        return None if best is None else best[1:]
 
     def _decided(
         self, tree: Sequence[Link], loops: Sequence[Link], root: int, *, grew: bool
@@ -265,10 +214,6 @@ class Smoother:
             for edge, left in weights.items()
         }
         return weights, decided
-
-
-def _taking_part(loops: Sequence[Link], inlier: Sequence[bool]) -> list[Link]:
-    return [loop for loop, good in zip(loops, inlier, strict=True) if good]
 
 
 def _weights(link: Link, decided: Mapping[Edge, Array]) -> Array:
