@@ -18,12 +18,12 @@ import trimesh
 
 from modeler import priors, se3
 from modeler.cli import main, nonvisual
-from modeler.cli.building import comes_back, other_step, sense_in_doubt
+from modeler.cli.building import comes_back, ends_without, other_step, sense_in_doubt
 from modeler.cli.interrupt import Interrupt
 from modeler.cli.options import PriorOptions
 from modeler.cli.usage import parsed
 from modeler.export import RunFolder, model_upright
-from modeler.types import Outcome
+from modeler.types import ACCEPTED, Outcome
 from sequences import bundled, open_sequence
 
 BOX = str(bundled("box"))
@@ -407,7 +407,9 @@ def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(run: Run, tmp_p
     told = report(tmp_path)
     assert not told["trustworthy"]
     assert told["complete"]
-    assert sum("left out" in reason for reason in told["reasons"]) == 3
+    assert [frame["outcome"].partition(":")[0] for frame in told["frames"]] == [Outcome.TOO_FEW_POINTS.label] * 3
+    (lost,) = (reason for reason in told["reasons"] if "left out" in reason)
+    assert lost.startswith("frames 0 to 2 were left out: too few points: ")
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"model.ply", "cloud.ply"}
 
 
@@ -432,10 +434,28 @@ def test_a_step_that_the_views_contradict_is_told() -> None:
     assert "turned by 15.0° from one frame number to the next, not by the 30° ± 2° that was told" in said
     assert said.endswith("is --step-deg -15.0 meant?")
     assert "turned by 15.0°" in other_step(steps(45.0, gap=3), prior)
+    again = [edge | {"source": edge["target"], "target": edge["source"]} for edge in steps(-29.0)[:1]]
+    assert other_step(steps(29.0) + again, prior) == ""  # a frame that was tried again lies before its target
+    assert "turned by 15.0°" in other_step(steps(15.0) + again, prior)
     lost = {"accepted": False, "kind": "odometry", "source": 9, "target": 8, "target_from_source": np.eye(4).tolist()}
     for edges in (steps(25.0), steps(90.0, gap=3), steps(15.0, count=2), [lost] * 5, []):
         assert other_step(edges, prior) == ""
     assert other_step(steps(15.0), priors.TablePrior()) == ""
+
+
+def test_frames_before_the_object_came_are_told() -> None:
+    few, lost = f"{Outcome.TOO_FEW_POINTS.label}: {Outcome.TOO_FEW_POINTS.advice}", Outcome.NO_OVERLAP.label
+
+    def said(*outcomes: str) -> str:
+        return ends_without([{"id": 2 * place, "outcome": outcome} for place, outcome in enumerate(outcomes)])
+
+    assert said(few, few, ACCEPTED, lost, ACCEPTED) == (
+        "the object is seen in frames 4 to 8, not before and not after; --frames 4: takes those alone"
+    )
+    assert "--frames :7 takes" in said(ACCEPTED, few, lost, ACCEPTED, few)
+    assert "--frames 2:5 takes" in said(few, ACCEPTED, ACCEPTED, few)
+    for whole in ((ACCEPTED, few, ACCEPTED), (lost, ACCEPTED, lost), (few, few, few), (few, ACCEPTED), ()):
+        assert said(*whole) == ""
 
 
 def test_ctrl_c_ends_the_frames_and_a_second_one_the_program() -> None:

@@ -22,7 +22,7 @@ from modeler.export import RunFolder, RunMeta, alone
 from modeler.pipeline import Modeler
 from modeler.priors import TurntablePrior
 from modeler.segmentation import Scene
-from modeler.types import ACCEPTED, AbstractPrior, InputError
+from modeler.types import ACCEPTED, AbstractPrior, InputError, Outcome
 from sequences import AbstractSequence, SensedSequence, frame_range, open_sequence, read_noise, survey
 from viz.ending import ends_whole
 from viz.stream import open_stream
@@ -131,7 +131,10 @@ def _run(
         with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
             wanted = frames.until(lambda: interrupt.asked)
             coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
-            for step in modeler.run(coming, scene, hurry=lambda: interrupt.asked, ending=console.ending):
+            steps = modeler.run(
+                coming, scene, hurry=lambda: interrupt.asked, ending=console.ending, remark=console.remark
+            )
+            for step in steps:
                 seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
                 seconds["total"] = time.perf_counter() - began_s
                 meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
@@ -178,11 +181,12 @@ def other_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
         prior: of the run.
     """
     odometry = [edge for edge in edges if edge["accepted"] and edge["kind"] == "odometry"]
-    gap = min((edge["source"] - edge["target"] for edge in odometry), default=1)
+    gaps = [abs(edge["source"] - edge["target"]) for edge in odometry]  # frames tried again lie before their targets
+    gap = min(gaps, default=1)
     turns = [
         np.degrees(se3.rotation_angle(np.reshape(edge["target_from_source"], (4, 4)))) / gap
-        for edge in odometry
-        if edge["source"] - edge["target"] == gap
+        for edge, apart in zip(odometry, gaps, strict=True)
+        if apart == gap
     ]
     if not isinstance(prior, TurntablePrior) or len(turns) < _SURE_STEPS:
         return ""
@@ -195,6 +199,23 @@ def other_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
     )
 
 
+def ends_without(frames: Sequence[Mapping[str, Any]]) -> str:
+    """Return in words which frames show the object, where the first or the last ones do not, else "".
+
+    Args:
+        frames: of the report.
+    """
+    ids = sorted(frame["id"] for frame in frames)
+    seen = sorted(frame["id"] for frame in frames if not frame["outcome"].startswith(Outcome.TOO_FEW_POINTS.label))
+    if len(seen) < 2 or (seen[0], seen[-1]) == (ids[0], ids[-1]):
+        return ""
+    begin, end = seen[0] if seen[0] > ids[0] else "", seen[-1] + 1 if seen[-1] < ids[-1] else ""
+    return (
+        f"the object is seen in frames {seen[0]} to {seen[-1]}, not before and not after; --frames {begin}:{end} takes "
+        "those alone"
+    )
+
+
 def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
     """Say on stderr what came out, and return the exit status."""
     accepted = sum(frame["outcome"] == ACCEPTED for frame in report["frames"])
@@ -203,13 +224,12 @@ def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> in
     frames = "1 frame" if len(report["frames"]) == 1 else f"{len(report['frames'])} frames"
     say(f"{accepted} of {frames}, {loop}, {took}: {options.out}")
     if report["reasons"]:
-        first, *others = sorted(
-            report["reasons"], key=lambda reason: reason.startswith("frame ")
-        )  # frames left out were told above
+        first, *others = sorted(report["reasons"], key=lambda reason: "left out" in reason)  # those were told above
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
         say(f"not to be trusted: {first}{more}")
         if sense_in_doubt(report["reasons"], prior):
             say("that the table turns the way round that was told is taken for granted; else give --step-sign unknown")
-    if remark := other_step(report["edges"], prior):
-        say(remark)
+    for remark in (other_step(report["edges"], prior), ends_without(report["frames"])):
+        if remark:
+            say(remark)
     return 0 if report["trustworthy"] else 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import platform
 from collections.abc import Mapping, Sequence
@@ -122,7 +123,7 @@ def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> l
         reasons.append(f"the run was interrupted after frame {step.frame.index}")
     elif not step.last:
         reasons.append("the run has not finished")
-    reasons += [f"frame {frame.id} was left out: {frame.outcome}" for frame in frames if not frame.accepted]
+    reasons += _left_out(frames)
     if sum(frame.accepted for frame in frames) < 2:
         reasons.append("fewer than two frames were accepted: there is nothing to align")
     edges = _taking_part(step)
@@ -146,6 +147,17 @@ def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> l
         if edge.posterior.overlap < _LITTLE_OVERLAP and not joined_without(edge, edges)
     ]
     return reasons + _unsure(step.solution)
+
+
+def _left_out(frames: Sequence[FrameRecord]) -> list[str]:
+    """Return in words which frames were left out and why, those that follow each other for one reason together."""
+    words = []
+    for outcome, together in itertools.groupby(sorted(frames, key=lambda frame: frame.id), key=lambda f: f.outcome):
+        ids = [frame.id for frame in together]
+        if outcome != ACCEPTED:
+            which = f"frame {ids[0]} was" if len(ids) == 1 else f"frames {ids[0]} to {ids[-1]} were"
+            words.append(f"{which} left out: {outcome}")
+    return words
 
 
 def _unsure(solution: Solution) -> list[str]:
