@@ -22,6 +22,8 @@ OFF_MIDDLE = 0.1
 exchanged."""
 FAR_OFF_MIDDLE = 0.3
 """Beyond such a share no camera has it, but intrinsics of larger images do."""
+LEAST_JOINED = 0.3
+"""Depth cameras measure whole areas; where fewer pixels have measured neighbours, it is lines or single points."""
 
 
 @final
@@ -41,6 +43,8 @@ class Survey:
     """Greatest depth in m."""
     measured: float
     """Share (0..1) of the pixels with a measurement."""
+    joined: float
+    """Share (0..1) of the measured pixels with a measured neighbour to the right and below: those of surfaces."""
     empty: tuple[int, ...]
     """Numbers of the frames without any measurement."""
     repeated: tuple[int, ...]
@@ -95,6 +99,11 @@ class Survey:
                     f"the principal point ({camera.cx:.0f}, {camera.cy:.0f}) lies {off_px:.0f} px off the middle of "
                     f"the images: are {question}?"
                 )
+        if self.joined < LEAST_JOINED:
+            doubts.append(
+                f"{1.0 - self.joined:.0%} of the measured pixels have none beside them: single points show no "
+                "surface to register; fill the gaps, or scale the images down until they close"
+            )
         if self.repeated:
             doubts.append(
                 f"{len(self.repeated)} of {len(self.indices)} frames have the depth of the frame before, to the bit "
@@ -115,13 +124,14 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
             the depth cannot be in the unit that it is said to be in.
     """
     cameras: dict[Camera, None] = {}
-    times_s, ranges, shares, farthest_m = [], [], [], 0.0
+    times_s, ranges, shares, joined, farthest_m = [], [], [], [], 0.0
     empty, empty_masks, repeated, masks, colours = [], [], [], 0, 0
     before_m = None
     for frame in sequence:
         cameras.setdefault(frame.camera)
         times_s.append(frame.time_s)
-        measured = frame.depth_m[measured_pixels(frame)]
+        pixels = measured_pixels(frame)
+        measured = frame.depth_m[pixels]
         shares.append(measured.size / frame.depth_m.size)
         colours += frame.colour is not None
         masks += frame.mask is not None
@@ -131,8 +141,9 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
         if before_m is not None and np.array_equal(frame.depth_m, before_m, equal_nan=True):
             repeated.append(frame.index)
         before_m = frame.depth_m
-        if frame.mask is not None and not (frame.mask & measured_pixels(frame)).any():
+        if frame.mask is not None and not (frame.mask & pixels).any():
             empty_masks.append(frame.index)
+        joined.append(np.count_nonzero(pixels[:-1, :-1] & pixels[:-1, 1:] & pixels[1:, :-1]) / measured.size)
         ranges.append(np.percentile(measured, (1.0, 50.0, 99.0)))
         farthest_m = max(farthest_m, float(measured.max()))
     if not ranges:
@@ -151,6 +162,7 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
         range_m=(low, middle, high),
         farthest_m=farthest_m,
         measured=float(np.mean(shares)),
+        joined=float(np.median(joined)),
         empty=tuple(empty),
         repeated=tuple(repeated),
         masks=masks,

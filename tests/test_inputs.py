@@ -304,6 +304,38 @@ def test_intrinsics_of_images_of_another_size_are_asked_about(tmp_path: Path, fr
     )
 
 
+def test_aligned_colour_that_is_finer_than_depth_is_shrunk(tmp_path: Path, frames: list[Frame]) -> None:
+    write_open3d(tmp_path / "s", frames)
+    before = [frame.colour for frame in open_sequence(tmp_path / "s")]
+    for path in (tmp_path / "s" / "color").iterdir():
+        with Image.open(path) as picture:
+            picture.resize((480, 360), Image.Resampling.NEAREST).save(path, quality=95)
+    sequence = open_sequence(tmp_path / "s")
+    assert sequence.notes == (
+        "colour is 480 x 360 where depth is 160 x 120: it is shrunk, and taken for the depth camera's view",
+    )
+    for frame, colour in zip(sequence, before, strict=True):
+        assert frame.colour is not None
+        assert colour is not None
+        assert np.abs(frame.colour.astype(float) - colour).mean() < 3.0
+
+
+@pytest.mark.parametrize(("every", "sparse"), [((1, 1), False), ((4, 1), True), ((4, 2), True)])
+def test_depth_of_lines_or_single_points_is_asked_about(
+    tmp_path: Path, frames: list[Frame], every: tuple[int, int], *, sparse: bool
+) -> None:
+    def thinned(frame: Frame) -> Frame:
+        depth_m = np.full_like(frame.depth_m, np.nan)
+        depth_m[:: every[0], :: every[1]] = frame.depth_m[:: every[0], :: every[1]]
+        return replace(frame, depth_m=depth_m)
+
+    write_open3d(tmp_path / "s", list(map(thinned, frames)))
+    doubts = survey(open_sequence(tmp_path / "s")).doubts
+    assert [doubt.partition(":")[0] for doubt in doubts] == [
+        "100% of the measured pixels have none beside them"
+    ] * sparse
+
+
 # BOP onboarding
 
 

@@ -194,7 +194,8 @@ FAULTS: dict[str, dict[str, tuple[Damage, str]]] = {
     "open3d": {
         **PICTURES,
         "metres for millimetres": (pixels(D, to_metres, every=True), "it looks like metres; correct the depth scale"),
-        "no intrinsics": (gone(O), "no intrinsics; add cam_K.txt"),
+        "no intrinsics": (gone(O), "no intrinsics; add camera.json"),
+        "colour of a coarser size": (pixels("color/*.jpg", lambda i: i[::2, ::2]), "colour and masks must be aligned"),
         "intrinsics empty": (text(O, lambda t: ""), "not valid JSON"),
         "matrix lacking": (text(O, lambda t: "{}"), "intrinsic_matrix"),
         "matrix of text": (entry(O, lambda c: c["intrinsic_matrix"].__setitem__(0, "575")), "9 finite numbers"),

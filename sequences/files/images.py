@@ -87,7 +87,7 @@ def _quiet() -> Iterator[None]:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) of a PNG as its header says.
+    """Return (width, height) of a picture as its header says.
 
     Raises:
         InputError: where the file is missing or no picture.
@@ -95,7 +95,7 @@ def picture_size(path: Path) -> tuple[int, int]:
     try:
         with warnings.catch_warnings(), _unlogged():
             warnings.simplefilter("ignore")
-            with Image.open(path, formats=("PNG", "TIFF")) as picture:
+            with Image.open(path, formats=("PNG", "TIFF", "JPEG")) as picture:
                 return picture.size
     except Exception as error:
         raise InputError(f"{path}: is not a readable picture ({type(error).__name__}); replace it.") from None
@@ -166,6 +166,24 @@ def check_size(path: Path, found: tuple[int, ...], depth: tuple[int, ...]) -> No
             f"{path}: is {found[1]} x {found[0]} pixels where its depth image is {depth[1]} x {depth[0]}; "
             "colour and masks must be aligned to depth; align them, or move colour away to do without."
         )
+
+
+def fitted(path: Path, colour: npt.NDArray[np.uint8], depth: tuple[int, ...]) -> npt.NDArray[np.uint8]:
+    """Return colour (h, w, 3) in the size of its depth image, shrunk where it is finer and of the same shape.
+
+    Raises:
+        InputError: where it is of another shape, or coarser.
+    """
+    height, width = depth
+    if finer(colour.shape[1::-1], (width, height)):
+        return np.array(Image.fromarray(colour).resize((width, height), Image.Resampling.BOX))
+    check_size(path, colour.shape[:2], depth)
+    return colour
+
+
+def finer(colour: tuple[int, ...], depth: tuple[int, ...]) -> bool:
+    """Return whether colour has more pixels than depth, each (width, height), and the same shape to the pixel."""
+    return colour[0] > depth[0] and abs(colour[0] * depth[1] / depth[0] - colour[1]) < 1.0
 
 
 def check_alike(path: Path, size: tuple[int, ...], alike: Path, said: str) -> None:

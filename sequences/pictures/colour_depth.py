@@ -38,8 +38,8 @@ def open_colour_depth(path: Path, given: Given) -> PictureSequence:
     found = find_intrinsics(path, given)
     if found is None:
         raise InputError(
-            f"{path}: no intrinsics; add cam_K.txt (fx fy cx cy, or three rows of K), camera_intrinsic.json (Open3D's) "
-            "or scene_camera.json (BOP's), or convert with --intrinsics FX FY CX CY."
+            f"{path}: no intrinsics; add camera.json with fx, fy, cx and cy in px, cam_K.txt (three rows of K), "
+            "camera_intrinsic.json (Open3D's) or scene_camera.json (BOP's), or convert with --intrinsics FX FY CX CY."
         )
     numbers = told_numbers(list(depth)) or {stem: place for place, stem in enumerate(depth)}
     remarks = found.doubts(picture_size(next(iter(depth.values()))))

@@ -8,7 +8,17 @@ from pathlib import Path
 from typing import final
 
 from modeler.types import Array, Camera, Frame
-from sequences.files.images import check_alike, check_size, metres, read_colour, read_depth, read_mask
+from sequences.files.images import (
+    check_alike,
+    check_size,
+    finer,
+    fitted,
+    metres,
+    picture_size,
+    read_colour,
+    read_depth,
+    read_mask,
+)
 from sequences.given import Intrinsics
 from sequences.recording import AbstractRecording
 
@@ -23,7 +33,7 @@ class Shot:
     depth: Path
     """16-bit picture."""
     colour: Path | None = None
-    """Colour aligned to depth."""
+    """Colour aligned to depth, in its size or finer."""
     mask: Path | None = None
     """Not black = object."""
 
@@ -74,7 +84,7 @@ class PictureSequence(AbstractRecording):
         if shot.mask is not None and mask is not None:
             check_size(shot.mask, mask.shape, raw.shape)
         if shot.colour is not None and colour is not None:
-            check_size(shot.colour, colour.shape[:2], raw.shape)
+            colour = fitted(shot.colour, colour, raw.shape)
         camera = Camera(raw.shape[1], raw.shape[0], *self.intrinsics)
         return Frame(index, shot.time_s, metres(raw, self.depth_scale_mm), camera, mask, colour)
 
@@ -95,4 +105,11 @@ class PictureSequence(AbstractRecording):
     @property
     def notes(self) -> tuple[str, ...]:
         """What the reader assumed, or left out."""
-        return self.remarks
+        coloured = next((shot for shot in self.shots.values() if shot.colour is not None), None)
+        if coloured is None or coloured.colour is None:
+            return self.remarks
+        colour, depth = picture_size(coloured.colour), picture_size(coloured.depth)
+        if not finer(colour, depth):
+            return self.remarks
+        sizes = f"{colour[0]} x {colour[1]} where depth is {depth[0]} x {depth[1]}"
+        return (*self.remarks, f"colour is {sizes}: it is shrunk, and taken for the depth camera's view")
