@@ -77,6 +77,10 @@ class Console:
             self._bar.reset(self._task)
         self._bar.update(self._task, completed=done, total=total, description=stage)
 
+    def remark(self, words: str) -> None:
+        """Tell in one line what the run has noticed."""
+        self._say(words)
+
     def _why(self, outcome: str) -> str:
         """Return why a frame was left out, with what to do about it where that has not been said yet."""
         what, *advice = re.split(": |; ", outcome, maxsplit=1)

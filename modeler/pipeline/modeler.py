@@ -21,12 +21,15 @@ from modeler.types import (
     AbstractRegistrar,
     Edge,
     Frame,
+    InputError,
     Outcome,
     Posterior,
     RayImage,
     Segmentation,
     Step,
 )
+
+_ASKED = 6  # pairs, of which three must be sure, to tell what a person got wrong
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,7 @@ class Modeler:
         *,
         hurry: Callable[[], bool] = lambda: False,
         ending: Callable[[str, int, int], None] = lambda stage, done, total: None,
+        remark: Callable[[str], None] = lambda words: None,
     ) -> Iterator[Step]:
         """Yield what each frame brings. A frame that cannot be used is reported and left out.
 
@@ -76,11 +80,13 @@ class Modeler:
             hurry: asked after the last frame; once it says so, no more edges are tried beyond those that placed the
                 frames.
             ending: told after the last frame what is being done, and how much of how much is done.
+            remark: told in one line, as soon as the first pairs show it, what the prior has wrong.
         """
         state = State()
         for frame, last in _with_last(frames):
             seen = Seen(frame, *self.view(frame, scene))
-            state, step = self._joined(state.read(frame.index), seen, state.latest, last=last)
+            state = self._asked(state.read(frame.index), seen.view, remark)
+            state, step = self._joined(state, seen, state.latest, last=last)
             if last:
                 for later, found in self._caught_up(state):
                     state = replace(later, growing=state.growing, model=state.model)
@@ -154,6 +160,25 @@ class Modeler:
             views=state.views,
         )
         return state, step
+
+    def _asked(self, state: State, view: RayImage | None, remark: Callable[[str], None]) -> State:
+        """Return the state with one more pair registered without what the prior takes for granted, till that is told.
+
+        Edges do not hold it, and the prior stays as it was told: a person may know better.
+        """
+        unassuming, before = self.prior.unassuming(), state.newest
+        if unassuming is None or view is None or before is None or len(state.asked) == _ASKED:
+            return state
+        if self.prior.refuted(state.asked) is not None:
+            return state
+        try:
+            posterior = self.register(view, self._ready(state, before), unassuming)
+        except InputError:
+            return state
+        asked = (*state.asked, posterior.without_samples())
+        if words := self.prior.refuted(asked):
+            remark(words)
+        return replace(state, asked=asked)
 
     def _caught_up(self, state: State) -> Iterator[tuple[State, Step]]:
         """Yield states and steps of lost frames, newest first, tried once more against a view that followed them."""

@@ -15,7 +15,17 @@ from modeler.priors.general import GeneralPrior, grown_limits, turned_offset_m
 from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M, no_plane, support
 from modeler.priors.proposal import guided, reach_deg
 from modeler.priors.table import TablePrior
-from modeler.types import AbstractMotion, AbstractPrior, Edge, Plane, RayImage, SharedAxis, Solution
+from modeler.types import (
+    AbstractMotion,
+    AbstractPrior,
+    Edge,
+    Outcome,
+    Plane,
+    Posterior,
+    RayImage,
+    SharedAxis,
+    Solution,
+)
 
 _UP = (0.0, -1.0, 0.0)  # against gravity for a camera held upright: y points down
 _BROAD_DEG, _GIVEN_DEG = 30.0, 1.0
@@ -94,12 +104,22 @@ class TurntablePrior(AbstractPrior):
         telling = [edge for edge in edges if solution.takes_part(edge)]
         motions = [solution.pose_of(edge) for edge in telling]
         learnt = common_axis(motions, float(np.radians(self.wobble_deg)), self.wobble_m)
-        sense = 0
-        if self.step_sign == "unknown":
-            up = np.array(_UP if self.axis_direction is None else self.axis_direction)
-            step_rad, sigma_rad = np.radians([abs(self.step_deg), self.step_sigma_deg])
-            sense = turn_sense([edge.posterior for edge in telling], up / np.linalg.norm(up), step_rad, sigma_rad)
+        sense = self._sense([edge.posterior for edge in telling]) if self.step_sign == "unknown" else 0
         return replace(self, learnt=learnt, sense=sense, newest=max(solution.trajectory, default=None))
+
+    def unassuming(self) -> TurntablePrior | None:
+        """Return the prior that leaves open which way round the table turns; None where that is not told anyway."""
+        return replace(self, step_sign="unknown") if self.step_sign == "known" and self.step_deg else None
+
+    def refuted(self, posteriors: Sequence[Posterior]) -> str | None:
+        """Return in one line that views turn the other way round; pairs that are not sure tell nothing."""
+        sense = self._sense([posterior for posterior in posteriors if posterior.outcome is Outcome.CONVERGED])
+        if sense * self.step_deg >= 0.0:
+            return "" if sense else None
+        return (
+            f"the first views turn the other way round than --step-deg {self.step_deg:g} tells; "
+            f"is --step-deg {-self.step_deg:g} meant?"
+        )
 
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
         """Return the axis that all steps share, as far as the edge of each does not hold it; None where it is given.
@@ -111,6 +131,12 @@ class TurntablePrior(AbstractPrior):
             return None
         vague = all(self._axis(view.plane).sigma_direction_rad >= np.radians(_VAGUE_DEG) for view in views)
         return SharedAxis(float(np.radians(self.wobble_deg)) if vague else np.inf, self.wobble_m)
+
+    def _sense(self, posteriors: Sequence[Posterior]) -> int:
+        """Return which way round pairs turn, right-handed about the axis +1; 0 = not known."""
+        up = np.array(_UP if self.axis_direction is None else self.axis_direction)
+        step_rad, sigma_rad = np.radians([abs(self.step_deg), self.step_sigma_deg])
+        return turn_sense(posteriors, up / np.linalg.norm(up), step_rad, sigma_rad)
 
     def _axis(self, plane: Plane | None) -> Axis:
         """Return what is known of the axis without comparing the images, on a table if one is seen."""
