@@ -63,7 +63,7 @@ class Console:
         again, self._placed[frame] = frame in self._placed, accepted
         if accepted and step.segmentation.outcome is Outcome.UNSURE_MASK:
             self._unsure.add(frame)
-        description = f"{len(step.views)} joined, {loops} loops closed"
+        description = f"{len(step.views)} joined, {loops} {'loop' if loops == 1 else 'loops'} closed"
         self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=description)
         if not accepted and not again:
             self._say(f"frame {frame} is left out: {self._why(step.outcome)}")
@@ -74,7 +74,7 @@ class Console:
         """Tell of what is done after the last frame: `done` of `total`."""
         if stage != self._stage:
             self._stage = stage
-            self._bar.reset(self._task)
+            self._bar.update(self._task, total=None, description=stage)  # forgets how fast the stage before went
         self._bar.update(self._task, completed=done, total=total, description=stage)
 
     def remark(self, words: str) -> None:
