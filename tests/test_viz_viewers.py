@@ -1,0 +1,256 @@
+"""No viewer, frozen, closed or absent, can stop a run or outlive it."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from streamed import COUNT, LOST, read, record
+from turning_box import steps
+
+from modeler.types import Step
+from viz import entities, viewer
+from viz.stream import RerunStream, open_stream
+
+
+@pytest.fixture(scope="module")
+def run() -> list[Step]:
+    return list(steps(COUNT, lost=LOST))
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_run_that_is_killed_leaves_a_readable_recording(run: list[Step], tmp_path: Path) -> None:
+    stream = open_stream("box", save=tmp_path / "r.rrd")
+    stream(run[0])
+    stream(run[1])
+    stream.recording.flush()
+    (tmp_path / "cut.rrd").write_bytes((tmp_path / "r.rrd").read_bytes())
+    stream.close()
+    assert set(read(tmp_path / "cut.rrd")[entities.NOW]) == {0, 1}
+
+
+def listeners(process: subprocess.Popen[bytes]) -> set[str]:
+    """Return the local addresses, as the kernel writes them, on which a process listens."""
+    inodes = set()
+    for descriptor in Path(f"/proc/{process.pid}/fd").iterdir():
+        link = os.readlink(descriptor)
+        if link.startswith("socket:["):
+            inodes.add(link[8:-1])
+    lines = [
+        line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]
+    ]
+    return {line[1].partition(":")[0] for line in lines if line[3] == "0A" and line[9] in inodes}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_the_page_is_served_on_this_machine_alone(run: list[Step], tmp_path: Path) -> None:
+    stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
+    stream(run[0])
+    assert stream.address is not None
+    assert stream.address.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(stream.address, timeout=5.0) as page:
+        assert b"<html" in page.read()
+    (server,) = stream.viewers
+    assert listeners(server.process) == {"0100007F"}
+    stream.close()
+    assert server.process.poll() is not None
+
+
+def test_a_viewer_that_dies_does_not_stop_the_run(
+    run: list[Step], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
+    stream(run[0])
+    stream.viewers[0].stop()
+    for step in run[1:]:
+        stream(step)
+    stream.close()
+    assert "the viewer was closed" in caplog.text
+    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
+
+
+def test_a_viewer_that_is_already_open_may_be_closed_while_the_run_goes_on(run: list[Step], tmp_path: Path) -> None:
+    served = viewer.start_web()
+    stream = open_stream("box", save=tmp_path / "r.rrd", connect=served.sink)
+    assert stream.viewers == ()  # it is not ours to end
+    stream(run[0])
+    assert served.process.poll() is None
+    served.stop()
+    for step in run[1:]:
+        stream(step)
+    stream.close()
+    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
+
+
+def test_a_viewer_that_freezes_does_not_stop_the_run(
+    run: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("viz.stream._PATIENCE_S", 0.5)
+    monkeypatch.setattr("viz.viewer._STOP_S", 0.2)
+    stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
+    stream(run[0])
+    stream.viewers[0].process.send_signal(signal.SIGSTOP)
+    for step in run[1:]:
+        stream(step)
+    stream.close()
+    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
+
+
+@dataclass
+class SlowDisk:
+    """A recording that takes its time to write its file."""
+
+    file: Path
+
+    def flush(self, timeout_sec: float) -> None:
+        raise RuntimeError("not everything was sent in time")
+
+    def disconnect(self) -> None:
+        for _ in range(10):
+            with self.file.open("ab") as file:
+                file.write(b"more")
+            time.sleep(0.05)
+        self.file.write_bytes(b"whole")
+
+
+@pytest.mark.parametrize("watched", [False, True])
+def test_a_recording_is_waited_for_as_long_as_it_grows(
+    watched: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("viz.stream._PATIENCE_S", 0.2)
+    recording: Any = SlowDisk(tmp_path / "r.rrd")
+    RerunStream(recording, (), 0.0, recording.file, watched=watched).close()
+    assert recording.file.read_bytes() == b"whole"
+
+
+def closed_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_a_viewer_that_is_not_there_is_reported_and_left_out(
+    run: list[Step], tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    address = f"rerun+http://127.0.0.1:{closed_port()}/proxy"
+    with caplog.at_level(logging.WARNING):
+        stream: RerunStream = open_stream("box", save=tmp_path / "r.rrd", spawn=True, connect=address)
+    assert address in caplog.text
+    assert "no display" in caplog.text
+    assert stream.address is None
+    stream(run[0])
+    stream.close()
+    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == {0}
+
+
+def test_a_stream_to_nowhere_takes_steps(run: list[Step]) -> None:
+    stream = open_stream("box", save=None)
+    stream(run[0])
+    stream.close()
+    assert stream.address is None
+
+
+@pytest.mark.parametrize("address", ["localhost", "http://127.0.0.1:9876", "rerun+http://127.0.0.1:x/proxy"])
+def test_a_wrong_address_is_refused(address: str) -> None:
+    with pytest.raises(viewer.InputError, match=r"--connect .*rerun\+http://127\.0\.0\.1:9876/proxy"):
+        open_stream("box", save=None, connect=address)
+
+
+@pytest.mark.parametrize("place", [f"{'a' * 300}:9876", "localhost:99999", "no such host:9876"])
+def test_nobody_listens_where_nobody_can(place: str) -> None:
+    assert not viewer.reachable(f"rerun+http://{place}/proxy")
+
+
+def test_a_recording_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(viewer.InputError, match=r"r\.rrd"):
+        open_stream("box", save=tmp_path / "missing" / "r.rrd")
+
+
+def test_viewing_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(viewer.InputError, match=r"no recording\.rrd .*build --out"):
+        viewer.view(tmp_path)
+
+
+def test_a_recording_is_viewed_in_the_browser(run: list[Step], tmp_path: Path) -> None:
+    record(tmp_path / "recording.rrd", run[:2])
+    served = viewer.view(tmp_path, web=True)
+    with urllib.request.urlopen(served.address, timeout=5.0) as page:
+        assert b"<html" in page.read()
+    served.stop()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp_path: Path, number: int) -> None:
+    record(tmp_path / "recording.rrd", run[:1])
+    program = (
+        "import sys, pathlib; from viz import viewer; served = viewer.view(pathlib.Path(sys.argv[1]), web=True);"
+        "print(served.process.pid, flush=True); served.wait()"
+    )
+    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as command:
+        assert command.stdout is not None
+        server = int(command.stdout.readline())
+        time.sleep(0.2)  # from the line to the wait
+        command.send_signal(number)
+        assert command.wait(timeout=10.0) == 0
+    with pytest.raises(ProcessLookupError):
+        os.kill(server, 0)
+
+
+def test_a_run_that_is_terminated_leaves_a_whole_recording_and_no_server(tmp_path: Path) -> None:
+    program = (
+        "import sys, pathlib, time; from modeler.cli.interrupt import terminable; from turning_box import steps;"
+        "from viz.stream import open_stream\n"
+        "with terminable():\n"
+        "    stream = open_stream('box', save=pathlib.Path(sys.argv[1]), web=True)\n"
+        "    try:\n"
+        "        stream(next(steps(1)))\n"
+        "        print(stream.viewers[0].process.pid, flush=True)\n"
+        "        time.sleep(60)\n"
+        "    finally:\n"
+        "        stream.close()\n"
+    )
+    arguments = [sys.executable, "-c", program, str(tmp_path / "r.rrd")]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, env=environment) as command:
+        assert command.stdout is not None
+        server = int(command.stdout.readline())
+        command.terminate()
+        assert command.wait(timeout=20.0) == 128 + signal.SIGTERM
+    with pytest.raises(ProcessLookupError):
+        os.kill(server, 0)
+    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == {0}
+
+
+def test_rerun_is_not_imported_before_it_is_needed() -> None:
+    program = "import sys, viz.stream, viz.viewer, viz.entities; sys.exit('rerun' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_the_notebook_runs_and_embeds_the_viewer(monkeypatch: pytest.MonkeyPatch) -> None:
+    display = pytest.importorskip("IPython.display")
+    shown: list[Any] = []
+    monkeypatch.setattr(display, "display", shown.append)
+    notebook = json.loads((Path(__file__).parents[1] / "docs" / "watch.ipynb").read_text())
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    whole = 'open_sequence(bundled("box"))'
+    assert sum(whole in cell for cell in cells) == 1
+    names: dict[str, Any] = {}
+    for cell in cells:
+        exec(cell.replace(whole, f"{whole}.select(frames=slice(0, 3))"), names)
+    (frame,) = shown
+    assert frame.src.startswith("http://127.0.0.1:")
+    assert len(names["step"].views) == 3
+    assert names["stream"].viewers[0].process.poll() is not None
