@@ -1,70 +1,31 @@
-"""The contract of the command line: statuses, streams, files, and the same bytes for the same seed."""
+"""The command line: what goes where, how commands end, and what they leave."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from commanded import BOX, FILES, Run, runner
 
-from modeler import priors, se3
-from modeler.cli import main, nonvisual
-from modeler.cli.building import comes_back, ends_without, other_step, sense_in_doubt
-from modeler.cli.interrupt import Interrupt
-from modeler.cli.options import PriorOptions
-from modeler.cli.usage import parsed
+from modeler import se3
+from modeler.cli import main
 from modeler.export import RunFolder, model_upright
-from modeler.types import ACCEPTED, Outcome
-from sequences import bundled, open_sequence
+from modeler.types import Outcome
+from sequences import open_sequence
 
-BOX = str(bundled("box"))
-FILES = {
-    "model.ply",
-    "cloud.ply",
-    "trajectory.txt",
-    "odometry.txt",
-    "graph.g2o",
-    "recording.rrd",
-    "report.json",
-}
-COMMANDS = "build register evaluate render view report export join info convert calibrate-sensor".split()
-DOCUMENTED = """out prior seed resume overwrite every frames roi max-depth-m max-rotation-deg max-offset-m max-shift-m
-step-deg step-sigma-deg held-sigma-deg held-sigma-m
-method view web"""
 QUICK = ("--prior", "table", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:3")
-
-
-@dataclasses.dataclass(frozen=True)
-class Ended:
-    status: int
-    out: str
-    err: str
-
-
-Run = Callable[..., Ended]
 
 
 @pytest.fixture
 def run(capfd: pytest.CaptureFixture[str]) -> Run:
-    def run(*arguments: str | Path) -> Ended:
-        capfd.readouterr()
-        try:
-            status = main([str(argument) for argument in arguments])
-        except SystemExit as ending:
-            status = ending.code if isinstance(ending.code, int) else 1
-        said = capfd.readouterr()
-        return Ended(status, str(said.out), str(said.err))
-
-    return run
+    return runner(capfd)
 
 
 @pytest.fixture(scope="module")
@@ -81,110 +42,6 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def report(folder: Path) -> dict:
     return json.loads((folder / "report.json").read_bytes())
-
-
-# Help
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help_on_stdout(run: Run, command: str) -> None:
-    assert re.search(rf"\b{command}\b", run("--help").out)
-    ended = run(command, "--help")
-    assert (ended.status, ended.err) == (0, "")
-    assert ended.out.startswith(f"usage: modeler {command}")
-
-
-def test_help_of_the_program_tells_each_command_in_a_sentence_and_a_command_tells_all(run: Run) -> None:
-    overall, alone = (" ".join(run(*words, "--help").out.replace("│", " ").split()) for words in ((), ("build",)))
-    for text in (overall, alone):
-        assert "Build the model of an object from a sequence: register its frames, close loops, fuse." in text
-    assert "Ctrl-C ends the run with the frames so far" in alone
-    assert "Ctrl-C" not in overall
-
-
-def test_help_may_be_asked_for_in_a_word(run: Run) -> None:
-    assert run("help") == run("--help")
-    assert run("help", "build") == run("build", "--help")
-    assert run("help", "nonsense") == run("--help")
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_takes_a_seed(run: Run, command: str) -> None:
-    # Enough for every command, too much for none: names of files that are never opened.
-    folders = {"register": ("S", "1", "0"), "join": ("A", "B")}.get(command, ("S",))
-    out = () if command in ("register", "info", "view") else ("--out", "OUT")
-    assert parsed((command, *folders, *out, "--seed", "7")) != parsed((command, *folders, *out, "--seed", "8"))
-    for seed in ("-1", "one", "1.5", "NaN"):
-        ended = run(command, *folders, *out, "--seed", seed)
-        assert (ended.status, ended.out) == (2, "")
-        assert f"--seed takes a whole number from 0 on, not '{seed}'; see modeler {command} --help\n" in ended.err
-
-
-def test_commands_that_draw_nothing_say_so_and_give_the_same_with_any_seed(run: Run) -> None:
-    for command in ("info", "convert", "calibrate-sensor", "view", "report", "export"):
-        words = " ".join(run(command, "--help").out.replace("│", " ").split())
-        assert "--seed N Without effect: this command draws nothing at random." in words
-    assert run("info", BOX, "--json", "--seed", "7") == run("info", BOX, "--json")
-
-
-@pytest.mark.parametrize("option", DOCUMENTED.split())
-def test_build_offers_what_is_documented(run: Run, option: str) -> None:
-    assert re.search(rf"^│ --{option}\b", run("build", "--help").out, re.MULTILINE)
-
-
-def test_help_imports_nothing_heavy() -> None:
-    heavy = "av gtsam matplotlib numba numpy open3d pyrealsense2 rerun rosbags scipy trimesh".split()
-    script = f"""
-import contextlib, sys
-from modeler.cli import main
-for command in {COMMANDS}:
-    with contextlib.suppress(SystemExit):
-        main([command, "--help"])
-sys.exit(", ".join(sorted(set({heavy}) & set(sys.modules))) or None)
-"""
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stderr) == (0, "")
-
-
-@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(PriorOptions) if field.name != "prior"])
-def test_defaults_told_in_help_are_those_of_the_priors(run: Run, name: str) -> None:
-    words = " ".join(run("build", "--help").out.replace("│", " ").split())
-    told = re.search(rf"--{name.replace('_', '-')} .*?\(default: (\S+)\)", words)
-    assert told is not None
-    defaults = {
-        field.default
-        for prior in vars(priors).values()
-        if isinstance(prior, type) and dataclasses.is_dataclass(prior)
-        for field in dataclasses.fields(prior)
-        if field.name == name and isinstance(field.default, float)
-    }
-    numbers = {float(told[1])} if re.fullmatch(r"[0-9.]+", told[1]) and defaults else set()
-    assert numbers == defaults
-
-
-README = (Path(__file__).parent.parent / "README.md").read_text()
-
-
-@pytest.mark.parametrize("line", re.findall(r"^    modeler ([^#\n]*)", README, re.MULTILINE))
-def test_commands_of_the_readme_are_understood(line: str) -> None:
-    assert parsed(line.split()).run.__doc__
-
-
-def test_python_of_the_readme_runs(capfd: pytest.CaptureFixture[str]) -> None:
-    pair, tour = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    exec(pair, {})
-    assert capfd.readouterr().out.startswith("Outcome.CONVERGED")
-    quick = tour.replace('open_sequence(bundled("box"))', 'open_sequence(bundled("box")).select(frames=slice(0, 2))')
-    assert quick != tour
-    exec(quick, {})
-    assert capfd.readouterr().out == "0 accepted 1\n1 accepted 2\n"
-
-
-def test_the_readme_names_every_file_of_a_run_folder() -> None:
-    assert {name for name in re.findall(r"`(\w+\.\w+)`", README) if name in FILES} == FILES
-
-
-# Wrong usage and unreadable input
 
 
 @pytest.mark.parametrize(
@@ -290,15 +147,6 @@ def test_a_full_disk_under_stdout_is_told_in_one_line(arguments: tuple[str, ...]
     )
 
 
-def test_the_version_is_told(run: Run) -> None:
-    ended = run("--version")
-    assert (ended.status, ended.err) == (0, "")
-    assert re.fullmatch(r"modeler \d+\.\d+\.\d+\n", ended.out)
-
-
-# register
-
-
 def test_register_prints_one_edge_the_same_for_the_same_seed(run: Run) -> None:
     ended = run("register", BOX, "1", "0", "--prior", "table", "--seed", "5")
     assert ended.status == 0
@@ -329,36 +177,11 @@ def test_the_sequence_says_what_is_known_and_the_user_is_told(run: Run, tmp_path
     assert report(tmp_path / "run")["prior"] == "table"
 
 
-def test_a_step_between_numbers_that_leave_some_out_is_told_as_a_step_between_frames() -> None:
-    options, whole = PriorOptions(prior="turntable", step_deg=-10.0), open_sequence(BOX)
-    assert nonvisual.told(options, whole) == ("turntable", "")
-    _, remark = nonvisual.told(options, whole.select(every=3))
-    assert remark == "frame numbers go up by 3: -10° from one number to the next is -30° from frame to frame"
-    assert nonvisual.told(PriorOptions(prior="table"), whole.select(every=3)) == ("table", "")
-
-
 def test_register_gives_the_edge_that_build_finds(run: Run, built: Path) -> None:
     edge = json.loads(run("register", BOX, "1", "0", *QUICK[:4]).out)
     found = report(built)["edges"][0]
     for name in ("source", "target", "outcome", "target_from_source", "covariance", "overlap"):
         assert edge[name] == found[name]
-
-
-# build
-
-
-@pytest.mark.parametrize(
-    ("frames", "given_deg", "expected"),
-    [
-        (slice(0, 14), None, False),  # 13 steps of 25°, as sequence.json says, and 35° to go
-        (slice(0, 14), 27.0, True),
-        (slice(0, 14), -27.0, True),
-        (slice(0, 8), 50.0, True),
-        (slice(0, 8), 25.0, False),
-    ],
-)
-def test_a_turn_that_is_told_by_hand_counts_more(frames: slice, given_deg: float | None, *, expected: bool) -> None:
-    assert comes_back(open_sequence(BOX).select(frames=frames), given_deg, reach_deg=20.0) is expected
 
 
 def test_build_fills_a_run_folder(built: Path) -> None:
@@ -411,76 +234,6 @@ def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(run: Run, tmp_p
     (lost,) = (reason for reason in told["reasons"] if "left out" in reason)
     assert lost.startswith("frames 0 to 2 were left out: too few points: ")
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"model.ply", "cloud.ply"}
-
-
-def test_a_table_that_turns_the_other_way_is_asked_about() -> None:
-    lost = [f"frame 2 was left out: {Outcome.NO_OVERLAP.label}: {Outcome.NO_OVERLAP.advice}"]
-    known, unknown = (priors.TurntablePrior(-25.0, 3.0, step_sign=sign) for sign in ("known", "unknown"))
-    assert sense_in_doubt(lost, known)
-    assert sense_in_doubt(["frames 6 and 5 share little surface (overlap 0.47), and no other edge ..."], known)
-    assert not sense_in_doubt(lost, unknown)
-    assert not sense_in_doubt(lost, priors.TablePrior())
-    assert not sense_in_doubt(["the run was interrupted after frame 3"], known)
-
-
-def test_a_step_that_the_views_contradict_is_told() -> None:
-    def steps(turn_deg: float, count: int = 4, gap: int = 1) -> list[dict]:
-        turn = se3.exp(np.array([0.0, np.radians(turn_deg), 0.0, 0.0, 0.0, 0.0]))
-        edge = {"accepted": True, "kind": "odometry", "target_from_source": turn.ravel().tolist()}
-        return [edge | {"source": gap * (k + 1), "target": gap * k} for k in range(count)]
-
-    prior = priors.TurntablePrior(-30.0, 2.0)
-    said = other_step(steps(15.0), prior)
-    assert "turned by 15.0° from one frame number to the next, not by the 30° ± 2° that was told" in said
-    assert said.endswith("is --step-deg -15.0 meant?")
-    assert "turned by 15.0°" in other_step(steps(45.0, gap=3), prior)
-    again = [edge | {"source": edge["target"], "target": edge["source"]} for edge in steps(-29.0)[:1]]
-    assert other_step(steps(29.0) + again, prior) == ""  # a frame that was tried again lies before its target
-    assert "turned by 15.0°" in other_step(steps(15.0) + again, prior)
-    lost = {"accepted": False, "kind": "odometry", "source": 9, "target": 8, "target_from_source": np.eye(4).tolist()}
-    for edges in (steps(25.0), steps(90.0, gap=3), steps(15.0, count=2), [lost] * 5, []):
-        assert other_step(edges, prior) == ""
-    assert other_step(steps(15.0), priors.TablePrior()) == ""
-
-
-def test_frames_before_the_object_came_are_told() -> None:
-    few, lost = f"{Outcome.TOO_FEW_POINTS.label}: {Outcome.TOO_FEW_POINTS.advice}", Outcome.NO_OVERLAP.label
-
-    def said(*outcomes: str) -> str:
-        return ends_without([{"id": 2 * place, "outcome": outcome} for place, outcome in enumerate(outcomes)])
-
-    assert said(few, few, ACCEPTED, lost, ACCEPTED) == (
-        "the object is seen in frames 4 to 8, not before and not after; --frames 4: takes those alone"
-    )
-    assert "--frames :7 takes" in said(ACCEPTED, few, lost, ACCEPTED, few)
-    assert "--frames 2:5 takes" in said(few, ACCEPTED, ACCEPTED, few)
-    for whole in ((ACCEPTED, few, ACCEPTED), (lost, ACCEPTED, lost), (few, few, few), (few, ACCEPTED), ()):
-        assert said(*whole) == ""
-
-
-def test_ctrl_c_ends_the_frames_and_a_second_one_the_program() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    seen = []
-    with Interrupt() as interrupt:
-        for item in interrupt.until(range(5)):
-            seen.append(item)
-            if item == 1:
-                signal.raise_signal(signal.SIGINT)
-        assert (seen, interrupt.ended_early) == ([0, 1], True)
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_ctrl_c_after_the_last_frame_changes_nothing() -> None:
-    with Interrupt() as interrupt:
-        for item in interrupt.until(range(2)):
-            if item == 1:
-                signal.raise_signal(signal.SIGINT)
-    assert not interrupt.ended_early
-
-
-# evaluate, export and render
 
 
 def test_evaluate_writes_errors_and_prints_a_table(run: Run, tmp_path: Path) -> None:

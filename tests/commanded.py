@@ -1,0 +1,48 @@
+"""Commands run in this process, and what they say."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from modeler.cli import main
+from sequences import bundled
+
+BOX = str(bundled("box"))
+FILES = {
+    "model.ply",
+    "cloud.ply",
+    "trajectory.txt",
+    "odometry.txt",
+    "graph.g2o",
+    "recording.rrd",
+    "report.json",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Ended:
+    status: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Ended]
+
+
+def runner(capfd: pytest.CaptureFixture[str]) -> Run:
+    """Return what runs a command in this process, and tells how it ended and what it said."""
+
+    def run(*arguments: str | Path) -> Ended:
+        capfd.readouterr()
+        try:
+            status = main([str(argument) for argument in arguments])
+        except SystemExit as ending:
+            status = ending.code if isinstance(ending.code, int) else 1
+        said = capfd.readouterr()
+        return Ended(status, str(said.out), str(said.err))
+
+    return run

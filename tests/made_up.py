@@ -1,0 +1,88 @@
+"""A run made up for tests of what runs leave on disk."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from modeler import se3
+from modeler.export import (
+    RunMeta,
+)
+from modeler.graph import PoseGraph, solve
+from modeler.types import (
+    Camera,
+    Edge,
+    EdgeKind,
+    Frame,
+    ObjectModel,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    Segmentation,
+    Step,
+)
+
+META = RunMeta(sequence="box", seed=3, prior="table", settings={"every": 1}, seconds={"total": 1.5})
+
+
+def ball(*, coloured: bool = True) -> ObjectModel:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    normals = np.asarray(ball.vertices / 0.05)
+    rng = np.random.default_rng(0)
+    colours = rng.integers(0, 256, size=(len(normals), 3), dtype=np.uint8) if coloured else None
+    cloud = np.asarray(ball.vertices) + np.array([0.0, 0.0, 0.8])
+    return ObjectModel(cloud[::2], normals[::2], None if colours is None else colours[::2], cloud,
+                       np.asarray(ball.faces, dtype=np.int64), normals, colours)  # fmt: skip
+
+
+def an_edge(target: int, source: int, rng: np.random.Generator, kind: EdgeKind = "odometry", **changes: Any) -> Edge:
+    step = np.array([0.02, 0.4 * (source - target), 0.01, -0.3 * (source - target), 0.0, 0.05])
+    factor = rng.normal(size=(6, 6)) * 0.003 + 0.004 * np.eye(6)
+    pose = PoseGaussian(se3.exp(step + 0.005 * rng.normal(size=6)), factor @ factor.T)
+    posterior = Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.81, effective_samples=1234.5)
+    return Edge(replace(posterior, **changes), kind, True, "made up")
+
+
+def made_up_steps(count: int = 4, *, closure: bool = True) -> list[Step]:
+    """A run of `count` frames numbered 3, 5, 7 …"""
+    rng = np.random.default_rng(1)
+    camera = Camera(4, 3, 500.0, 500.0, 1.5, 1.0)
+    graph, views, steps = PoseGraph(first=3), {}, []
+    for number in range(count):
+        index, last = 3 + 2 * number, number == count - 1
+        frame = Frame(index, 0.1 * index, np.full((3, 4), 0.8, dtype=np.float32), camera)
+        pixels = np.zeros((5, 2), dtype=np.int64)
+        view = RayImage(frame, None, 0.001, 0.001, np.ones((5, 3)), np.ones((5, 3)), pixels)
+        edges = [an_edge(index - 2, index, rng)] if number else []
+        if last and closure:
+            edges.append(an_edge(3, index, rng, "closure"))
+        graph, views = graph.plus(edges), {**views, index: view}
+        steps.append(
+            Step(
+                frame=frame,
+                segmentation=Segmentation(np.ones((3, 4), dtype=bool), None, Outcome.CONVERGED),
+                view=view,
+                posteriors=tuple(edge.posterior for edge in edges),
+                edges=tuple(edges),
+                outcome="accepted",
+                solution=solve(graph, {}),
+                model=ball(),
+                edges_so_far=graph.edges,
+                views=views,
+                last=last,
+            )
+        )
+    return steps
+
+
+def strict_json(text: str) -> Any:
+    """Parse JSON as the standard has it: no NaN, no Infinity."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)

@@ -1,0 +1,130 @@
+"""Help and README say what there is, and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from commanded import BOX, FILES, Run, runner
+
+from modeler import priors
+from modeler.cli.options import PriorOptions
+from modeler.cli.usage import parsed
+
+COMMANDS = "build register evaluate render view report export join info convert calibrate-sensor".split()
+DOCUMENTED = """out prior seed resume overwrite every frames roi max-depth-m max-rotation-deg max-offset-m max-shift-m
+step-deg step-sigma-deg held-sigma-deg held-sigma-m
+method view web"""
+
+
+@pytest.fixture
+def run(capfd: pytest.CaptureFixture[str]) -> Run:
+    return runner(capfd)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_on_stdout(run: Run, command: str) -> None:
+    assert re.search(rf"\b{command}\b", run("--help").out)
+    ended = run(command, "--help")
+    assert (ended.status, ended.err) == (0, "")
+    assert ended.out.startswith(f"usage: modeler {command}")
+
+
+def test_help_of_the_program_tells_each_command_in_a_sentence_and_a_command_tells_all(run: Run) -> None:
+    overall, alone = (" ".join(run(*words, "--help").out.replace("│", " ").split()) for words in ((), ("build",)))
+    for text in (overall, alone):
+        assert "Build the model of an object from a sequence: register its frames, close loops, fuse." in text
+    assert "Ctrl-C ends the run with the frames so far" in alone
+    assert "Ctrl-C" not in overall
+
+
+def test_help_may_be_asked_for_in_a_word(run: Run) -> None:
+    assert run("help") == run("--help")
+    assert run("help", "build") == run("build", "--help")
+    assert run("help", "nonsense") == run("--help")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_takes_a_seed(run: Run, command: str) -> None:
+    # Enough for every command, too much for none: names of files that are never opened.
+    folders = {"register": ("S", "1", "0"), "join": ("A", "B")}.get(command, ("S",))
+    out = () if command in ("register", "info", "view") else ("--out", "OUT")
+    assert parsed((command, *folders, *out, "--seed", "7")) != parsed((command, *folders, *out, "--seed", "8"))
+    for seed in ("-1", "one", "1.5", "NaN"):
+        ended = run(command, *folders, *out, "--seed", seed)
+        assert (ended.status, ended.out) == (2, "")
+        assert f"--seed takes a whole number from 0 on, not '{seed}'; see modeler {command} --help\n" in ended.err
+
+
+def test_commands_that_draw_nothing_say_so_and_give_the_same_with_any_seed(run: Run) -> None:
+    for command in ("info", "convert", "calibrate-sensor", "view", "report", "export"):
+        words = " ".join(run(command, "--help").out.replace("│", " ").split())
+        assert "--seed N Without effect: this command draws nothing at random." in words
+    assert run("info", BOX, "--json", "--seed", "7") == run("info", BOX, "--json")
+
+
+@pytest.mark.parametrize("option", DOCUMENTED.split())
+def test_build_offers_what_is_documented(run: Run, option: str) -> None:
+    assert re.search(rf"^│ --{option}\b", run("build", "--help").out, re.MULTILINE)
+
+
+def test_help_imports_nothing_heavy() -> None:
+    heavy = "av gtsam matplotlib numba numpy open3d pyrealsense2 rerun rosbags scipy trimesh".split()
+    script = f"""
+import contextlib, sys
+from modeler.cli import main
+for command in {COMMANDS}:
+    with contextlib.suppress(SystemExit):
+        main([command, "--help"])
+sys.exit(", ".join(sorted(set({heavy}) & set(sys.modules))) or None)
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(PriorOptions) if field.name != "prior"])
+def test_defaults_told_in_help_are_those_of_the_priors(run: Run, name: str) -> None:
+    words = " ".join(run("build", "--help").out.replace("│", " ").split())
+    told = re.search(rf"--{name.replace('_', '-')} .*?\(default: (\S+)\)", words)
+    assert told is not None
+    defaults = {
+        field.default
+        for prior in vars(priors).values()
+        if isinstance(prior, type) and dataclasses.is_dataclass(prior)
+        for field in dataclasses.fields(prior)
+        if field.name == name and isinstance(field.default, float)
+    }
+    numbers = {float(told[1])} if re.fullmatch(r"[0-9.]+", told[1]) and defaults else set()
+    assert numbers == defaults
+
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+
+
+@pytest.mark.parametrize("line", re.findall(r"^    modeler ([^#\n]*)", README, re.MULTILINE))
+def test_commands_of_the_readme_are_understood(line: str) -> None:
+    assert parsed(line.split()).run.__doc__
+
+
+def test_python_of_the_readme_runs(capfd: pytest.CaptureFixture[str]) -> None:
+    pair, tour = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    exec(pair, {})
+    assert capfd.readouterr().out.startswith("Outcome.CONVERGED")
+    quick = tour.replace('open_sequence(bundled("box"))', 'open_sequence(bundled("box")).select(frames=slice(0, 2))')
+    assert quick != tour
+    exec(quick, {})
+    assert capfd.readouterr().out == "0 accepted 1\n1 accepted 2\n"
+
+
+def test_the_readme_names_every_file_of_a_run_folder() -> None:
+    assert {name for name in re.findall(r"`(\w+\.\w+)`", README) if name in FILES} == FILES
+
+
+def test_the_version_is_told(run: Run) -> None:
+    ended = run("--version")
+    assert (ended.status, ended.err) == (0, "")
+    assert re.fullmatch(r"modeler \d+\.\d+\.\d+\n", ended.out)

@@ -1,0 +1,145 @@
+"""Intrinsics and the unit of depth are read in each spelling, and asked about where they may be meant otherwise."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layouts import WRITERS
+from PIL import Image
+from recordings import save, small_frames, small_truth, write_open3d, write_tum
+
+from modeler.types import Frame, InputError
+from sequences import Given, open_sequence, survey, write_bop
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return small_frames()
+
+
+@pytest.fixture(scope="module")
+def truth() -> dict[int, np.ndarray]:
+    return small_truth()
+
+
+@pytest.fixture(params=WRITERS)
+def folder(request: pytest.FixtureRequest, tmp_path: Path, frames: list[Frame], truth: dict[int, np.ndarray]) -> Path:
+    path = tmp_path / request.param
+    WRITERS[request.param](path, frames, truth)
+    return path
+
+
+def test_what_a_person_says_counts_more(folder: Path) -> None:
+    sequence = open_sequence(folder, Given(intrinsics=(100.0, 101.0, 80.0, 60.0), depth_scale_mm=0.4))
+    plain = open_sequence(folder)
+    unit = 0.2 if folder.name == "TUM RGB-D" else 1.0
+    for first, second in zip(plain, sequence, strict=True):
+        np.testing.assert_allclose(second.depth_m, first.depth_m * np.float32(0.4 / unit), rtol=1e-6)
+        assert (second.camera.fx, second.camera.fy, second.camera.cx, second.camera.cy) == (100.0, 101.0, 80.0, 60.0)
+    assert sequence.depth_unit == "0.4 mm (--depth-scale-mm)"
+
+
+def test_the_benchmarks_own_size_needs_no_intrinsics(tmp_path: Path, frames: list[Frame]) -> None:
+    write_tum(tmp_path / "s", frames)
+    (tmp_path / "s" / "calibration.txt").unlink()
+    with pytest.raises(InputError, match=r"no intrinsics for images of 160 x 120"):
+        open_sequence(tmp_path / "s")
+    for path in (tmp_path / "s").glob("*/*.png"):
+        with Image.open(path) as picture:
+            large = np.asarray(picture).repeat(4, axis=0).repeat(4, axis=1)
+        save(path, large)
+    sequence = open_sequence(tmp_path / "s")
+    assert sequence.frame(0).camera.fx == 525.0
+    assert "assumed" in sequence.notes[0]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"width": 160, "height": 120, "intrinsic_matrix": [143.75, 0, 0, 0, 143.75, 0, 79.875, 59.875, 1]},
+        {"intrinsic_matrix": [143.75, 0, 79.875, 0, 143.75, 59.875, 0, 0, 1]},
+        {"camera_matrix": [[143.75, 0, 79.875], [0, 143.75, 59.875], [0, 0, 1]]},
+        {"fx": 143.75, "fy": 143.75, "ppx": 79.875, "ppy": 59.875},
+        {"intrinsic": {"fx": 143.75, "fy": 143.75, "cx": 79.875, "cy": 59.875}},
+    ],
+)
+def test_intrinsics_are_read_in_each_spelling(tmp_path: Path, frames: list[Frame], content: dict) -> None:
+    write_open3d(tmp_path / "s", frames)
+    (tmp_path / "s" / "camera_intrinsic.json").write_text(json.dumps(content))
+    camera = open_sequence(tmp_path / "s").frame(0).camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (143.75, 143.75, 79.875, 59.875)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "143.75 143.75 79.875 59.875 0 0 0 0 0",
+        "# fx, fy, cx, cy\n143.75, 143.75, 79.875, 59.875\n",
+        "143.75 0 79.875\n0 143.75 59.875\n0 0 1\n",
+        "[[143.75   0.     79.875]\n [  0.   143.75   59.875]\n [  0.     0.      1.   ]]\n",
+    ],
+)
+def test_intrinsics_are_read_from_text_in_each_spelling(tmp_path: Path, frames: list[Frame], content: str) -> None:
+    write_open3d(tmp_path / "s", frames)
+    (tmp_path / "s" / "cam_K.txt").write_text(content)
+    camera = open_sequence(tmp_path / "s").frame(0).camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (143.75, 143.75, 79.875, 59.875)
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(0.1, "0.1 mm"), (0.0001, "0.1 mm"), (5000, "0.2 mm"), (1, "1 mm")])
+def test_the_unit_of_depth_that_stands_beside_the_intrinsics_counts(
+    tmp_path: Path, frames: list[Frame], scale: float, unit: str
+) -> None:
+    """BOP's mm a unit, RealSense's m a unit, Open3D's units a m."""
+    write_open3d(tmp_path / "s", frames)
+    (tmp_path / "s" / "camera_intrinsic.json").unlink()
+    told = {"fx": 143.75, "fy": 143.75, "cx": 79.875, "cy": 59.875, "depth_scale": scale}
+    (tmp_path / "s" / "camera.json").write_text(json.dumps(told))
+    sequence = open_sequence(tmp_path / "s")
+    assert sequence.layout == "folder of pictures"
+    assert sequence.depth_unit == f"{unit} (camera.json)"
+    given = open_sequence(tmp_path / "s", Given(depth_scale_mm=3.0))
+    ratio = np.nanmedian(given.frame(0).depth_m / sequence.frame(0).depth_m)
+    assert ratio == pytest.approx(3.0 / float(unit.split()[0]), rel=1e-5)
+    (tmp_path / "s" / "camera.json").write_text(json.dumps({**told, "depth_scale": 30}))
+    with pytest.raises(InputError, match=r"camera\.json: \"depth_scale\" is 30; it must be millimetres"):
+        open_sequence(tmp_path / "s")
+
+
+def test_intrinsics_of_images_of_another_size_are_asked_about(tmp_path: Path, frames: list[Frame]) -> None:
+    write_open3d(tmp_path / "s", frames)
+    assert not open_sequence(tmp_path / "s").notes
+    path = tmp_path / "s" / "camera_intrinsic.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "width": 640, "height": 480}))
+    assert open_sequence(tmp_path / "s").notes == (
+        "camera_intrinsic.json is of images of 640 x 480 where the depth images are 160 x 120: are its intrinsics "
+        "theirs?",
+    )
+
+
+def test_what_may_be_meant_otherwise_is_asked(tmp_path: Path, frames: list[Frame]) -> None:
+    write_bop(tmp_path / "right", frames, depth_scale_mm=1.0)
+    assert survey(open_sequence(tmp_path / "right")).doubts == ()
+    doubled = [frames[0], replace(frames[0], index=1), frames[2], replace(frames[2], index=3)]
+    write_open3d(tmp_path / "twice", doubled)
+    (doubt,) = survey(open_sequence(tmp_path / "twice")).doubts
+    assert doubt == (
+        "2 of 4 frames have the depth of the frame before, to the bit (1, 3): were they saved twice? If so, remove them"
+    )
+    write_bop(tmp_path / "unit", [replace(one, depth_m=10.0 * one.depth_m) for one in frames], depth_scale_mm=1.0)
+    (doubt,) = survey(open_sequence(tmp_path / "unit")).doubts
+    assert "very far for an object: is the unit right?" in doubt
+    cameras = [replace(one.camera, cx=one.camera.cy, cy=one.camera.cx) for one in frames]
+    swapped = [replace(one, camera=camera) for one, camera in zip(frames, cameras, strict=True)]
+    write_bop(tmp_path / "swapped", swapped, depth_scale_mm=1.0)
+    (doubt,) = survey(open_sequence(tmp_path / "swapped")).doubts
+    assert doubt.endswith("are cx and cy exchanged?")
+    larger = [replace(one.camera, cx=2.0 * one.camera.cx, cy=2.0 * one.camera.cy) for one in frames]
+    doubled = [replace(one, camera=camera) for one, camera in zip(frames, larger, strict=True)]
+    write_bop(tmp_path / "larger", doubled, depth_scale_mm=1.0)
+    (doubt,) = survey(open_sequence(tmp_path / "larger")).doubts
+    assert doubt.endswith("are the intrinsics those of images of another size?")
