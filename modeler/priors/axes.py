@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
-from modeler.priors.axis_turn import across_axis
+from modeler.priors.directions import across_axis, directions_about
 from modeler.priors.general import centroid_offset
 from modeler.priors.proposal import AbstractGuess, guided
 from modeler.types import AbstractMotion, Array, RayImage
@@ -68,12 +68,8 @@ class Aligned(AbstractMotion):
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Draw motions (count, 4, 4)."""
-        concentration = self.sigma_rad**-2.0
-        cosine = 1.0 + np.log1p(rng.random(count) * np.expm1(-2.0 * concentration)) / concentration
-        bearing, turn = rng.uniform(0.0, 2.0 * np.pi, (2, count))
-        across = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
-        local = np.stack([across * np.cos(bearing), across * np.sin(bearing), cosine], axis=1)
-        carried = local @ np.vstack([across_axis(self.target_axis), self.target_axis])
+        carried = directions_about(self.target_axis, self.sigma_rad**-2.0, count, rng)
+        turn = rng.uniform(0.0, 2.0 * np.pi, count)
         carried *= rng.choice([-1.0, 1.0], (count, 1))
         spun = se3.exp(np.concatenate([turn[:, None] * self.source_axis, np.zeros((count, 3))], axis=1))
         poses = _onto(self.source_axis, carried) @ spun

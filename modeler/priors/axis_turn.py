@@ -1,11 +1,14 @@
 """A turn by about a known angle about an axis whose direction is more or less known: a density on rotations."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from modeler import se3
+from modeler.priors.directions import directions_about
 from modeler.types import Array
 
 _REACH = 8.0  # standard deviations of the turn that are drawn
@@ -42,11 +45,7 @@ class AxisTurn:
         if self.either_way:
             turn = turn * rng.choice([-1.0, 1.0], count)
         concentration = np.maximum(self._concentration(spread(turn)), 1e-9)
-        cosine = 1.0 + np.log1p(rng.random(count) * np.expm1(-2.0 * concentration)) / concentration
-        bearing = rng.uniform(0.0, 2.0 * np.pi, count)
-        across = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
-        local = np.stack([across * np.cos(bearing), across * np.sin(bearing), cosine], axis=1)
-        axes = local @ np.vstack([across_axis(self.axis), self.axis])
+        axes = directions_about(self.axis, concentration, count, rng)
         return se3.exp(np.concatenate([turn[:, None] * axes, np.zeros((count, 3))], axis=1))[:, :3, :3]
 
     def log_density(self, angle_rad: Array, cosine: Array) -> Array:
@@ -136,10 +135,3 @@ def angles_and_axes(rotations: Array) -> tuple[Array, Array]:
         vectors = se3.log(motions)[:, :3]
         axes[half_turns] = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     return angle_rad, axes
-
-
-def across_axis(axis: Array) -> Array:
-    """Return two unit vectors (2, 3) that span the plane across a unit axis (3,), right-handed with it."""
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    first = np.asarray(first / np.linalg.norm(first), dtype=np.float64)
-    return np.array([first, np.cross(axis, first)], dtype=np.float64)

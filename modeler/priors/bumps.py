@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import i0e, i1e
 
 from modeler import se3
-from modeler.priors.general import directions
+from modeler.priors.directions import directions
 from modeler.types import AbstractMotion, Array
 
 _NODES = 4097

@@ -9,7 +9,7 @@ from scipy.special import logsumexp
 
 from modeler import se3
 from modeler.priors.about_axis import Axis
-from modeler.priors.axis_turn import across_axis
+from modeler.priors.directions import across_axis
 from modeler.types import Array, PoseGaussian, Posterior
 
 _LEAST_PAIRS, _MOST_PAIRS = 3, 60  # the latest of many say enough

@@ -1,10 +1,13 @@
 """Nothing known but that the views are neighbours (paper, section IV: the general prior)."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from modeler import se3
+from modeler.priors.directions import directions
 from modeler.types import AbstractMotion, AbstractPrior, Array, EvenSpread, RayImage
 
 _SMALL_DEG = 30.0  # up to this turn limits of the centroids' offset are what they say
@@ -20,11 +23,11 @@ class GeneralPrior(AbstractPrior):
     max_offset_m: float = 0.04
     """Largest distance between the target's centroid and the source's, carried over."""
 
-    def between(self, source: RayImage, target: RayImage) -> "GeneralMotion":
+    def between(self, source: RayImage, target: RayImage) -> GeneralMotion:
         """Return the density of target_from_source."""
         return GeneralMotion(source.centroid_m, target.centroid_m, np.deg2rad(self.max_rotation_deg), self.max_offset_m)
 
-    def grown(self, steps: float) -> "GeneralPrior":
+    def grown(self, steps: float) -> GeneralPrior:
         """Return the prior whose limits hold for several steps."""
         rotation_deg, offset_m = grown_limits(self.max_rotation_deg, self.max_offset_m, steps)
         return replace(self, max_rotation_deg=rotation_deg, max_offset_m=offset_m)
@@ -94,12 +97,6 @@ def turned_offset_m(max_offset_m: float, turn_rad: float) -> float:
     """Return the limit of the centroids' offset in m for a turn of any size: up to 30 degrees what it says itself."""
     share = max(abs(np.remainder(turn_rad + np.pi, 2.0 * np.pi) - np.pi) / np.radians(_SMALL_DEG), 1.0)
     return grown_limits(_SMALL_DEG, max_offset_m, float(share))[1]
-
-
-def directions(count: int, rng: np.random.Generator) -> Array:
-    """Draw unit vectors (count, 3) evenly over the sphere."""
-    vectors = rng.normal(size=(count, 3))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def sample_angles(limit_rad: float, count: int, rng: np.random.Generator) -> Array:

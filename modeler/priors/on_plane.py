@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from modeler import se3
-from modeler.priors.axis_turn import across_axis
+from modeler.priors.directions import across_axis
 from modeler.priors.general import centroid_offset
 from modeler.types import Array, InputError, Plane, RayImage
 
