@@ -102,10 +102,9 @@ def cut(view: RayImage, where: tuple[slice, slice], *, margin_px: int, min_cosin
     index = np.full(depth_m.shape, -1, dtype=np.int32)
     index[tuple(pixels.T)] = np.arange(len(pixels))
     around = np.asarray(maximum_filter(mask, size=2 * margin_px + 1, mode="nearest"), dtype=bool)
-    reach_m = minimum_filter(np.where(measured, depth_m, np.inf), size=2 * margin_px + 1, mode="nearest")
     return Cut(
         index=index,
-        free_m=np.where(measured, reach_m, 0.0).astype(np.float32),
+        free_m=free_of(depth_m, margin_px),
         beside_m=np.where(measured & ~around, depth_m, 0.0).astype(np.float32),
         colour=colour,
         lens=lens,
@@ -114,6 +113,18 @@ def cut(view: RayImage, where: tuple[slice, slice], *, margin_px: int, min_cosin
         weights=weights[kept],
         colours=_sampled(colour, pixels),
     )
+
+
+def free_of(depth_m: npt.NDArray[np.float32], margin_px: int) -> npt.NDArray[np.float32]:
+    """Return up to which depth (h, w) the space along pixels is seen empty: as far as all around each are, 0 = unknown.
+
+    Args:
+        depth_m: (h, w), not positive or NaN where nothing is measured, which forbids nothing.
+        margin_px: how far around.
+    """
+    measured = np.isfinite(depth_m) & (depth_m > 0.0)
+    reach_m = minimum_filter(np.where(measured, depth_m, np.inf), size=2 * margin_px + 1, mode="nearest")
+    return np.where(measured, reach_m, 0.0).astype(np.float32)
 
 
 def pose_variances(part: Cut, covariance: Array | None, sigma_r_m: float) -> Array:

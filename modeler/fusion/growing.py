@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import minimum_filter
 
 from modeler import se3
 from modeler.fusion import surface
-from modeler.fusion.cut import GREY, colours_at
+from modeler.fusion.cut import GREY, colours_at, free_of
 from modeler.fusion.stack import posed
 from modeler.kernels import isosurface, preview
 from modeler.kernels.pieces import PIECES
@@ -186,12 +185,10 @@ def _images(view: RayImage, margin_px: int) -> tuple[npt.NDArray[np.int32], npt.
     low = np.maximum(view.pixels.min(axis=0) - MARGIN_PX, 0)
     high = np.minimum(view.pixels.max(axis=0) + MARGIN_PX + 1, depth_m.shape)
     cut = depth_m[low[0] : high[0], low[1] : high[1]]
-    measured = np.isfinite(cut) & (cut > 0.0)
     index = np.full(cut.shape, -1, dtype=np.int32)
     index[tuple((view.pixels - low).T)] = np.arange(len(view.pixels))
-    reach_m = minimum_filter(np.where(measured, cut, np.inf), size=2 * margin_px + 1, mode="nearest")
     lens = np.array([camera.fx, camera.fy, camera.cx - low[1], camera.cy - low[0]])
-    return index, np.where(measured, reach_m, 0.0).astype(np.float32), lens
+    return index, free_of(cut, margin_px), lens
 
 
 def _shifts_m(pairs: Mapping[int, tuple[RayImage, Array]], places: Mapping[int, _Place]) -> dict[int, float]:

@@ -54,6 +54,21 @@ class Stack:
         """Arguments that every kernel shares."""
         return self.index, self.free_m, self.poses, self.lenses, self.points_m, self.normals, self.weights
 
+    def alone(self, view: int) -> Stack:
+        """Return the stack with the images of one view only; the surface points of all stay, by their numbers."""
+        here = slice(view, view + 1)
+        return replace(
+            self,
+            index=self.index[here],
+            free_m=self.free_m[here],
+            beside_m=self.beside_m[here],
+            colour=self.colour[here],
+            coloured=self.coloured[here],
+            poses=self.poses[here],
+            lenses=self.lenses[here],
+            planes=self.planes[here],
+        )
+
     def carving(self, tau_m: float) -> Stack:
         """Return the views with empty space that ends behind what is measured beside the object, by a band ±`tau_m`.
 

@@ -38,24 +38,10 @@ def gains(seen: Stack, points_m: Array, normals: Array, *, tau_m: float, near_m:
     points_m, normals = np.ascontiguousarray(points_m[chosen]), np.ascontiguousarray(normals[chosen])
     levels = np.zeros((len(with_colour), len(chosen), 3))
     shown = np.zeros((len(with_colour), len(chosen)))
-    alone = np.ones((1, 4))
+    plain = np.ones((1, 4))
     for row, view in enumerate(with_colour):
-        _, colours = fusion.survey(
-            points_m,
-            normals,
-            near_m,
-            tau_m,
-            seen.index[view : view + 1],
-            seen.free_m[view : view + 1],
-            seen.poses[view : view + 1],
-            seen.lenses[view : view + 1],
-            seen.points_m,
-            seen.normals,
-            seen.weights,
-            seen.colour[view : view + 1],
-            alone,
-            1.0,
-        )
+        one = seen.alone(int(view))
+        _, colours = fusion.survey(points_m, normals, near_m, tau_m, *one.lookup, one.colour, plain, 1.0)
         levels[row], shown[row] = colours[:, :3], colours[:, 3]
     shown[np.any((levels < DARK) | (levels > BRIGHT), axis=2)] = 0.0
     shown[:, np.count_nonzero(shown, axis=0) < 2] = 0.0

@@ -66,7 +66,7 @@ class State:
     @property
     def newest(self) -> RayImage | None:
         """The view read last, accepted or left out; None where there is none."""
-        for frame in reversed(self.places):
+        for frame in reversed(list(self.places)):
             if frame in self.views or frame in self.lost:
                 return self.views[frame] if frame in self.views else self.lost[frame].view
         return None
