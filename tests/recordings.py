@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -121,3 +122,7 @@ def write_bundlesdf(folder: Path, frames: list[Frame], truth: dict[int, np.ndarr
             (folder / "annotated_poses").mkdir(exist_ok=True)
             np.savetxt(folder / "annotated_poses" / f"{stem}.txt", truth[frame.index])
     np.savetxt(folder / "cam_K.txt", matrix(frames[0].camera))
+
+
+Writer = Callable[[Path, list[Frame], dict[int, np.ndarray] | None], None]
+WRITERS: dict[str, Writer] = {"TUM RGB-D": write_tum, "Open3D": write_open3d, "BundleSDF": write_bundlesdf}

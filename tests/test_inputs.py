@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bags import Recorder
-from layouts import WRITERS
-from recordings import small_frames, small_truth, write_tum
+from recordings import WRITERS, small_frames, small_truth, write_tum
 
 from modeler import se3
 from modeler.cli import main

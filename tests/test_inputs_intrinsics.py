@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import WRITERS
 from PIL import Image
-from recordings import save, small_frames, small_truth, write_open3d, write_tum
+from recordings import WRITERS, save, small_frames, small_truth, write_open3d, write_tum
 
 from modeler.types import Frame, InputError
 from sequences import Given, open_sequence, survey, write_bop
