@@ -10,7 +10,7 @@ from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.kernels import matching
 from modeler.rays import Sensor
 from modeler.registration.posterior import weighted_gaussian
-from modeler.registration.refinement import Refiner, seen_alone
+from modeler.registration.refinement import Refiner, seen_alone, shrunk
 from modeler.registration.visibility import VisibilityRegistrar
 from modeler.se3 import rows
 from sequences import bundled, open_sequence
@@ -113,14 +113,26 @@ def test_the_scatter_of_patches_leaves_out_what_neighbours_share(width, rng):
     assert np.mean(sums**2) / width**2 == pytest.approx(seen_alone((width / ball) ** 2), rel=0.1)  # pixels, not areas
 
 
-@pytest.mark.parametrize("fields", [{"caution": 0.0}, {"caution": 4.0}])
-def test_caution_widens(fields, rng):
-    pair, truth, centre_m = bundled_pair("box")
-    poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
-    plain = sigmas_about(
-        Refiner().refine(pair, poses, np.ones(len(poses)), np.random.default_rng(1), fine_m=0.001), centre_m
-    )
-    other = sigmas_about(
-        Refiner(**fields).refine(pair, poses, np.ones(len(poses)), np.random.default_rng(1), fine_m=0.001), centre_m
-    )
-    assert (other[1] > plain[1]) == (fields["caution"] > 2.0)
+@pytest.mark.parametrize("departs", [False, True])
+def test_variability_of_few_scores_is_told_better_with_the_shape_it_should_have(departs, rng):
+    """Errors that are alike everywhere, and such as are far larger in one direction than they should be."""
+    root = rng.normal(size=(6, 6))
+    shape = root @ root.T
+    truth = shape + (30.0 * np.outer(root[:, 0], root[:, 0]) if departs else 0.0)
+    draws = rng.normal(size=(400, 32, 6)) @ np.linalg.cholesky(truth).T
+
+    def error(found):
+        return np.linalg.norm(np.linalg.solve(root, np.linalg.solve(root, found / 32 - truth).T))  # in units of shape
+
+    shrinking = np.mean([error(shrunk(scores, 5.0 * shape)) for scores in draws])
+    scattering = np.mean([error(scores.T @ scores * 32 / 31) for scores in draws])
+    assert shrinking < (1.0 if departs else 0.4) * scattering
+
+
+def test_variability_is_the_scatter_of_many_scores_and_follows_a_change_of_coordinates(rng):
+    root, turned = rng.normal(size=(2, 6, 6))
+    scores = rng.normal(size=(100_000, 6)) @ root.T
+    np.testing.assert_allclose(shrunk(scores, np.eye(6)), scores.T @ scores, rtol=0.01, atol=0.01 * len(scores))
+    few = scores[:20]
+    here, there = shrunk(few, root @ root.T), shrunk(few @ turned.T, turned @ root @ root.T @ turned.T)
+    np.testing.assert_allclose(there, turned @ here @ turned.T, rtol=1e-6, atol=1e-6 * np.trace(there))

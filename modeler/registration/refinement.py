@@ -31,8 +31,6 @@ class Refiner:
     """A patch holds at least so many matching points; with fewer in all, there are fewer patches."""
     min_patches: int = 16
     """With fewer patches than this nothing is refined: the scatter of six equations would not be known."""
-    caution: float = 1.0
-    """By so many standard errors the sensitivity is lowered, so that noise does not pass for knowledge."""
 
     def refine(self, pair: Pair, poses: Array, weights: Array, rng: np.random.Generator, *, fine_m: float) -> Array:
         """Return the refined samples (n, 4, 4): those of posterior × matching surface, if both were Gaussian.
@@ -76,14 +74,34 @@ class Refiner:
         sensitivity, axes = np.linalg.eigh(0.5 * (product + product.T))
         count = 2**halvings
         members = (patches.halved(places, halvings) == np.arange(count)[:, None]).astype(np.float64)
-        scores = members @ (0.5 * (by_own + by_other) @ axes * (weights * residuals)[:, None])
-        parts = members @ ((by_own @ axes) * (by_other @ axes) * weights[:, None])
-        variability = scores.T @ scores * count / (count - 1.0)
-        error = np.std(parts, axis=0, ddof=1) * np.sqrt(count)
-        sure = np.diag(np.maximum(sensitivity - self.caution * error, 0.0))
-        variability += 1e-9 * max(np.trace(variability), 1e-300) * np.eye(6)
+        by_both = 0.5 * (by_own + by_other) @ axes
+        scores = members @ (by_both * (weights * residuals)[:, None])
+        variability = shrunk(scores, (by_both.T * weights) @ by_both)
+        sure = np.diag(np.maximum(sensitivity, 0.0))
         information = seen_alone(pair.patches / count) * sure @ np.linalg.solve(variability, sure)
         return spread @ axes, np.asarray(0.5 * (information + information.T), dtype=np.float64)
+
+
+def shrunk(scores: Array, shape: Array) -> Array:
+    """Return the variability (k, k) of a sum of scores, from their scatter and from what it should look like.
+
+    A few dozen scores tell it poorly, and what they tell too low makes a posterior too sure. So it is drawn to the
+    shape that errors alike everywhere would give it, the farther, the less their scatter departs from that beyond
+    chance (oracle approximating shrinkage: Chen, Wiesel, Eldar and Hero 2010, equation 23).
+
+    Args:
+        scores: (n, k), which sum up to about 0.
+        shape: (k, k) positive semi-definite, of any scale.
+    """
+    count, size = scores.shape
+    root = np.linalg.cholesky(shape + max(1e-9 * np.trace(shape), 1e-300) * np.eye(size))
+    white = np.linalg.solve(root, scores.T)
+    scatter = white @ white.T * count / (count - 1.0)
+    level, square = np.trace(scatter) / size, np.sum(scatter**2)
+    departure = (count + 1.0 - 2.0 / size) * (square - size * level**2)
+    chance = (1.0 - 2.0 / size) * square + (size * level) ** 2
+    share = chance / max(chance, departure, 1e-300)
+    return np.asarray(root @ ((1.0 - share) * scatter + share * level * np.eye(size)) @ root.T, dtype=np.float64)
 
 
 def seen_alone(size: float) -> float:

@@ -41,8 +41,11 @@ class Search:
     """Gauss-Newton steps of each stage."""
     max_step_rad: float = 0.2
     """A step turns the object no further."""
+    led_points: float = 400.0
+    """Number of independent measurements that all points are worth on the way down: so many that the Gaussian which
+    stands for an even prior hardly draws what matching surface leaves open to the middle."""
     local_points: float = 40.0
-    """Number of independent measurements that all points are worth around a candidate."""
+    """Likewise around a candidate."""
     effective_points: float = 120.0
     """Most independent measurements that all points are worth when separate places are compared; see
     `Pair.independent`."""
@@ -246,7 +249,7 @@ class Search:
 
     def _pull(self, pair: Pair, prior: PoseGaussian) -> Pull:
         """Return what holds motions on their way down: the prior, and some damping."""
-        hold = np.asarray(np.linalg.inv(self.local_points / pair.points * prior.covariance), dtype=np.float64)
+        hold = np.asarray(np.linalg.inv(self.led_points / pair.points * prior.covariance), dtype=np.float64)
         damping = np.repeat([1.0 / self.max_step_rad, 1.0 / (self.max_step_rad * pair.size_m)], 3) ** 2
         return Pull(se3.rows(prior.mean), hold, 0.0025 * pair.points * damping, self.max_step_rad)
 

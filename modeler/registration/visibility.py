@@ -56,7 +56,7 @@ class VisibilityRegistrar(AbstractRegistrar):
 
     points: int = 600
     """Surface points taken from each view."""
-    effective_points: float = 80.0
+    effective_points: float = 70.0
     """Most independent measurements that the points of both views together are worth where surface matches; see
     `Pair.independent`."""
     compared_points: float = 40.0
