@@ -2,11 +2,14 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from recordings import small_frames, small_truth
+from turning_box import COUNT, LOST, steps
 
+from modeler.types import Frame, Step
 from sequences import bundled, write_bop
 
 
@@ -14,6 +17,32 @@ from sequences import bundled, write_bop
 def rng():
     """Return a generator with a fixed seed."""
     return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="session")
+def frames() -> list[Frame]:
+    """Return small frames of the bundled box."""
+    return small_frames()
+
+
+@pytest.fixture(scope="session")
+def truth() -> dict[int, np.ndarray]:
+    """Return camera_from_model (4, 4) of those frames."""
+    return small_truth()
+
+
+@pytest.fixture(scope="session")
+def run() -> list[Step]:
+    """Return a made-up run, one frame of which is lost."""
+    return list(steps(COUNT, lost=LOST))
+
+
+@pytest.fixture(scope="session")
+def recording(run: list[Step], tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[int, dict[str, Any]]]:
+    """Return what is recorded of that run, as `streamed.read` has it."""
+    from streamed import record  # and with it Rerun, which few tests need
+
+    return record(tmp_path_factory.mktemp("viz") / "recording.rrd", run)
 
 
 @pytest.fixture(scope="session")

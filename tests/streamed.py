@@ -14,7 +14,6 @@ from viz import entities
 from viz.stream import open_stream
 
 Recording = dict[str, dict[int, dict[str, Any]]]
-COUNT, LOST = 6, 3
 MERGED = (entities.MERGED_BEFORE, entities.MERGED_AFTER)
 
 

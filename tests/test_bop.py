@@ -5,29 +5,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_scene import CAMERA, INDICES, META, frame
+from small_scene import CAMERA, INDICES, META, random_frames, random_truth, written
 
-from modeler import se3
 from modeler.types import Frame, InputError
 from sequences import BopSequence, open_sequence, write_bop
 
 
 @pytest.fixture
 def frames() -> list[Frame]:
-    rng = np.random.default_rng(0)
-    return [frame(index, rng) for index in INDICES]
+    return random_frames()
 
 
 @pytest.fixture
 def truth() -> dict[int, np.ndarray]:
-    rng = np.random.default_rng(1)
-    return {index: se3.exp(rng.normal(size=6)) for index in INDICES}
+    return random_truth()
 
 
 @pytest.fixture
-def scene(tmp_path: Path, frames: list[Frame], truth: dict[int, np.ndarray]) -> Path:
-    write_bop(tmp_path / "scene", frames, truth, META)
-    return tmp_path / "scene"
+def scene(tmp_path: Path) -> Path:
+    return written(tmp_path / "scene")
 
 
 def test_reading_undoes_writing(scene: Path, frames: list[Frame], truth: dict[int, np.ndarray]) -> None:

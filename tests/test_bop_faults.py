@@ -11,29 +11,15 @@ from hypothesis import strategies as st
 from PIL import Image
 from recordings import png_claiming
 from refusal import refused
-from small_scene import INDICES, META, frame
+from small_scene import frame, written
 
-from modeler import se3
-from modeler.types import Frame, InputError
+from modeler.types import InputError
 from sequences import BopSequence, open_sequence, write_bop
 
 
 @pytest.fixture
-def frames() -> list[Frame]:
-    rng = np.random.default_rng(0)
-    return [frame(index, rng) for index in INDICES]
-
-
-@pytest.fixture
-def truth() -> dict[int, np.ndarray]:
-    rng = np.random.default_rng(1)
-    return {index: se3.exp(rng.normal(size=6)) for index in INDICES}
-
-
-@pytest.fixture
-def scene(tmp_path: Path, frames: list[Frame], truth: dict[int, np.ndarray]) -> Path:
-    write_bop(tmp_path / "scene", frames, truth, META)
-    return tmp_path / "scene"
+def scene(tmp_path: Path) -> Path:
+    return written(tmp_path / "scene")
 
 
 def edit_json(name: str, change: Callable[[dict], object]) -> Callable[[Path], object]:

@@ -9,22 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bags import Recorder
-from recordings import WRITERS, small_frames, small_truth, write_tum
+from recordings import WRITERS, write_tum
 
 from modeler import se3
 from modeler.cli import main
 from modeler.types import Frame
 from sequences import AbstractSequence, bundled, open_sequence, write_bop
-
-
-@pytest.fixture(scope="module")
-def frames() -> list[Frame]:
-    return small_frames()
-
-
-@pytest.fixture(scope="module")
-def truth() -> dict[int, np.ndarray]:
-    return small_truth()
 
 
 @pytest.fixture(params=WRITERS)

@@ -9,20 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from recordings import WRITERS, save, small_frames, small_truth, write_open3d, write_tum
+from recordings import WRITERS, save, write_open3d, write_tum
 
 from modeler.types import Frame, InputError
 from sequences import Given, open_sequence, survey, write_bop
-
-
-@pytest.fixture(scope="module")
-def frames() -> list[Frame]:
-    return small_frames()
-
-
-@pytest.fixture(scope="module")
-def truth() -> dict[int, np.ndarray]:
-    return small_truth()
 
 
 @pytest.fixture(params=WRITERS)

@@ -11,21 +11,11 @@ import numpy as np
 import pytest
 from bags import Recorder
 from PIL import Image
-from recordings import raw_depth, save, small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
+from recordings import raw_depth, save, write_bundlesdf, write_open3d, write_tum
 from test_inputs_clouds import WRITERS as CLOUDS
 
 from modeler.types import Frame, InputError
 from sequences import open_sequence, survey, write_bop
-
-
-@pytest.fixture(scope="module")
-def frames() -> list[Frame]:
-    return small_frames()
-
-
-@pytest.fixture(scope="module")
-def truth() -> dict[int, np.ndarray]:
-    return small_truth()
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3", "", ".pcd", ".ply"])

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from turning_box import CENTRE_M, HALF_M, object_from_camera, steps
+from turning_box import CENTRE_M, COUNT, HALF_M, LOST, object_from_camera, steps
 
 from modeler import se3
 from modeler.cli import main
@@ -26,7 +26,6 @@ from viz.report.recorded import recorded, surfaces
 from viz.report.result import Result
 from viz.stream import open_stream
 
-COUNT, LOST = 6, 3
 TRUTH = {k: se3.inverse(object_from_camera(k)) for k in range(COUNT)}
 ODD_NAME = 'a <b> & "c"'
 

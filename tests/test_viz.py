@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pytest
 import rerun as rr
 import rerun.chunk
 from PIL import Image
-from streamed import COUNT, LOST, MERGED, Recording, drawn, read, record
-from turning_box import CENTRE_M, HALF_M, steps
+from streamed import MERGED, Recording, drawn, read, record
+from turning_box import CENTRE_M, HALF_M, LOST, steps
 
 from modeler.types import Outcome, Plane, PoseGaussian, Segmentation, Solution, Step
 from viz import blueprint, clouds, entities, images
@@ -39,16 +38,6 @@ SPREADS = (
     entities.BEFORE_AXIS_TIPS_1_SIGMA,
 )
 EDGES = (entities.ODOMETRY, entities.CLOSURE, entities.REJECTED)
-
-
-@pytest.fixture(scope="module")
-def run() -> list[Step]:
-    return list(steps(COUNT, lost=LOST))
-
-
-@pytest.fixture(scope="module")
-def recording(run: list[Step], tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return record(tmp_path_factory.mktemp("viz") / "recording.rrd", run)
 
 
 def decoded(blob: list[list[int]]) -> npt.NDArray[Any]:

@@ -6,25 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
-from streamed import COUNT, LOST, MERGED, Recording, drawn, record
-from turning_box import COVARIANCE, steps
+from streamed import MERGED, Recording, drawn, record
+from turning_box import COUNT, COVARIANCE, LOST
 
 from modeler import se3
 from modeler.types import PoseGaussian, Step
 from viz import clouds, entities, uncertainty
 from viz.stream import graph_due
-
-
-@pytest.fixture(scope="module")
-def run() -> list[Step]:
-    return list(steps(COUNT, lost=LOST))
-
-
-@pytest.fixture(scope="module")
-def recording(run: list[Step], tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return record(tmp_path_factory.mktemp("viz") / "recording.rrd", run)
 
 
 def drawn_factor(label: str) -> float:

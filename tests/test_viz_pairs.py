@@ -9,22 +9,12 @@ import numpy as np
 import pytest
 import rerun as rr
 import rerun.chunk
-from streamed import COUNT, LOST, Recording, drawn, record
-from turning_box import CENTRE_M, COVARIANCE, HALF_M, object_from_camera, steps
+from streamed import Recording, drawn
+from turning_box import CENTRE_M, COUNT, COVARIANCE, HALF_M, LOST, object_from_camera
 
 from modeler import se3
 from modeler.types import Mode, PoseGaussian, Step
 from viz import entities, ghosts, readings, spread, visibility
-
-
-@pytest.fixture(scope="module")
-def run() -> list[Step]:
-    return list(steps(COUNT, lost=LOST))
-
-
-@pytest.fixture(scope="module")
-def recording(run: list[Step], tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return record(tmp_path_factory.mktemp("viz") / "recording.rrd", run)
 
 
 def test_alignment_brings_the_pair_together(recording: Recording) -> None:

@@ -16,17 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from streamed import COUNT, LOST, read, record
-from turning_box import steps
+from streamed import read, record
+from turning_box import COUNT
 
 from modeler.types import Step
 from viz import entities, viewer
 from viz.stream import RerunStream, open_stream
-
-
-@pytest.fixture(scope="module")
-def run() -> list[Step]:
-    return list(steps(COUNT, lost=LOST))
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
@@ -196,7 +191,8 @@ def test_a_recording_is_viewed_in_the_browser(run: list[Step], tmp_path: Path) -
 def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp_path: Path, number: int) -> None:
     record(tmp_path / "recording.rrd", run[:1])
     program = (
-        "import sys, pathlib; from viz import viewer; served = viewer.view(pathlib.Path(sys.argv[1]), web=True);"
+        "import sys, pathlib, signal; from viz import viewer; signal.signal(signal.SIGINT, signal.default_int_handler);"
+        "served = viewer.view(pathlib.Path(sys.argv[1]), web=True);"
         "print(served.process.pid, flush=True); served.wait()"
     )
     with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as command:

@@ -27,6 +27,8 @@ from modeler.types import (
     Step,
 )
 
+COUNT, LOST = 6, 3
+"""Frames of the run that tests share, and which of them is lost."""
 HALF_M = np.array([0.06, 0.09, 0.04])
 CENTRE_M = np.array([0.02, 0.0, 0.8])
 STEP_RAD = np.deg2rad(25.0)
