@@ -1,8 +1,11 @@
 """Shared fixtures."""
 
+import os
 import shutil
 from pathlib import Path
 from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as commands do: matrices are small, and NumPy asks once
 
 import numpy as np
 import pytest

@@ -155,7 +155,8 @@ def test_frames_of_different_size_are_one_model(
     assert "resolution    320 x 240, 160 x 120\n" in capsys.readouterr().out
     if masked:  # what is made of a run does not know where its masks come from
         assert main(["report", str(tmp_path / "run")]) == 0
-        assert main(["export", str(tmp_path / "run"), "--out", str(tmp_path / "m.obj"), "--texture"]) == 0
+        textured = ["--out", str(tmp_path / "m.obj"), "--texture", "--triangles", "500"]
+        assert main(["export", str(tmp_path / "run"), *textured]) == 0
 
 
 def test_frames_of_different_size_need_different_intrinsics(
@@ -173,13 +174,14 @@ def test_frames_of_different_size_need_different_intrinsics(
     assert "000003.png: is 160 x 120 pixels where 000000.png is 320 x 240, with the same cam_K" in said
 
 
-def test_a_thousand_frames_are_read_and_converted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_hundreds_of_frames_are_read_and_converted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pattern = tiny(4)
-    write_bop(tmp_path / "in", (replace(pattern[k % 4], index=k, time_s=0.1 * k) for k in range(1000)))
+    numbers = range(900, 1200)  # of three digits and of four, which as words come in another order
+    write_bop(tmp_path / "in", (replace(pattern[k % 4], index=k, time_s=0.1 * k) for k in numbers))
     assert main(["info", str(tmp_path / "in"), "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)["frames"]) == 1000
+    assert json.loads(capsys.readouterr().out)["frames"] == list(numbers)
     assert main(["convert", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--every", "2"]) == 0
-    assert open_sequence(tmp_path / "out").indices == tuple(range(0, 1000, 2))
+    assert open_sequence(tmp_path / "out").indices == tuple(numbers[::2])
 
 
 def test_frames_far_apart_in_number_stay_so(frames: list[Frame], tmp_path: Path) -> None:
