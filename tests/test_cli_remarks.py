@@ -76,10 +76,10 @@ def test_frames_before_the_object_came_are_told() -> None:
         return ends_without([{"id": 2 * place, "outcome": outcome} for place, outcome in enumerate(outcomes)])
 
     assert said(few, few, ACCEPTED, lost, ACCEPTED) == (
-        "the object is seen in frames 4 to 8, not before and not after; --frames 4: takes those alone"
+        "the object is seen from frame 4 on; --frames 4: takes those frames alone"
     )
-    assert "--frames :7 takes" in said(ACCEPTED, few, lost, ACCEPTED, few)
-    assert "--frames 2:5 takes" in said(few, ACCEPTED, ACCEPTED, few)
+    assert "seen up to frame 6; --frames :7 takes" in said(ACCEPTED, few, lost, ACCEPTED, few)
+    assert "seen from frame 2 on, up to frame 4; --frames 2:5 takes" in said(few, ACCEPTED, ACCEPTED, few)
     for whole in ((ACCEPTED, few, ACCEPTED), (lost, ACCEPTED, lost), (few, few, few), (few, ACCEPTED), ()):
         assert said(*whole) == ""
 

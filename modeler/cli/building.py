@@ -209,11 +209,10 @@ def ends_without(frames: Sequence[Mapping[str, Any]]) -> str:
     seen = sorted(frame["id"] for frame in frames if not frame["outcome"].startswith(Outcome.TOO_FEW_POINTS.label))
     if len(seen) < 2 or (seen[0], seen[-1]) == (ids[0], ids[-1]):
         return ""
-    begin, end = seen[0] if seen[0] > ids[0] else "", seen[-1] + 1 if seen[-1] < ids[-1] else ""
-    return (
-        f"the object is seen in frames {seen[0]} to {seen[-1]}, not before and not after; --frames {begin}:{end} takes "
-        "those alone"
-    )
+    late, early = seen[0] > ids[0], seen[-1] < ids[-1]
+    when = [f"from frame {seen[0]} on"] * late + [f"up to frame {seen[-1]}"] * early
+    only = f"{seen[0] if late else ''}:{seen[-1] + 1 if early else ''}"
+    return f"the object is seen {', '.join(when)}; --frames {only} takes those frames alone"
 
 
 def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
