@@ -94,13 +94,28 @@ def _holds_clouds(path: Path) -> bool:
     return any(entry.suffix.lower() in clouds.SUFFIXES for entry in entries(path))
 
 
+def _folders(path: Path) -> list[str]:
+    return [entry.name for entry in entries(path) if entry.is_dir()]
+
+
+def _scenes(path: Path, names: list[str]) -> list[str]:
+    """Return which of the folders of these names hold depth as sequences do."""
+    return [name for name in names if any((path / name / mark).exists() for mark in ("depth", "depth.txt"))]
+
+
 def _advice(path: Path) -> str:
     """Return what is wrong with a folder that holds no depth."""
-    inner = [entry.name for entry in entries(path) if entry.is_dir()]
-    scenes = [name for name in inner if any((path / name / mark).exists() for mark in ("depth", "depth.txt"))]
+    inner = _folders(path)
+    scenes = _scenes(path, inner) or _scenes(
+        path, [f"{name}/{deeper}" for name in inner for deeper in _folders(path / name)]
+    )
     if scenes:
-        more = ", ..." if len(scenes) > 3 else ""
-        return f"holds {len(scenes)} sequences; give one of them: {', '.join(scenes[:3])}{more}."
+        more, one = ", ..." if len(scenes) > 3 else "", len(scenes) == 1
+        held, which = ("a sequence", "it") if one else (f"{len(scenes)} sequences", "one of them")
+        return f"holds {held}; give {which}: {', '.join(scenes[:3])}{more}."
+    of_depth = [name for name in inner if "depth" in name.lower()]
+    if len(of_depth) == 1:
+        return f"holds no folder depth; if its depth images are those in {of_depth[0]}, rename that to depth."
     if any(name in COLOUR_FOLDERS for name in inner):
         return "holds colour but no depth images; only depth can be registered, put it into depth/."
     if path.absolute().name == "depth":

@@ -197,7 +197,7 @@ FAULTS: dict[str, dict[str, tuple[Damage, str]]] = {
         "no intrinsics": (gone(O), "no intrinsics; add camera.json"),
         "colour of a coarser size": (pixels("color/*.jpg", lambda i: i[::2, ::2]), "colour and masks must be aligned"),
         "intrinsics empty": (text(O, lambda t: ""), "not valid JSON"),
-        "matrix lacking": (text(O, lambda t: "{}"), "intrinsic_matrix"),
+        "intrinsics lacking": (text(O, lambda t: "{}"), "intrinsics, with fx, fy, cx and cy in px, or with"),
         "matrix of text": (entry(O, lambda c: c["intrinsic_matrix"].__setitem__(0, "575")), "9 finite numbers"),
         "matrix singular": (entry(O, lambda c: c["intrinsic_matrix"].__setitem__(0, 0)), "pinhole camera"),
         "matrix a list": (text(O, lambda t: "[1, 2]"), "must be an object"),
@@ -289,6 +289,14 @@ def test_pictures_that_lie_elsewhere_are_seen(
     for name in ("flat", "deeper"):
         assert main(["info", str(tmp_path / name)]) == 2
         assert "holds pictures but no folder depth; put the depth images into one" in capsys.readouterr().err
+    (tmp_path / "deeper" / "images").rename(tmp_path / "deeper" / "Depth_16bit")
+    assert main(["info", str(tmp_path / "deeper")]) == 2
+    assert "if its depth images are those in Depth_16bit, rename that to depth" in capsys.readouterr().err
+    shutil.copytree(written / "bop", tmp_path / "monday" / "take 1" / "scan")
+    assert main(["info", str(tmp_path / "monday")]) == 2
+    assert "holds a sequence; give it: take 1/scan" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "monday" / "take 1")]) == 2
+    assert "holds a sequence; give it: scan" in capsys.readouterr().err
 
 
 def test_a_path_that_is_misspelt_is_asked_about(tmp_path: Path) -> None:

@@ -54,6 +54,7 @@ def test_the_benchmarks_own_size_needs_no_intrinsics(tmp_path: Path, frames: lis
         {"camera_matrix": [[143.75, 0, 79.875], [0, 143.75, 59.875], [0, 0, 1]]},
         {"fx": 143.75, "fy": 143.75, "ppx": 79.875, "ppy": 59.875},
         {"intrinsic": {"fx": 143.75, "fy": 143.75, "cx": 79.875, "cy": 59.875}},
+        {"intrinsics": {"fx": 143.75, "fy": 143.75, "ppx": 79.875, "ppy": 59.875, "model": "none"}},
     ],
 )
 def test_intrinsics_are_read_in_each_spelling(tmp_path: Path, frames: list[Frame], content: dict) -> None:

@@ -152,7 +152,7 @@ def test_onboarding_scenes_are_read(tmp_path: Path, frames: list[Frame], truth: 
     assert (found.masks, found.colours, found.truths) == (2, 4, 4)
     assert "no mask in 2 frames: the object is segmented by the program" in found.missing
     assert sequence.notes == ("1 colour images have no depth image and are left out",)
-    with pytest.raises(InputError, match="holds 1 sequences; give one of them: obj_000001_up"):
+    with pytest.raises(InputError, match="holds a sequence; give it: obj_000001_up"):
         open_sequence(tmp_path / "onboarding_static")
 
 

@@ -82,6 +82,7 @@ def find_intrinsics(folder: Path, given: Given) -> Told | None:
     return None
 
 
+_WITHIN = ("intrinsic", "intrinsics")
 _SPACE = str.maketrans(",;[]", "    ")
 
 
@@ -109,8 +110,7 @@ def _from_text(path: Path) -> Intrinsics:
 def _from_json(node: Node, name: str) -> Told:
     """Read what Open3D writes (columns of the matrix in turn), a matrix in rows, or fx, fy, cx, cy by name."""
     scale = node.get("depth_scale")
-    if node.get("intrinsic") is not None:
-        node = node.need("intrinsic")
+    node = next((within for key in _WITHIN if (within := node.get(key)) is not None), node)
     width, height = node.get("width"), node.get("height")
     size = None if width is None or height is None else (int(width.number(1.0, 1e5)), int(height.number(1.0, 1e5)))
     return Told(_pinhole(node), name, None if scale is None else _unit_mm(scale), size)
@@ -133,6 +133,9 @@ def _unit_mm(scale: Node) -> float:
     raise scale.fault("millimetres per unit of depth, as in 1 or 0.1")
 
 
+_MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K")
+
+
 def _pinhole(node: Node) -> Intrinsics:
     """Return the intrinsics that an object of a JSON file holds, in whichever spelling."""
     names = next(
@@ -143,8 +146,9 @@ def _pinhole(node: Node) -> Intrinsics:
         if not sane((fx, fy, cx, cy)):
             raise node.fault("intrinsics in px with fx and fy of at least 1")
         return fx, fy, cx, cy
-    key = next((key for key in ("intrinsic_matrix", "camera_matrix", "cam_K", "K") if node.get(key) is not None), None)
-    entry = node.need("intrinsic_matrix" if key is None else key)
+    entry = next((found for key in _MATRICES if (found := node.get(key)) is not None), None)
+    if entry is None:
+        raise node.fault("intrinsics, with fx, fy, cx and cy in px, or with their matrix as intrinsic_matrix")
     if isinstance(entry.value, list) and len(entry.value) == 3:
         matrix = np.stack([row.numbers(3) for row in entry.elements()])
     else:
