@@ -43,6 +43,7 @@ def test_lost_frames_are_found_again_from_any_earlier_view(lost: int) -> None:
     else:
         np.testing.assert_allclose(run.solution.trajectory[back], run.truth[back], atol=0.02)
         assert sum(edge.accepted for edge in run.judged[back]) >= 2  # a witness
+        assert run.judged[back][0].kind == "odometry"  # that failed, though the object had turned away
 
 
 def test_lost_frame_is_bridged_from_the_last_accepted_one() -> None:
