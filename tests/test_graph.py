@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import gtsam
 import numpy as np
 import pytest
-from rings import OBJECT_M, spin
+from rings import OBJECT_M, spin, spun
 from rings import covariance as _covariance
 from rings import edge as _edge
 from rings import measured as _measured
@@ -238,3 +238,14 @@ def test_covariance_that_is_none_is_refused() -> None:
     flat = PoseGaussian(np.eye(4), np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 0.0]))
     with pytest.raises(ValueError, match="edge 1 -> 0 is not positive definite"):
         solve(PoseGraph((_edge(0, 1, flat), _edge(0, 1, flat, "closure"))), {})
+
+
+def test_a_closure_that_comes_before_odometry_of_the_same_frames_does_not_bear_it() -> None:
+    rng = np.random.default_rng(3)
+    truth = _truth(6)
+    odometry = [_edge(k - 1, k, _measured(truth, k - 1, k, rng)) for k in range(1, 6)]
+    lie = spun(_edge(0, 5, _measured(truth, 0, 5, rng), "closure"), [0.0, 1.5, 0.0])
+    solution = solve(PoseGraph((*odometry[:4], lie, odometry[4])), {})
+    assert solution.outliers == (lie,)
+    chain = solve(PoseGraph(tuple(odometry)), {}).trajectory
+    assert all(np.allclose(solution.trajectory[frame], pose) for frame, pose in chain.items())

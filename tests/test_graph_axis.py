@@ -214,3 +214,15 @@ def test_table_that_does_not_turn_shows_no_axis() -> None:
 def test_axis_and_shared_noise_are_not_for_the_same_solution() -> None:
     with pytest.raises(ValueError, match="shared"):
         solve(PoseGraph(first=0), {}, axis=TABLE, shared=0.5)
+
+
+def test_slip_over_frames_that_are_missing_is_that_of_as_many_steps() -> None:
+    rng = np.random.default_rng(7)
+    graph = _graph(rng, _table(rng)[0])
+    half = CommonAxis(0.5 * TABLE.sigma_tilt_rad, 0.5 * TABLE.sigma_shift_m, 0.5 * TABLE.sigma_lift_m)
+    sparse = PoseGraph(tuple(edge(4 * e.target, 4 * e.source, e.posterior.pose) for e in graph.edges), first=0)
+    dense, apart = solve(graph, {}, axis=TABLE), solve(sparse, {}, axis=half)
+    assert dense.camera_from_axis is not None
+    for frame, pose in dense.trajectory.items():
+        np.testing.assert_allclose(apart.trajectory[4 * frame], pose, atol=1e-6)
+        np.testing.assert_allclose(apart.covariances[4 * frame], dense.covariances[frame], rtol=1e-3, atol=1e-12)

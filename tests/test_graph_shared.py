@@ -131,3 +131,14 @@ def test_graph_without_loops_tells_nothing() -> None:
 @given(probability=st.floats(1e-6, 1.0 - 1e-6), degrees=st.integers(1, 3000))
 def test_quantiles_are_those_of_scipy(probability: float, degrees: int) -> None:
     assert chi_square_quantile(probability, degrees) == pytest.approx(stats.chi2(degrees).ppf(probability), rel=1e-12)
+
+
+def test_it_does_not_matter_which_way_round_edges_are_written() -> None:
+    rng = np.random.default_rng(4)
+    graph, _ = ring(COUNT, rng, [(0, COUNT - 1), (2, 6), (3, 9)])
+    back = [edge(one.source, one.target, one.posterior.pose.inverse(), one.kind) for one in graph.edges]
+    forth, written_back = (solve(PoseGraph(tuple(edges), first=0), {}, shared=0.6) for edges in (graph.edges, back))
+    for frame in range(1, COUNT):
+        sigmas = np.sqrt(np.diag(forth.covariances[frame]))
+        off = (written_back.covariances[frame] - forth.covariances[frame]) / np.outer(sigmas, sigmas)
+        assert np.abs(off).max() < 1e-4

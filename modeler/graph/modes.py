@@ -28,7 +28,7 @@ from modeler.types import Array, Edge
 _BEAM = 4096  # hypotheses kept while loops are taken one by one: all of twelve edges with two modes
 _SOLVED = 8  # hypotheses solved whole
 _MARGIN = 15.0  # nats below the best at which a hypothesis is no longer worth solving
-_DECIDED = 0.9999  # weight from which a mode is taken for the only one, unless a loop then contradicts it
+_DECIDED = 0.9999  # weight from which a mode is taken for the only one
 _REFUTED = 1.5  # false loops more than the best hypothesis has, and one is dropped: two, for one may lie
 _PAIRS = 16  # edges up to which the modes of two of them are changed at once
 
@@ -48,16 +48,13 @@ def decide(
         loops: the links beyond those.
         root: a frame of the tree.
         threshold: half the squared Mahalanobis distance at which a loop is taken to be false.
-        before: weights that fewer loops left; modes settled there are not put in question unless a loop contradicts
-            them on whose way there are others that are not.
+        before: weights that fewer loops left; modes settled there are not put in question.
     """
     settled = {edge: weights for edge, weights in (before or {}).items() if weights.max() >= _DECIDED}
     if not any(link.modes and link.edge not in settled for link in (*tree, *loops)):
         return settled
     search = _Search.of(tree, loops, root, settled, threshold)
     best = search.best() if search.edges else None
-    if settled and best is not None and search.contradicted(best[0][:1]):
-        return decide(tree, loops, root=root, threshold=threshold)
     decided = dict(settled)
     if best is not None:
         hypotheses, scores = best
@@ -102,7 +99,7 @@ class _Search:
             for column in cycle.columns:
                 if hypotheses[0, column] < 0:
                     hypotheses, scores = self._grown(hypotheses, scores, column)
-            scores = scores + self._closes(cycle, hypotheses)[0]
+            scores = scores + self._closes(cycle, hypotheses)
             alive = scores >= scores.max() - _REFUTED * self.threshold
             hypotheses, scores = hypotheses[alive], scores[alive]
         hypotheses = hypotheses[np.argsort(-scores, kind="stable")[:_SOLVED]]
@@ -113,10 +110,6 @@ class _Search:
             if np.array_equal(around[order[0]], hypotheses[0]):
                 return around[order], scores[order]
             hypotheses = around[order]
-
-    def contradicted(self, hypothesis: npt.NDArray[np.int64]) -> bool:
-        """Return whether a loop is false under a hypothesis (1, edges)."""
-        return any(bool(self._closes(cycle, hypothesis)[1][0]) for cycle in self.cycles)
 
     def evidence(
         self,
@@ -169,12 +162,12 @@ class _Search:
         scores = np.zeros(len(hypotheses))
         for column in range(len(self.edges)):
             scores = scores + self._weights(column)[hypotheses[:, column]]
-        return scores + np.sum([self._closes(cycle, hypotheses)[0] for cycle in self.cycles], axis=0)
+        return scores + np.sum([self._closes(cycle, hypotheses) for cycle in self.cycles], axis=0)
 
-    def _closes(self, cycle: Cycle, hypotheses: npt.NDArray[np.int64]) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Return how well a loop closes (h,), as a log density that is cut off where it is false, and where it is."""
+    def _closes(self, cycle: Cycle, hypotheses: npt.NDArray[np.int64]) -> Array:
+        """Return how well a loop closes (h,), as a log density that is cut off where it is false."""
         error, log_volume = cycle.gap(hypotheses)
-        return -np.minimum(error, self.threshold) - log_volume, error > self.threshold
+        return -np.minimum(error, self.threshold) - log_volume
 
 
 def _chosen(link: Link, modes: Mapping[Edge, int]) -> Link:

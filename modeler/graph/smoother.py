@@ -108,8 +108,9 @@ class Smoother:
             trajectory, inlier, engine = closed(taken, closing, start, root=root, threshold=threshold, before=before)
         state = _State(root, links, frames, decided, weights, inlier, engine)
         if grew and decided and inlier.count(False) > self.state.inlier.count(False):
-            again = replace(self, state=_State()).to(graph)  # it may be that other modes make fewer loops lie
-            if len(again.solution.outliers) < inlier.count(False):
+            # Modes that were settled may have been so by a lie: all are put in question.
+            again = replace(self, state=_State()).to(graph)
+            if len(again.solution.outliers) <= inlier.count(False):
                 return again
         solution = self._solution(state, (taken, closing), trajectory, grew=grew and graph is not self.graph)
         return replace(self, graph=graph, solution=replace(solution, odometry=odometry), state=state)
