@@ -15,9 +15,9 @@ from modeler.cli.options import IdleSeed, MovedOptions, default
 class Export:
     """Write the fused mesh of a run as PLY, OBJ, GLB or STL, in m, object frame.
 
-    The axes are those of the camera at the first frame: x right, y down, z forward; a GLB's node turns them so that
-    y is up, as glTF has it. What --watertight, --texture and --voxel-m ask for is made anew from the frames, so the
-    sequence must be there.
+    The axes are those of the camera at the first frame: x right, y down, z forward. A GLB's node turns them so that y
+    is up, as glTF has it, and the model stands as it stood. What --watertight, --texture and --voxel-m ask for is made
+    anew from the frames, so the sequence must be there.
     """
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
