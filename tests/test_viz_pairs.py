@@ -193,6 +193,16 @@ def test_readings_that_a_method_does_not_give_are_left_out(run: list[Step]) -> N
     edge = run[1].edges[0]
     poor = replace(edge, posterior=replace(edge.posterior, effective_samples=float("nan"), seconds=float("nan")))
     assert "nan" not in readings.pair_words(poor, run[1])
+    single = replace(
+        edge.posterior,
+        pose=PoseGaussian(edge.posterior.pose.mean, 1e-18 * np.eye(6)),
+        overlap=0.02,
+        effective_samples=1.2,
+        seconds=0.1,
+    )
+    assert readings.pair_words(replace(edge, posterior=single), run[1]).endswith(
+        "rotation sd <0.01°, translation sd <0.01 mm, overlap 2 %, 1 effective sample, 0.1 s"
+    )
     paths = {path for path, _ in readings.drawing(replace(run[1], edges=(poor,)))}
     assert f"{entities.OVERLAP}/odometry" in paths
     assert f"{entities.SECONDS}/odometry" not in paths

@@ -114,6 +114,17 @@ def test_modes_are_told_apart_instead_of_called_free() -> None:
     ]
 
 
+def test_modes_that_lie_near_each_other_are_told_in_one_line() -> None:
+    sure = _two_modes()
+    near = PoseGaussian(sure.modes[0].pose.mean @ spin(np.radians(2.0) * NORMAL), sure.modes[0].pose.covariance)
+    heaviest, turned = (replace(mode, weight=weight) for mode, weight in zip(sure.modes, (0.4, 0.3), strict=True))
+    several = replace(sure, modes=(heaviest, Mode(0.2, near), turned, Mode(0.1, near)))
+    assert undetermined(several, _view((0.03, 0.03, 0.03))) == [
+        "perhaps turned by 90° more about the table's normal: 30 % against 40 %",
+        "perhaps elsewhere nearby: 20 %, 10 % against 40 %",
+    ]
+
+
 def test_report_holds_modes_words_and_what_the_graph_made_of_them() -> None:
     posterior = _two_modes()
     judged = edge(0, 1, posterior.pose, modes=posterior.modes)

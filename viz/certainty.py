@@ -47,11 +47,17 @@ def words(posterior: Posterior, centre_m: Array) -> list[str]:
         centre_m: (3,) the object's centre in the source camera's frame.
     """
     sd = sd_of(posterior.pose, centre_m)
+    samples = f"{posterior.effective_samples:.0f}"
     readings = (
-        ("rotation sd {:.2g}°", sd.rotation_deg),
-        ("translation sd {:.2g} mm", sd.translation_mm),
-        ("overlap {:.0f} %", 100.0 * posterior.overlap),
-        ("{:.0f} effective samples", posterior.effective_samples),
-        ("{:.2g} s", posterior.seconds),
+        (sd.rotation_deg, f"rotation sd {_short(sd.rotation_deg)}°"),
+        (sd.translation_mm, f"translation sd {_short(sd.translation_mm)} mm"),
+        (posterior.overlap, f"overlap {100.0 * posterior.overlap:.0f} %"),
+        (posterior.effective_samples, f"{samples} effective sample" + "s" * (samples != "1")),
+        (posterior.seconds, f"{posterior.seconds:.2g} s"),
     )
-    return [form.format(value) for form, value in readings if math.isfinite(value)]
+    return [said for value, said in readings if math.isfinite(value)]
+
+
+def _short(value: float) -> str:
+    """Return a number of two digits, none of which lie beyond what anybody measures."""
+    return "<0.01" if 0.0 < value < 0.01 else f"{value:.2g}"

@@ -54,14 +54,18 @@ def _elsewhere(posterior: Posterior, view: RayImage | None) -> Iterator[str]:
     if not posterior.modes:
         return
     first, *others = posterior.modes
+    against = f"against {_percent(first.weight)}"
+    nearby: list[str] = []
     for mode in others:
         xi = se3.log(se3.inverse(first.pose.mean) @ mode.pose.mean)
-        angle_rad = float(np.linalg.norm(xi[:3]))
-        share = f"{100.0 * mode.weight:.0f} % against {100.0 * first.weight:.0f} %"
+        angle_rad, share = float(np.linalg.norm(xi[:3])), _percent(mode.weight)
         if angle_rad > _FREE_RAD:
-            yield f"perhaps turned by {_degrees(angle_rad)} more about {_name(xi[:3] / angle_rad, view)}: {share}"
+            about = _name(xi[:3] / angle_rad, view)
+            yield f"perhaps turned by {_degrees(angle_rad)} more about {about}: {share} {against}"
         else:
-            yield f"perhaps elsewhere nearby: {share}"
+            nearby.append(share)
+    if nearby:
+        yield f"perhaps elsewhere nearby: {', '.join(nearby)} {against}"
 
 
 def _principal(covariance: Array) -> tuple[Array, Array]:
@@ -91,6 +95,10 @@ def _directions(view: RayImage | None) -> Iterator[tuple[str, Array]]:
     yield "the viewing direction", np.array([0.0, 0.0, 1.0])
     yield "the camera's vertical", np.array([0.0, 1.0, 0.0])
     yield "the camera's horizontal", np.array([1.0, 0.0, 0.0])
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f} %"
 
 
 def _degrees(angle_rad: float) -> str:

@@ -62,7 +62,7 @@ def _pair(result: Result, edge: Edge, record: Mapping[str, Any], pictures: Thumb
             f"rotation off by {evaluation.rotation_error_deg(posterior.pose.mean, truth):.2f}°",
             f"translation by {1000.0 * evaluation.translation_error_m(posterior.pose.mean, truth, seen_m):.1f} mm",
         ]
-    words = ", ".join(facts)
+    words = escape(", ".join(facts))
     open_words = _mode_words(record.get("modes", [])) + "".join(
         f"<p>{escape(words)}.</p>" for words in record.get("undetermined", [])
     )
