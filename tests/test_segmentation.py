@@ -184,6 +184,17 @@ def test_own_masks_are_kept_within_region_and_depth(rng):
     np.testing.assert_array_equal(near.mask, masks[0] & ~(frames[0].depth_m > np.float32(depth)))
 
 
+def test_masks_that_hold_the_table_as_well_are_unsure(rng):
+    frames, masks = turned(2, rng)
+    for frame, mask in zip(frames, masks, strict=True):
+        rows, columns = (slice(found.min() - 12, found.max() + 13) for found in np.nonzero(mask))
+        box = np.zeros_like(mask)
+        box[rows, columns] = True
+        told = [Segmenter().segment(replace(frame, mask=one), Scene()) for one in (mask, box)]
+        assert [one.outcome for one in told] == [Outcome.CONVERGED, Outcome.UNSURE_MASK]
+        np.testing.assert_array_equal(told[1].mask, box)  # it is kept all the same
+
+
 def test_a_masked_object_before_nothing_has_no_plane(rng):
     frame, mask = World().box((0.0, 0.0, 0.0), (0.06, 0.06, 0.06), label=OBJECT).frame(0, rng)
     one = Segmenter().segment(replace(frame, mask=mask), Scene())

@@ -23,6 +23,7 @@ _AREA_FACTOR = 2.5  # by which the visible area may leave the range it had in th
 _AGREEING_SHARE = 0.5  # of what stood still, for the scene to hold in a frame
 _NOISIEST = 3.0  # times the noise that is expected; where depth changes more from frame to frame, the camera moves
 _PLANE_SHARE = 0.02  # of the surroundings of a masked object that a plane must cover
+_LOOSE_SHARE = 0.15  # of a mask on that plane: more of it than the rim of an object, seen from anywhere
 
 
 @final
@@ -85,13 +86,15 @@ class Segmenter:
     def segment(self, frame: Frame, scene: Scene) -> Segmentation:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
 
-        A frame's own mask is kept, within region and greatest depth.
+        A frame's own mask is kept, within region and greatest depth; it is unsure where it holds much of the support.
         """
         if frame.mask is not None:
             mask = frame.mask & self._allowed(frame.depth_m)
             few = np.count_nonzero(mask & (frame.depth_m > 0.0)) < self.min_points
             plane = None if few else self._plane_beside(frame, mask)
-            return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else Outcome.CONVERGED)
+            loose = plane is not None and self._share_on(plane, frame, mask) > _LOOSE_SHARE
+            outcome = Outcome.UNSURE_MASK if loose else Outcome.CONVERGED
+            return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome)
         if scene.alone:
             mask = clean(self._kept(frame), frame.camera, self.noise)
             few = np.count_nonzero(mask) < self.min_points
@@ -154,6 +157,13 @@ class Segmenter:
         off = depth - scene.still_m
         agreeing = np.count_nonzero(np.abs(off) < 2.0 * (scene.noise or self.noise).tolerance_m(depth))
         return bool(agreeing >= _AGREEING_SHARE * np.count_nonzero(np.isfinite(off)))
+
+    def _share_on(self, plane: Plane, frame: Frame, mask: BoolArray) -> float:
+        """Return how much of what is measured within a mask belongs to the plane that the object stands on."""
+        stride = planning_stride(frame.camera)
+        points = _points(frame, stride)
+        points = points[mask[::stride, ::stride] & np.isfinite(points[..., 2])].astype(np.float64)
+        return float(np.mean(np.abs(plane.height_m(points)) < self.noise.tolerance_m(points[:, 2])))
 
     def _plane_beside(self, frame: Frame, mask: BoolArray) -> Plane | None:
         """Return the support that is seen around a masked object, if any is."""

@@ -22,7 +22,10 @@ class Outcome(enum.Enum):
         "(general) or --max-shift-m (table, turntable).",
     )
     TOO_FEW_POINTS = "too few points", "The object covers too few pixels; check the mask, --roi and --max-depth-m."
-    UNSURE_MASK = "unsure mask", "The object is hard to tell from its surroundings; give --roi, --max-depth-m or masks."
+    UNSURE_MASK = (
+        "unsure mask",
+        "The object is hard to tell from its surroundings; give --roi, --max-depth-m, or masks that hold nothing else.",
+    )
     NOT_KNOWN = (
         "prior does not apply",
         "These views lack what the prior goes by; show it to the camera, or use another.",
