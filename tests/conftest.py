@@ -9,7 +9,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as commands do: matrices a
 
 import numpy as np
 import pytest
-from recordings import small_frames, small_truth
+from recordings import small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
 from turning_box import COUNT, LOST, steps
 
 from modeler.types import Frame, Step
@@ -55,3 +55,14 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_bop(folder, small_frames(3), small_truth(3), depth_scale_mm=1.0)
     shutil.copy(bundled("box") / "model.ply", folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with one intact sequence of each kind of folders of pictures: to be read only."""
+    root, frames, truth = tmp_path_factory.mktemp("intact"), small_frames(3), small_truth(3)
+    write_bop(root / "bop", frames, truth, depth_scale_mm=1.0)
+    write_tum(root / "tum", frames, truth)
+    write_open3d(root / "open3d", frames, truth)
+    write_bundlesdf(root / "bundlesdf", frames, truth)
+    return root
