@@ -16,6 +16,7 @@ from modeler.closure import Closer
 from modeler.fusion import Fuser
 from modeler.graph import CommonAxis, PoseGraph, shared_noise, solve
 from modeler.pipeline import ACCEPTED, Modeler
+from modeler.pipeline.state import Seen, State
 from modeler.priors.bumps import Bumps
 from modeler.priors.proposal import Guided
 from modeler.rays import Sensor
@@ -32,6 +33,7 @@ from modeler.types import (
     PoseGaussian,
     Posterior,
     RayImage,
+    Segmentation,
     SharedAxis,
     Solution,
     Step,
@@ -496,3 +498,12 @@ def test_a_scene_is_told_by_few_frames_spread_over_the_sequence(frames: int, tol
     assert chosen[-1] == indices[-1] or frames == 1
     gaps = np.diff(chosen)
     assert np.ptp(gaps) <= 2 if len(gaps) else told == 1
+
+
+def test_only_frames_that_a_view_followed_soon_are_tried_again_newest_first() -> None:
+    seen = {
+        k: Seen(FRAMES[k], Segmentation(np.ones((2, 2), dtype=bool), None, Outcome.CONVERGED), None) for k in (1, 4, 5)
+    }
+    views = {k: tabletop.view(BOX, POSES[k], k) for k in (0, 7)}
+    state = State(views=views, lost=seen, places={k: k for k in range(9)})
+    assert [(lost.frame.index, view) for lost, view in state.overdue()] == [(5, 7), (4, 7)]
