@@ -87,6 +87,26 @@ def test_what_to_do_about_frames_left_out_is_told_once(capfd: pytest.CaptureFixt
     ]
 
 
+def test_frames_that_are_left_out_in_a_row_are_told_together(capfd: pytest.CaptureFixture[str]) -> None:
+    frame = next(iter(open_sequence(bundled("tube"))))
+    few = Outcome.TOO_FEW_POINTS
+    nothing = Segmentation(np.zeros_like(frame.depth_m, dtype=bool), None, few)
+    lost = Step(frame, nothing, None, (), (), f"{few.label}: {few.advice}", Solution(), None)
+    with Console(12, None) as console:
+        for number in range(12):
+            outcome = ACCEPTED if number in (0, 9) else lost.outcome
+            console(replace(lost, frame=replace(frame, index=number), outcome=outcome))
+    assert capfd.readouterr().err.splitlines() == [
+        f"modeler: frame 1 is left out: {few.label}: {few.advice}",
+        f"modeler: frame 2 is left out: {few.label}",
+        f"modeler: frame 3 is left out: {few.label}",
+        f"modeler: frame 4 is left out: {few.label}",
+        f"modeler: frames 5 to 8 are left out: {few.label}",
+        f"modeler: frame 10 is left out: {few.label}",
+        f"modeler: frame 11 is left out: {few.label}",
+    ]
+
+
 def on_a_terminal(command: list[str]) -> str:
     """Return what a command writes to a terminal that is its stderr."""
     ours, theirs = pty.openpty()

@@ -1,4 +1,4 @@
-"""What a run says on stderr while it runs: a bar where somebody watches, and one line for each frame left out."""
+"""What a run says on stderr while it runs: a bar where somebody watches, and which frames are left out."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from modeler import kernels
 from modeler.types import Outcome, Step, loops_closed
+
+_ONE_BY_ONE = 3  # frames left out in a row that are told as they come
 
 
 def bar() -> Progress:
@@ -37,6 +39,8 @@ class Console:
         self._placed: dict[int, bool] = {}  # a lost frame that later views place comes a second time
         self._unsure: set[int] = set()
         self._advised: set[str] = set()
+        self._told, self._aloud = "", 0
+        self._held: list[int] = []  # frames of which the same is to be told as of the last few
 
     def __enter__(self) -> Console:
         """Show the bar."""
@@ -52,6 +56,7 @@ class Console:
     ) -> None:
         """Leave the bar as it stands, and tell in how many frames something else may have been taken for the object."""
         self._bar.stop()
+        self._release()
         if self._unsure:
             doubt = Outcome.UNSURE_MASK
             self._say(f"{len(self._unsure)} of {len(self._placed)} frames: {doubt.label}: {doubt.advice}")
@@ -66,9 +71,11 @@ class Console:
         description = f"{len(step.views)} joined, {loops} {'loop' if loops == 1 else 'loops'} closed"
         self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=description)
         if not accepted and not again:
-            self._say(f"frame {frame} is left out: {self._why(step.outcome)}")
+            self._tell(frame, f"left out: {self._why(step.outcome)}")
         elif accepted and again:
-            self._say(f"frame {frame} is placed after all")
+            self._tell(frame, "placed after all")
+        elif accepted:
+            self._release()
 
     def ending(self, stage: str, done: int, total: int) -> None:
         """Tell of what is done after the last frame: `done` of `total`."""
@@ -80,6 +87,25 @@ class Console:
     def remark(self, words: str) -> None:
         """Tell in one line what the run has noticed."""
         self._say(words)
+
+    def _tell(self, frame: int, what: str) -> None:
+        """Tell what became of a frame; of those that follow each other for one reason, only the first few by one."""
+        if what != self._told:
+            self._release()
+            self._told = what
+        self._aloud += 1
+        if self._aloud > _ONE_BY_ONE:
+            self._held.append(frame)
+        else:
+            self._say(f"frame {frame} is {what}")
+
+    def _release(self) -> None:
+        """Tell what was held back, together."""
+        if len(self._held) == 1:
+            self._say(f"frame {self._held[0]} is {self._told}")
+        elif self._held:
+            self._say(f"frames {self._held[0]} to {self._held[-1]} are {self._told}")
+        self._told, self._aloud, self._held = "", 0, []
 
     def _why(self, outcome: str) -> str:
         """Return why a frame was left out, with what to do about it where that has not been said yet."""
