@@ -49,6 +49,7 @@ def report(folder: Path) -> dict:
     [
         ((), "give a command: build, "),
         (("frobnicate", "x"), "there is no command 'frobnicate'; there are build, "),
+        (("biuld", "x"), "there is no command 'biuld', perhaps you meant build; there are build, "),
         (("build", BOX), "--out"),
         (("build", BOX, "--out", "OUT", "--frob"), "unknown: --frob; see modeler build --help"),
         (("build", BOX, "--out", "OUT", "--prio", "table"), "perhaps you meant --prior NAME[+NAME]; see"),

@@ -149,7 +149,11 @@ def test_pokes_are_read() -> None:
         (PriorOptions(prior="held"), TURNTABLE, "telling: has no robot.txt"),
         (PriorOptions(prior="poke"), TURNTABLE, "give them"),
         (PriorOptions(prior="poke", poke_length_m=0.1), None, "--poke-point-m as well"),
-        (PriorOptions(prior="table", step_deg=3.0), None, "--step-deg is no parameter of --prior table"),
+        (
+            PriorOptions(prior="table", step_deg=3.0),
+            None,
+            "--step-deg is no parameter of --prior table; leave it out, or give --prior turntable",
+        ),
         (PriorOptions(prior="table+turntable", max_rotation_deg=3.0), TURNTABLE, "--max-rotation-deg"),
         (PriorOptions(prior="turntable", step_deg=float("nan")), None, "--step-deg nan is out of range"),
         (

@@ -71,7 +71,7 @@ def prior(options: PriorOptions, sequence: AbstractSequence | None) -> AbstractP
             raise InputError(f"--prior {name} names {part} twice; name each once")
     known = [part for part in parts if part not in _GUESSES] or ["general"]
     accepted = {parameter for part in (*parts, *known) for parameter in _GIVEN[part]}
-    given = options.given(name, accepted)
+    given = options.given(name, accepted, _GIVEN)
     of = {part: {key: value for key, value in given.items() if key in _GIVEN[part]} for part in _GIVEN}
     if {"table", "turntable"} <= set(known):  # the axis is the table's normal: to multiply would count the table twice
         if "max_rotation_deg" in given:

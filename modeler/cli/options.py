@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -138,12 +138,13 @@ class PriorOptions:
     velocity_sigma_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.01")] = None
     """Standard deviation of the change of shift from one motion to the next, along each axis (velocity)."""
 
-    def given(self, name: str, accepted: Collection[str]) -> dict[str, Any]:
+    def given(self, name: str, accepted: Collection[str], of: Mapping[str, Collection[str]]) -> dict[str, Any]:
         """Return the parameters that were given, by field name.
 
         Args:
             name: the prior's.
             accepted: names of the parameters that it has.
+            of: those of each prior, by its name.
 
         Raises:
             InputError: where a parameter of another prior was given, or a value that is none.
@@ -152,7 +153,10 @@ class PriorOptions:
 
         given = self.parameters()
         for parameter in sorted(given.keys() - set(accepted)):
-            raise InputError(f"{_flag(parameter)} is no parameter of --prior {name}; leave it out or change the prior.")
+            others = " or ".join(prior for prior, parameters in of.items() if parameter in parameters)
+            raise InputError(
+                f"{_flag(parameter)} is no parameter of --prior {name}; leave it out, or give --prior {others}."
+            )
         for parameter, value in given.items():
             if isinstance(value, str):
                 continue

@@ -4,6 +4,7 @@ import contextlib
 import io
 import re
 from collections.abc import Sequence
+from difflib import get_close_matches
 from importlib import metadata
 from itertools import groupby
 from typing import Annotated, Any, Union
@@ -50,7 +51,10 @@ _REWORDED = (
     (r" Arguments are applied to the directly preceding subcommand, so ordering can matter", ""),
     (r"; For full helptext, .*", ""),
     (r"Unrecognized options: (-[^,;]+).*; Available subcommands: ", r"unknown before a command: \1; commands are "),
-    (r"Unrecognized options: ([^,;]+).*; Available subcommands: ", r"there is no command '\1'; there are "),
+    (
+        r"Unrecognized options: ([^,;]+).*; Available subcommands: ",
+        lambda found: f"there is no command '{found[1]}'{_meant(found[1])}; there are ",
+    ),
     (r"Unrecognized (?:or misplaced )?options: ([^;]*)", lambda found: f"unknown: {found[1].strip().replace(',', '')}"),
     (r"Perhaps you meant: ([^;]*)", r"perhaps you meant \1"),
     (r"Missing from modeler [a-z-]+: ", "missing: "),
@@ -129,6 +133,11 @@ def _one_line(box: str, asked: str) -> str:
     for words, ours in _REWORDED:
         line = re.sub(words, ours, line)
     return line.replace(") (", ", ")
+
+
+def _meant(name: str) -> str:
+    """Return in words which command is called nearly that, "" where none is."""
+    return "".join(f", perhaps you meant {near}" for near in get_close_matches(name, _COMMANDS, n=1))
 
 
 def _is_ruler(row: str) -> bool:
