@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.fusion import Fuser, own_covariances, surface
+from modeler.fusion import Fuser, own_covariances, surface, tones
 from modeler.fusion.grid import Field, Grid
 from modeler.fusion.stack import posed, spread, stack
 from modeler.kernels import closing, fusion, isosurface, thinning
@@ -339,10 +339,12 @@ def test_fusing_averages_the_noise_of_the_views(rng):
     assert np.sqrt(np.mean(cloud**2)) < 1e-3
 
 
+CORNERS_M = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
+
+
 def disagreement_m(views, trajectory):
     pairs = posed(views, trajectory)
-    corners = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
-    found = spread(stack(pairs, corners, margin_px=2, min_cosine=0.15, edge_weight=0.1), 0.02)
+    found = spread(stack(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1), 0.02)
     return float("nan") if found is None else found[0]
 
 
@@ -600,6 +602,18 @@ def test_differences_of_exposure_are_evened_out(brick):
     ratio = np.log(model.vertex_colours / brick.vertex_colours).mean(axis=1)
     assert np.std(ratio) < 0.03  # against 0.2 between the frames
     assert np.exp(ratio.mean()) == pytest.approx(0.79, abs=0.05)
+
+
+def test_sharp_views_have_more_say_in_colours_than_blurred_ones(rng):
+    def textured(view: RayImage, spread: int) -> RayImage:
+        levels = 120 + rng.integers(-spread, spread + 1, view.frame.depth_m.shape)
+        return replace(view, frame=replace(view.frame, colour=np.repeat(levels[..., None], 3, axis=2).astype(np.uint8)))
+
+    views = {k: textured(view, 60 if k % 3 else 20) for k, view in tabletop.views(BRICK, POSES).items()}
+    seen = stack(posed(views, tabletop.trajectory(POSES)), CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1)
+    say = tones.gains(seen, seen.points_m, seen.normals, tau_m=0.005, near_m=0.003)[:, 3]
+    sharp = np.arange(len(POSES)) % 3 > 0
+    np.testing.assert_allclose(say[~sharp] / say[sharp].mean(), 20.0 / 60.0, rtol=0.15)
 
 
 def test_a_view_without_colour_leaves_the_colours_to_others(brick):

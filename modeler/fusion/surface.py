@@ -15,7 +15,6 @@ from modeler.types import Array, BoolArray
 
 Triangles = npt.NDArray[np.int64]
 
-
 PINCHES = 50  # rounds after which sheets that touch are left touching
 NEAREST = 6  # vertices that lend their colour to one that has none
 AROUND = 12  # vertices that tell how the surface lies beside them
