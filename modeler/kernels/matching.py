@@ -85,7 +85,7 @@ def matches(pose, sight, surface_m):
     return found
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
+@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def derive(points, carried, found, centre, surface_m2, rows):
     """Write the equations of matches into `rows` (9, n): derivatives by ζ, residual and weight; see `equations`."""
     cx, cy, cz = np.float32(centre[0]), np.float32(centre[1]), np.float32(centre[2])
@@ -105,7 +105,7 @@ def derive(points, carried, found, centre, surface_m2, rows):
         rows[3, j], rows[4, j], rows[5, j] = normal_x, normal_y, normal_z
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
+@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def gather(rows, count, gradient, matrix):
     """Write the gradient (6,), -Σ w a r, and the matrix (6, 6), Σ w a aᵀ, of the first equations in `rows` (8, n)."""
     for u in range(6):
@@ -146,7 +146,7 @@ def into_source(pose, part, block, turned, gradient, matrix):
                 matrix[m, half + k] = a * turned[m, half] + b * turned[m, half + 1] + c * turned[m, half + 2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
 def equations(pose, forward, backward, centre, surface_m, room, gradient, matrix):
     """Write the point-to-plane normal equations of matching points for ξ of a pose about the source's centre.
 

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from modeler.kernels.planes import CELL_SIZE, KIND, MISSING
 
 # No flag lets the compiler assume away NaN or infinity; these let it use multiply-add and one reciprocal, and add up
-# in any order.
+# in any order. So whatever is called from a kernel is made part of it (`forceinline`): a call may end in another copy,
+# compiled by itself, that adds up in another order, and a kernel just compiled would not answer as one from the cache.
 VECTOR_MATHS = {"contract", "arcp", "nsz", "reassoc"}
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)  # a plain 0.5 would make double precision of all
 
@@ -38,7 +39,7 @@ class Sight(NamedTuple):
     relied on to measure it."""
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def invert(pose, inverse):
     """Write the inverse of a pose (12,), the rows of a 3×4 matrix, into `inverse` (12,)."""
     for k in range(3):
@@ -48,7 +49,7 @@ def invert(pose, inverse):
             inverse[4 * k + 3] -= pose[4 * m + k] * pose[4 * m + 3]
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
+@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def carry(pose, sight, carried, pixels):
     """Carry points into the other camera: straight-line code over rows of numbers, which compilers turn into vectors.
 
@@ -86,7 +87,7 @@ def carry(pose, sight, carried, pixels):
         pixels[j] = pixel if inside else np.int32(-1)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def fetch(pixels, cells, found):
     """Copy the cells at `pixels` (n,) into the columns of `found` (8, n); outside the image they are `MISSING`."""
     for j in range(pixels.shape[0]):
@@ -97,14 +98,14 @@ def fetch(pixels, cells, found):
             found[KIND, j] = MISSING
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def look(pose, sight, carried, pixels, found):
     """Carry points by a pose (12,), and copy what lies there: `carry`, then `fetch`."""
     carry(pose, sight, carried, pixels)
     fetch(pixels, sight.cells, found)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def buffers(sight):
     """Return room for what `look` finds: carried (8, n), pixels (n,), cells (8, n)."""
     count = sight.points.shape[1]

@@ -114,7 +114,7 @@ def agreement_of(carried, found, j):
     )
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
+@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def score(points, carried, found, model):
     """Return the log-likelihood of carried points, and how many are explained: all cases of every point, then a choice.
 
@@ -153,7 +153,7 @@ def score(points, carried, found, model):
     return total, explained
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
 def compare(pose, forward, backward, forward_model, backward_model, room):
     """Return the log-likelihood of one pose (12,) and the number of explained points; see `log_likelihoods`.
 
