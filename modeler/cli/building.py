@@ -58,7 +58,9 @@ def build(options: Build) -> int:
     with alone(options.out):
         before = RunFolder(options.out).changed_versions(meta) if options.resume else ()
         folder = RunFolder.open(options.out, overwrite=options.overwrite, resume=options.resume)
-        modeler = replace(modeler, registrar=Remembered(modeler.registrar, folder.pairs, meta.versions))
+        glance = None if modeler.glance is None else Remembered(modeler.glance, folder.pairs, meta.versions)
+        registrar = Remembered(modeler.registrar, folder.pairs, meta.versions)
+        modeler = replace(modeler, registrar=registrar, glance=glance)
         if before:
             say(f"was begun with {', '.join(before)}: pairs are registered anew")
         if remark:
@@ -132,7 +134,12 @@ def _run(
             wanted = frames.until(lambda: interrupt.asked)
             coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
             steps = modeler.run(
-                coming, scene, hurry=lambda: interrupt.asked, ending=console.ending, remark=console.remark
+                coming,
+                scene,
+                hurry=lambda: interrupt.asked,
+                ending=console.ending,
+                remark=console.remark,
+                seeking=console.seeking,
             )
             for step in steps:
                 seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)

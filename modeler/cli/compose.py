@@ -7,7 +7,7 @@ from modeler.cli import nonvisual
 from modeler.cli.options import Method, MethodOptions, ObjectOptions, PriorOptions
 from modeler.closure import Closer
 from modeler.fusion import Fuser
-from modeler.pipeline import Modeler
+from modeler.pipeline import Modeler, glancing
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import AbstractRegistrar, InputError
@@ -23,12 +23,13 @@ def modeler(
         InputError: where an option cannot be used.
     """
     check_region(where, sequence)
-    noise = sequence.sensor()
+    noise, chosen = sequence.sensor(), registrar(method.method)
     return Modeler(
         segmenter=segmenter(where),
         sensor=Sensor() if noise is None else Sensor(*noise),
         prior=nonvisual.prior(prior_options, sequence),
-        registrar=registrar(method.method),
+        registrar=chosen,
+        glance=glancing(chosen),
         closer=Closer(),
         fuser=Fuser(),
         seed=method.seed,

@@ -84,6 +84,10 @@ class Console:
             self._bar.update(self._task, total=None, description=stage)  # forgets how fast the stage before went
         self._bar.update(self._task, completed=done, total=total, description=stage)
 
+    def seeking(self, frame: int) -> None:
+        """Tell that a frame did not join the previous view and is being tried against others."""
+        self._bar.update(self._task, description=f"trying frame {frame} again")
+
     def remark(self, words: str) -> None:
         """Tell in one line what the run has noticed."""
         self._say(words)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -55,6 +56,9 @@ class Modeler:
     common_noise: float = 0.1
     """Covariance of what all views of a run err by alike, as a share of an edge's. No loop tells it: over many rendered
     runs, whose truth is known, the covariances of poses come out no smaller than they may be with this."""
+    glance: AbstractRegistrar | None = None
+    """Looks briefly at pairs of frames that are likely hidden, so that a search follows only where surface matches (see
+    `glancing`); None: every frame that is lost is searched for."""
     seed: int = 0
     """Each pair draws from a generator of its own, made from this and the two frame numbers."""
     executor: Executor | None = None
@@ -68,6 +72,7 @@ class Modeler:
         hurry: Callable[[], bool] = lambda: False,
         ending: Callable[[str, int, int], None] = lambda stage, done, total: None,
         remark: Callable[[str], None] = lambda words: None,
+        seeking: Callable[[int], None] = lambda frame: None,
     ) -> Iterator[Step]:
         """Yield what each frame brings. A frame that cannot be used is reported and left out.
 
@@ -81,14 +86,15 @@ class Modeler:
                 frames.
             ending: told after the last frame what is being done, and how much of how much is done.
             remark: told in one line, as soon as the first pairs show it, what the prior has wrong.
+            seeking: told the number of a frame that the previous view does not place, while others are tried.
         """
         state = State()
         for frame, last in _with_last(frames):
             seen = Seen(frame, *self.view(frame, scene))
             state = self._asked(state.read(frame.index), seen.view, remark)
-            state, step = self._joined(state, seen, state.latest, last=last)
+            state, step = self._joined(state, seen, state.latest, last=last, seeking=seeking)
             if last:
-                for later, found in self._caught_up(state):
+                for later, found in self._caught_up(state, seeking):
                     state = replace(later, growing=state.growing, model=state.model)
                     if found.accepted:
                         state = self._fused(state, last=False)
@@ -122,12 +128,23 @@ class Modeler:
         Raises:
             InputError: where the views lack what the prior needs.
         """
-        motion = (self.prior if prior is None else prior).between(source, target)
+        return self._asking(self.registrar, source, target, self.prior if prior is None else prior)
+
+    def _asking(
+        self, registrar: AbstractRegistrar, source: RayImage, target: RayImage, prior: AbstractPrior
+    ) -> Posterior:
         rng = np.random.default_rng([self.seed, source.index, target.index])
-        return self.registrar.register(source, target, motion, rng=rng)
+        return registrar.register(source, target, prior.between(source, target), rng=rng)
 
     def _joined(
-        self, state: State, seen: Seen, previous: int | None, *, last: bool = False, again: bool = False
+        self,
+        state: State,
+        seen: Seen,
+        previous: int | None,
+        *,
+        seeking: Callable[[int], None],
+        last: bool = False,
+        again: bool = False,
     ) -> tuple[State, Step]:
         """Return the state with one more frame, if it can be placed, and its step.
 
@@ -135,10 +152,11 @@ class Modeler:
             state: what is known so far.
             seen: the frame.
             previous: the view that it should hang on; None where there is none.
+            seeking: told its number where that view does not place it.
             last: whether it is the last.
             again: whether it was tried before.
         """
-        pairing, posteriors = self._pairing(), ()
+        pairing, posteriors = replace(self._pairing(), seeking=seeking), ()
         if seen.view is not None and previous is not None:
             posteriors = pairing.placed(state, seen.view, previous, last=last, again=again)
         lasting = [posterior.without_samples() for posterior in posteriors]
@@ -180,16 +198,17 @@ class Modeler:
             remark(words)
         return replace(state, asked=asked)
 
-    def _caught_up(self, state: State) -> Iterator[tuple[State, Step]]:
+    def _caught_up(self, state: State, seeking: Callable[[int], None]) -> Iterator[tuple[State, Step]]:
         """Yield states and steps of lost frames, newest first, tried once more against a view that followed them."""
         tried: set[tuple[int, int]] = set()
         waiting = list(state.overdue())
         while waiting:
             seen, neighbour = waiting[0]
             tried.add((seen.frame.index, neighbour))
+            seeking(seen.frame.index)
             if seen.view is not None:
                 seen = replace(seen, view=self._ready(state, seen.view))
-            state, step = self._joined(state, seen, neighbour, again=True)
+            state, step = self._joined(state, seen, neighbour, seeking=seeking, again=True)
             yield state, step
             waiting = [(seen, view) for seen, view in state.overdue() if (seen.frame.index, view) not in tried]
 
@@ -228,7 +247,8 @@ class Modeler:
         return state.solved(axis=common)
 
     def _pairing(self) -> Pairing:
-        return Pairing(self.prior, self.closer, self.register, self._ready, self.executor)
+        glance = None if self.glance is None else partial(self._asking, self.glance)
+        return Pairing(self.prior, self.closer, self.register, self._ready, self.executor, glance=glance)
 
     def _ready(self, state: State, view: RayImage) -> RayImage:
         """Return a view with the images that a likelihood looks up."""

@@ -14,6 +14,7 @@ from modeler.registration.posterior import failed
 from modeler.types import AbstractPrior, Edge, InputError, Outcome, Posterior, RayImage
 
 _BEYOND = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # what a motion beyond the prior may look like
+_PATIENCE = 1  # frames searched for in vain, from which on others are glanced at first
 _ROOM = 2.0  # steps for which limits hold where the graph foretells a motion: they are not to cut it off
 
 
@@ -33,6 +34,10 @@ class Pairing:
     """Where pairs are registered side by side; None: one after the other."""
     refusals: dict[tuple[int, int], str] = field(default_factory=dict)
     """Why the prior does not apply to a pair, in words, by (source, target): filled as pairs are registered."""
+    glance: Callable[[RayImage, RayImage, AbstractPrior], Posterior] | None = None
+    """As `register`, but gives hopeless pairs up soon; None: there is nothing of the kind."""
+    seeking: Callable[[int], None] = lambda frame: None
+    """Told the number of a frame before other views than the previous one are tried to place it."""
 
     def placed(self, state: State, view: RayImage, previous: int, *, last: bool, again: bool) -> tuple[Posterior, ...]:
         """Return the posteriors of a new view, against the previous one first.
@@ -46,10 +51,20 @@ class Pairing:
         """
         steps, known = state.steps(view.index, previous), state.graph.edges
         prior = self.prior.learned(state.solution, known)
+        wary = self.glance is not None and state.vain >= _PATIENCE
+        if wary and (steps > 1 or again):
+            glances = self._glances(state, view, previous, prior, again=again)
+            if not _promising(glances[-1]):
+                return glances
         odometry = self._pair(state, view, previous, prior.grown(steps) if steps > 1 else prior)
         posteriors = (odometry,)
         base, _ = self.closer.base(posteriors, state.past, steps=steps)
         if base is None:
+            if wary and steps == 1 and not again and not odometry.matches:
+                glances = self._glances(state, view, previous, prior, again=again)
+                if not _promising(glances[-1]):
+                    return (odometry, *glances[1:])
+            self.seeking(view.index)
             posteriors = self._relocalised(state, view, odometry, prior, again=again)
             base, _ = self.closer.base(posteriors, state.past, steps=steps)
         if base is None:
@@ -75,6 +90,23 @@ class Pairing:
             else edge
             for edge in edges
         )
+
+    def _glances(
+        self, state: State, view: RayImage, previous: int, prior: AbstractPrior, *, again: bool
+    ) -> tuple[Posterior, ...]:
+        """Return glances at the previous view and at others till surface matches or none is left.
+
+        After frames that were searched for in vain (a hand hides the object), another is likely one more.
+        """
+        grown = prior.grown(max(state.steps(view.index, previous), 2))
+        glances, target = (), previous
+        while target is not None:
+            glances = (*glances, self._pair(state, view, target, grown, briefly=True))
+            if again or _promising(glances[-1]):
+                break
+            self.seeking(view.index)
+            target = self.closer.relocation(glances, state.past)
+        return glances
 
     def _relocalised(
         self, state: State, view: RayImage, odometry: Posterior, prior: AbstractPrior, *, again: bool
@@ -102,11 +134,19 @@ class Pairing:
         apply = map if self.executor is None else self.executor.map
         yield from apply(lambda pair, prior: self._pair(state, pair[0], pair[1], prior), pairs, priors)
 
-    def _pair(self, state: State, source: RayImage, target: int, prior: AbstractPrior) -> Posterior:
+    def _pair(
+        self, state: State, source: RayImage, target: int, prior: AbstractPrior, *, briefly: bool = False
+    ) -> Posterior:
         """Register a view against an accepted one; where the prior does not apply, that is the outcome."""
         view = self.ready(state, state.views[target])
+        register = self.glance if briefly and self.glance is not None else self.register
         try:
-            return self.register(self.ready(state, source), view, prior)
+            return register(self.ready(state, source), view, prior)
         except InputError as error:
             self.refusals[source.index, target] = str(error)
             return failed(source, view, Outcome.NOT_KNOWN)
+
+
+def _promising(glance: Posterior) -> bool:
+    """Return whether a search may place a frame where a glance went; at a limit it may find only what is cut off."""
+    return glance.matches and glance.outcome is not Outcome.AT_LIMIT

@@ -41,6 +41,8 @@ class State:
     """How many frames were read before each."""
     lost: Mapping[int, Seen] = field(default_factory=dict)
     """Frames that show the object and were left out."""
+    vain: int = 0
+    """How many frames were searched for in vain since one was last found by it."""
     asked: tuple[Posterior, ...] = ()
     """The first pairs, registered without what the prior takes for granted."""
     model: ObjectModel | None = None
@@ -90,7 +92,8 @@ class State:
         number, graph = seen.frame.index, self.graph.plus(edges)
         if not accepted or seen.view is None:
             lost = self.lost if seen.view is None else {**self.lost, number: replace(seen, view=_light(seen.view))}
-            return replace(self, graph=graph, lost=lost)
+            return replace(self, graph=graph, lost=lost, vain=self.vain + (seen.view is not None))
+        found = number in self.lost or (bool(edges) and not edges[0].accepted)
         graph = graph if graph.first is not None else replace(graph, first=number)
         ready = {**self.ready, number: seen.view}
         return replace(
@@ -99,6 +102,7 @@ class State:
             smoother=self.smoother.to(graph),
             views={**self.views, number: _light(seen.view)},
             ready=dict(list(ready.items())[-_READY:]),
+            vain=0 if found else self.vain,
             lost={frame: other for frame, other in self.lost.items() if frame != number},
         )
 
