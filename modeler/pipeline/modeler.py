@@ -12,6 +12,7 @@ import numpy as np
 from modeler.closure import Closer
 from modeler.fusion import Fuser, own_covariances
 from modeler.graph import CommonAxis, shared_noise
+from modeler.pipeline.false_start import false_start
 from modeler.pipeline.pairing import Pairing
 from modeler.pipeline.state import Seen, State
 from modeler.rays import Sensor
@@ -85,7 +86,8 @@ class Modeler:
             hurry: asked after the last frame; once it says so, no more edges are tried beyond those that placed the
                 frames.
             ending: told after the last frame what is being done, and how much of how much is done.
-            remark: told in one line, as soon as the first pairs show it, what the prior has wrong.
+            remark: told in one line, as soon as pairs show it, what the prior has wrong, or that the first frames show
+                something else than those after them.
             seeking: told the number of a frame that the previous view does not place, while others are tried.
         """
         state = State()
@@ -93,6 +95,7 @@ class Modeler:
             seen = Seen(frame, *self.view(frame, scene))
             state = self._asked(state.read(frame.index), seen.view, remark)
             state, step = self._joined(state, seen, state.latest, last=last, seeking=seeking)
+            state = self._doubted(state, remark)
             if last:
                 for later, found in self._caught_up(state, seeking):
                     state = replace(later, growing=state.growing, model=state.model)
@@ -197,6 +200,17 @@ class Modeler:
         if words := self.prior.refuted(asked):
             remark(words)
         return replace(state, asked=asked)
+
+    def _doubted(self, state: State, remark: Callable[[str], None]) -> State:
+        """Return the state once it is told that frames match each other, but not the few that came first."""
+
+        def register(source: RayImage, target: RayImage) -> Posterior:
+            views = self._ready(state, source), self._ready(state, target)
+            return self._asking(self.glance or self.registrar, *views, self.prior)
+
+        if words := false_start(state, register):
+            remark(words)
+        return replace(state, warned=state.warned or bool(words))
 
     def _caught_up(self, state: State, seeking: Callable[[int], None]) -> Iterator[tuple[State, Step]]:
         """Yield states and steps of lost frames, newest first, tried once more against a view that followed them."""

@@ -43,6 +43,8 @@ class State:
     """Frames that show the object and were left out."""
     vain: int = 0
     """How many frames were searched for in vain since one was last found by it."""
+    warned: bool = False
+    """Whether it was told that the first frames may show something else than the object."""
     asked: tuple[Posterior, ...] = ()
     """The first pairs, registered without what the prior takes for granted."""
     model: ObjectModel | None = None
