@@ -63,6 +63,8 @@ class Search:
     """Length of a walker's stride in standard deviations."""
     max_strides: int = 10
     """A walker takes at most so many."""
+    next_to: float = 1.5
+    """What is so many basins beyond the possible is still next to it, and may be where the motion leads."""
     poor: float = -20.0
     """Where the best place is worse than this (nats) even to somewhat blurred views, little surface matches."""
     scarce_points: float = 150.0
@@ -99,7 +101,7 @@ class Search:
             poses = self._led(pair, poses, prior, blur * pair.size_m)
         fine_m = self.blurs[-1] * pair.size_m
         outside = ~np.isfinite(motion.log_evidence(poses))
-        beyond = poses[outside]
+        beyond = self._next_to_possible(pair, motion, poses[outside], prior)
         poses = motion.sample(starts, rng) if outside.all() else poses[~outside]
         poses, scores = self._ordered(pair, poses, fine_m)
         lifted = self._lifted(pair, motion, poses, scores, rng)
@@ -246,6 +248,17 @@ class Search:
     def _led(self, pair: Pair, poses: Array, prior: PoseGaussian, blur_m: float) -> Array:
         """Return motions led downhill on matching surface, held by what the prior says of them."""
         return pair.downhill(poses, blur_m, self._pull(pair, prior), steps=self.iterations, stride=4)
+
+    def _next_to_possible(self, pair: Pair, motion: AbstractMotion, poses: Array, prior: PoseGaussian) -> Array:
+        """Return those of poses (n, 4, 4) beyond what is possible that are not far beyond.
+
+        Surface leads a quarter turn round a carton, where other sides of it may match better than the right ones; that
+        is no sign that limits cut off the motion.
+        """
+        back = se3.difference(poses, prior.mean, pair.centre_m)
+        basins = np.linalg.norm(back / self._basin(pair.size_m), axis=1, keepdims=True)
+        nearer = se3.moved(poses, back * np.minimum(self.next_to / np.maximum(basins, 1e-12), 1.0), pair.centre_m)
+        return poses[np.isfinite(motion.log_evidence(nearer))]
 
     def _pull(self, pair: Pair, prior: PoseGaussian) -> Pull:
         """Return what holds motions on their way down: the prior, and some damping."""
