@@ -98,8 +98,9 @@ def test_beyond_the_limits_only_what_matches_far_better_is_believed(
     assert found(outcome, wider_deg, gain_nats) == pytest.approx(wanted_deg, abs=0.1)
 
 
-def test_a_place_within_the_limits_that_hardly_matches_does_not_count() -> None:
-    assert found(Outcome.AT_LIMIT, -65.0, 4.0, overlap=0.27) == pytest.approx(-65.0, abs=0.1)
+@pytest.mark.parametrize("overlap", [0.27, 0.5])
+def test_a_place_within_the_limits_that_matches_far_less_does_not_count(overlap: float) -> None:
+    assert found(Outcome.AT_LIMIT, -65.0, 4.0, overlap=overlap) == pytest.approx(-65.0, abs=0.1)
 
 
 def of_modes(*modes: tuple[float, float]) -> Posterior:

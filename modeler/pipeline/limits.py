@@ -14,6 +14,7 @@ from modeler import se3
 from modeler.types import AbstractMotion, Array, BoolArray, Mode, Outcome, Posterior, as_one, separate
 
 _SURPRISE_NATS = 7.0  # one motion of a thousand goes beyond what is known
+_MORE_OVERLAP = 0.15  # sides that are alike match about as much; the right place shows more than the end of the limits
 _ELSEWHERE_RAD = 0.26  # two registrations turned against each other by more are at two places
 _LEAST_WEIGHT = 0.01  # of a mode that is kept
 
@@ -31,7 +32,8 @@ def believed(within: Posterior, wider: Posterior, known: AbstractMotion) -> Post
         # Unless it is one bump: a mean between places may lie inside, and is at none of them.
         possible = wider.outcome is Outcome.CONVERGED and _inside(known, wider.pose.mean[None])[0]
         better_nats = wider.log_evidence - within.log_evidence
-        if elsewhere and not possible and better_nats < _SURPRISE_NATS:
+        alike = wider.overlap < within.overlap + _MORE_OVERLAP
+        if elsewhere and not possible and alike and better_nats < _SURPRISE_NATS:
             return replace(within, outcome=Outcome.AMBIGUOUS)
     return _discounted(wider, known)
 

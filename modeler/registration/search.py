@@ -64,7 +64,9 @@ class Search:
     max_strides: int = 10
     """A walker takes at most so many."""
     next_to: float = 1.5
-    """What is so many basins beyond the possible is still next to it, and may be where the motion leads."""
+    """What is so many basins beyond the possible is still next to it, and may be where the motion leads;"""
+    enough_overlap: float = 0.5
+    """what is farther only where no possible place shows so much of the surface that both views should."""
     poor: float = -20.0
     """Where the best place is worse than this (nats) even to somewhat blurred views, little surface matches."""
     scarce_points: float = 150.0
@@ -101,7 +103,7 @@ class Search:
             poses = self._led(pair, poses, prior, blur * pair.size_m)
         fine_m = self.blurs[-1] * pair.size_m
         outside = ~np.isfinite(motion.log_evidence(poses))
-        beyond = self._next_to_possible(pair, motion, poses[outside], prior)
+        beyond = poses[outside]
         poses = motion.sample(starts, rng) if outside.all() else poses[~outside]
         poses, scores = self._ordered(pair, poses, fine_m)
         lifted = self._lifted(pair, motion, poses, scores, rng)
@@ -113,6 +115,8 @@ class Search:
             search, sharp = self._higher(pair, motion, sharp, prior, rng)
         sharp = search._along(pair, motion, sharp, prior)
         blunt = replace(blunt, blunt=np.ones(len(blunt), dtype=np.bool_))
+        if pair.overlap(sharp.poses[0]) > self.enough_overlap:
+            beyond = self._next_to_possible(pair, motion, beyond, prior)
         better = search.scores(pair, beyond, fine_m).max() - sharp.scores[0] if len(beyond) else -np.inf
         return replace(sharp.beside(blunt), beyond=float(better), scarce=search is not self)
 
