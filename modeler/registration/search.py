@@ -115,7 +115,7 @@ class Search:
             search, sharp = self._higher(pair, motion, sharp, prior, rng)
         sharp = search._along(pair, motion, sharp, prior)
         blunt = replace(blunt, blunt=np.ones(len(blunt), dtype=np.bool_))
-        if pair.overlap(sharp.poses[0]) > self.enough_overlap:
+        if len(beyond) and pair.overlap(sharp.poses[0]) > self.enough_overlap:
             beyond = self._next_to_possible(pair, motion, beyond, prior)
         better = search.scores(pair, beyond, fine_m).max() - sharp.scores[0] if len(beyond) else -np.inf
         return replace(sharp.beside(blunt), beyond=float(better), scarce=search is not self)
