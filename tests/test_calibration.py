@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calibration.__main__ import panels, run
-from calibration.specimens import SPECIMENS, Specimen
+from calibration.specimens import SPECIMENS, Specimen, load_specimen, recipe_names
 from calibration.study import CONTROL, MEASURES, OURS, OUTSIDE, Condition, Study, Trial, judged, staged
 from calibration.tables import rows, text
 from scipy.spatial import KDTree
@@ -19,7 +19,6 @@ from modeler.priors import TablePrior
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.registration.importance import AdaptiveSampler
 from modeler.types import Outcome, PoseGaussian, Posterior
-from sequences.rendering.recipe import builtin_recipes, load_recipe
 from sequences.rendering.renderer import RenderedSequence
 from viz.calibration import coverage_curves
 
@@ -46,7 +45,7 @@ def _drawn(count: int, claim: float) -> list[Trial]:
 
 def test_the_design_is_as_wide_as_promised() -> None:
     study = Study()
-    assert {specimen.recipe for specimen in SPECIMENS} <= set(builtin_recipes())
+    assert {specimen.recipe for specimen in SPECIMENS} <= set(recipe_names())
     assert len({specimen.recipe for specimen in SPECIMENS}) == len(SPECIMENS)
     for half, pairs in (("tuning", 280), ("held-out", 330)):
         members = tuple(specimen for specimen in SPECIMENS if specimen.half == half)
@@ -61,7 +60,7 @@ def test_the_design_is_as_wide_as_promised() -> None:
 
 @pytest.mark.parametrize("specimen", SPECIMENS, ids=lambda specimen: specimen.recipe)
 def test_shapes_have_the_symmetry_of_their_class(specimen: Specimen) -> None:
-    mesh, rng = load_recipe(specimen.recipe).object.mesh(), np.random.default_rng(0)
+    mesh, rng = load_specimen(specimen.recipe).object.mesh(), np.random.default_rng(0)
     surface_m = sample_surface(mesh.vertices_m, mesh.triangles, 62_000, rng)
     # Shapes with an axis have it along z through their origin; what else there is may have one through its middle.
     surface_m -= surface_m.mean(axis=0) if specimen.symmetry == "asymmetric" else 0.0
@@ -89,7 +88,7 @@ def test_shapes_have_the_symmetry_of_their_class(specimen: Specimen) -> None:
 
 @pytest.mark.parametrize("name", [specimen.recipe for specimen in SPECIMENS])
 def test_staging_changes_what_the_condition_says(name: str) -> None:
-    recipe = load_recipe(name)
+    recipe = load_specimen(name)
     usual, other = (
         RenderedSequence(staged(recipe, condition, frames=4, seed=7))
         for condition in (Condition(), Condition(distance_m=1.1, noise=2.0, step_deg=40.0))
@@ -107,7 +106,7 @@ def test_staging_changes_what_the_condition_says(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["box", "tube", "jar"])
 def test_the_table_of_the_study_is_as_plane_as_the_prior_takes_it(name: str) -> None:
-    recipe, prior = staged(load_recipe(name), Condition(), frames=2001, seed=7), TablePrior()
+    recipe, prior = staged(load_specimen(name), Condition(), frames=2001, seed=7), TablePrior()
     table_from_object = se3.inverse(recipe.view.camera_from_table()) @ [*RenderedSequence(recipe).truth().values()]
     motions = table_from_object[1:] @ se3.inverse(table_from_object[:-1])
     np.testing.assert_allclose(np.degrees(motions[:, :2, 2].std(axis=0)), prior.sigma_tilt_deg, rtol=0.06)

@@ -1,6 +1,7 @@
 """What smoothing makes of surfaces: as far aside as noise, no farther."""
 
 import numpy as np
+from calibration.specimens import load_specimen
 from calibration.study import Condition, rendered_views, staged
 
 from modeler import se3
@@ -9,7 +10,6 @@ from modeler.priors import TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.types import Camera, Frame
-from sequences.rendering.recipe import load_recipe
 from sequences.rendering.renderer import RenderedSequence
 
 CAMERA = Camera(width=320, height=480, fx=575.0, fy=575.0, cx=159.5, cy=239.5)
@@ -45,7 +45,7 @@ def test_thin_rods_sink_by_a_share_of_the_noise_whatever_the_noise():
 
 def test_thin_legs_are_not_dragged_behind():
     """Turned there and back, a tripod errs to either side alike: what is common goes with the camera, not the turn."""
-    sequence = RenderedSequence(staged(load_recipe("tripod"), Condition(noise=0.5), frames=3, seed=5))
+    sequence = RenderedSequence(staged(load_specimen("tripod"), Condition(noise=0.5), frames=3, seed=5))
     views, truth = rendered_views(sequence), sequence.truth()
     drags_mm = []
     for earlier, later in zip(sequence.indices[:-1], sequence.indices[1:], strict=True):

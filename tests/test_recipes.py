@@ -6,20 +6,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration.specimens import load_specimen, recipe_names
 from refusal import refused
 
 from modeler import se3
 from modeler.types import InputError
 from sequences.rendering.mesh import ply_bytes
-from sequences.rendering.recipe import Recipe, Viewpoint, builtin_recipes, load_recipe
+from sequences.rendering.recipe import Recipe, Viewpoint, load_recipe
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.shapes import Box, Cylinder, MeshFile, Sphere
 from sequences.rendering.trajectory import Hand, Place, Places, Tabletop, Turntable
 
 
-@pytest.mark.parametrize("name", builtin_recipes())
-def test_builtin_recipes_stand_on_the_table_in_view(name: str) -> None:
-    recipe = load_recipe(name)
+@pytest.mark.parametrize("name", recipe_names())
+def test_recipes_stand_on_the_table_in_view(name: str) -> None:
+    recipe = load_specimen(name)
     assert recipe.name == name
     sequence = RenderedSequence(recipe)
     truth = sequence.truth()
@@ -40,7 +41,7 @@ def test_builtin_recipes_stand_on_the_table_in_view(name: str) -> None:
 
 def test_symmetric_shapes_are_symmetric_and_the_others_are_not() -> None:
     def turned_onto_itself(name: str, angle_deg: float) -> bool:
-        mesh = load_recipe(name).object.mesh()
+        mesh = load_specimen(name).object.mesh()
         angle = np.radians(angle_deg)
         turn = se3.exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))
         turned = se3.transform(turn, mesh.vertices_m)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
+from calibration.specimens import load_specimen
 
 from modeler import se3
 from modeler.types import Camera, Frame, InputError
@@ -27,7 +28,7 @@ def points_m(frame: Frame, where: np.ndarray) -> np.ndarray:
 
 
 def small(name: str, **changes: object) -> Recipe:
-    recipe = load_recipe(name)
+    recipe = load_specimen(name)
     view = replace(recipe.view, width=160, height=120, focal_px=144.0)
     return replace(recipe, view=view, **changes)  # type: ignore[arg-type]
 
@@ -137,7 +138,7 @@ def test_noise_does_not_move_the_surface() -> None:
 def turned(name: str, angle_deg: float, **changes: object) -> RenderedSequence:
     """Return a shape at one place: twice as it is, and once turned about the vertical."""
     place, there = Place((0.01, 0.02, 0.0)), Place((0.01, 0.02, 0.0), (0.0, 0.0, angle_deg))
-    return RenderedSequence(replace(load_recipe(name), trajectory=Places((place, place, there)), **changes))  # type: ignore[arg-type]
+    return RenderedSequence(replace(load_specimen(name), trajectory=Places((place, place, there)), **changes))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["can", "goblet", "soup_plate"])

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibration.specimens import load_specimen
 from calibration.study import Condition, rendered_views, staged
 
 from modeler import se3
@@ -18,7 +19,6 @@ from modeler.registration.search import Search
 from modeler.registration.visibility import VisibilityRegistrar
 from modeler.types import Outcome
 from sequences import bundled, open_sequence
-from sequences.rendering.recipe import load_recipe
 from sequences.rendering.renderer import RenderedSequence
 
 
@@ -69,7 +69,7 @@ def test_a_turn_beyond_the_prior_shows(rng):
 
 def test_a_stool_may_have_turned_either_way():
     """Four legs: 40° on and 50° back look alike, and both are found, however near downhill leads to either."""
-    sequence = RenderedSequence(staged(load_recipe("stool"), Condition(step_deg=40.0), frames=2, seed=3660532166))
+    sequence = RenderedSequence(staged(load_specimen("stool"), Condition(step_deg=40.0), frames=2, seed=3660532166))
     made, truth = rendered_views(sequence), sequence.truth()
     target, source = (made[index] for index in sequence.indices)
     right = true_motion(truth, target.index, source.index)

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from calibration.specimens import load_specimen, recipe_names
 
 from sequences.rendering.mesh import Mesh, ply_bytes
-from sequences.rendering.recipe import builtin_recipes, load_recipe
 from sequences.rendering.shapes import (
     AnyShape,
     Box,
@@ -114,9 +114,9 @@ def lathes(shape: AnyShape) -> list[Lathe]:
     return [shape] if isinstance(shape, Lathe) else []
 
 
-@pytest.mark.parametrize("name", builtin_recipes())
-def test_builtin_recipes_are_well_formed_and_of_a_size_to_handle(name: str) -> None:
-    shape = load_recipe(name).object
+@pytest.mark.parametrize("name", recipe_names())
+def test_recipes_are_well_formed_and_of_a_size_to_handle(name: str) -> None:
+    shape = load_specimen(name).object
     mesh = shape.mesh()
     assert 0.05 < np.ptp(mesh.vertices_m, axis=0).max() < 0.3
     for number in np.unique(mesh.part):

@@ -1,10 +1,13 @@
-"""The shapes of the study: which half each is in, and its symmetry."""
+"""The shapes of the study: their recipes, which half each is in, and its symmetry."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final, Literal, final
+
+from sequences.rendering.recipe import Recipe, builtin_recipes, load_recipe
 
 Half = Literal["tuning", "held-out"]
 Symmetry = Literal["asymmetric", "near-symmetric", "n-fold", "revolution"]
@@ -16,11 +19,25 @@ class Specimen:
     """One shape of the study."""
 
     recipe: str
-    """Name of the built-in recipe."""
+    """Name of its recipe, of this folder or built in."""
     symmetry: Symmetry
     """Its class; a near-symmetric shape is a body of revolution but for something small."""
     half: Half
     """Whether methods may be tuned on it."""
+
+
+_FOLDER: Final = Path(__file__).with_name("recipes")
+
+
+def recipe_names() -> tuple[str, ...]:
+    """Return the names of all recipes, of this folder and built in."""
+    return tuple(sorted({*builtin_recipes(), *(path.stem for path in _FOLDER.glob("*.json"))}))
+
+
+def load_specimen(name: str) -> Recipe:
+    """Return the recipe of a name, from this folder or built in."""
+    path = _FOLDER / f"{name}.json"
+    return load_recipe(path if path.is_file() else name)
 
 
 FRAMES: Final = 2

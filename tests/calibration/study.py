@@ -8,7 +8,7 @@ from typing import final
 
 import numpy as np
 
-from calibration.specimens import FRAMES, SPECIMENS, Half, Specimen, Symmetry
+from calibration.specimens import FRAMES, SPECIMENS, Half, Specimen, Symmetry, load_specimen
 from modeler import se3
 from modeler.evaluation import about, nees, rotation_error_deg, translation_error_m, true_motion
 from modeler.priors import GeneralPrior, TablePrior
@@ -17,7 +17,7 @@ from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.segmentation import Segmenter, telling
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Posterior, RayImage
-from sequences.rendering.recipe import Recipe, load_recipe
+from sequences.rendering.recipe import Recipe
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.trajectory import Tabletop, Turntable
 
@@ -146,7 +146,7 @@ class Study:
 
     def trials(self, specimen: Specimen) -> Iterator[Trial]:
         """Yield what every method makes of every pair of a shape with every prior."""
-        recipe = load_recipe(specimen.recipe)
+        recipe = load_specimen(specimen.recipe)
         for number, condition in enumerate(self.conditions):
             seed = int(np.random.SeedSequence([self.seed, recipe.seed, number]).generate_state(1)[0])
             sequence = RenderedSequence(staged(recipe, condition, frames=self.frames, seed=seed))

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from calibration.specimens import load_specimen
 
 from loops.study import mean_nees
 from modeler import se3
@@ -27,7 +28,6 @@ from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
 from modeler.types import Array, Solution, Step
 from sequences import AbstractSequence
-from sequences.rendering.recipe import load_recipe
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.trajectory import Turntable
 
@@ -38,7 +38,7 @@ _HEADS = ("max °", "rms °", "max mm", "NEES", "first pairs °")
 
 def rendered(shape: str, seed: int, width: int) -> AbstractSequence:
     """Return a turn of an object on a turntable, nearly whole."""
-    recipe = load_recipe(shape)
+    recipe = load_specimen(shape)
     scale = width / recipe.view.width
     height, focal_px = round(scale * recipe.view.height), scale * recipe.view.focal_px
     view = replace(recipe.view, width=width, height=height, focal_px=focal_px)

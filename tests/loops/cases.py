@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from calibration.specimens import load_specimen
 
 import sequences
 from modeler.types import Array, Frame
 from sequences import AbstractSequence
-from sequences.rendering.recipe import load_recipe
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.trajectory import Place, Places
 
@@ -52,7 +52,7 @@ def turned(angles_deg: Sequence[float], *, shape: str, width: int = 640, seed: i
 
     Each turn is off by a little, as a hand's is; the last is exact.
     """
-    recipe = load_recipe(shape)
+    recipe = load_specimen(shape)
     rng = np.random.default_rng(seed)
     wobble_deg = rng.normal(0.0, 0.5, len(angles_deg))
     wobble_deg[[0, -1]] = 0.0

@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from calibration.specimens import SPECIMENS
+from calibration.specimens import SPECIMENS, load_specimen
 from scipy import stats
 
 from loops.cases import Case
@@ -29,7 +29,6 @@ from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M
 from modeler.segmentation import telling
 from modeler.types import Array, Solution
 from sequences import AbstractSequence
-from sequences.rendering.recipe import load_recipe
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.trajectory import Tabletop
 
@@ -39,7 +38,7 @@ _KINDS = ("pose", "near", "far")
 
 def pushed(shape: str, seed: int, frames: int, step_deg: float) -> AbstractSequence:
     """Return a rendered sequence of a shape that stands on the table as the seed has it."""
-    recipe = load_recipe(shape)
+    recipe = load_specimen(shape)
     x_deg, y_deg, z_deg = recipe.rest_rotation_deg
     turned_deg = float(np.random.default_rng([seed, 5]).uniform(0.0, 360.0))
     trajectory = Tabletop(frames=frames, step_deg=step_deg, wobble_deg=WOBBLE_DEG, wobble_m=WOBBLE_M)
