@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from modeler import se3
-from modeler.closure import Closer, Past
+from modeler.closure import Closer, MapView
 from modeler.graph import PoseGraph, solve
 from modeler.types import Array, Camera, Edge, Frame, Outcome, PoseGaussian, Posterior, RayImage, Solution
 
@@ -60,22 +60,22 @@ class Run:
         bias_here = np.zeros(6) if bias is None else bias
         for source in self.numbers:
             posteriors: list[Posterior] = []
-            past = Past(self.views, self.solution, self.graph.edges)
+            map_view = MapView(self.views, self.solution, self.graph.edges)
             steps = self.numbers.index(source) - self.numbers.index(max(self.views)) if self.views else 1
             if self.views:
                 posteriors = [spoil(self.measured(next(reversed(self.views)), source, rng, bias_here))]
-                while closer.base(posteriors, past, steps=steps)[0] is None:
-                    target = closer.relocation(posteriors, past)
+                while closer.placement(posteriors, map_view, steps=steps)[0] is None:
+                    target = closer.relocalisation_target(posteriors, map_view)
                     if target is None:
                         break
                     posteriors.append(spoil(self.measured(target, source, rng, bias_here)))
-                base, _ = closer.base(posteriors, past, steps=steps)
+                base, _ = closer.placement(posteriors, map_view, steps=steps)
                 if base is not None:
-                    targets = closer.closures(base, past, last=source == self.numbers[-1])
+                    targets = closer.closure_targets(base, map_view, last=source == self.numbers[-1])
                     tried = [posterior.target for posterior in posteriors]
                     targets = [target for target in targets if target not in tried]
                     posteriors += [spoil(self.measured(target, source, rng, bias_here)) for target in targets]
-            edges = closer.edges(posteriors, past, steps=steps)
+            edges = closer.judge(posteriors, map_view, steps=steps)
             self.tried[source], self.judged[source] = tuple(p.target for p in posteriors), edges
             self.graph = self.graph.plus(edges)
             if not self.views or any(edge.accepted for edge in edges):

@@ -8,13 +8,13 @@ import pytest
 from closing import ABOUT_OBJECT, COVARIANCE, REGULAR_DEG, Run, posterior_of, told, turned, view, witnessed
 
 from modeler import se3
-from modeler.closure import Closer, Past
+from modeler.closure import Closer, MapView
 from modeler.types import Array, Outcome, PoseGaussian, Posterior, Solution
 
 
 def test_first_frame_has_nothing_to_be_registered_against() -> None:
-    assert Closer().base([], Past({}, Solution())) == (None, "")
-    assert Closer().edges([], Past({}, Solution())) == ()
+    assert Closer().placement([], MapView({}, Solution())) == (None, "")
+    assert Closer().judge([], MapView({}, Solution())) == ()
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_odometry_is_accepted_where_usable_and_refused_with_advice() -> None:
     closer = Closer()
     start = Solution({0: np.eye(4)})
     for outcome in Outcome:
-        (edge,) = closer.edges([posterior_of(1, 0, np.eye(4), outcome)], Past({0: view(0)}, start))
+        (edge,) = closer.judge([posterior_of(1, 0, np.eye(4), outcome)], MapView({0: view(0)}, start))
         assert edge.kind == "odometry"
         assert edge.accepted == (outcome in (Outcome.CONVERGED, Outcome.AMBIGUOUS))
         assert edge.accepted or outcome.advice in edge.reason
@@ -133,7 +133,7 @@ def test_odometry_is_accepted_where_usable_and_refused_with_advice() -> None:
 )
 def test_covariance_that_is_none_is_refused(covariance: Array) -> None:
     posterior = replace(posterior_of(1, 0, np.eye(4)), pose=PoseGaussian(np.eye(4), covariance))
-    (edge,) = Closer().edges([posterior], Past({0: view(0)}, Solution({0: np.eye(4)})))
+    (edge,) = Closer().judge([posterior], MapView({0: view(0)}, Solution({0: np.eye(4)})))
     assert not edge.accepted
     assert "covariance" in edge.reason or "finite" in edge.reason
 
@@ -217,28 +217,28 @@ def test_evidence_that_scatters_or_is_not_told_refuses_nothing() -> None:
 def test_once_all_frames_are_in_each_is_tried_over_two_steps() -> None:
     run = Run(list(REGULAR_DEG))
     run.run(Closer(max_closures=0))
-    pairs = Closer().spans(Past(run.views, run.solution, run.graph.edges))
+    pairs = Closer().span_pairs(MapView(run.views, run.solution, run.graph.edges))
     assert {(source, source - 2) for source in range(2, 12)} <= set(pairs)
     assert {source for source, _ in pairs} == set(range(2, 14))
-    assert Closer(max_spans=0).spans(Past(run.views, run.solution, run.graph.edges)) == ()
-    assert Closer(max_span_deg=40.0).spans(Past(run.views, run.solution, run.graph.edges[:11])) == ()
+    assert Closer(max_spans=0).span_pairs(MapView(run.views, run.solution, run.graph.edges)) == ()
+    assert Closer(max_span_deg=40.0).span_pairs(MapView(run.views, run.solution, run.graph.edges[:11])) == ()
     rng = np.random.default_rng(1)
     for source, target in pairs:
         true = run.measured(target, source, rng, np.zeros(6))
-        edge = Closer().spanning(true, Past(run.views, run.solution, run.graph.edges))
+        edge = Closer().judge_span(true, MapView(run.views, run.solution, run.graph.edges))
         assert edge.accepted
         assert edge.kind == ("closure" if source - target > 3 else "span")
         wrong = replace(true, pose=PoseGaussian(true.pose.mean @ turned(30.0), COVARIANCE))
-        edge = Closer().spanning(wrong, Past(run.views, run.solution, run.graph.edges))
+        edge = Closer().judge_span(wrong, MapView(run.views, run.solution, run.graph.edges))
         assert not edge.accepted
         assert edge.reason.startswith("contradicts the chain: ")
-        assert Closer().spanning(witnessed(true, -1e9), Past(run.views, run.solution, run.graph.edges)).accepted
+        assert Closer().judge_span(witnessed(true, -1e9), MapView(run.views, run.solution, run.graph.edges)).accepted
 
 
 def test_of_small_steps_the_widest_that_tells_most_is_tried() -> None:
     run = Run(list(3.0 * np.arange(30)))
     run.run(Closer(max_closures=0))
-    pairs = Closer().spans(Past(run.views, run.solution, run.graph.edges))
+    pairs = Closer().span_pairs(MapView(run.views, run.solution, run.graph.edges))
     apart = [source - target for source, target in pairs if source > 20]
     assert len(apart) == 9
     assert min(apart) >= 4

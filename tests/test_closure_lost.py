@@ -7,7 +7,7 @@ import pytest
 from closing import ABOUT_OBJECT, COVARIANCE, REGULAR_DEG, Run, told, witnessed
 
 from modeler import se3
-from modeler.closure import Closer, Past
+from modeler.closure import Closer, MapView
 from modeler.types import Outcome, PoseGaussian, Posterior
 
 
@@ -16,11 +16,11 @@ def test_previous_view_is_not_believed_after_lost_frames_where_the_images_contra
     run.run(Closer(), told(-1))
     truth, solution = run.measured(4, 8, np.random.default_rng(0), np.zeros(6)), run.solution  # as far as four steps
     doubtful = witnessed(replace(truth, source=12, target=8), -90.0)
-    past = Past(run.views, solution, run.graph.edges)
-    assert Closer().base([doubtful], past, steps=1)[0] is doubtful
-    assert Closer().base([doubtful], past, steps=4)[0] is None
-    assert Closer().edges([doubtful], past, steps=4)[0].reason.startswith("the images contradict it")
-    assert Closer().base([witnessed(doubtful, -30.0)], past, steps=4)[0] is not None
+    map_view = MapView(run.views, solution, run.graph.edges)
+    assert Closer().placement([doubtful], map_view, steps=1)[0] is doubtful
+    assert Closer().placement([doubtful], map_view, steps=4)[0] is None
+    assert Closer().judge([doubtful], map_view, steps=4)[0].reason.startswith("the images contradict it")
+    assert Closer().placement([witnessed(doubtful, -30.0)], map_view, steps=4)[0] is not None
 
 
 @pytest.mark.parametrize("lost", [1, 16])

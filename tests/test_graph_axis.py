@@ -8,7 +8,7 @@ from rings import OBJECT_M, covariance, edge, nees, ring, rotation_error, spin
 
 from modeler import se3
 from modeler.graph import CommonAxis, PoseGraph, solve
-from modeler.graph.links import Link
+from modeler.graph.factors import Factor
 from modeler.graph.turning import estimated_axis, slip, surest_point
 from modeler.types import Array, Edge, PoseGaussian
 
@@ -64,13 +64,13 @@ def test_derivatives_are_those_of_the_slip() -> None:
 def test_surest_point_is_where_the_object_is() -> None:
     rng = np.random.default_rng(2)
     graph, _ = ring(14, rng, [])
-    links = [Link(e, e.posterior.pose) for e in graph.edges]
+    factors = [Factor(e, e.posterior.pose) for e in graph.edges]
     np.testing.assert_allclose(
-        surest_point(links), OBJECT_M, atol=0.05
+        surest_point(factors), OBJECT_M, atol=0.05
     )  # covariances couple turns and shifts at random
     exact = se3.adjoint(se3.translation(OBJECT_M))
     pose = PoseGaussian(np.eye(4), exact @ np.diag([1e-3, 2e-4, 5e-4, 1e-6, 1e-6, 1e-6]) @ exact.T)
-    np.testing.assert_allclose(surest_point([Link(edge(0, 1, pose), pose)]), OBJECT_M, atol=1e-9)
+    np.testing.assert_allclose(surest_point([Factor(edge(0, 1, pose), pose)]), OBJECT_M, atol=1e-9)
 
 
 def test_perfect_table_has_no_slip_and_shows_its_axis() -> None:

@@ -9,9 +9,9 @@ import pytest
 from rings import covariance, edge, ring, spin
 
 from modeler import se3
-from modeler.graph.belief import belief
+from modeler.graph.collapse import collapse_modes
 from modeler.graph.cycles import cycles
-from modeler.graph.links import Frames, Link
+from modeler.graph.factors import Factor, SpanningTree
 from modeler.types import Array, Edge, Mode, PoseGaussian
 
 COUNT = 8
@@ -38,7 +38,7 @@ def _reversed(one: Edge) -> Edge:
 
 def _gaps(edges: list[Edge], root: int) -> dict[int, tuple[Array, Array]]:
     """Return the gaps of loops, by the number of the frames that they span, for all hypotheses in the same order."""
-    frames = Frames.of([Link(one, belief(one.posterior)) for one in edges], root)
+    frames = SpanningTree.of([Factor(one, collapse_modes(one.posterior)) for one in edges], root)
     columns, found = cycles(frames.tree, frames.loops, root, {})
     order = [sorted((one.source, one.target))[1] for one in columns]
     assert sorted(order) == list(OPEN)
@@ -65,8 +65,8 @@ def test_a_gap_is_told_by_the_covariances_of_both_ways() -> None:
     rng = np.random.default_rng(1)
     first, second = (PoseGaussian(se3.exp(0.01 * rng.normal(size=6)), covariance(rng)) for _ in range(2))
     edges = [_two_modes(edge(0, 1, first)), edge(0, 1, second, "closure")]
-    links = [Link(one, belief(one.posterior)) for one in edges]
-    _, (cycle,) = cycles(links[:1], links[1:], 0, {})
+    factors = [Factor(one, collapse_modes(one.posterior)) for one in edges]
+    _, (cycle,) = cycles(factors[:1], factors[1:], 0, {})
     error, log_volume = cycle.gap(np.array([[0]]))
     xi, spread = se3.log(se3.inverse(second.mean) @ first.mean), first.covariance + second.covariance
     assert error[0] == pytest.approx(0.5 * xi @ np.linalg.solve(spread, xi))
@@ -76,7 +76,7 @@ def test_a_gap_is_told_by_the_covariances_of_both_ways() -> None:
 def test_what_is_settled_is_open_no_more() -> None:
     edges = _edges()
     settled = {one: np.array([0.0, 1.0]) for one in edges if one.source in OPEN[:2] and one.posterior.modes}
-    frames = Frames.of([Link(one, belief(one.posterior)) for one in edges], 0)
+    frames = SpanningTree.of([Factor(one, collapse_modes(one.posterior)) for one in edges], 0)
     columns, found = cycles(frames.tree, frames.loops, 0, settled)
     assert [one.source for one in columns] == [OPEN[2]]
     whole = _gaps(edges, 0)[7][0]

@@ -153,9 +153,9 @@ def test_frames_that_hang_on_one_edge_are_as_sure_as_in_the_batch() -> None:
 def test_covariances_of_all_are_worked_out_again_only_where_a_loop_has_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
-    def counted(links: Sequence[object], *args: object) -> object:
-        asked.append(len(links))
-        return rows(links, *args)  # pyright: ignore[reportArgumentType]
+    def counted(factors: Sequence[object], *args: object) -> object:
+        asked.append(len(factors))
+        return rows(factors, *args)  # pyright: ignore[reportArgumentType]
 
     growing, rows = Smoother(), marginals._rows
     for edges in _arrivals(np.random.default_rng(12)):

@@ -1,4 +1,4 @@
 """Which pairs of views to register, and which of their posteriors become edges of the graph."""
 
 from modeler.closure.closer import Closer as Closer
-from modeler.closure.past import Past as Past
+from modeler.closure.map_view import MapView as MapView

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from modeler import se3
-from modeler.closure.past import Past
-from modeler.closure.placing import Placing
-from modeler.closure.prospects import Outlook
-from modeler.closure.reckoning import came_back, onwards
-from modeler.closure.trust import Trust
-from modeler.closure.verdict import Agreement, Standard, flaw, modes, open_turn, standard
-from modeler.closure.ways import Ways
+from modeler.closure.consistency import Agreement, Thresholds, flaw, modes, open_turn, thresholds_from
+from modeler.closure.consistency_model import ConsistencyModel
+from modeler.closure.extrapolation import came_back, composed
+from modeler.closure.information_gain import InformationGain
+from modeler.closure.map_view import MapView
+from modeler.closure.paths import ShortestPaths
+from modeler.closure.relocaliser import Relocaliser
 from modeler.types import Edge, EdgeKind, PoseGaussian, Posterior, Solution
 
 _NOWHERE = "neither the previous view nor another one places the frame with certainty"
@@ -57,13 +57,13 @@ class Closer:
     as badly. What leaves a turn open, about the axis of a bottle, is bounded by the same limits as the edges that
     placed the frames, which hold these already; and where that axis lies it knows too badly for a wide turn about it
     not to contradict the others."""
-    trust: Trust = field(default_factory=Trust)
+    consistency_model: ConsistencyModel = field(default_factory=ConsistencyModel)
     """In covariances that edges state."""
 
-    def closures(
+    def closure_targets(
         self,
         base: Posterior,
-        past: Past,
+        map_view: MapView,
         *,
         last: bool = False,
     ) -> tuple[int, ...]:
@@ -71,73 +71,79 @@ class Closer:
 
         Args:
             base: the registration that places the frame.
-            past: what is known so far.
+            map_view: what is known so far.
             last: whether this is the last frame: it is tried against the first wherever that is in reach.
         """
-        frames = past.frames
+        frames = map_view.frames
         if self.max_closures == 0 or len(frames) < 2:
             return ()
-        expected = past.solution.trajectory[base.target] @ modes(base)[0][1].mean
-        angle_deg = np.degrees(se3.rotation_angle(se3.inverse(past.all_poses) @ expected))
-        own = self.trust.systematic(1, past.views[base.target].centroid_m)
-        outlook = Outlook(past, base.target, expected, own, self.max_angle_deg)
-        in_reach = outlook.within(frames, angle_deg) >= _LEAST_CHANCE
+        expected = map_view.solution.trajectory[base.target] @ modes(base)[0][1].mean
+        angle_deg = np.degrees(se3.rotation_angle(se3.inverse(map_view.all_poses) @ expected))
+        own = self.consistency_model.systematic(1, map_view.views[base.target].centroid_m)
+        information_gain = InformationGain(map_view, base.target, expected, own, self.max_angle_deg)
+        in_reach = information_gain.within(frames, angle_deg) >= _LEAST_CHANCE
         near = [int(number) for number in np.flatnonzero(in_reach) if frames[number] != base.target]
         chosen, spanned = [], False
-        for prospect in outlook.prospects([frames[number] for number in near], angle_deg[near], self.min_gain_nats):
-            if prospect.overlap >= self.min_overlap:
-                back = self._back(prospect.frame, base.source, outlook.reach, past)
+        for candidate in information_gain.candidates(
+            [frames[number] for number in near], angle_deg[near], self.min_gain_nats
+        ):
+            if candidate.overlap >= self.min_overlap:
+                back = self._back(candidate.frame, base.source, information_gain.reach, map_view)
                 if back or not spanned:  # one large step over many small ones is enough
-                    chosen.append(prospect.frame)
+                    chosen.append(candidate.frame)
                 spanned = spanned or not back
         first = frames[0]
-        if first in chosen or (last and 0 in near and self._back(first, base.source, outlook.reach, past)):
+        if first in chosen or (last and 0 in near and self._back(first, base.source, information_gain.reach, map_view)):
             chosen = [first, *(frame for frame in chosen if frame != first)]  # to close on the first is best
         return tuple(chosen[: self.max_closures])
 
-    def spans(self, past: Past) -> tuple[tuple[int, int], ...]:
+    def span_pairs(self, map_view: MapView) -> tuple[tuple[int, int], ...]:
         """Return pairs (source, target) of views to register once all are in: for each view those that tell most."""
-        frames = sorted(past.frames)
-        poses = past.poses(frames)
-        tried = {frozenset((edge.source, edge.target)) for edge in past.edges}
+        frames = sorted(map_view.frames)
+        poses = map_view.poses(frames)
+        tried = {frozenset((edge.source, edge.target)) for edge in map_view.edges}
         pairs: list[tuple[int, int]] = []
         limit_deg = self.max_span_deg
         for number, source in enumerate(frames if self.max_spans else ()):
             angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses[:number]) @ poses[number]))
             near = [k for k in np.flatnonzero(angle_deg <= limit_deg) if {source, frames[k]} not in tried]
-            own = self.trust.systematic(1, past.views[source].centroid_m)
-            outlook = Outlook(past, source, poses[number], own, limit_deg, hangs=False, power=_SPAN_POWER)
-            found = outlook.prospects([frames[k] for k in near], angle_deg[near], self.min_span_gain_nats)
-            telling = [(source, prospect.frame) for prospect in found if prospect.overlap >= self.min_overlap]
+            own = self.consistency_model.systematic(1, map_view.views[source].centroid_m)
+            information_gain = InformationGain(
+                map_view, source, poses[number], own, limit_deg, hangs=False, power=_SPAN_POWER
+            )
+            found = information_gain.candidates([frames[k] for k in near], angle_deg[near], self.min_span_gain_nats)
+            telling = [(source, candidate.frame) for candidate in found if candidate.overlap >= self.min_overlap]
             pairs += telling[: self.max_spans]
         return tuple(pairs)
 
-    def foreseen(self, base: Posterior, target: int, solution: Solution) -> PoseGaussian:
+    def predicted_motion(self, base: Posterior, target: int, solution: Solution) -> PoseGaussian:
         """Return target_from_source of the frame that a registration places and a view, as all edges tell it."""
-        return onwards(solution.relative_gaussian(target, base.target), modes(base)[0][1])
+        return composed(solution.relative_gaussian(target, base.target), modes(base)[0][1])
 
-    def relocation(self, posteriors: Sequence[Posterior], past: Past) -> int | None:
-        """Return the earlier view to register a lost frame against next; None: it is given up. See `Placing.next`.
+    def relocalisation_target(self, posteriors: Sequence[Posterior], map_view: MapView) -> int | None:
+        """Return the earlier view to register a lost frame against next; None: it is given up. See `Relocaliser.next`.
 
         Args:
             posteriors: what was tried for the frame, the previous view first.
-            past: what is known so far.
+            map_view: what is known so far.
         """
         if len(posteriors) > self.max_relocations:
             return None
-        return self._placing(past).next(posteriors)
+        return self._placing(map_view).next(posteriors)
 
-    def base(self, posteriors: Sequence[Posterior], past: Past, *, steps: int = 1) -> tuple[Posterior | None, str]:
-        """Return the posterior that places a frame, and why: the previous view's, or else another's. See `Placing`.
+    def placement(
+        self, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1
+    ) -> tuple[Posterior | None, str]:
+        """Return the posterior that places a frame, and why: the previous view's, or else another's. See `Relocaliser`.
 
         Args:
             posteriors: registrations of the frame, the previous view first.
-            past: what is known so far.
+            map_view: what is known so far.
             steps: how many frames lie between the previous view and this frame, this one counted.
         """
-        return self._placing(past, steps=steps).base(posteriors)
+        return self._placing(map_view, steps=steps).base(posteriors)
 
-    def edges(self, posteriors: Sequence[Posterior], past: Past, *, steps: int = 1) -> tuple[Edge, ...]:
+    def judge(self, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1) -> tuple[Edge, ...]:
         """Return one judged edge per posterior, in their order. The frame joins the graph if any is accepted.
 
         Edges to views that the object had turned away from are closures; of the others the one that places the frame,
@@ -145,38 +151,42 @@ class Closer:
 
         Args:
             posteriors: registrations of one new frame, against the previous view first.
-            past: what is known so far.
+            map_view: what is known so far.
             steps: how many frames lie between the previous view and this frame, this one counted.
         """
-        base, base_reason = self.base(posteriors, past, steps=steps)
-        reach = past.ways(base.target) if base is not None and len(posteriors) > 1 else Ways()
-        edges, asked = [], self._asked(past)
+        base, base_reason = self.placement(posteriors, map_view, steps=steps)
+        reach = map_view.shortest_paths(base.target) if base is not None and len(posteriors) > 1 else ShortestPaths()
+        edges, thresholds = [], self._thresholds(map_view)
         for number, posterior in enumerate(posteriors):
-            back = number > 0 and self._back(posterior.target, posterior.source, reach, past)
+            back = number > 0 and self._back(posterior.target, posterior.source, reach, map_view)
             places = number == 0 or base is None or posterior is base
             kind: EdgeKind = "closure" if back else "odometry" if places else "span"
             if posterior is base:
                 edge = Edge(posterior, kind, accepted=True, reason=base_reason)
-            elif (found := flaw(posterior, asked if number or steps > 1 else None)) is not None:
+            elif (found := flaw(posterior, thresholds if number or steps > 1 else None)) is not None:
                 edge = Edge(posterior, kind, accepted=False, reason=found)
             elif base is None:
                 edge = Edge(posterior, kind, accepted=False, reason=_NOWHERE)
-            elif (found := self._open(posterior, self.foreseen(base, posterior.target, past.solution))) is not None:
+            elif (
+                found := self._open(posterior, self.predicted_motion(base, posterior.target, map_view.solution))
+            ) is not None:
                 edge = Edge(posterior, kind, accepted=False, reason=found)
             else:
-                edge = _judged(posterior, kind, self.trust.agreement_by_way_of(base, posterior, past, reach))
+                edge = _judged(
+                    posterior, kind, self.consistency_model.consistency_through(base, posterior, map_view, reach)
+                )
             edges.append(edge)
         return tuple(edges)
 
-    def spanning(self, posterior: Posterior, past: Past) -> Edge:
+    def judge_span(self, posterior: Posterior, map_view: MapView) -> Edge:
         """Return the judged edge between two views of the graph, from a registration that it does not hold yet."""
-        reach = past.ways(posterior.source)
-        kind = "closure" if self._back(posterior.target, posterior.source, reach, past) else "span"
-        foretold = past.solution.relative_gaussian(posterior.target, posterior.source)
-        if (found := flaw(posterior, self._asked(past)) or self._open(posterior, foretold)) is not None:
+        reach = map_view.shortest_paths(posterior.source)
+        kind = "closure" if self._back(posterior.target, posterior.source, reach, map_view) else "span"
+        foretold = map_view.solution.relative_gaussian(posterior.target, posterior.source)
+        if (found := flaw(posterior, self._thresholds(map_view)) or self._open(posterior, foretold)) is not None:
             return Edge(posterior, kind, accepted=False, reason=found)
-        length, centroid_m = reach[posterior.target].edges, past.views[posterior.source].centroid_m
-        agreed = self.trust.agreement(posterior, [(1.0, foretold)], length=length, centroid_m=centroid_m)
+        length, centroid_m = reach[posterior.target].edges, map_view.views[posterior.source].centroid_m
+        agreed = self.consistency_model.agreement(posterior, [(1.0, foretold)], length=length, centroid_m=centroid_m)
         return _judged(posterior, kind, agreed)
 
     def _open(self, posterior: Posterior, foretold: PoseGaussian) -> str | None:
@@ -188,14 +198,16 @@ class Closer:
         sigma_deg = np.degrees(sigma_rad)
         return f"it leaves a turn open by ±{sigma_deg:.0f}°, of which the edges that placed the frames know as much"
 
-    def _back(self, target: int, source: int, reach: Ways, past: Past) -> bool:
-        return came_back(target, source, reach, past, away_deg=self.away_deg)
+    def _back(self, target: int, source: int, reach: ShortestPaths, map_view: MapView) -> bool:
+        return came_back(target, source, reach, map_view, away_deg=self.away_deg)
 
-    def _placing(self, past: Past, *, steps: int = 1) -> Placing:
-        return Placing(past, self._asked(past), self.trust, self.max_angle_deg, steps)
+    def _placing(self, map_view: MapView, *, steps: int = 1) -> Relocaliser:
+        return Relocaliser(map_view, self._thresholds(map_view), self.consistency_model, self.max_angle_deg, steps)
 
-    def _asked(self, past: Past) -> Standard:
-        return standard(past.edges, past.solution, min_overlap=self.min_overlap, drop_nats=self.max_evidence_drop_nats)
+    def _thresholds(self, map_view: MapView) -> Thresholds:
+        return thresholds_from(
+            map_view.edges, map_view.solution, min_overlap=self.min_overlap, drop_nats=self.max_evidence_drop_nats
+        )
 
 
 def _judged(posterior: Posterior, kind: EdgeKind, agreed: Agreement) -> Edge:

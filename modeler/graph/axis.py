@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.graph.chi_square import chi_square_quantile
-from modeler.graph.links import Link, inverse_right_jacobian
+from modeler.graph.factors import Factor, inverse_right_jacobian
 from modeler.graph.square_root import Rows
 from modeler.graph.turning import estimated_axis, slip, surest_point
 from modeler.types import Array
@@ -32,7 +32,7 @@ _FITS = 1.0 - 1e-6  # of tables that are as they are said to be; the others cost
 
 
 @dataclass(frozen=True, eq=False)
-class Turned:
+class AxisSolution:
     """A solution with a common axis."""
 
     poses: Mapping[int, Array]
@@ -59,33 +59,33 @@ class CommonAxis:
     sigma_lift_m: float = 0.0005
     """How far it moves along the axis in a step; infinite where edges hold that."""
 
-    def solved(self, links: Sequence[Link], trajectory: Mapping[int, Array], root: int) -> Turned | None:
-        """Return the poses that meet links and axis best; None where no axis is to be seen, or none that links allow.
+    def solved(self, factors: Sequence[Factor], trajectory: Mapping[int, Array], root: int) -> AxisSolution | None:
+        """Return the poses that meet factors and axis best; None where there is no axis that factors allow.
 
         Args:
-            links: all that take part.
+            factors: all that take part.
             trajectory: object_from_camera (4, 4) by frame number, not far off.
             root: the frame whose pose is the identity.
         """
         if len(trajectory) < 2:
             return None
-        start = estimated_axis(trajectory, surest_point(links))
+        start = estimated_axis(trajectory, surest_point(factors))
         if start is None:
             return None
-        known = _Known(self, links, list(trajectory), root, start)
-        alone = _half_square(known.rows({**trajectory, _AXIS: start})[: len(links)])
+        known = _Known(self, factors, list(trajectory), root, start)
+        alone = _half_square(known.rows({**trajectory, _AXIS: start})[: len(factors)])
         poses, rows = known.minimised({**trajectory, _AXIS: start})
-        if not self._fits(rows[len(links) + 1 :], 2.0 * (_half_square(rows) - alone)):
+        if not self._fits(rows[len(factors) + 1 :], 2.0 * (_half_square(rows) - alone)):
             return None
         to_object = {key: se3.adjoint(se3.inverse(pose)) for key, pose in poses.items() if key != _AXIS}
         said: list[Rows] = [
             {key: block @ to_object[key] if key in to_object else block for key, block in blocks.items()}
-            for blocks, _ in rows[len(links) :]
+            for blocks, _ in rows[len(factors) :]
         ]
-        return Turned({frame: poses[frame] for frame in trajectory}, said, poses[_AXIS])
+        return AxisSolution({frame: poses[frame] for frame in trajectory}, said, poses[_AXIS])
 
     def _fits(self, steps: Sequence[tuple[Rows, Array]], cost: float) -> bool:
-        """Return whether steps may share an axis that adds `cost` to the squared distance of links from poses.
+        """Return whether steps may share an axis that adds `cost` to the squared distance of factors from poses.
 
         That is chi² with as many degrees of freedom as the axis says more than has to be found: two numbers of its
         direction, two of its place.
@@ -99,33 +99,33 @@ class CommonAxis:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """All that is known of poses and axis: links, a loose guess of the axis, and how little steps slip."""
+    """All that is known of poses and axis: factors, a loose guess of the axis, and how little steps slip."""
 
     axis: CommonAxis
-    links: Sequence[Link]
+    factors: Sequence[Factor]
     frames: Sequence[int]
     root: int
     start: Array
 
     def rows(self, poses: Mapping[int, Array]) -> list[tuple[Rows, Array]]:
-        """Return whitened derivatives by variable, blocks (m, 6), and errors (m,): of links, the guess, and steps.
+        """Return whitened derivatives by variable, blocks (m, 6), and errors (m,): of factors, the guess, and steps.
 
         Args:
             poses: object_from_camera (4, 4) by frame number, and camera_from_axis.
         """
         targets, sources = (
             np.stack([poses[frame] for frame in ends])
-            for ends in ([link.target for link in self.links], [link.source for link in self.links])
+            for ends in ([factor.target for factor in self.factors], [factor.source for factor in self.factors])
         )
         target_from_source = se3.inverse(targets) @ sources
-        xi = se3.log(se3.inverse(np.stack([link.pose.mean for link in self.links])) @ target_from_source)
-        whiten = np.stack([link.root_information for link in self.links])
+        xi = se3.log(se3.inverse(np.stack([factor.pose.mean for factor in self.factors])) @ target_from_source)
+        whiten = np.stack([factor.root_information for factor in self.factors])
         of_source = whiten @ inverse_right_jacobian(xi)
         of_target = -of_source @ se3.adjoint(se3.inverse(target_from_source))
         errors = (whiten @ xi[..., None])[..., 0]
         rows: list[tuple[Rows, Array]] = [
-            (self._free({link.target: to, link.source: of}), error)
-            for link, to, of, error in zip(self.links, of_target, of_source, errors, strict=True)
+            (self._free({factor.target: to, factor.source: of}), error)
+            for factor, to, of, error in zip(self.factors, of_target, of_source, errors, strict=True)
         ]
         away = se3.log(se3.inverse(self.start) @ poses[_AXIS])
         away[2] = 0.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 
+from modeler.graph.factors import Factor, chain
 from modeler.graph.incremental import Incremental
-from modeler.graph.links import Link, chain
 from modeler.graph.optimise import agree, joining, optimise, poses_of
 from modeler.types import Array
 
@@ -18,8 +18,8 @@ Inlier = tuple[bool, ...]
 
 
 def closed(
-    tree: Sequence[Link],
-    loops: Sequence[Link],
+    tree: Sequence[Factor],
+    loops: Sequence[Factor],
     start: Mapping[int, Array],
     *,
     root: int,
@@ -29,8 +29,8 @@ def closed(
     """Return the poses under all loops, which loops take part, and the engine that can go on from there.
 
     Args:
-        tree: links that are trusted.
-        loops: links that may be contradicted, those of before first.
+        tree: factors that are trusted.
+        loops: factors that may be contradicted, those of before first.
         start: object_from_camera (4, 4) by frame number.
         root: the frame whose pose is the identity.
         threshold: half the squared Mahalanobis distance beyond which a loop is left out.
@@ -52,8 +52,8 @@ def closed(
 
 def _went_on(
     before: tuple[Inlier, Incremental],
-    tree: Sequence[Link],
-    loops: Sequence[Link],
+    tree: Sequence[Factor],
+    loops: Sequence[Factor],
     start: Mapping[int, Array],
     threshold: float,
 ) -> tuple[Inlier, Incremental] | None:

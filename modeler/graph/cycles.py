@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.graph.links import Link, walk
+from modeler.graph.factors import Factor, walk
 from modeler.types import Array, Edge
 
 
@@ -61,48 +61,48 @@ class Cycle:
 
 
 def cycles(
-    tree: Sequence[Link], loops: Sequence[Link], root: int, settled: Mapping[Edge, Array]
+    tree: Sequence[Factor], loops: Sequence[Factor], root: int, settled: Mapping[Edge, Array]
 ) -> tuple[tuple[Edge, ...], list[Cycle]]:
     """Return the edges on loops whose mode is open, one a column of hypotheses, and the cycles that depend on them.
 
     Args:
-        tree: links along which the frames hang together.
-        loops: the links beyond those.
+        tree: factors along which the frames hang together.
+        loops: the factors beyond those.
         root: a frame of the tree.
         settled: weights of the modes of edges of which the heaviest is to be taken.
     """
-    above = {neighbour: (frame, link) for frame, neighbour, link in walk(tree, root)}
+    above = {neighbour: (frame, factor) for frame, neighbour, factor in walk(tree, root)}
     depth = {root: 0}
     for neighbour, (frame, _) in above.items():  # outwards
         depth[neighbour] = depth[frame] + 1
     columns: dict[Edge, int] = {}
     found = []
     for loop in loops:
-        ahead: list[tuple[Link, bool]] = []  # each with whether the way goes from its target to its source
-        back: list[tuple[Link, bool]] = []
+        ahead: list[tuple[Factor, bool]] = []  # each with whether the way goes from its target to its source
+        back: list[tuple[Factor, bool]] = []
         target, source = loop.target, loop.source
         while target != source:
             if depth[target] >= depth[source]:
-                target, link = above[target]
-                ahead.append((link, link.source == target))
+                target, factor = above[target]
+                ahead.append((factor, factor.source == target))
             else:
-                source, link = above[source]
-                back.append((link, link.target == source))
+                source, factor = above[source]
+                back.append((factor, factor.target == source))
         way = [*ahead, *reversed(back), (loop, True)]
-        if any(link.modes and link.edge not in settled for link, _ in way):
-            *pieces, own = (_piece(link, settled, columns, forwards=forwards) for link, forwards in way)
+        if any(factor.modes and factor.edge not in settled for factor, _ in way):
+            *pieces, own = (_piece(factor, settled, columns, forwards=forwards) for factor, forwards in way)
             found.append(Cycle(_joined(pieces), own))
     return tuple(columns), found
 
 
-def _piece(link: Link, settled: Mapping[Edge, Array], columns: dict[Edge, int], *, forwards: bool) -> _Piece:
-    """Return a link as a stretch of a loop, along it or against it; an open edge is given a column."""
-    edge, poses, column = link.edge, [link.pose], None
-    if link.modes:
+def _piece(factor: Factor, settled: Mapping[Edge, Array], columns: dict[Edge, int], *, forwards: bool) -> _Piece:
+    """Return a factor as a stretch of a loop, along it or against it; an open edge is given a column."""
+    edge, poses, column = factor.edge, [factor.pose], None
+    if factor.modes:
         if edge in settled:
-            poses = [link.modes[int(np.argmax(settled[edge]))].pose]
+            poses = [factor.modes[int(np.argmax(settled[edge]))].pose]
         else:
-            poses, column = [mode.pose for mode in link.modes], columns.setdefault(edge, len(columns))
+            poses, column = [mode.pose for mode in factor.modes], columns.setdefault(edge, len(columns))
     poses = poses if forwards else [pose.inverse() for pose in poses]
     return _Piece(column, np.stack([pose.mean for pose in poses]), np.stack([pose.covariance for pose in poses]))
 

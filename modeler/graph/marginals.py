@@ -1,12 +1,12 @@
 """Uncertainty of solved frames and of the motion between any two of them, from square roots of information.
 
 Errors are written in object coordinates, δ_k with true object_from_camera(k) = exp(δ_k) object_from_camera(k), so that
-a link says R J Ad(source_from_object) (δ_source − δ_target) ~ N(0, I), with RᵀR the inverse of its covariance and J the
-derivative of its error's logarithm, the identity but for what is left of that error; the root has none. The square root
-U of the information of all poses is all that is ever worked out (Kaess and Dellaert, Covariance recovery from a square
-root information matrix, RAS 2009). Neither information nor covariance is ever formed, subtracted or inverted as a
-whole, so that a direction nobody observed, metres wide beside micrometres, is as welcome as any other. First order in
-the errors; links are taken where the frames were some steps ago as long as that is near enough.
+a factor says R J Ad(source_from_object) (δ_source − δ_target) ~ N(0, I), with RᵀR the inverse of its covariance and J
+the derivative of its error's logarithm, the identity but for what is left of that error; the root has none. The square
+root U of the information of all poses is all that is ever worked out (Kaess and Dellaert, Covariance recovery from a
+square root information matrix, RAS 2009). Neither information nor covariance is ever formed, subtracted or inverted as
+a whole, so that a direction nobody observed, metres wide beside micrometres, is as welcome as any other. First order in
+the errors; factors are taken where the frames were some steps ago as long as that is near enough.
 """
 
 from __future__ import annotations
@@ -19,40 +19,40 @@ import numpy as np
 from scipy.linalg import get_blas_funcs
 
 from modeler import se3
-from modeler.graph.links import ROOT_SIGMA, Link, inverse_right_jacobian
+from modeler.graph.factors import ROOT_SIGMA, Factor, inverse_right_jacobian
 from modeler.graph.square_root import Clique, Rows, SquareRoot
 from modeler.types import Array
 
-_NEAR = 4e-3  # rad and m by which a pose may be off the place where its links were taken: a hundredth of a covariance
+_NEAR = 4e-3  # rad and m by which a pose may be off the place where its factors were taken: a hundredth of a covariance
 (_solved,) = get_blas_funcs(("trsm",))  # LAPACK's trtrs, and all that rests on it, wakes threads for the least system
 
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
-    """Links as rows, and what all of them say."""
+    """Factors as rows, and what all of them say."""
 
     poses: Mapping[int, Array] = field(default_factory=dict)
     """object_from_camera (4, 4) of each frame, where they were taken."""
-    rows: Mapping[Link, Rows] = field(default_factory=dict)
+    rows: Mapping[Factor, Rows] = field(default_factory=dict)
     root: SquareRoot = field(default_factory=SquareRoot)
     """Of the information of all poses."""
 
-    def to(self, links: Sequence[Link], trajectory: Mapping[int, Array], root: int) -> _Taken:
+    def to(self, factors: Sequence[Factor], trajectory: Mapping[int, Array], root: int) -> _Taken:
         """Return those of a solution, which costs the less the more of it stayed."""
         both = [frame for frame in trajectory if frame in self.poses]
         before, after = ([poses[frame] for frame in both] for poses in (self.poses, trajectory))
         far = np.abs(np.reshape(before, (-1, 16)) - np.reshape(after, (-1, 16))).max(axis=1, initial=0.0) > _NEAR
         moved = {both[place] for place in np.flatnonzero(far)}
         poses = {frame: pose if frame in moved else self.poses.get(frame, pose) for frame, pose in trajectory.items()}
-        present = frozenset(links)
+        present = frozenset(factors)
         kept = {
-            link: rows
-            for link, rows in self.rows.items()
-            if link in present and not (moved and (link.target in moved or link.source in moved))
+            factor: rows
+            for factor, rows in self.rows.items()
+            if factor in present and not (moved and (factor.target in moved or factor.source in moved))
         }
-        new = [link for link in links if link not in kept]
+        new = [factor for factor in factors if factor not in kept]
         rows = dict(zip(new, _rows(new, poses, root), strict=True))
-        gone = [rows for link, rows in self.rows.items() if link not in kept]
+        gone = [rows for factor, rows in self.rows.items() if factor not in kept]
         return _Taken(poses, kept | rows, self.root.plus(list(rows.values()), gone))
 
 
@@ -64,17 +64,17 @@ class RelativeCovariance:
     """object_from_camera (4, 4) by frame number."""
     root: int
     """The frame without error."""
-    links: Sequence[Link]
+    factors: Sequence[Factor]
     """All that take part."""
     others: Sequence[Rows] = ()
     """What else is known, as rows of errors in object coordinates; more variables than frames may take part."""
     before: _Taken = field(default_factory=_Taken)
-    """The links of an earlier solution with the same root, as far as these were asked for."""
+    """The factors of an earlier solution with the same root, as far as these were asked for."""
 
-    def to(self, trajectory: Mapping[int, Array], links: Sequence[Link]) -> RelativeCovariance:
+    def to(self, trajectory: Mapping[int, Array], factors: Sequence[Factor]) -> RelativeCovariance:
         """Return that of a solution with the same root, which costs the less the more of it stayed."""
         before = self._taken if "_taken" in vars(self) and not self.others else self.before
-        return RelativeCovariance(trajectory, self.root, links, before=before)
+        return RelativeCovariance(trajectory, self.root, factors, before=before)
 
     def __call__(self, target: int, source: int) -> Array:
         """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
@@ -137,25 +137,25 @@ class RelativeCovariance:
 
     @cached_property
     def _taken(self) -> _Taken:
-        taken = self.before.to(self.links, self.trajectory, self.root)
+        taken = self.before.to(self.factors, self.trajectory, self.root)
         if not self.others:
             return taken
         others = [{frame: block for frame, block in rows.items() if frame != self.root} for rows in self.others]
         return _Taken(taken.poses, taken.rows, SquareRoot().plus([*taken.rows.values(), *others]))
 
 
-def _rows(links: Sequence[Link], trajectory: Mapping[int, Array], root: int) -> Iterator[Rows]:
-    """Yield the rows of each link, where it stands in a solution."""
-    if not links:
+def _rows(factors: Sequence[Factor], trajectory: Mapping[int, Array], root: int) -> Iterator[Rows]:
+    """Yield the rows of each factor, where it stands in a solution."""
+    if not factors:
         return
-    targets = np.stack([trajectory[link.target] for link in links])
-    sources = np.stack([trajectory[link.source] for link in links])
-    means = np.stack([link.pose.mean for link in links])
+    targets = np.stack([trajectory[factor.target] for factor in factors])
+    sources = np.stack([trajectory[factor.source] for factor in factors])
+    means = np.stack([factor.pose.mean for factor in factors])
     xi = se3.log(se3.inverse(means) @ se3.inverse(targets) @ sources)
-    roots = np.stack([link.root_information for link in links])
+    roots = np.stack([factor.root_information for factor in factors])
     blocks = roots @ inverse_right_jacobian(xi) @ se3.adjoint(se3.inverse(sources))
-    for link, block in zip(links, blocks, strict=True):
-        yield {frame: rows for frame, rows in ((link.target, -block), (link.source, block)) if frame != root}
+    for factor, block in zip(factors, blocks, strict=True):
+        yield {frame: rows for frame, rows in ((factor.target, -block), (factor.source, block)) if frame != root}
 
 
 def _spread(clique: Clique, outer: Array) -> Array:

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.graph.cycles import Cycle, cycles
-from modeler.graph.links import Link, chain
+from modeler.graph.factors import Factor, chain
 from modeler.graph.marginals import RelativeCovariance
 from modeler.graph.optimise import joining, optimise
 from modeler.types import Array, Edge
@@ -34,8 +34,8 @@ _PAIRS = 16  # edges up to which the modes of two of them are changed at once
 
 
 def decide(
-    tree: Sequence[Link],
-    loops: Sequence[Link],
+    tree: Sequence[Factor],
+    loops: Sequence[Factor],
     *,
     root: int,
     threshold: float,
@@ -44,14 +44,14 @@ def decide(
     """Return the weights (m,) that the loops leave to the modes of each edge with several that lies on a loop.
 
     Args:
-        tree: links along which the frames hang together.
-        loops: the links beyond those.
+        tree: factors along which the frames hang together.
+        loops: the factors beyond those.
         root: a frame of the tree.
         threshold: half the squared Mahalanobis distance at which a loop is taken to be false.
         before: weights that fewer loops left; modes settled there are not put in question.
     """
     settled = {edge: weights for edge, weights in (before or {}).items() if weights.max() >= _DECIDED}
-    if not any(link.modes and link.edge not in settled for link in (*tree, *loops)):
+    if not any(factor.modes and factor.edge not in settled for factor in (*tree, *loops)):
         return settled
     search = _Search.of(tree, loops, root, settled, threshold)
     best = search.best() if search.edges else None
@@ -86,7 +86,7 @@ class _Search:
 
     @classmethod
     def of(
-        cls, tree: Sequence[Link], loops: Sequence[Link], root: int, settled: Mapping[Edge, Array], threshold: float
+        cls, tree: Sequence[Factor], loops: Sequence[Factor], root: int, settled: Mapping[Edge, Array], threshold: float
     ) -> _Search:
         """Return the search for the modes of all edges on loops that are not settled."""
         edges, found = cycles(tree, loops, root, settled)
@@ -113,8 +113,8 @@ class _Search:
 
     def evidence(
         self,
-        tree: Sequence[Link],
-        loops: Sequence[Link],
+        tree: Sequence[Factor],
+        loops: Sequence[Factor],
         root: int,
         hypothesis: Mapping[Edge, np.int64],
         settled: Mapping[Edge, Array],
@@ -122,7 +122,7 @@ class _Search:
         """Return Laplace's log evidence of a hypothesis, but for what all hypotheses share."""
         of = {edge: int(mode) for edge, mode in hypothesis.items()}
         of |= {edge: int(np.argmax(weights)) for edge, weights in settled.items()}
-        tree, loops = ([_chosen(link, of) for link in some] for some in (tree, loops))
+        tree, loops = ([_chosen(factor, of) for factor in some] for some in (tree, loops))
         optimum = optimise(tree, loops, chain(tree, root, {}), root=root, threshold=self.threshold)
         chosen = joining(loops, optimum.inlier)
         evidence = -optimum.error - RelativeCovariance(optimum.poses, root, (*tree, *chosen)).log_determinant
@@ -170,6 +170,6 @@ class _Search:
         return -np.minimum(error, self.threshold) - log_volume
 
 
-def _chosen(link: Link, modes: Mapping[Edge, int]) -> Link:
-    """Return a link with the mode that is named for it."""
-    return Link(link.edge, link.edge.posterior.modes[modes[link.edge]].pose) if link.edge in modes else link
+def _chosen(factor: Factor, modes: Mapping[Edge, int]) -> Factor:
+    """Return a factor with the mode that is named for it."""
+    return Factor(factor.edge, factor.edge.posterior.modes[modes[factor.edge]].pose) if factor.edge in modes else factor

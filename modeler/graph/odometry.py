@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from modeler import se3
-from modeler.graph.belief import belief
-from modeler.graph.links import ROOT_SIGMA, Frames, Link, walk
+from modeler.graph.collapse import collapse_modes
+from modeler.graph.factors import ROOT_SIGMA, Factor, SpanningTree, walk
 from modeler.graph.pose_graph import PoseGraph
 from modeler.types import PoseGaussian
 
@@ -19,11 +19,11 @@ def dead_reckoning(graph: PoseGraph) -> dict[int, PoseGaussian]:
     root = graph.root
     if root is None:
         return {}
-    tree = Frames.of([Link(edge, belief(edge.posterior)) for edge in graph.accepted], root).tree
+    tree = SpanningTree.of([Factor(edge, collapse_modes(edge.posterior)) for edge in graph.accepted], root).tree
     poses = {root: PoseGaussian(np.eye(4), ROOT_SIGMA**2 * np.eye(6))}
-    for frame, neighbour, link in walk(tree, root):
+    for frame, neighbour, factor in walk(tree, root):
         before = poses[frame]
-        motion = link.pose if link.target == frame else link.pose.inverse()
+        motion = factor.pose if factor.target == frame else factor.pose.inverse()
         covariance = se3.composed_covariance(before.covariance, motion.mean, motion.covariance)
         poses[neighbour] = PoseGaussian(before.mean @ motion.mean, covariance)
     return poses

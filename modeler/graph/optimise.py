@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from modeler.graph.links import Link
+from modeler.graph.factors import Factor
 from modeler.types import Array
 
 _PIN_SIGMA = 1e-6  # rad and m: far below any registration, so that it pins a pose without being seen
@@ -17,19 +17,19 @@ _ROUGH = 1e-4  # of the error, while annealing: what it chooses is then solved w
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """The poses that meet a set of links best."""
+    """The poses that meet a set of factors best."""
 
     poses: Mapping[int, Array]
     """object_from_camera (4, 4) by frame number."""
     inlier: tuple[bool, ...]
     """Which loops take part."""
     error: float
-    """Half the squared Mahalanobis distance of all links to the poses; those left out count as the threshold."""
+    """Half the squared Mahalanobis distance of all factors to the poses; those left out count as the threshold."""
 
 
 def optimise(
-    tree: Sequence[Link],
-    loops: Sequence[Link],
+    tree: Sequence[Factor],
+    loops: Sequence[Factor],
     start: Mapping[int, Array],
     *,
     root: int,
@@ -43,8 +43,8 @@ def optimise(
     take part agree with the optimum, all that are left out contradict it.
 
     Args:
-        tree: links that are trusted.
-        loops: links that may be contradicted.
+        tree: factors that are trusted.
+        loops: factors that may be contradicted.
         start: object_from_camera (4, 4) by frame number.
         root: the frame whose pose is the identity.
         threshold: half the squared Mahalanobis distance beyond which a loop is left out.
@@ -53,21 +53,21 @@ def optimise(
     initial = values_of(start)
     taking_part = (*inlier, *[True] * (len(loops) - len(inlier)))
     chosen = joining(loops, taking_part)
-    found = _least_squares(factors_of([*tree, *chosen], root), initial)
+    found = _least_squares(gtsam_graph_of([*tree, *chosen], root), initial)
     if agree(loops, found, threshold) != taking_part:
-        factors = factors_of([*tree, *loops], root)
+        gtsam_graph = gtsam_graph_of([*tree, *loops], root)
         trusted = 1 + len(tree)
         parameters = gtsam.GncLMParams(_parameters(_ROUGH))
         parameters.setLossType(gtsam.GncLossType.TLS)
         parameters.setKnownInliers(list(range(trusted)))
-        annealing = gtsam.GncLMOptimizer(factors, initial, parameters)
+        annealing = gtsam.GncLMOptimizer(gtsam_graph, initial, parameters)
         annealing.setInlierCostThresholds(threshold)
         found = annealing.optimize()
         taking_part = tuple(bool(weight > 0.5) for weight in annealing.getWeights()[trusted:])
         chosen = joining(loops, taking_part)
         # At full weight, where annealing ended between.
-        found = _least_squares(factors_of([*tree, *chosen], root), found)
-    error = factors_of([*tree, *chosen], root).error(found) + threshold * taking_part.count(False)
+        found = _least_squares(gtsam_graph_of([*tree, *chosen], root), found)
+    error = gtsam_graph_of([*tree, *chosen], root).error(found) + threshold * taking_part.count(False)
     return Optimum(poses_of(found, start, root), taking_part, error)
 
 
@@ -93,27 +93,27 @@ def poses_of(values: gtsam.Values, frames: Iterable[int], root: int) -> dict[int
     return {frame: found[frame] for frame in frames} | {root: np.eye(4)}
 
 
-def agree(loops: Iterable[Link], values: gtsam.Values, threshold: float) -> tuple[bool, ...]:
+def agree(loops: Iterable[Factor], values: gtsam.Values, threshold: float) -> tuple[bool, ...]:
     """Return which loops stay below the threshold: where that is which take part, the choice stands."""
-    return tuple(loop.factor.error(values) <= threshold for loop in loops)
+    return tuple(loop.between.error(values) <= threshold for loop in loops)
 
 
-def joining(loops: Sequence[Link], taking_part: Sequence[bool]) -> list[Link]:
+def joining(loops: Sequence[Factor], taking_part: Sequence[bool]) -> list[Factor]:
     """Return the loops that take part."""
     return [loop for loop, good in zip(loops, taking_part, strict=True) if good]
 
 
-def factors_of(links: Iterable[Link], root: int) -> gtsam.NonlinearFactorGraph:
-    """Return a prior that pins the root at the identity, and links."""
-    factors = gtsam.NonlinearFactorGraph()
-    factors.add(anchor(root))
-    for link in links:
-        factors.push_back(link.factor)
-    return factors
+def gtsam_graph_of(factors: Iterable[Factor], root: int) -> gtsam.NonlinearFactorGraph:
+    """Return a prior that pins the root at the identity, and factors."""
+    gtsam_graph = gtsam.NonlinearFactorGraph()
+    gtsam_graph.add(anchor(root))
+    for factor in factors:
+        gtsam_graph.push_back(factor.between)
+    return gtsam_graph
 
 
-def _least_squares(factors: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
-    return gtsam.LevenbergMarquardtOptimizer(factors, start, _parameters()).optimize()
+def _least_squares(gtsam_graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
+    return gtsam.LevenbergMarquardtOptimizer(gtsam_graph, start, _parameters()).optimize()
 
 
 def _parameters(tolerance: float = 1e-12) -> gtsam.LevenbergMarquardtParams:

@@ -27,7 +27,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.graph.chi_square import chi_square_quantile
-from modeler.graph.links import Link
+from modeler.graph.factors import Factor
 from modeler.graph.marginals import RelativeCovariance
 from modeler.graph.pose_graph import PoseGraph
 from modeler.types import Array, Solution
@@ -42,7 +42,7 @@ class SharedCovariance:
 
     independent: RelativeCovariance
     """Those for edges with nothing in common."""
-    links: Sequence[Link]
+    factors: Sequence[Factor]
     """All that take part."""
     share: float
     """That is the frames' own, 0 to 1."""
@@ -81,11 +81,11 @@ class SharedCovariance:
     def _own(self) -> dict[int, Array]:
         """Covariances Q (6, 6) of the frames' own noise: as the edges of each say, those that are sure first."""
         informations: dict[int, list[Array]] = {}
-        for link in self.links:
-            information = link.root_information.T @ link.root_information
-            to_target = se3.adjoint(se3.inverse(link.pose.mean))  # ξ of the source frame from one of the target's
-            informations.setdefault(link.source, []).append(information)
-            informations.setdefault(link.target, []).append(to_target.T @ information @ to_target)
+        for factor in self.factors:
+            information = factor.root_information.T @ factor.root_information
+            to_target = se3.adjoint(se3.inverse(factor.pose.mean))  # ξ of the source frame from one of the target's
+            informations.setdefault(factor.source, []).append(information)
+            informations.setdefault(factor.target, []).append(to_target.T @ information @ to_target)
         return {
             frame: np.asarray(0.5 * self.share * np.linalg.inv(np.mean(some, axis=0)), dtype=np.float64)
             for frame, some in informations.items()
@@ -94,7 +94,7 @@ class SharedCovariance:
     @cached_property
     def _alike(self) -> Array:
         """B (6, 6)."""
-        informations = [link.root_information.T @ link.root_information for link in self.links]
+        informations = [factor.root_information.T @ factor.root_information for factor in self.factors]
         return np.asarray(self.common * np.linalg.inv(np.mean(informations, axis=0)), dtype=np.float64)
 
 

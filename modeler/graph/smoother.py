@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from modeler.graph.axis import CommonAxis, Turned
-from modeler.graph.belief import belief
+from modeler.graph.axis import AxisSolution, CommonAxis
 from modeler.graph.closing import closed
+from modeler.graph.collapse import collapse_modes
+from modeler.graph.factors import Factor, SpanningTree, anchored, chain
 from modeler.graph.incremental import Incremental
-from modeler.graph.links import Frames, Link, anchored, chain
 from modeler.graph.marginals import PoseCovariances, RelativeCovariance
 from modeler.graph.modes import decide
 from modeler.graph.optimise import agree, joining, values_of
@@ -26,14 +26,14 @@ _ROUNDS = 5  # in which an axis may change which loops agree
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What a solution rests on, by identity of edges and links: where it stands, it need not be worked out again."""
+    """What a solution rests on, by identity of edges and factors: where it stands, it need not be worked out again."""
 
     root: int | None = None
-    links: Mapping[Edge, Link] = field(default_factory=dict)
+    factors: Mapping[Edge, Factor] = field(default_factory=dict)
     """Every accepted edge as one Gaussian, before any loop."""
-    frames: Frames = field(default_factory=Frames)
+    frames: SpanningTree = field(default_factory=SpanningTree)
     """How these hang together."""
-    decided: Mapping[Edge, Link] = field(default_factory=dict)
+    decided: Mapping[Edge, Factor] = field(default_factory=dict)
     """Edges with several modes on loops, after them."""
     weights: Mapping[Edge, Array] = field(default_factory=dict)
     """What the loops leave to their modes."""
@@ -88,16 +88,16 @@ class Smoother:
         root = graph.root
         if root is None:
             return replace(self, graph=graph, solution=Solution(), state=_State())
-        known = self.state.links
-        links = {edge: known.get(edge) or Link(edge, belief(edge.posterior)) for edge in graph.accepted}
-        frames, grew = self._frames(list(links.values()), root)
+        known = self.state.factors
+        factors = {edge: known.get(edge) or Factor(edge, collapse_modes(edge.posterior)) for edge in graph.accepted}
+        frames, grew = self._frames(list(factors.values()), root)
         tree, loops, closes = frames.tree, frames.loops, not grew or len(frames.loops) > len(self.state.frames.loops)
         odometry = chain(tree, root, self.solution.odometry if grew else {})
         weights, decided = self.state.weights, self.state.decided
         if closes:
             weights, decided = self._decided(tree, loops, root, grew=grew)
         taken, closing = (
-            [decided.get(link.edge, link) for link in some] if decided else some for some in (tree, loops)
+            [decided.get(factor.edge, factor) for factor in some] if decided else some for some in (tree, loops)
         )
         jumped = _jumped(decided, self.state)
         start = chain(taken, root, {} if jumped else anchored(self.solution.trajectory, root))
@@ -106,7 +106,7 @@ class Smoother:
         if closes:  # otherwise the new frames hang on one edge each
             before = ((), None) if jumped or not grew else (inlier, engine)
             trajectory, inlier, engine = closed(taken, closing, start, root=root, threshold=threshold, before=before)
-        state = _State(root, links, frames, decided, weights, inlier, engine)
+        state = _State(root, factors, frames, decided, weights, inlier, engine)
         if grew and decided and inlier.count(False) > self.state.inlier.count(False):
             # Modes that were settled may have been so by a lie: all are put in question.
             again = replace(self, state=_State()).to(graph)
@@ -118,7 +118,7 @@ class Smoother:
     def _solution(
         self,
         state: _State,
-        links: tuple[Sequence[Link], Sequence[Link]],
+        factors: tuple[Sequence[Factor], Sequence[Factor]],
         trajectory: Mapping[int, Array],
         *,
         grew: bool,
@@ -127,18 +127,18 @@ class Smoother:
 
         Args:
             state: what it rests on.
-            links: tree and loops, of several modes as loops have decided.
+            factors: tree and loops, of several modes as loops have decided.
             trajectory: object_from_camera (4, 4) by frame number, as all but an axis has it.
             grew: whether the graph grew from that of the solution before.
         """
-        root, (taken, closing), inlier = state.root or 0, links, state.inlier
-        turned: Turned | None = None
+        root, (taken, closing), inlier = state.root or 0, factors, state.inlier
+        turned: AxisSolution | None = None
         if self.axis is not None:
             inlier, turned = self._turned(self.axis, taken, closing, trajectory, state)
         trajectory = trajectory if turned is None else turned.poses
         taking_part = [*taken, *joining(closing, inlier)]
         relative_covariance = self._covariance(taking_part, trajectory, turned, root=root, grew=grew)
-        several = [link for link in (*taken, *closing) if link.modes]
+        several = [factor for factor in (*taken, *closing) if factor.modes]
         return Solution(
             trajectory=trajectory,
             covariances=PoseCovariances(
@@ -146,26 +146,26 @@ class Smoother:
             ),
             outliers=tuple(loop.edge for loop, good in zip(closing, inlier, strict=True) if not good),
             relative_covariance=relative_covariance,
-            edge_poses={(link.source, link.target): link.pose for link in several},
-            mode_weights={(link.source, link.target): _weights(link, state.weights) for link in several},
+            edge_poses={(factor.source, factor.target): factor.pose for factor in several},
+            mode_weights={(factor.source, factor.target): _weights(factor, state.weights) for factor in several},
             camera_from_axis=None if turned is None else turned.camera_from_axis,
         )
 
-    def _frames(self, links: list[Link], root: int) -> tuple[Frames, bool]:
-        """Return how links hang together, and whether those before hung together so and have but grown."""
+    def _frames(self, factors: list[Factor], root: int) -> tuple[SpanningTree, bool]:
+        """Return how factors hang together, and whether those before hung together so and have but grown."""
         before = self.state.frames
-        count = len(before.links)
-        if root == self.state.root and len(links) >= count and all(map(operator.is_, links, before.links)):
-            grown = before.plus(links[count:])
+        count = len(before.factors)
+        if root == self.state.root and len(factors) >= count and all(map(operator.is_, factors, before.factors)):
+            grown = before.plus(factors[count:])
             if grown is not None:
                 return grown, True
-        return Frames.of(links, root), False
+        return SpanningTree.of(factors, root), False
 
     def _covariance(
         self,
-        links: Sequence[Link],
+        factors: Sequence[Factor],
         trajectory: Mapping[int, Array],
-        turned: Turned | None,
+        turned: AxisSolution | None,
         *,
         root: int,
         grew: bool,
@@ -175,21 +175,21 @@ class Smoother:
         if isinstance(before, SharedCovariance):
             before = before.independent
         if turned is None and isinstance(before, RelativeCovariance) and grew:
-            found = before.to(trajectory, links)
+            found = before.to(trajectory, factors)
         else:
-            found = RelativeCovariance(trajectory, root, links, () if turned is None else turned.rows)
-        if not (links and (self.shared or self.common)):
+            found = RelativeCovariance(trajectory, root, factors, () if turned is None else turned.rows)
+        if not (factors and (self.shared or self.common)):
             return found
-        return SharedCovariance(found, links, self.shared, self.common)
+        return SharedCovariance(found, factors, self.shared, self.common)
 
     def _turned(
         self,
         axis: CommonAxis,
-        tree: Sequence[Link],
-        loops: Sequence[Link],
+        tree: Sequence[Factor],
+        loops: Sequence[Factor],
         trajectory: Mapping[int, Array],
         state: _State,
-    ) -> tuple[tuple[bool, ...], Turned | None]:
+    ) -> tuple[tuple[bool, ...], AxisSolution | None]:
         """Return which loops take part where steps share an axis, and the solution then; None: they do not."""
         inlier, turned = state.inlier, None
         for _ in range(_ROUNDS):
@@ -203,26 +203,26 @@ class Smoother:
         return inlier, turned
 
     def _decided(
-        self, tree: Sequence[Link], loops: Sequence[Link], root: int, *, grew: bool
-    ) -> tuple[dict[Edge, Array], dict[Edge, Link]]:
+        self, tree: Sequence[Factor], loops: Sequence[Factor], root: int, *, grew: bool
+    ) -> tuple[dict[Edge, Array], dict[Edge, Factor]]:
         """Return what the loops leave to the modes of edges with several, and those edges as one Gaussian each."""
         threshold, before = 0.5 * self.outlier_distance**2, self.state.weights if grew else {}
         weights = decide(tree, loops, root=root, threshold=threshold, before=before)
         decided = {
             edge: self.state.decided[edge]
             if edge in before and np.array_equal(before[edge], left)
-            else Link(edge, belief(edge.posterior, left))
+            else Factor(edge, collapse_modes(edge.posterior, left))
             for edge, left in weights.items()
         }
         return weights, decided
 
 
-def _weights(link: Link, decided: Mapping[Edge, Array]) -> Array:
-    """Return the weights of a link's modes: as loops have decided, or else the posterior's own."""
-    return decided.get(link.edge, np.array([mode.weight for mode in link.modes]))
+def _weights(factor: Factor, decided: Mapping[Edge, Array]) -> Array:
+    """Return the weights of a factor's modes: as loops have decided, or else the posterior's own."""
+    return decided.get(factor.edge, np.array([mode.weight for mode in factor.modes]))
 
 
-def _jumped(decided: Mapping[Edge, Link], state: _State) -> bool:
+def _jumped(decided: Mapping[Edge, Factor], state: _State) -> bool:
     """Return whether another mode was chosen than the one that the poses so far rest on."""
-    before = ((link, state.decided.get(edge) or state.links.get(edge)) for edge, link in decided.items())
-    return any(old is not None and not np.array_equal(link.pose.mean, old.pose.mean) for link, old in before)
+    before = ((factor, state.decided.get(edge) or state.factors.get(edge)) for edge, factor in decided.items())
+    return any(old is not None and not np.array_equal(factor.pose.mean, old.pose.mean) for factor, old in before)

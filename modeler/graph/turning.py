@@ -8,18 +8,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from modeler import se3
-from modeler.graph.links import Link, inverse_right_jacobian
+from modeler.graph.factors import Factor, inverse_right_jacobian
 from modeler.types import Array
 
 _LEAST_RAD = np.radians(5.0)  # a table that has turned by less in all shows no axis
 _KEPT = [0, 1, 3, 4, 5]  # of a step without its turn
 
 
-def surest_point(links: Sequence[Link]) -> Array:
-    """Return the point (3,) in camera coordinates whose motion links know best: where the object is."""
+def surest_point(factors: Sequence[Factor]) -> Array:
+    """Return the point (3,) in camera coordinates whose motion factors know best: where the object is."""
     inertia, moment = np.zeros((3, 3)), np.zeros(3)
-    for link in links:  # least Σ E|υ + ω × p|²
-        spread = link.pose.covariance / np.trace(link.pose.covariance[:3, :3])
+    for factor in factors:  # least Σ E|υ + ω × p|²
+        spread = factor.pose.covariance / np.trace(factor.pose.covariance[:3, :3])
         turns, mixed = spread[:3, :3], spread[:3, 3:]
         inertia += np.trace(turns) * np.eye(3) - turns
         moment += np.array([mixed[1, 2] - mixed[2, 1], mixed[2, 0] - mixed[0, 2], mixed[0, 1] - mixed[1, 0]])

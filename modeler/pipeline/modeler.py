@@ -164,7 +164,7 @@ class Modeler:
             posteriors = pairing.placed(state, seen.view, previous, last=last, again=again)
         lasting = [posterior.without_samples() for posterior in posteriors]
         steps = state.steps(seen.frame.index, previous)
-        edges = self.closer.edges(lasting, state.past, steps=steps)
+        edges = self.closer.judge(lasting, state.map_view, steps=steps)
         edges = pairing.explained(edges)
         outcome = _outcome(seen, edges, first=not state.views)
         state = state.joined(seen, edges, accepted=outcome == ACCEPTED)
@@ -237,10 +237,10 @@ class Modeler:
             return state, ()
         ending("choosing more pairs", 0, 1)
         pairing, edges, stage = self._pairing(), [], "registering more pairs"
-        pairs = self.closer.spans(state.past)
+        pairs = self.closer.span_pairs(state.map_view)
         ending(stage, 0, len(pairs))
         for posterior in pairing.spanning(state, pairs):
-            edges.append(self.closer.spanning(posterior.without_samples(), state.past))
+            edges.append(self.closer.judge_span(posterior.without_samples(), state.map_view))
             ending(stage, len(edges), len(pairs))
             if hurry():
                 break

@@ -58,7 +58,7 @@ class Pairing:
                 return glances
         odometry = self._pair(state, view, previous, prior.grown(steps) if steps > 1 else prior)
         posteriors = (odometry,)
-        base, _ = self.closer.base(posteriors, state.past, steps=steps)
+        base, _ = self.closer.placement(posteriors, state.map_view, steps=steps)
         if base is None:
             if wary and steps == 1 and not again and not odometry.matches:
                 glances = self._glances(state, view, previous, prior, again=again)
@@ -66,14 +66,16 @@ class Pairing:
                     return (odometry, *glances[1:])
             self.seeking(view.index)
             posteriors = self._relocalised(state, view, odometry, prior, again=again)
-            base, _ = self.closer.base(posteriors, state.past, steps=steps)
+            base, _ = self.closer.placement(posteriors, state.map_view, steps=steps)
         if base is None:
             return posteriors
         tried = {previous, *(posterior.target for posterior in posteriors)}
         tried |= {edge.target for edge in known if edge.source == view.index} if again else set()
-        targets = self.closer.closures(base, state.past, last=last)
+        targets = self.closer.closure_targets(base, state.map_view, last=last)
         targets = [target for target in targets if target not in tried]
-        foreseen = [ForeseenPrior(prior, self.closer.foreseen(base, target, state.solution)) for target in targets]
+        foreseen = [
+            ForeseenPrior(prior, self.closer.predicted_motion(base, target, state.solution)) for target in targets
+        ]
         return (*posteriors, *self._pairs(state, [(view, target) for target in targets], foreseen))
 
     def spanning(self, state: State, pairs: Sequence[tuple[int, int]]) -> Iterator[Posterior]:
@@ -105,7 +107,7 @@ class Pairing:
             if again or _promising(glances[-1]):
                 break
             self.seeking(view.index)
-            target = self.closer.relocation(glances, state.past)
+            target = self.closer.relocalisation_target(glances, state.map_view)
         return glances
 
     def _relocalised(
@@ -120,8 +122,8 @@ class Pairing:
             known = prior.between(view, state.views[odometry.target])
             odometry = replace(believed(odometry, wider, known), seconds=seconds)
         posteriors = (odometry,)
-        while not again and self.closer.base(posteriors, state.past, steps=steps)[0] is None:
-            target = self.closer.relocation(posteriors, state.past)
+        while not again and self.closer.placement(posteriors, state.map_view, steps=steps)[0] is None:
+            target = self.closer.relocalisation_target(posteriors, state.map_view)
             if target is None:
                 break
             posteriors = (*posteriors, self._pair(state, view, target, grown))

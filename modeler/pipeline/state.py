@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-from modeler.closure import Past
+from modeler.closure import MapView
 from modeler.fusion import Growing
 from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.types import Edge, Frame, InputError, ObjectModel, Posterior, RayImage, Segmentation, Solution
@@ -58,9 +58,9 @@ class State:
         return self.smoother.solution
 
     @cached_property
-    def past(self) -> Past:
+    def map_view(self) -> MapView:
         """What closures are chosen and judged by."""
-        return Past(self.views, self.solution, self.graph.edges)
+        return MapView(self.views, self.solution, self.graph.edges)
 
     @property
     def latest(self) -> int | None:

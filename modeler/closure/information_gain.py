@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from modeler import se3
-from modeler.closure.past import Past
-from modeler.closure.ways import Ways
+from modeler.closure.map_view import MapView
+from modeler.closure.paths import ShortestPaths
 from modeler.types import Array
 
 _ASKED = 6  # views whose motion's covariance is worked out: the most promising by a bound that costs little
@@ -20,7 +20,7 @@ _WITNESSES = 200  # points of a view asked whether the new view should see them
 
 
 @dataclass(frozen=True)
-class Prospect:
+class Candidate:
     """An earlier view, and what an edge to it would be worth."""
 
     frame: int
@@ -34,10 +34,10 @@ class Prospect:
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook:
+class InformationGain:
     """What is expected of a new view's place among the earlier ones."""
 
-    past: Past
+    map_view: MapView
     """What is known so far."""
     previous: int
     """The view that the new one hangs on; or the new view itself, where it is in the graph already."""
@@ -54,9 +54,9 @@ class Outlook:
     edges have in common and no loop shows."""
 
     @cached_property
-    def reach(self) -> Ways:
+    def reach(self) -> ShortestPaths:
         """The surest ways from the view that the new one hangs on."""
-        return self.past.ways(self.previous)
+        return self.map_view.shortest_paths(self.previous)
 
     def within(self, frames: Sequence[int], angle_deg: Array) -> Array:
         """Return the chances (n,) that the turns to views are no larger than views are registered across.
@@ -70,7 +70,7 @@ class Outlook:
         sigma_deg = np.maximum(np.degrees(np.sqrt(variance_rad2 + one_edge_rad2)), 1e-6)
         return np.where(np.isinf(variance_rad2), 0.0, ndtr((self.max_angle_deg - angle_deg) / sigma_deg))
 
-    def prospects(self, frames: Sequence[int], angle_deg: Array, least_nats: float) -> list[Prospect]:
+    def candidates(self, frames: Sequence[int], angle_deg: Array, least_nats: float) -> list[Candidate]:
         """Return the most promising of `frames`, whose predicted rotations to the new view are `angle_deg` (n,).
 
         An edge of covariance R between two frames whose motion is known with covariance P adds ½ log |1 + P R⁻¹| nats,
@@ -97,19 +97,19 @@ class Outlook:
         for place in order[bound_nats[order] >= least_nats][:_ASKED]:
             frame = frames[place]
             overlap = self._overlap(frame)
-            known = self.past.solution.relative_covariance(frame, self.previous)
+            known = self.map_view.solution.relative_covariance(frame, self.previous)
             known = known + float(self.hangs) * one_edge + float(length[place]) * self.systematic
             more = overlap * tells[place] * np.linalg.solve(one_edge, known)
             gain_nats = 0.5 * float(chance[place] * np.linalg.slogdet(np.eye(6) + more)[1])
             if gain_nats >= least_nats:
-                found.append(Prospect(frame, float(angle_deg[place]), overlap, gain_nats))
-        return sorted(found, key=lambda prospect: -prospect.gain_nats)
+                found.append(Candidate(frame, float(angle_deg[place]), overlap, gain_nats))
+        return sorted(found, key=lambda candidate: -candidate.gain_nats)
 
     @cached_property
     def _one_edge(self) -> Array | None:
         """Covariance (6, 6) of an edge; None where there is none to go by."""
-        edges = [edge for edge in self.past.edges[-_RECENT:] if self.past.solution.takes_part(edge)]
-        recent = [self.past.solution.pose_of(edge).covariance for edge in edges]
+        edges = [edge for edge in self.map_view.edges[-_RECENT:] if self.map_view.solution.takes_part(edge)]
+        recent = [self.map_view.solution.pose_of(edge).covariance for edge in edges]
         return np.asarray(np.mean(recent, axis=0) + self.systematic) if recent else None
 
     def _tells(self, angle_deg: Array) -> Array:
@@ -123,9 +123,9 @@ class Outlook:
 
     def _overlap(self, frame: int) -> float:
         """Return the share of a view's surface that should face the new view's camera."""
-        view = self.past.views[frame]
+        view = self.map_view.views[frame]
         chosen = np.linspace(0, len(view.points_m) - 1, min(_WITNESSES, len(view.points_m))).astype(int)
-        camera_from_frame = se3.inverse(self.expected) @ self.past.solution.trajectory[frame]
+        camera_from_frame = se3.inverse(self.expected) @ self.map_view.solution.trajectory[frame]
         points_m = se3.transform(camera_from_frame, view.points_m[chosen])
         normals = view.normals[chosen] @ camera_from_frame[:3, :3].T
         return float(np.mean(np.sum(points_m * normals, axis=1) < 0.0))

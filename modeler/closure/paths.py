@@ -1,4 +1,4 @@
-"""Ways through the pose graph: over which edges two frames hang together most surely."""
+"""Shortest paths through the pose graph: over which edges two frames hang together most surely."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from modeler.types import Array, Edge, Solution
 
 
 @dataclass(frozen=True)
-class Way:
+class ShortestPath:
     """The surest way from one frame to another."""
 
     edges: int
@@ -26,7 +26,7 @@ class Way:
 
 
 @dataclass(frozen=True, eq=False)
-class Ways(Mapping[int, Way]):
+class ShortestPaths(Mapping[int, ShortestPath]):
     """The surest ways from one frame to all that hang together with it, by their numbers."""
 
     places: Mapping[int, int] = field(default_factory=dict)
@@ -36,13 +36,13 @@ class Ways(Mapping[int, Way]):
     before: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(n,) place of the frame before the last on the way; its own at the start, and where no way leads."""
 
-    def __getitem__(self, frame: int) -> Way:
+    def __getitem__(self, frame: int) -> ShortestPath:
         """Return the way to one frame."""
         place = self.places[frame]
         if np.isinf(self.distances_rad2[place]):
             raise KeyError(frame)
         before = self._frames[self.before[place]]
-        return Way(int(self.lengths[place]), float(self.distances_rad2[place]), before)
+        return ShortestPath(int(self.lengths[place]), float(self.distances_rad2[place]), before)
 
     def __iter__(self) -> Iterator[int]:
         """Yield the frames to which ways lead."""
@@ -83,7 +83,7 @@ class Ways(Mapping[int, Way]):
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
+class PathNetwork:
     """The edges that take part, by how sure they are of the rotation between their frames."""
 
     places: Mapping[int, int]
@@ -92,7 +92,7 @@ class Network:
     """(n, n), from frame to frame."""
 
     @classmethod
-    def of(cls, edges: Sequence[Edge], solution: Solution) -> Network:
+    def of(cls, edges: Sequence[Edge], solution: Solution) -> PathNetwork:
         """Return the network of edges, as they were judged, by what a solution makes of them."""
         taking_part = [edge for edge in edges if solution.takes_part(edge)]
         ends = np.array([(edge.posterior.source, edge.posterior.target) for edge in taking_part], dtype=np.int64)
@@ -108,11 +108,11 @@ class Network:
         matrix = csr_array((sure[first], (rows[first], columns[first])), shape=(size, size))
         return cls({frame: place for place, frame in enumerate(frames.tolist())}, matrix)
 
-    def ways(self, start: int) -> Ways:
+    def shortest_paths(self, start: int) -> ShortestPaths:
         """Return the surest way from a frame to every other that hangs together with it (Dijkstra 1959)."""
         if start not in self.places:
-            return Ways({start: 0}, np.zeros(1), np.zeros(1, dtype=np.int64))
+            return ShortestPaths({start: 0}, np.zeros(1), np.zeros(1, dtype=np.int64))
         place = self.places[start]
         distances, before = csgraph.dijkstra(self.variances_rad2, indices=place, return_predecessors=True)
         own = np.arange(len(before))
-        return Ways(self.places, distances, np.where(before < 0, own, before).astype(np.int64))
+        return ShortestPaths(self.places, distances, np.where(before < 0, own, before).astype(np.int64))

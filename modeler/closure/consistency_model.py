@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
-from modeler.closure.past import Past
-from modeler.closure.reckoning import onwards
-from modeler.closure.verdict import Agreement, agreement, modes
-from modeler.closure.ways import Ways
+from modeler.closure.consistency import Agreement, agreement, modes
+from modeler.closure.extrapolation import composed
+from modeler.closure.map_view import MapView
+from modeler.closure.paths import ShortestPaths
 from modeler.types import Array, PoseGaussian, Posterior
 
 
 @dataclass(frozen=True)
-class Trust:
+class ConsistencyModel:
     """What is believed of stated covariances.
 
     Pairwise covariances hold no systematic error, which adds up along a chain instead of averaging out, so that
@@ -59,25 +59,25 @@ class Trust:
         systematic = self.systematic(length, centroid_m)
         return agreement(posterior, predictions, systematic=systematic, scale=self.sigma_scale, centroid_m=centroid_m)
 
-    def agreement_by_way_of(
+    def consistency_through(
         self,
         base: Posterior,
         posterior: Posterior,
-        past: Past,
-        reach: Ways,
+        map_view: MapView,
+        reach: ShortestPaths,
     ) -> Agreement:
         """Return how well a registration of a frame agrees with the way through the graph and along another of it.
 
         Args:
             base: the other, by which the frame is placed.
             posterior: target_from_source of the frame and some view.
-            past: what is known so far.
+            map_view: what is known so far.
             reach: ways from the view of `base`.
         """
-        way = past.solution.relative_gaussian(posterior.target, base.target)
-        predictions = [(weight, onwards(way, pose)) for weight, pose in modes(base)]
-        centroid_m = se3.transform(se3.inverse(modes(base)[0][1].mean), past.views[base.target].centroid_m[None])[0]
+        way = map_view.solution.relative_gaussian(posterior.target, base.target)
+        predictions = [(weight, composed(way, pose)) for weight, pose in modes(base)]
+        centroid_m = se3.transform(se3.inverse(modes(base)[0][1].mean), map_view.views[base.target].centroid_m[None])[0]
         surest = reach.get(posterior.target)
-        order = list(past.views)
+        order = list(map_view.views)
         length = abs(order.index(base.target) - order.index(posterior.target)) if surest is None else surest.edges
         return self.agreement(posterior, predictions, length=1 + length, centroid_m=centroid_m)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from modeler.types import Array, PoseGaussian, Posterior, as_one, separate
 
 
-def belief(posterior: Posterior, weights: Array | None = None) -> PoseGaussian:
+def collapse_modes(posterior: Posterior, weights: Array | None = None) -> PoseGaussian:
     """Return a posterior as one Gaussian: at its heaviest mode, as wide as all of them make it.
 
     Modes that are not separate have a mean and covariance that say as much as they do.

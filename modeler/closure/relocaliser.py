@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
-from modeler.closure.past import Past
-from modeler.closure.reckoning import continued
-from modeler.closure.trust import Trust
-from modeler.closure.verdict import Standard, flaw, modes, stands
+from modeler.closure.consistency import Thresholds, flaw, modes, stands
+from modeler.closure.consistency_model import ConsistencyModel
+from modeler.closure.extrapolation import extrapolated
+from modeler.closure.map_view import MapView
 from modeler.types import Posterior
 
 
 @dataclass(frozen=True, eq=False)
-class Placing:
+class Relocaliser:
     """Tells which of a frame's registrations places it.
 
     The previous view's is believed frame by frame. After lost frames, and where another view has to take its place, an
@@ -24,11 +24,11 @@ class Placing:
     only near where the motion led, and farther from there if that of another view agrees.
     """
 
-    past: Past
+    map_view: MapView
     """What is known so far."""
-    asked: Standard
+    thresholds: Thresholds
     """Of registrations."""
-    trust: Trust
+    consistency_model: ConsistencyModel
     """In what the graph foretells."""
     max_angle_deg: float
     """How far in degrees from where the motion led a registration is believed by itself."""
@@ -47,7 +47,7 @@ class Placing:
         joins = f"joins the previous view: {odometry.outcome.label}, overlap {odometry.overlap:.2f}"
         if self._follows(odometry) and (self.steps == 1 or self._off_deg(odometry) <= self.max_angle_deg):
             return odometry, joins
-        standing = [posterior for posterior in posteriors if stands(posterior, self.asked)]
+        standing = [posterior for posterior in posteriors if stands(posterior, self.thresholds)]
         for posterior in sorted(standing, key=lambda posterior: -posterior.overlap):
             instead = f"joins in place of the failed previous view: overlap {posterior.overlap:.2f}"
             reason = joins if posterior is odometry else instead
@@ -70,24 +70,24 @@ class Placing:
             posteriors: what was tried for the frame, the previous view first.
         """
         tried = [posterior.target for posterior in posteriors]
-        left = [frame for frame in self.past.frames if frame not in tried]
+        left = [frame for frame in self.map_view.frames if frame not in tried]
         if not left:
             return None
-        poses = self.past.poses(left)
-        for posterior in (posterior for posterior in posteriors if stands(posterior, self.asked)):
-            placed = self.past.solution.trajectory[posterior.target] @ posterior.pose.mean
+        poses = self.map_view.poses(left)
+        for posterior in (posterior for posterior in posteriors if stands(posterior, self.thresholds)):
+            placed = self.map_view.solution.trajectory[posterior.target] @ posterior.pose.mean
             angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ placed))
             if angle_deg.min() <= self.max_angle_deg:
                 return left[int(np.argmin(angle_deg))]
         if len(tried) == 1:
-            expected = continued(self.past.solution, self.past.frames, posteriors[0].source)
+            expected = extrapolated(self.map_view.solution, self.map_view.frames, posteriors[0].source)
             return left[int(np.argmin(se3.rotation_angle(se3.inverse(poses) @ expected)))]
-        apart = [se3.rotation_angle(se3.inverse(pose) @ poses) for pose in self.past.poses(tried)]
+        apart = [se3.rotation_angle(se3.inverse(pose) @ poses) for pose in self.map_view.poses(tried)]
         return left[int(np.argmax(np.min(apart, axis=0)))]
 
     def _follows(self, odometry: Posterior) -> bool:
         """Return whether the previous view's registration came to an end, and after lost frames matches like others."""
-        matches = self.steps == 1 or not odometry.log_evidence < self.asked.least_nats
+        matches = self.steps == 1 or not odometry.log_evidence < self.thresholds.least_nats
         return flaw(odometry) is None and matches
 
     def _witness(self, posterior: Posterior, standing: Sequence[Posterior]) -> Posterior | None:
@@ -95,17 +95,19 @@ class Placing:
         # A pace that changes at random from step to step goes astray with the root of their number.
         if self._off_deg(posterior) > float(np.sqrt(self.steps)) * self.max_angle_deg:
             return None
-        reach = self.past.ways(posterior.target)
+        reach = self.map_view.shortest_paths(posterior.target)
         others = (other for other in standing if other is not posterior)
         agreeing = (
-            other for other in others if self.trust.agreement_by_way_of(posterior, other, self.past, reach).agrees
+            other
+            for other in others
+            if self.consistency_model.consistency_through(posterior, other, self.map_view, reach).agrees
         )
         return next(agreeing, None)
 
     def _off_deg(self, posterior: Posterior) -> float:
         """Return the angle between where a registration puts a frame and where the motion going on would have."""
-        if len(self.past.frames) == 1:
+        if len(self.map_view.frames) == 1:
             return 0.0
-        expected = continued(self.past.solution, self.past.frames, posterior.source)
-        placed = self.past.solution.trajectory[posterior.target] @ modes(posterior)[0][1].mean
+        expected = extrapolated(self.map_view.solution, self.map_view.frames, posterior.source)
+        placed = self.map_view.solution.trajectory[posterior.target] @ modes(posterior)[0][1].mean
         return float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ placed)))

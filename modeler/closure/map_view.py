@@ -8,12 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
-from modeler.closure.ways import Network, Ways
+from modeler.closure.paths import PathNetwork, ShortestPaths
 from modeler.types import Array, Edge, RayImage, Solution
 
 
 @dataclass(frozen=True, eq=False)
-class Past:
+class MapView:
     """The accepted views, their poses, and the edges that these rest on."""
 
     views: Mapping[int, RayImage]
@@ -33,14 +33,14 @@ class Past:
         """object_from_camera (n, 4, 4) of these."""
         return self.poses(self.frames)
 
-    def ways(self, start: int) -> Ways:
+    def shortest_paths(self, start: int) -> ShortestPaths:
         """Return the surest ways from a frame to all others."""
-        return self._network.ways(start)
+        return self._network.shortest_paths(start)
 
     def poses(self, frames: Sequence[int]) -> Array:
         """Return object_from_camera (n, 4, 4) of frames."""
         return np.array([self.solution.trajectory[frame] for frame in frames]).reshape(-1, 4, 4)
 
     @cached_property
-    def _network(self) -> Network:
-        return Network.of(self.edges, self.solution)
+    def _network(self) -> PathNetwork:
+        return PathNetwork.of(self.edges, self.solution)

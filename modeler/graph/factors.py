@@ -1,6 +1,6 @@
 """Edges as the optimisation takes them, and how they hang together: a spanning tree, and loops beyond it.
 
-Variables are object_from_camera(k). A link is `BetweenFactorPose3(target, source, target_from_source)`, whose noise
+Variables are object_from_camera(k). A factor is `BetweenFactorPose3(target, source, target_from_source)`, whose noise
 GTSAM expresses as `target_from_source @ exp(ξ)`, rotation first: the package's own convention, see `se3`.
 """
 
@@ -22,7 +22,7 @@ _FIRST: tuple[EdgeKind, ...] = ("odometry", "span", "closure")  # what connects 
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
+class Factor:
     """One edge as one Gaussian."""
 
     edge: Edge
@@ -46,8 +46,8 @@ class Link:
         return self.edge.posterior.modes if separate(self.edge.posterior.modes) else ()
 
     @cached_property
-    def factor(self) -> gtsam.BetweenFactorPose3:
-        """The link as GTSAM takes it.
+    def between(self) -> gtsam.BetweenFactorPose3:
+        """The factor as GTSAM takes it.
 
         Raises:
             ValueError: where the covariance is not positive definite.
@@ -73,87 +73,87 @@ class Link:
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
-    """How links hang together: those that first connect each frame with the root, odometry preferred, and loops."""
+class SpanningTree:
+    """How factors hang together: those that first connect each frame with the root, odometry preferred, and loops."""
 
-    links: Sequence[Link] = ()
+    factors: Sequence[Factor] = ()
     """All of them, in order of arrival."""
-    tree: Sequence[Link] = ()
+    tree: Sequence[Factor] = ()
     """Those that connect, whatever closes loops."""
-    loops: Sequence[Link] = ()
-    """The rest; links that do not hang together with the root are in neither."""
+    loops: Sequence[Factor] = ()
+    """The rest; factors that do not hang together with the root are in neither."""
     reached: frozenset[int] = frozenset()
     """The frames of the tree, and the root."""
     last: int = 0
     """Place among the kinds, from the preferred one on, of the last that the tree needed."""
 
     @classmethod
-    def of(cls, links: Sequence[Link], root: int) -> Frames:
-        """Return how links hang together with the root."""
-        tree: list[Link] = []
-        loops: list[Link] = []
+    def of(cls, factors: Sequence[Factor], root: int) -> SpanningTree:
+        """Return how factors hang together with the root."""
+        tree: list[Factor] = []
+        loops: list[Factor] = []
         group: dict[int, set[int]] = {}
-        for link in sorted(links, key=_place):  # stable: by arrival within a kind
-            target, source = (group.setdefault(frame, {frame}) for frame in (link.target, link.source))
+        for factor in sorted(factors, key=_place):  # stable: by arrival within a kind
+            target, source = (group.setdefault(frame, {frame}) for frame in (factor.target, factor.source))
             if source is target:
-                loops.append(link)
+                loops.append(factor)
                 continue
-            tree.append(link)
+            tree.append(factor)
             larger, smaller = (target, source) if len(target) >= len(source) else (source, target)
             larger |= smaller
             group.update(dict.fromkeys(smaller, larger))
         reached = frozenset(group.get(root, {root}))
-        tree, loops = ([link for link in some if link.target in reached] for some in (tree, loops))
-        return cls(links, tree, loops, reached, max(map(_place, tree), default=0))
+        tree, loops = ([factor for factor in some if factor.target in reached] for some in (tree, loops))
+        return cls(factors, tree, loops, reached, max(map(_place, tree), default=0))
 
-    def plus(self, links: Sequence[Link]) -> Frames | None:
-        """Return it with more links; None where these would have connected other frames than the tree did."""
-        if len(self.tree) + len(self.loops) < len(self.links):
+    def plus(self, factors: Sequence[Factor]) -> SpanningTree | None:
+        """Return it with more factors; None where these would have connected other frames than the tree did."""
+        if len(self.tree) + len(self.loops) < len(self.factors):
             return None
         tree, loops, reached, last = list(self.tree), list(self.loops), set(self.reached), self.last
-        for link in sorted(links, key=_place):
-            known = (link.target in reached) + (link.source in reached)
-            if known == 0 or (known == 2 and _place(link) < last):
+        for factor in sorted(factors, key=_place):
+            known = (factor.target in reached) + (factor.source in reached)
+            if known == 0 or (known == 2 and _place(factor) < last):
                 return None
             if known == 2:
-                loops.append(link)
+                loops.append(factor)
                 continue
-            tree.append(link)
-            reached |= {link.target, link.source}
-            last = max(last, _place(link))
-        return Frames([*self.links, *links], tree, loops, frozenset(reached), last)
+            tree.append(factor)
+            reached |= {factor.target, factor.source}
+            last = max(last, _place(factor))
+        return SpanningTree([*self.factors, *factors], tree, loops, frozenset(reached), last)
 
 
-def _place(link: Link) -> int:
-    return _FIRST.index(link.edge.kind)
+def _place(factor: Factor) -> int:
+    return _FIRST.index(factor.edge.kind)
 
 
-def walk(tree: Sequence[Link], *starts: int) -> Iterator[tuple[int, int, Link]]:
-    """Yield (frame, neighbour, link) over links that make no loop, outwards from frames, nearer frames first."""
-    links: dict[int, list[Link]] = {}
-    for link in tree:
-        links.setdefault(link.target, []).append(link)
-        links.setdefault(link.source, []).append(link)
+def walk(tree: Sequence[Factor], *starts: int) -> Iterator[tuple[int, int, Factor]]:
+    """Yield (frame, neighbour, factor) over factors that make no loop, outwards from frames, nearer frames first."""
+    factors: dict[int, list[Factor]] = {}
+    for factor in tree:
+        factors.setdefault(factor.target, []).append(factor)
+        factors.setdefault(factor.source, []).append(factor)
     waiting, reached = list(starts), set(starts)
     for frame in waiting:
-        for link in links.get(frame, []):
-            neighbour = link.source if link.target == frame else link.target
+        for factor in factors.get(frame, []):
+            neighbour = factor.source if factor.target == frame else factor.target
             if neighbour not in reached:
                 reached.add(neighbour)
                 waiting.append(neighbour)
-                yield frame, neighbour, link
+                yield frame, neighbour, factor
 
 
-def chain(tree: Sequence[Link], root: int, guess: Mapping[int, Array]) -> dict[int, Array]:
+def chain(tree: Sequence[Factor], root: int, guess: Mapping[int, Array]) -> dict[int, Array]:
     """Return object_from_camera by frame, outwards from the root: the guess, or else dead reckoning."""
     poses = {root: np.eye(4)}
-    poses |= {frame: guess[frame] for link in tree for frame in (link.target, link.source) if frame in guess}
+    poses |= {frame: guess[frame] for factor in tree for frame in (factor.target, factor.source) if frame in guess}
     poses[root] = np.eye(4)
-    left = [link for link in tree if link.target not in poses or link.source not in poses]
-    known = [frame for link in left for frame in (link.target, link.source) if frame in poses]
-    for frame, neighbour, link in walk(left, *known):
-        target_from_source = link.pose.mean
-        frame_from_neighbour = target_from_source if link.target == frame else se3.inverse(target_from_source)
+    left = [factor for factor in tree if factor.target not in poses or factor.source not in poses]
+    known = [frame for factor in left for frame in (factor.target, factor.source) if frame in poses]
+    for frame, neighbour, factor in walk(left, *known):
+        target_from_source = factor.pose.mean
+        frame_from_neighbour = target_from_source if factor.target == frame else se3.inverse(target_from_source)
         poses[neighbour] = poses[frame] @ frame_from_neighbour
     return poses
 

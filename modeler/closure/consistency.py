@@ -17,7 +17,7 @@ _LEAST_WEIGHT = 0.05  # modes that agree with the prediction must hold so much o
 
 
 @dataclass(frozen=True)
-class Standard:
+class Thresholds:
     """What is asked of a registration besides that it came to an end."""
 
     min_overlap: float
@@ -28,7 +28,7 @@ class Standard:
     """Below it the images speak against any surface in common, and rather for none."""
 
 
-def standard(edges: Sequence[Edge], solution: Solution, *, min_overlap: float, drop_nats: float) -> Standard:
+def thresholds_from(edges: Sequence[Edge], solution: Solution, *, min_overlap: float, drop_nats: float) -> Thresholds:
     """Return what the edges of a run so far, between neighbours, ask of further ones.
 
     How well two views of one object match depends on its shape and on the sensor, so that evidence tells little by
@@ -44,13 +44,13 @@ def standard(edges: Sequence[Edge], solution: Solution, *, min_overlap: float, d
     nats = [edge.posterior.log_evidence for edge in islice(joining, _RECENT)]
     told = np.array([evidence for evidence in nats if np.isfinite(evidence)])
     if len(told) < _FEWEST:
-        return Standard(min_overlap)
+        return Thresholds(min_overlap)
     usual = float(np.median(told))
     scatter = 1.4826 * float(np.median(np.abs(told - usual)))
-    return Standard(min_overlap, usual, usual - max(drop_nats, 8.0 * scatter))
+    return Thresholds(min_overlap, usual, usual - max(drop_nats, 8.0 * scatter))
 
 
-def flaw(posterior: Posterior, asked: Standard | None = None) -> str | None:
+def flaw(posterior: Posterior, thresholds: Thresholds | None = None) -> str | None:
     """Return what keeps a posterior out of the graph whatever the others say; None: nothing."""
     if not posterior.usable:
         return f"{posterior.outcome.label}: {posterior.outcome.advice}"
@@ -60,10 +60,11 @@ def flaw(posterior: Posterior, asked: Standard | None = None) -> str | None:
     variances = np.linalg.eigvalsh(pose.covariance)
     if variances[0] <= 1e-15 * variances[-1]:
         return "the covariance is not positive definite: the registration is degenerate"
-    if asked is not None and not posterior.overlap >= asked.min_overlap:
-        return f"the overlap {posterior.overlap:.2f} is below {asked.min_overlap:.2f}"
-    if asked is not None and posterior.log_evidence < asked.least_nats:
-        return f"the images contradict it: log evidence {posterior.log_evidence:.0f}, of others {asked.usual_nats:.0f}"
+    if thresholds is not None and not posterior.overlap >= thresholds.min_overlap:
+        return f"the overlap {posterior.overlap:.2f} is below {thresholds.min_overlap:.2f}"
+    if thresholds is not None and posterior.log_evidence < thresholds.least_nats:
+        usual = thresholds.usual_nats
+        return f"the images contradict it: log evidence {posterior.log_evidence:.0f}, of others {usual:.0f}"
     return None
 
 
@@ -77,9 +78,9 @@ def open_turn(posterior: Posterior) -> tuple[float, Array]:
     return float(np.sqrt(variances[vaguest, -1])), axes[vaguest, :, -1]
 
 
-def stands(posterior: Posterior, asked: Standard) -> bool:
+def stands(posterior: Posterior, thresholds: Thresholds) -> bool:
     """Return whether a registration could place a frame without the previous view."""
-    return posterior.outcome is Outcome.CONVERGED and flaw(posterior, asked) is None
+    return posterior.outcome is Outcome.CONVERGED and flaw(posterior, thresholds) is None
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Ways through the graph: as sure as the surest, however many edges lie between two frames."""
+"""Shortest paths through the graph: as sure as the surest, however many edges lie between two frames."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rings import edge
 
-from modeler.closure.ways import Network, Ways
+from modeler.closure.paths import PathNetwork, ShortestPaths
 from modeler.types import Edge, PoseGaussian, Solution
 
 COUNT = 12
@@ -40,9 +40,9 @@ def _naive(edges: list[Edge]) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(5))
 def test_ways_are_the_surest_and_lead_where_they_say(seed: int) -> None:
     edges = _edges(np.random.default_rng(seed))
-    network, wanted = Network.of(edges, Solution()), _naive(edges)
+    network, wanted = PathNetwork.of(edges, Solution()), _naive(edges)
     for start in range(COUNT):
-        found = network.ways(start)
+        found = network.shortest_paths(start)
         assert set(found) == set(np.flatnonzero(np.isfinite(wanted[start])))
         assert len(found) == len(list(found))
         variances, lengths = found.to(range(COUNT))
@@ -57,8 +57,8 @@ def test_ways_are_the_surest_and_lead_where_they_say(seed: int) -> None:
 
 
 def test_no_way_leads_where_nothing_hangs_together() -> None:
-    found = Network.of([edge(0, 2, PoseGaussian(np.eye(4), np.eye(6)))], Solution()).ways(0)
+    found = PathNetwork.of([edge(0, 2, PoseGaussian(np.eye(4), np.eye(6)))], Solution()).shortest_paths(0)
     assert 1 not in found
-    assert found.along(1) == Ways().along(1) == []
-    assert Network.of([], Solution()).ways(7)[7].edges == 0
+    assert found.along(1) == ShortestPaths().along(1) == []
+    assert PathNetwork.of([], Solution()).shortest_paths(7)[7].edges == 0
     np.testing.assert_array_equal(found.to([1, 0])[0], [np.inf, 0.0])
