@@ -9,7 +9,7 @@ import pytest
 from prior_cases import NORMAL, edges, solution, told, turned, turntable, view, views
 
 from modeler import se3
-from modeler.priors import AxesPrior, ForeseenPrior, Poke, PokePrior, TablePrior, VelocityPrior
+from modeler.priors import ForeseenPrior, Poke, PokePrior, TablePrior, VelocityPrior
 from modeler.priors.about_axis import Axis
 from modeler.priors.bumps import Bumps
 from modeler.priors.common_axis import common_axis
@@ -114,8 +114,3 @@ def test_directions_about_an_axis_have_the_mean_that_their_concentration_says(co
     mean: Array = drawn.mean(axis=0)
     assert mean @ NORMAL == pytest.approx(1.0 / np.tanh(concentration) - 1.0 / concentration, abs=0.01)
     assert np.linalg.norm(mean - (mean @ NORMAL) * NORMAL) < 0.01
-
-
-def test_guesses_ask_what_is_known_whether_it_takes_anything_for_granted() -> None:
-    assert AxesPrior(TablePrior()).unassuming() is None
-    assert AxesPrior(turntable(HERE)).unassuming() == turntable(HERE, step_sign="unknown")

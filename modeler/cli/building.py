@@ -138,7 +138,6 @@ def _run(
                 scene,
                 hurry=lambda: interrupt.asked,
                 ending=console.ending,
-                remark=console.remark,
                 seeking=console.seeking,
             )
             for step in steps:

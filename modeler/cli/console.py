@@ -88,10 +88,6 @@ class Console:
         """Tell that a frame did not join the previous view and is being tried against others."""
         self._bar.update(self._task, description=f"trying frame {frame} again")
 
-    def remark(self, words: str) -> None:
-        """Tell in one line what the run has noticed."""
-        self._say(words)
-
     def _tell(self, frame: int, what: str) -> None:
         """Tell what became of a frame; of those that follow each other for one reason, only the first few by one."""
         if what != self._told:

@@ -12,7 +12,6 @@ import numpy as np
 from modeler.closure import Closer
 from modeler.fusion import Fuser, own_covariances
 from modeler.graph import CommonAxis, shared_noise
-from modeler.pipeline.false_start import false_start
 from modeler.pipeline.pairing import Pairing
 from modeler.pipeline.state import Seen, State
 from modeler.rays import Sensor
@@ -23,15 +22,12 @@ from modeler.types import (
     AbstractRegistrar,
     Edge,
     Frame,
-    InputError,
     Outcome,
     Posterior,
     RayImage,
     Segmentation,
     Step,
 )
-
-_ASKED = 6  # pairs, of which three must be sure, to tell what a person got wrong
 
 
 @dataclass(frozen=True)
@@ -72,7 +68,6 @@ class Modeler:
         *,
         hurry: Callable[[], bool] = lambda: False,
         ending: Callable[[str, int, int], None] = lambda stage, done, total: None,
-        remark: Callable[[str], None] = lambda words: None,
         seeking: Callable[[int], None] = lambda frame: None,
     ) -> Iterator[Step]:
         """Yield what each frame brings. A frame that cannot be used is reported and left out.
@@ -86,16 +81,13 @@ class Modeler:
             hurry: asked after the last frame; once it says so, no more edges are tried beyond those that placed the
                 frames.
             ending: told after the last frame what is being done, and how much of how much is done.
-            remark: told in one line, as soon as pairs show it, what the prior has wrong, or that the first frames show
-                something else than those after them.
             seeking: told the number of a frame that the previous view does not place, while others are tried.
         """
         state = State()
         for frame, last in _with_last(frames):
             seen = Seen(frame, *self.view(frame, scene))
-            state = self._asked(state.read(frame.index), seen.view, remark)
+            state = state.read(frame.index)
             state, step = self._joined(state, seen, state.latest, last=last, seeking=seeking)
-            state = self._doubted(state, remark)
             if last:
                 for later, found in self._caught_up(state, seeking):
                     state = replace(later, growing=state.growing, model=state.model)
@@ -181,36 +173,6 @@ class Modeler:
             views=state.views,
         )
         return state, step
-
-    def _asked(self, state: State, view: RayImage | None, remark: Callable[[str], None]) -> State:
-        """Return the state with one more pair registered without what the prior takes for granted, till that is told.
-
-        Edges do not hold it, and the prior stays as it was told: a person may know better.
-        """
-        unassuming, before = self.prior.unassuming(), state.newest
-        if unassuming is None or view is None or before is None or len(state.asked) == _ASKED:
-            return state
-        if self.prior.refuted(state.asked) is not None:
-            return state
-        try:
-            posterior = self.register(view, self._ready(state, before), unassuming)
-        except InputError:
-            return state
-        asked = (*state.asked, posterior.without_samples())
-        if words := self.prior.refuted(asked):
-            remark(words)
-        return replace(state, asked=asked)
-
-    def _doubted(self, state: State, remark: Callable[[str], None]) -> State:
-        """Return the state once it is told that frames match each other, but not the few that came first."""
-
-        def register(source: RayImage, target: RayImage) -> Posterior:
-            views = self._ready(state, source), self._ready(state, target)
-            return self._asking(self.glance or self.registrar, *views, self.prior)
-
-        if words := false_start(state, register):
-            remark(words)
-        return replace(state, warned=state.warned or bool(words))
 
     def _caught_up(self, state: State, seeking: Callable[[int], None]) -> Iterator[tuple[State, Step]]:
         """Yield states and steps of lost frames, newest first, tried once more against a view that followed them."""

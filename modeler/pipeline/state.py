@@ -9,7 +9,7 @@ from functools import cached_property
 from modeler.closure import MapView
 from modeler.fusion import Growing
 from modeler.graph import CommonAxis, PoseGraph, Smoother
-from modeler.types import Edge, Frame, InputError, ObjectModel, Posterior, RayImage, Segmentation, Solution
+from modeler.types import Edge, Frame, InputError, ObjectModel, RayImage, Segmentation, Solution
 
 _READY = 8  # views kept ready for registration; of others the images that a likelihood looks up are made again
 _SPANNED = 3  # frames between a lost one and a view that followed it, at most, for it to be tried once more
@@ -43,10 +43,6 @@ class State:
     """Frames that show the object and were left out."""
     vain: int = 0
     """How many frames were searched for in vain since one was last found by it."""
-    warned: bool = False
-    """Whether it was told that the first frames may show something else than the object."""
-    asked: tuple[Posterior, ...] = ()
-    """The first pairs, registered without what the prior takes for granted."""
     model: ObjectModel | None = None
     """The newest model."""
     growing: Growing | None = None
@@ -66,14 +62,6 @@ class State:
     def latest(self) -> int | None:
         """Number of the view accepted last; None where there is none."""
         return next(reversed(list(self.views)), None)
-
-    @property
-    def newest(self) -> RayImage | None:
-        """The view read last, accepted or left out; None where there is none."""
-        for frame in reversed(list(self.places)):
-            if frame in self.views or frame in self.lost:
-                return self.views[frame] if frame in self.views else self.lost[frame].view
-        return None
 
     def steps(self, frame: int, other: int | None) -> int:
         """Return how many frames apart two that were read are; 1 without another."""

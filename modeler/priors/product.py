@@ -15,7 +15,6 @@ from modeler.types import (
     Array,
     Edge,
     InputError,
-    Posterior,
     RayImage,
     SharedAxis,
     Solution,
@@ -60,18 +59,6 @@ class ProductPrior(AbstractPrior):
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
         """Return the axis that all steps share, where either part has one."""
         return self.first.shared_axis(views) or self.second.shared_axis(views)
-
-    def unassuming(self) -> ProductPrior | None:
-        """Return the product of parts of which one takes less for granted; None where neither does."""
-        first, second = self.first.unassuming(), self.second.unassuming()
-        if first is None and second is None:
-            return None
-        return replace(self, first=first or self.first, second=second or self.second)
-
-    def refuted(self, posteriors: Sequence[Posterior]) -> str | None:
-        """Return what speaks against what either part takes for granted."""
-        told = [part.refuted(posteriors) for part in (self.first, self.second)]
-        return next((words for words in told if words), None if None in told else "")
 
     def grown(self, steps: float) -> ProductPrior:
         """Return the product with limits that hold for several steps."""

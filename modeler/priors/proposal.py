@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler.priors.general import GeneralPrior
-from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, Posterior, RayImage, SharedAxis, Solution
+from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, RayImage, SharedAxis, Solution
 
 _TRIED = 4096  # draws by which the share of a guess within the support is told
 _LEAST_SHARE = 0.01  # a guess with less of its mass within the support is of no use
@@ -29,14 +29,6 @@ class AbstractGuess(AbstractPrior):
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
         """Return the axis that all steps share, as what is known has it."""
         return self.known.shared_axis(views)
-
-    def unassuming(self) -> AbstractPrior | None:
-        """Return what is known without what it takes for granted."""
-        return self.known.unassuming()
-
-    def refuted(self, posteriors: Sequence[Posterior]) -> str | None:
-        """Return what speaks against what is taken for known."""
-        return self.known.refuted(posteriors)
 
     def grown(self, steps: float) -> AbstractPrior:
         """Return the prior within limits that hold for several steps."""

@@ -19,7 +19,6 @@ from modeler.types import (
     AbstractMotion,
     AbstractPrior,
     Edge,
-    Outcome,
     Plane,
     Posterior,
     RayImage,
@@ -106,20 +105,6 @@ class TurntablePrior(AbstractPrior):
         learnt = common_axis(motions, float(np.radians(self.wobble_deg)), self.wobble_m)
         sense = self._sense([edge.posterior for edge in telling]) if self.step_sign == "unknown" else 0
         return replace(self, learnt=learnt, sense=sense, newest=max(solution.trajectory, default=None))
-
-    def unassuming(self) -> TurntablePrior | None:
-        """Return the prior that leaves open which way round the table turns; None where that is not told anyway."""
-        return replace(self, step_sign="unknown") if self.step_sign == "known" and self.step_deg else None
-
-    def refuted(self, posteriors: Sequence[Posterior]) -> str | None:
-        """Return in one line that views turn the other way round; pairs that are not sure tell nothing."""
-        sense = self._sense([posterior for posterior in posteriors if posterior.outcome is Outcome.CONVERGED])
-        if sense * self.step_deg >= 0.0:
-            return "" if sense else None
-        return (
-            f"the first views turn the other way round than --step-deg {self.step_deg:g} tells; "
-            f"is --step-deg {-self.step_deg:g} meant?"
-        )
 
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
         """Return the axis that all steps share, as far as the edge of each does not hold it; None where it is given.

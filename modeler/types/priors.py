@@ -7,7 +7,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from modeler.types.motions import AbstractMotion
-from modeler.types.posteriors import Posterior
 from modeler.types.solution import Edge, Solution
 from modeler.types.views import RayImage
 
@@ -60,18 +59,3 @@ class AbstractPrior(ABC):
         Only what no edge holds is told, so that all edges and the axis together count everything once.
         """
         return None
-
-    def unassuming(self) -> AbstractPrior | None:
-        """Return the prior without what a person easily gets wrong, as the way round a table turns.
-
-        None, the default, where there is nothing of the kind.
-        """
-        return None
-
-    def refuted(self, posteriors: Sequence[Posterior]) -> str | None:
-        """Return in one line what speaks against what `unassuming` leaves out; "" = nothing, None = not yet known.
-
-        Args:
-            posteriors: of pairs under that prior.
-        """
-        return ""
