@@ -12,7 +12,7 @@ from modeler import se3
 from modeler.experiment import Experiment, Pairing, Trial
 from modeler.priors import GeneralPrior
 from modeler.types import (
-    AbstractMotion,
+    AbstractPoseDensity,
     AbstractRegistrar,
     Array,
     Frame,
@@ -54,7 +54,7 @@ class Oracle(AbstractRegistrar):
     off_rad: float = 0.0
 
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         truth = POSES[target.index] @ se3.inverse(POSES[source.index])
         error = se3.exp(rng.normal(size=6) * SIGMAS) @ se3.exp(np.array([self.off_rad, 0, 0, 0, 0, 0]))

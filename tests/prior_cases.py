@@ -11,18 +11,18 @@ from modeler import se3
 from modeler.priors import (
     AxesPrior,
     FeaturesPrior,
-    ForeseenPrior,
     GeneralPrior,
     HeldPrior,
     Poke,
     PokePrior,
+    PredictedProposal,
     ProductPrior,
     TablePrior,
     TurntablePrior,
     VelocityPrior,
 )
 from modeler.types import (
-    AbstractMotion,
+    AbstractPoseDensity,
     AbstractPrior,
     Array,
     Camera,
@@ -138,7 +138,7 @@ class Case:
     shaken: float = 1e-5
     """Most that another camera frame changes in the log density, where cubes or draws depend on it."""
 
-    def motion(self, camera: Array | None = None) -> AbstractMotion:
+    def density(self, camera: Array | None = None) -> AbstractPoseDensity:
         """The density between the two views."""
         camera = np.eye(4) if camera is None else camera
         return self.prior(camera).between(*views(camera, table=self.table))
@@ -170,7 +170,7 @@ def foreseen(camera: Array) -> AbstractPrior:
     """A motion on the table that the graph foretells, about right."""
     spread = se3.adjoint(camera) @ (0.02**2 * np.eye(6)) @ se3.adjoint(camera).T
     about_right = camera @ turned(-STEP) @ se3.exp(np.full(6, 0.01)) @ se3.inverse(camera)
-    return ForeseenPrior(TablePrior(), PoseGaussian(about_right, spread))
+    return PredictedProposal(TablePrior(), PoseGaussian(about_right, spread))
 
 
 CASES: dict[str, Case] = {

@@ -28,7 +28,7 @@ from modeler.registration.clouds import (
     scaled_information,
     start,
 )
-from modeler.types import AbstractMotion, Array, Outcome, RayImage
+from modeler.types import AbstractPoseDensity, Array, Outcome, RayImage
 
 BODY = tabletop.Box((0.05, 0.08, 0.035))
 POSES = tabletop.turntable(24)[2:4]
@@ -51,7 +51,7 @@ def pair() -> Pair:
 
 
 @dataclass(frozen=True)
-class Normal(AbstractMotion):
+class Normal(AbstractPoseDensity):
     """A Gaussian about a motion, isotropic in rotation about a point and in shift."""
 
     pose: Array
@@ -69,7 +69,7 @@ class Normal(AbstractMotion):
 
 
 @dataclass(frozen=True)
-class AnyTurn(AbstractMotion):
+class AnyTurn(AbstractPoseDensity):
     """Any rotation at all about the centroids."""
 
     source_m: Array
@@ -123,9 +123,9 @@ def test_starts_without_turning_where_the_prior_has_no_centre(pair: Pair, rng: n
 
 def test_spread_is_stated_at_the_start_in_our_tangent(pair: Pair, rng: np.random.Generator) -> None:
     source, target = pair
-    motion = Normal(POSES[1] @ se3.inverse(POSES[0]), source.centroid_m, 0.1, 0.02)
-    begin = start(source, target, motion, rng)
-    xi = se3.log(se3.inverse(begin.target_from_source) @ motion.sample(20_000, rng))
+    density = Normal(POSES[1] @ se3.inverse(POSES[0]), source.centroid_m, 0.1, 0.02)
+    begin = start(source, target, density, rng)
+    xi = se3.log(se3.inverse(begin.target_from_source) @ density.sample(20_000, rng))
     # Sampled Gaussians of this spread have squared Mahalanobis length 6 on average.
     assert np.mean(np.einsum("ni,ij,nj->n", xi, begin.information, xi)) == pytest.approx(6.0, rel=0.05)
 

@@ -25,8 +25,8 @@ def box():
 
 
 def climbed(box, climb, seed=0):
-    pair, motion, _ = box
-    return climb.places(pair, motion, BASIN, np.random.default_rng(seed), effective_points=80.0)
+    pair, density, _ = box
+    return climb.places(pair, density, BASIN, np.random.default_rng(seed), effective_points=80.0)
 
 
 def heights(box, poses, climb):
@@ -61,10 +61,10 @@ def test_places_are_apart_and_come_again_with_the_seed(box):
 
 def test_a_turn_is_found_where_surface_leads_astray(box):
     """Most surface matches with another side of the box, though then it stands in space that was seen to be empty."""
-    pair, motion, truth = box
+    pair, density, truth = box
     dragged = Search(led_points=40.0)  # to the middle of the prior, so that few come down near the truth
-    astray = replace(dragged, poor=-np.inf).candidates(pair, motion, np.random.default_rng(1))
-    found = dragged.candidates(pair, motion, np.random.default_rng(1))
+    astray = replace(dragged, poor=-np.inf).candidates(pair, density, np.random.default_rng(1))
+    found = dragged.candidates(pair, density, np.random.default_rng(1))
     assert rotation_error_deg(astray.poses[0], truth) > 45.0
     assert rotation_error_deg(found.poses[0], truth) < 5.0  # samples find the rest of the way
     assert not found.scarce
@@ -72,8 +72,8 @@ def test_a_turn_is_found_where_surface_leads_astray(box):
 
 def test_an_even_prior_does_not_drag(box):
     """Where little surface holds a motion on its way down, the middle of what is possible is no better than its end."""
-    pair, motion, truth = box
-    found = replace(Search(), poor=-np.inf).candidates(pair, motion, np.random.default_rng(1))  # without a climb
+    pair, density, truth = box
+    found = replace(Search(), poor=-np.inf).candidates(pair, density, np.random.default_rng(1))  # without a climb
     assert rotation_error_deg(found.poses[0], truth) < 5.0
 
 

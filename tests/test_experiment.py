@@ -17,7 +17,7 @@ from modeler.experiment.viewed import viewed
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.types import (
-    AbstractMotion,
+    AbstractPoseDensity,
     AbstractPrior,
     AbstractRegistrar,
     Edge,
@@ -31,7 +31,7 @@ from modeler.types import (
 class Refusing(AbstractPrior):
     """Lacks what it needs."""
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         raise InputError("no robot was seen")
 
 
@@ -170,10 +170,10 @@ def test_sparse_experiments_give_methods_few_points(sparse: Mapping[str, int]) -
             self.seen: list[int] = []
 
         def register(
-            self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+            self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
         ) -> Posterior:
             self.seen.extend([len(source.points_m), len(target.points_m)])
-            return Oracle().register(source, target, motion, rng=rng)
+            return Oracle().register(source, target, density, rng=rng)
 
     dense, thin = Counting(), Counting()
     list(experiment(methods={"dense": dense}).trials(Recording()))

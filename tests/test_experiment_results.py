@@ -17,7 +17,7 @@ from PIL import Image
 from modeler import se3
 from modeler.experiment import Pairing, Trial, evaluate, summaries
 from modeler.types import (
-    AbstractMotion,
+    AbstractPoseDensity,
     AbstractRegistrar,
     InputError,
     Posterior,
@@ -52,10 +52,10 @@ def test_a_closed_turn_is_judged_by_what_all_its_steps_leave(known: bool) -> Non
         """Turns by a little too much about one axis at every step."""
 
         def register(
-            self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+            self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
         ) -> Posterior:
             truth = POSES[target.index] @ se3.inverse(POSES[source.index])
-            posterior = Oracle().register(source, target, motion, rng=rng)
+            posterior = Oracle().register(source, target, density, rng=rng)
             in_model = POSES[source.index] @ se3.exp(np.array([0, 0, 0.05, 0, 0, 0])) @ se3.inverse(POSES[source.index])
             return replace(posterior, pose=replace(posterior.pose, mean=truth @ in_model))
 

@@ -9,13 +9,13 @@ from test_kernels import ANISOTROPIC, INTRINSICS, ISOTROPIC, SHAPE, random_pose
 from modeler import se3
 from modeler.kernels import free_space as kernel
 from modeler.kernels import paper
-from modeler.priors.general import GeneralMotion, GeneralPrior
+from modeler.priors.general import GeneralDensity, GeneralPrior
 from modeler.registration.free_space import Draws, FreeSpace, Measured
 from modeler.se3 import matrices, rows
 
 CENTRE_M = np.array([0.02, -0.03, 0.8])
 MIDDLE = se3.exp(np.array([0.3, -0.5, 0.2, 0.0, 0.0, 0.0]))[:3, :3]
-MOTION = GeneralMotion(CENTRE_M, CENTRE_M + 0.05, np.radians(50.0), 0.04, MIDDLE)
+MOTION = GeneralDensity(CENTRE_M, CENTRE_M + 0.05, np.radians(50.0), 0.04, MIDDLE)
 # Lateral and range noise that leave windows of several pixels in an image of 64 px.
 NOISES = {
     "isotropic": 0.3 * ISOTROPIC,
@@ -134,16 +134,16 @@ def test_motions_drawn_by_number_are_those_of_the_prior():
 
 
 def test_a_spread_too_wide_to_draw_by_trying_is_left_to_the_prior(rng):
-    wide = GeneralMotion(CENTRE_M, CENTRE_M, np.radians(170.0), 0.04)
+    wide = GeneralDensity(CENTRE_M, CENTRE_M, np.radians(170.0), 0.04)
     assert Draws.of(wide.even_spread(), rng) is None
     assert Draws.of(None, rng) is None
-    narrow = GeneralPrior().grown(100.0).max_rotation_deg
-    assert Draws.of(GeneralMotion(CENTRE_M, CENTRE_M, np.radians(narrow), 0.04).even_spread(), rng) is not None
+    narrow = GeneralPrior().relaxed(100.0).max_rotation_deg
+    assert Draws.of(GeneralDensity(CENTRE_M, CENTRE_M, np.radians(narrow), 0.04).even_spread(), rng) is not None
 
 
 def test_which_motions_pass_depends_on_no_thread_and_no_batch(rng):
     free = FreeSpace.of(scene(rng, NOISES["isotropic"]), scene(rng, NOISES["isotropic"]), 4.0, 1e-6)
-    spread = GeneralMotion(CENTRE_M, CENTRE_M, 0.3, 0.04).even_spread()
+    spread = GeneralDensity(CENTRE_M, CENTRE_M, 0.3, 0.04).even_spread()
     draws = Draws.of(spread, rng)
     assert draws is not None
     whole = free.passing(draws, 0, 30_000)

@@ -13,7 +13,7 @@ from modeler import se3
 from modeler.graph import PoseGraph, solve
 from modeler.registration.importance import AdaptiveSampler
 from modeler.registration.posterior import weighted_gaussian
-from modeler.types import AbstractMotion, Array, PoseGaussian
+from modeler.types import AbstractPoseDensity, Array, PoseGaussian
 
 VARIANCE = 0.02e-2  # the check of the design, in units of a tenth of a radian and of a metre
 SAMPLER = AdaptiveSampler(enough=1000.0, kept=2000)
@@ -24,7 +24,7 @@ SPREAD = VARIANCE * ABOUT @ ABOUT.T  # the variance in all directions, about the
 
 @final
 @dataclass(frozen=True, eq=False)
-class Known(AbstractMotion):
+class Known(AbstractPoseDensity):
     """A Gaussian about a motion, of VARIANCE in all directions about the object."""
 
     mean: Array
@@ -48,9 +48,9 @@ def _off(pose: Array, rng: np.random.Generator) -> Array:
     return pose @ CENTRE @ se3.exp(-np.sqrt(VARIANCE) * rng.normal(size=6)) @ se3.inverse(CENTRE)
 
 
-def _registered(motion: AbstractMotion, images: Array, rng: np.random.Generator) -> PoseGaussian:
-    """The posterior of images that alone would say `images`, with VARIANCE, sampled from `motion` on."""
-    found = SAMPLER.run(motion, lambda poses: _log_gaussian(poses, images), OBJECT_M, rng)
+def _registered(density: AbstractPoseDensity, images: Array, rng: np.random.Generator) -> PoseGaussian:
+    """The posterior of images that alone would say `images`, with VARIANCE, sampled from `density` on."""
+    found = SAMPLER.run(density, lambda poses: _log_gaussian(poses, images), OBJECT_M, rng)
     return weighted_gaussian(found.poses, found.weights, OBJECT_M)
 
 

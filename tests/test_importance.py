@@ -10,7 +10,7 @@ import pytest
 from modeler import se3
 from modeler.registration.importance import AdaptiveSampler, effective_samples, pareto_tail, thinned
 from modeler.registration.mixture import Gaussians
-from modeler.types import AbstractMotion, Array
+from modeler.types import AbstractPoseDensity, Array
 
 CENTRE_M = np.array([0.05, -0.02, 0.7])
 ABOUT = se3.exp(np.array([0.2, -0.1, 0.3, 0.01, 0.02, -0.03]))
@@ -18,7 +18,7 @@ SIGMAS = np.array([0.05, 0.02, 0.08, 0.004, 0.01, 0.002])
 
 
 @dataclass(frozen=True, eq=False)
-class Around(AbstractMotion):
+class Around(AbstractPoseDensity):
     """A Gaussian of ξ about a motion, the only thing known."""
 
     sigmas: Array

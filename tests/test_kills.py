@@ -21,7 +21,7 @@ from modeler.export import Pairs, RunFolder, alone
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar
-from modeler.types import AbstractMotion, InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage
 from sequences import bundled, open_sequence
 
 BOX = str(bundled("box"))
@@ -41,10 +41,15 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     pairs, register = [], IcpRegistrar.register
 
     def noted(
-        self: IcpRegistrar, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self: IcpRegistrar,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
     ) -> Posterior:
         pairs.append((source.index, target.index))
-        return register(self, source, target, motion, rng=rng)
+        return register(self, source, target, density, rng=rng)
 
     monkeypatch.setattr(IcpRegistrar, "register", noted)
     return pairs
@@ -279,12 +284,12 @@ def test_an_answer_is_to_one_question_only(tmp_path: Path, asked: list[tuple[int
     frames = [open_sequence(BOX).frame(index) for index in (0, 1)]
     views = [Sensor().ray_image(frame, None) for frame in frames]
     nearer = Sensor().ray_image(replace(frames[0], depth_m=frames[0].depth_m - np.float32(0.001)), None)
-    priors = [GeneralPrior(), GeneralPrior().grown(2)]
+    priors = [GeneralPrior(), GeneralPrior().relaxed(2)]
     remembered = Remembered(IcpRegistrar(), Pairs(tmp_path), {})
 
     def ask(target: RayImage, prior: int = 0, seed: int = 0) -> int:
-        motion = priors[prior].between(views[1], target)
-        remembered.register(views[1], target, motion, rng=np.random.default_rng(seed))
+        density = priors[prior].between(views[1], target)
+        remembered.register(views[1], target, density, rng=np.random.default_rng(seed))
         return len(asked)
 
     assert [ask(views[0]), ask(views[0])] == [1, 1]

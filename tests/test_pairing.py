@@ -14,7 +14,7 @@ from modeler.pipeline.limits import believed
 from modeler.pipeline.pairing import Pairing
 from modeler.pipeline.state import State
 from modeler.types import (
-    AbstractMotion,
+    AbstractPoseDensity,
     AbstractPrior,
     Array,
     Edge,
@@ -32,7 +32,7 @@ TRUE_DEG, LIMIT_DEG = 25.0, 50.0
 
 @final
 @dataclass(frozen=True)
-class Limited(AbstractMotion):
+class Limited(AbstractPoseDensity):
     limit_deg: float
     evidence = True
 
@@ -48,10 +48,10 @@ class Limited(AbstractMotion):
 class Limits(AbstractPrior):
     limit_deg: float = LIMIT_DEG
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         return Limited(self.limit_deg)
 
-    def grown(self, steps: float) -> AbstractPrior:
+    def relaxed(self, steps: float) -> AbstractPrior:
         return replace(self, limit_deg=steps * self.limit_deg)
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:

@@ -17,12 +17,12 @@ from modeler.fusion import Fuser
 from modeler.graph import CommonAxis, PoseGraph, shared_noise, solve
 from modeler.pipeline import ACCEPTED, Modeler
 from modeler.pipeline.state import Seen, State
-from modeler.priors.bumps import Bumps
-from modeler.priors.proposal import Guided
+from modeler.priors.bumps import KernelMixture
+from modeler.priors.proposal import DefensiveMixture
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import (
-    AbstractMotion,
+    AbstractPoseDensity,
     AbstractPrior,
     AbstractRegistrar,
     Array,
@@ -47,7 +47,7 @@ SIGMAS = np.repeat([0.002, 0.0005], 3)
 
 @final
 @dataclass(frozen=True)
-class AnyMotion(AbstractMotion):
+class AnyDensity(AbstractPoseDensity):
     steps: float = 1.0
     evidence = True
 
@@ -66,12 +66,12 @@ class AnyPrior(AbstractPrior):
     axis: SharedAxis | None = None
     lessons: list[tuple[list[int], int]] = field(default_factory=list)
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         if (source.index, target.index) in self.refused:
             raise InputError(f"frames {source.index} and {target.index}: no plane")
-        return AnyMotion(self.steps)
+        return AnyDensity(self.steps)
 
-    def grown(self, steps: float) -> AbstractPrior:
+    def relaxed(self, steps: float) -> AbstractPrior:
         return replace(self, steps=steps)
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
@@ -93,19 +93,21 @@ class Oracle(AbstractRegistrar):
     priors: list[tuple[int, int, float]] = field(default_factory=list)
 
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
-        if isinstance(motion, Guided):  # the graph foretells it
-            (guess,) = motion.guesses
-            assert isinstance(guess, Bumps)
-            np.testing.assert_allclose(guess.motions[0, :3, :3], self._truth(source, target)[:3, :3], atol=0.1)
-            motion = motion.known
-        assert isinstance(motion, AnyMotion)
+        if isinstance(density, DefensiveMixture):  # the graph foretells it
+            (guess,) = density.proposals
+            assert isinstance(guess, KernelMixture)
+            np.testing.assert_allclose(guess.means[0, :3, :3], self._truth(source, target)[:3, :3], atol=0.1)
+            density = density.known
+        assert isinstance(density, AnyDensity)
         self.asked.append((source.index, target.index))
-        self.priors.append((source.index, target.index, motion.steps))
+        self.priors.append((source.index, target.index, density.steps))
         target_from_source = self._truth(source, target)
         error = se3.exp(self.noise * SIGMAS * rng.standard_normal(6))
-        lost = source.index in self.blind or ((source.index, target.index) in self.apart and motion.steps <= self.reach)
+        lost = source.index in self.blind or (
+            (source.index, target.index) in self.apart and density.steps <= self.reach
+        )
         pose = PoseGaussian(target_from_source @ error, np.diag(SIGMAS**2))
         outcome = Outcome.NO_OVERLAP if lost else Outcome.CONVERGED
         samples = np.broadcast_to(pose.mean, (50, 4, 4))

@@ -9,13 +9,13 @@ import pytest
 from prior_cases import NORMAL, edges, solution, told, turned, turntable, view, views
 
 from modeler import se3
-from modeler.priors import ForeseenPrior, Poke, PokePrior, TablePrior, VelocityPrior
+from modeler.priors import Poke, PokePrior, PredictedProposal, TablePrior, VelocityPrior
 from modeler.priors.about_axis import Axis
-from modeler.priors.bumps import Bumps
+from modeler.priors.bumps import KernelMixture
 from modeler.priors.common_axis import common_axis
 from modeler.priors.directions import directions_about
 from modeler.priors.on_plane import on_plane
-from modeler.priors.proposal import Guided
+from modeler.priors.proposal import DefensiveMixture
 from modeler.types import Array, Plane, PoseGaussian, RayImage
 
 HERE = np.eye(4)
@@ -96,14 +96,14 @@ def test_wherever_the_centre_of_friction_lies_the_contact_goes_with_the_finger()
 @pytest.mark.parametrize(("index", "goes_on"), [(3, True), (5, True), (6, False), (12, False)])
 def test_the_pace_is_not_believed_for_long(index: int, goes_on: bool) -> None:
     prior = VelocityPrior(TablePrior(175.0, 0.2)).learned(solution(HERE, 3), ())
-    assert isinstance(prior.between(at(index), at(2)), Guided) == goes_on
+    assert isinstance(prior.between(at(index), at(2)), DefensiveMixture) == goes_on
 
 
 def test_what_the_graph_foretells_is_never_taken_for_surer_than_a_search_needs() -> None:
-    motion = ForeseenPrior(TablePrior(), PoseGaussian(turned(-0.1), 1e-14 * np.eye(6))).between(SOURCE, TARGET)
-    assert isinstance(motion, Guided)
-    (guess,) = motion.guesses
-    assert isinstance(guess, Bumps)
+    density = PredictedProposal(TablePrior(), PoseGaussian(turned(-0.1), 1e-14 * np.eye(6))).between(SOURCE, TARGET)
+    assert isinstance(density, DefensiveMixture)
+    (guess,) = density.proposals
+    assert isinstance(guess, KernelMixture)
     assert (guess.sigma_rad, guess.sigma_m) == (pytest.approx(np.radians(2.0)), 0.004)
 
 

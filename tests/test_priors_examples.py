@@ -40,7 +40,7 @@ from modeler.priors import (
 from modeler.priors.axis_turn import AxisTurn, angles_and_axes
 from modeler.priors.common_axis import common_axis
 from modeler.priors.poke import pushed
-from modeler.priors.proposal import Guided
+from modeler.priors.proposal import DefensiveMixture
 from modeler.types import Array, Edge, InputError, Mode, Plane, RayImage, SharedAxis
 
 HERE = np.eye(4)
@@ -70,16 +70,16 @@ def test_a_step_turns_right_handed_about_the_tables_normal_and_errors_of_steps_a
 
 
 def test_without_a_table_the_axis_is_about_the_cameras_up(rng: np.random.Generator) -> None:
-    motion = TurntablePrior(24.0, 1.0).between(BARE_SOURCE, BARE_TARGET)
-    angle_rad, axes = angles_and_axes(motion.sample(4000, rng)[:, :3, :3])
+    density = TurntablePrior(24.0, 1.0).between(BARE_SOURCE, BARE_TARGET)
+    angle_rad, axes = angles_and_axes(density.sample(4000, rng)[:, :3, :3])
     assert np.degrees(angle_rad.mean()) == pytest.approx(24.0, abs=0.2)
     tilt_deg = np.degrees(np.arccos(np.clip(axes @ np.array([0.0, 1.0, 0.0]), -1, 1)))  # it turns back: about -up
     assert 30.0 < np.median(tilt_deg) < 45.0
 
 
 def test_of_any_axis_every_direction_is_as_likely(rng: np.random.Generator) -> None:
-    motion = TurntablePrior(24.0, 1.0, axis_sigma_deg=180.0).between(BARE_SOURCE, BARE_TARGET)
-    _, axes = angles_and_axes(motion.sample(8000, rng)[:, :3, :3])
+    density = TurntablePrior(24.0, 1.0, axis_sigma_deg=180.0).between(BARE_SOURCE, BARE_TARGET)
+    _, axes = angles_and_axes(density.sample(8000, rng)[:, :3, :3])
     np.testing.assert_allclose(axes.mean(axis=0), 0.0, atol=0.03)
     np.testing.assert_allclose(axes.T @ axes / len(axes), np.eye(3) / 3, atol=0.02)
 
@@ -94,9 +94,9 @@ def test_a_turntable_does_not_lift_the_object(rng: np.random.Generator) -> None:
 
 def test_a_turntable_without_any_error_is_still_a_density(rng: np.random.Generator) -> None:
     prior = TurntablePrior(24.0, 0.0, axis_direction=told(NORMAL), axis_sigma_deg=0.0, wobble_deg=0.0, wobble_m=0.0)
-    motion = prior.between(SOURCE, TARGET)
-    samples = motion.sample(100, rng)
-    assert np.isfinite(motion.log_density(samples)).all()
+    density = prior.between(SOURCE, TARGET)
+    samples = density.sample(100, rng)
+    assert np.isfinite(density.log_density(samples)).all()
     np.testing.assert_allclose(turns_deg(samples), -24.0, atol=0.01)
 
 
@@ -134,11 +134,11 @@ def test_views_without_their_table_are_refused_where_it_is_asked_for() -> None:
 
 
 def test_the_table_prior_holds_an_object_on_its_table(rng: np.random.Generator) -> None:
-    motion = TablePrior(sigma_tilt_deg=0.01, sigma_height_m=1e-5, max_shift_m=0.03).between(SOURCE, TARGET)
+    density = TablePrior(sigma_tilt_deg=0.01, sigma_height_m=1e-5, max_shift_m=0.03).between(SOURCE, TARGET)
     plane = SOURCE.plane
     assert isinstance(plane, Plane)
     before = plane.height_m(SOURCE.points_m)
-    for sample in motion.sample(20, rng):
+    for sample in density.sample(20, rng):
         after = plane.height_m(se3.transform(sample, SOURCE.points_m))
         np.testing.assert_allclose(after, before, atol=0.003)  # what the plane's own tilt of 0.004 rad leaves
 
@@ -272,22 +272,22 @@ def test_steps_count_once_however_many_edges_follow_from_them(prior: TurntablePr
         taught.between(SOURCE, TARGET).log_evidence(samples), prior.between(SOURCE, TARGET).log_density(samples)
     )
     earlier = taught.between(SOURCE, at(1, TARGET))
-    assert isinstance(earlier, Guided)
+    assert isinstance(earlier, DefensiveMixture)
     evidence = earlier.log_evidence(earlier.known.sample(300, np.random.default_rng(RNG)))
     assert np.isfinite(evidence).all()
     assert earlier.known.sample(1, np.random.default_rng(0)).shape == (1, 4, 4)
-    assert not isinstance(earlier.known, Guided)
+    assert not isinstance(earlier.known, DefensiveMixture)
 
 
 # A robot's hand
 
 
 def test_the_object_goes_with_the_hand(rng: np.random.Generator) -> None:
-    motion = held(HERE).between(SOURCE, TARGET)
-    off = se3.log(se3.inverse(truth(HERE)) @ motion.sample(4000, rng))
+    density = held(HERE).between(SOURCE, TARGET)
+    off = se3.log(se3.inverse(truth(HERE)) @ density.sample(4000, rng))
     np.testing.assert_allclose(np.degrees(off[:, :3].std(axis=0)), 3.0, rtol=0.05)
     place_m = hand(HERE)[1][3][:3, 3]
-    shift_m = np.array([se3.transform(pose, place_m[None])[0] for pose in motion.sample(2000, rng)])
+    shift_m = np.array([se3.transform(pose, place_m[None])[0] for pose in density.sample(2000, rng)])
     np.testing.assert_allclose(shift_m.std(axis=0), 0.008, rtol=0.08)
 
 
@@ -312,14 +312,14 @@ def test_a_hand_that_turned_far_leaves_room_for_what_is_seen(steps: int) -> None
 
 def test_a_hand_whose_prior_grows_leaves_more_room() -> None:
     taught = replace(held(HERE), newest=9)
-    for prior in (taught, taught.grown(2.0)):
-        motion = prior.between(SOURCE, TARGET)
-        assert isinstance(motion, Guided)
-        samples = motion.known.sample(2000, np.random.default_rng(RNG))
+    for prior in (taught, taught.relaxed(2.0)):
+        density = prior.between(SOURCE, TARGET)
+        assert isinstance(density, DefensiveMixture)
+        samples = density.known.sample(2000, np.random.default_rng(RNG))
         offset_m = samples[:, :3, :3] @ SOURCE.centroid_m + samples[:, :3, 3] - TARGET.centroid_m
         assert np.linalg.norm(offset_m, axis=1).max() == pytest.approx(prior.max_offset_m, rel=0.02)
-    assert taught.grown(2.0).max_offset_m > 1.8 * taught.max_offset_m
-    assert taught.grown(1.0).max_offset_m == taught.max_offset_m
+    assert taught.relaxed(2.0).max_offset_m > 1.8 * taught.max_offset_m
+    assert taught.relaxed(1.0).max_offset_m == taught.max_offset_m
 
 
 def test_a_missing_pose_is_interpolated_and_less_sure() -> None:

@@ -51,9 +51,9 @@ def test_thin_legs_are_not_dragged_behind():
     for earlier, later in zip(sequence.indices[:-1], sequence.indices[1:], strict=True):
         for source, target, sign in ((later, earlier, 1.0), (earlier, later, -1.0)):
             there = true_motion(truth, target, source)
-            motion = TablePrior().between(views[source], views[target])
+            density = TablePrior().between(views[source], views[target])
             rng = np.random.default_rng([source, target])
-            found = VisibilityRegistrar().register(views[source], views[target], motion, rng=rng)
+            found = VisibilityRegistrar().register(views[source], views[target], density, rng=rng)
             centre_m = views[source].centroid_m
             error = se3.log(se3.inverse(about(found.pose, centre_m).mean) @ there @ se3.translation(centre_m))
             drags_mm.append(1e3 * sign * error[3])

@@ -10,9 +10,18 @@ import pytest
 import tabletop
 
 from modeler import registration, se3
-from modeler.priors import ForeseenPrior, GeneralPrior
+from modeler.priors import GeneralPrior, PredictedProposal
 from modeler.rays import Sensor
-from modeler.types import AbstractMotion, AbstractRegistrar, Array, Frame, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import (
+    AbstractPoseDensity,
+    AbstractRegistrar,
+    Array,
+    Frame,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+)
 
 PRIOR = GeneralPrior(max_rotation_deg=25.0, max_offset_m=0.02)
 BODY = tabletop.Box((0.05, 0.08, 0.035))
@@ -42,19 +51,19 @@ every_cloud_method = pytest.mark.parametrize("method", CLOUD_METHODS, ids=lambda
 
 
 @dataclass(frozen=True)
-class Carried(AbstractMotion):
-    """Another motion between views that were each moved: target_new_from_target · T · source_from_source_new."""
+class Carried(AbstractPoseDensity):
+    """Another density between views that were each moved: target_new_from_target · T · source_from_source_new."""
 
-    motion: AbstractMotion
+    density: AbstractPoseDensity
     before: Array
     after: Array
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        return self.after @ self.motion.sample(count, rng) @ self.before
+        return self.after @ self.density.sample(count, rng) @ self.before
 
     def log_density(self, target_from_source: Array) -> Array:
-        return self.motion.log_density(se3.inverse(self.after) @ target_from_source @ se3.inverse(self.before))
+        return self.density.log_density(se3.inverse(self.after) @ target_from_source @ se3.inverse(self.before))
 
 
 @cache
@@ -124,7 +133,7 @@ def test_a_guess_tells_where_to_look_and_is_no_evidence(method: AbstractRegistra
     turned_deg = []
     for off_deg in (-6.0, 6.0):
         xi = np.concatenate([np.radians(off_deg) * axis, np.zeros(3)])
-        guess = ForeseenPrior(PRIOR, PoseGaussian(se3.moved(truth, xi, source.centroid_m), spread))
+        guess = PredictedProposal(PRIOR, PoseGaussian(se3.moved(truth, xi, source.centroid_m), spread))
         found = method.register(source, target, guess.between(source, target), rng=np.random.default_rng(5))
         turned_deg.append(np.degrees(se3.difference(truth, found.pose.mean, source.centroid_m)[:3] @ axis))
     assert abs(turned_deg[1] - turned_deg[0]) < 1.5  # of the 12 between the guesses
@@ -146,11 +155,11 @@ def test_moving_the_views_moves_the_answer(method: AbstractRegistrar) -> None:
     source, target = view(0), view(1)
     source_new_from_source = se3.exp(np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.05]))
     target_new_from_target = se3.exp(np.array([-0.4, 0.1, 0.2, -0.2, 0.1, 0.1]))
-    motion = Carried(PRIOR.between(source, target), se3.inverse(source_new_from_source), target_new_from_target)
+    density = Carried(PRIOR.between(source, target), se3.inverse(source_new_from_source), target_new_from_target)
     found = method.register(
         moved(source, source_new_from_source),
         moved(target, target_new_from_target),
-        motion,
+        density,
         rng=np.random.default_rng(5),
     )
     back = se3.inverse(target_new_from_target) @ found.pose.mean @ source_new_from_source
@@ -175,10 +184,10 @@ def test_states_a_proper_gaussian(method: AbstractRegistrar) -> None:
 @every_method
 @pytest.mark.parametrize("missing", ["source", "target", "both"])
 def test_says_so_where_there_is_nothing_to_register(method: AbstractRegistrar, missing: str) -> None:
-    motion = PRIOR.between(view(0), view(1))
+    density = PRIOR.between(view(0), view(1))
     source = view(0) if missing == "target" else empty(0)
     target = view(1) if missing == "source" else empty(1)
-    found = method.register(source, target, motion, rng=np.random.default_rng(5))
+    found = method.register(source, target, density, rng=np.random.default_rng(5))
     assert found.outcome in (Outcome.TOO_FEW_POINTS, Outcome.NO_OVERLAP)
     assert found.overlap == 0.0
     assert not found.matches
@@ -200,6 +209,6 @@ def test_gives_the_same_answer_for_the_same_seed(method: AbstractRegistrar) -> N
 def test_finds_no_overlap_between_views_that_the_prior_keeps_apart(method: AbstractRegistrar) -> None:
     source, target = view(0), view(1)
     apart = se3.translation(np.array([0.6, 0.0, 0.0]))
-    motion = Carried(PRIOR.between(source, target), np.eye(4), apart)
-    found = method.register(source, target, motion, rng=np.random.default_rng(5))
+    density = Carried(PRIOR.between(source, target), np.eye(4), apart)
+    found = method.register(source, target, density, rng=np.random.default_rng(5))
     assert not found.usable

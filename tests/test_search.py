@@ -10,10 +10,10 @@ from calibration.study import Condition, rendered_views, staged
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior
-from modeler.priors.general import GeneralMotion
+from modeler.priors.general import GeneralDensity
 from modeler.rays import Sensor
 from modeler.registration.candidates import Candidates
-from modeler.registration.mixture import Gaussians, MixtureMotion
+from modeler.registration.mixture import Gaussians, MixtureProposal
 from modeler.registration.modes import Place, by_place, weighed
 from modeler.registration.search import Search
 from modeler.registration.visibility import VisibilityRegistrar
@@ -47,10 +47,10 @@ def turned(angle_rad):
 @pytest.mark.parametrize("name", ["box", "flashlight"])
 def test_the_search_finds_the_motion_in_a_wide_prior(name, rng):
     source, target, truth = views(name, source=2, target=0)
-    motion = GeneralPrior(max_rotation_deg=110.0, max_offset_m=0.08).between(source, target)
+    density = GeneralPrior(max_rotation_deg=110.0, max_offset_m=0.08).between(source, target)
     pair = VisibilityRegistrar().pair(source, target, rng)
-    found = Search().candidates(pair, motion, rng)
-    assert np.isfinite(motion.log_density(found.poses)).all()
+    found = Search().candidates(pair, density, rng)
+    assert np.isfinite(density.log_density(found.poses)).all()
     assert (np.diff(found.scores[~found.blunt]) <= 0).all()
     rolled_deg = min(rotation_error_deg(pose, truth) for pose in found.poses)
     assert rolled_deg < 8.0  # a flashlight's roll is all but free
@@ -73,10 +73,10 @@ def test_a_stool_may_have_turned_either_way():
     made, truth = rendered_views(sequence), sequence.truth()
     target, source = (made[index] for index in sequence.indices)
     right = true_motion(truth, target.index, source.index)
-    motion = GeneralPrior().between(source, target)
+    density = GeneralPrior().between(source, target)
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        found = Search().candidates(VisibilityRegistrar().pair(source, target, rng), motion, rng)
+        found = Search().candidates(VisibilityRegistrar().pair(source, target, rng), density, rng)
         turned_deg = np.array([rotation_error_deg(pose, right) for pose in found.poses[~found.blunt]])
         assert (turned_deg < 3.0).any()
         assert (np.abs(turned_deg - 90.0) < 3.0).any()
@@ -85,10 +85,10 @@ def test_a_stool_may_have_turned_either_way():
 def test_the_search_goes_on_along_the_ridge_of_a_roll(rng):
     """From one good pose of a tube the whole of its roll is found, and what was found blunt is kept."""
     source, target, truth = views("tube", source=1, target=0)
-    motion = GeneralPrior().between(source, target)
+    density = GeneralPrior().between(source, target)
     pair, search = VisibilityRegistrar().pair(source, target, rng), Search()
     blunt = candidates([truth @ turned(0.1)], [0.1], [0.0], [True])
-    onward = search.onward(pair, motion, blunt, truth[None], rng)
+    onward = search.onward(pair, density, blunt, truth[None], rng)
     rolled_deg = [rotation_error_deg(pose, truth) for pose in onward.poses[~onward.blunt]]
     assert max(rolled_deg) > 20.0
     assert onward.blunt.sum() == 1
@@ -129,25 +129,25 @@ def test_places_are_weighed_and_those_of_no_weight_dropped(rng):
 def mixture(rng):
     """Three Gaussians a few centimetres off the axes of motion, over a general prior."""
     centre_m = np.array([0.02, -0.05, 0.8])
-    known = GeneralMotion(centre_m, centre_m + 0.01, max_rotation_rad=0.9, max_offset_m=0.04)
+    known = GeneralDensity(centre_m, centre_m + 0.01, max_rotation_rad=0.9, max_offset_m=0.04)
     means = se3.exp(rng.normal(size=(3, 6)) * np.repeat([0.3, 0.02], 3))
     spreads = np.linalg.cholesky(np.stack([np.cov(rng.normal(size=(6, 20))) for _ in range(3)]))
     spreads *= np.repeat([0.1, 0.005], 3)[:, None]
-    return MixtureMotion(known, Gaussians(means, spreads, np.log([0.5, 0.3, 0.2]), centre_m))
+    return MixtureProposal(known, Gaussians(means, spreads, np.log([0.5, 0.3, 0.2]), centre_m))
 
 
 def test_a_mixture_has_the_density_of_its_samples(rng):
     """∫ q over a broad known density, by importance: 1; and the mean of log q agrees with the entropy of samples."""
-    motion = mixture(rng)
-    broad = replace(motion.gaussians, spreads=2.0 * motion.gaussians.spreads)
+    density = mixture(rng)
+    broad = replace(density.gaussians, spreads=2.0 * density.gaussians.spreads)
     samples = broad.sample(40_000, rng)
-    ratio = np.exp(motion.log_density(samples) - broad.log_density(samples))
+    ratio = np.exp(density.log_density(samples) - broad.log_density(samples))
     assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std() / np.sqrt(len(ratio))
 
 
 def test_a_narrow_component_has_the_gaussian_density(rng):
-    motion = mixture(rng)
-    several = motion.gaussians
+    density = mixture(rng)
+    several = density.gaussians
     narrow = Gaussians(several.means[:1], 0.01 * several.spreads[:1], np.zeros(1), several.centre_m)
     centre = se3.translation(several.centre_m)
     xi = (narrow.spreads[0] @ rng.normal(size=(6, 50))).T
@@ -159,6 +159,6 @@ def test_a_narrow_component_has_the_gaussian_density(rng):
 
 
 def test_a_mixture_only_proposes(rng):
-    motion = mixture(rng)
-    samples = motion.sample(200, rng)
-    np.testing.assert_array_equal(motion.log_evidence(samples), motion.known.log_density(samples))
+    density = mixture(rng)
+    samples = density.sample(200, rng)
+    np.testing.assert_array_equal(density.log_evidence(samples), density.known.log_density(samples))

@@ -61,8 +61,8 @@ def test_harmed_images_cost_accuracy_not_honesty(flashlight, harm, rng):
 def test_a_motion_beyond_the_prior_is_not_passed_off_as_one_within(flashlight, rng):
     frames, plane, sensor, _ = flashlight
     target, source = (sensor.ray_image(frame, plane) for frame in frames)
-    motion = TablePrior(max_rotation_deg=12.0).between(source, target)  # the object turned by 24°
-    posterior = VisibilityRegistrar().register(source, target, motion, rng=rng)
+    density = TablePrior(max_rotation_deg=12.0).between(source, target)  # the object turned by 24°
+    posterior = VisibilityRegistrar().register(source, target, density, rng=rng)
     assert posterior.outcome is Outcome.AT_LIMIT
     assert not posterior.usable
 

@@ -18,7 +18,7 @@ from modeler.export import RunFolder, RunMeta, alone
 from modeler.export.report import FrameRecord
 from modeler.fusion import Fuser, Match, Matcher, own_covariances
 from modeler.graph import PoseGraph, solve
-from modeler.priors.bumps import Bumps
+from modeler.priors.bumps import KernelMixture
 from modeler.registration import VisibilityRegistrar
 from modeler.types import ACCEPTED, Array, Edge, InputError, Outcome, Posterior, RayImage, Segmentation, Solution, Step
 from viz.stream import open_stream
@@ -129,7 +129,7 @@ def _edges(first: Reopened, second: Reopened, match: Match, options: Join) -> tu
         views = second.views[source], first.views[target]
         poses = second.solution.trajectory[source], first.solution.trajectory[target]
         guess = se3.inverse(poses[1]) @ match.target_from_source @ poses[0]
-        motion = Bumps(
+        density = KernelMixture(
             guess[None],
             np.ones(1),
             centre_m=views[0].centroid_m,
@@ -138,7 +138,7 @@ def _edges(first: Reopened, second: Reopened, match: Match, options: Join) -> tu
             evidence=False,
         )
         rng = np.random.default_rng([options.seed, source, target])
-        posterior = VisibilityRegistrar().register(*views, motion, rng=rng)
+        posterior = VisibilityRegistrar().register(*views, density, rng=rng)
         edges.append(_judged(posterior, guess))
     return tuple(edges)
 

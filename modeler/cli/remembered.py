@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from modeler.export import Pairs
-from modeler.types import AbstractMotion, AbstractRegistrar, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, AbstractRegistrar, Posterior, RayImage
 
 _DRAWN = 64  # motions by which one prior is told from another
 
@@ -28,31 +28,33 @@ class Remembered(AbstractRegistrar):
     """Of the packages: with others, answers may be others."""
 
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior of target_from_source."""
-        question = self._question((source, target), motion, rng)
+        question = self._question((source, target), density, rng)
         known = self.pairs.get(source.index, target.index, question)
         if known is not None:
             return known
-        found = self.registrar.register(source, target, motion, rng=rng)
+        found = self.registrar.register(source, target, density, rng=rng)
         self.pairs.keep(found, question)
         return found
 
-    def _question(self, views: tuple[RayImage, RayImage], motion: AbstractMotion, rng: np.random.Generator) -> str:
+    def _question(
+        self, views: tuple[RayImage, RayImage], density: AbstractPoseDensity, rng: np.random.Generator
+    ) -> str:
         """Return a digest of all that an answer depends on.
 
         A pair may be asked about more than once: with a prior that was grown, or has learnt from frames in between.
         """
         digest = hashlib.blake2b(digest_size=12)
-        asked = (self.registrar, sorted(self.versions.items()), rng.bit_generator.state, motion.evidence)
+        asked = (self.registrar, sorted(self.versions.items()), rng.bit_generator.state, density.evidence)
         digest.update(" ".join(map(str, asked)).encode())
         for view in views:
             frame = view.frame
             digest.update(f"{frame.camera!r} {view.plane!r} {view.sigma_wh!r} {view.sigma_r_m!r}".encode())
             for pixels in (frame.depth_m, frame.mask, frame.colour, view.points_m):
                 digest.update(b"none" if pixels is None else np.ascontiguousarray(pixels).tobytes())
-        drawn = motion.sample(_DRAWN, np.random.default_rng(0))
-        for numbers in (drawn, motion.log_density(drawn), motion.log_evidence(drawn)):
+        drawn = density.sample(_DRAWN, np.random.default_rng(0))
+        for numbers in (drawn, density.log_density(drawn), density.log_evidence(drawn)):
             digest.update(np.ascontiguousarray(numbers).tobytes())
         return digest.hexdigest()

@@ -137,11 +137,11 @@ class Experiment:
         """
         try:
             prior = self.prior.learned(Solution(), trusted) if self.learn else self.prior
-            motion = prior.between(source, target)
+            density = prior.between(source, target)
         except InputError as error:
             return str(error)
         rng = np.random.default_rng([self.seed, source.index, target.index])
-        return method.register(source, target, motion, rng=rng)
+        return method.register(source, target, density, rng=rng)
 
 
 def _blank(sequence: str, method: str, pair: Pair, truth: Array | None) -> Trial:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from modeler import se3
-from modeler.types import AbstractMotion, Array, BoolArray, Mode, Outcome, Posterior, as_one, separate
+from modeler.types import AbstractPoseDensity, Array, BoolArray, Mode, Outcome, Posterior, as_one, separate
 
 _SURPRISE_NATS = 7.0  # one motion of a thousand goes beyond what is known
 _MORE_OVERLAP = 0.15  # sides that are alike match about as much; the right place shows more than the end of the limits
@@ -19,7 +19,7 @@ _ELSEWHERE_RAD = 0.26  # two registrations turned against each other by more are
 _LEAST_WEIGHT = 0.01  # of a mode that is kept
 
 
-def believed(within: Posterior, wider: Posterior, known: AbstractMotion) -> Posterior:
+def believed(within: Posterior, wider: Posterior, known: AbstractPoseDensity) -> Posterior:
     """Return what is believed of a view that a prior's limits seemed to cut off.
 
     Args:
@@ -38,7 +38,7 @@ def believed(within: Posterior, wider: Posterior, known: AbstractMotion) -> Post
     return _discounted(wider, known)
 
 
-def _discounted(posterior: Posterior, known: AbstractMotion) -> Posterior:
+def _discounted(posterior: Posterior, known: AbstractPoseDensity) -> Posterior:
     """Return a posterior with modes beyond the limits as unlikely as such motions are."""
     if not separate(posterior.modes):
         return posterior
@@ -61,6 +61,6 @@ def _discounted(posterior: Posterior, known: AbstractMotion) -> Posterior:
     )
 
 
-def _inside(known: AbstractMotion, motions: Array) -> BoolArray:
+def _inside(known: AbstractPoseDensity, motions: Array) -> BoolArray:
     """Return which motions (n, 4, 4) are within the limits."""
     return np.isfinite(known.log_density(motions))

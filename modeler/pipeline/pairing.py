@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from modeler.closure import Closer
 from modeler.pipeline.limits import believed
 from modeler.pipeline.state import State
-from modeler.priors import ForeseenPrior
+from modeler.priors import PredictedProposal
 from modeler.registration.posterior import failed
 from modeler.types import AbstractPrior, Edge, InputError, Outcome, Posterior, RayImage
 
@@ -56,7 +56,7 @@ class Pairing:
             glances = self._glances(state, view, previous, prior, again=again)
             if not _promising(glances[-1]):
                 return glances
-        odometry = self._pair(state, view, previous, prior.grown(steps) if steps > 1 else prior)
+        odometry = self._pair(state, view, previous, prior.relaxed(steps) if steps > 1 else prior)
         posteriors = (odometry,)
         base, _ = self.closer.placement(posteriors, state.map_view, steps=steps)
         if base is None:
@@ -74,14 +74,14 @@ class Pairing:
         targets = self.closer.closure_targets(base, state.map_view, last=last)
         targets = [target for target in targets if target not in tried]
         foreseen = [
-            ForeseenPrior(prior, self.closer.predicted_motion(base, target, state.solution)) for target in targets
+            PredictedProposal(prior, self.closer.predicted_motion(base, target, state.solution)) for target in targets
         ]
         return (*posteriors, *self._pairs(state, [(view, target) for target in targets], foreseen))
 
     def spanning(self, state: State, pairs: Sequence[tuple[int, int]]) -> Iterator[Posterior]:
         """Yield posteriors of pairs (source, target) of views of the graph that were not registered yet."""
-        prior = self.prior.learned(state.solution, state.graph.edges).grown(_ROOM)
-        foreseen = [ForeseenPrior(prior, state.solution.relative_gaussian(t, s)) for s, t in pairs]
+        prior = self.prior.learned(state.solution, state.graph.edges).relaxed(_ROOM)
+        foreseen = [PredictedProposal(prior, state.solution.relative_gaussian(t, s)) for s, t in pairs]
         yield from self._pairs(state, [(state.views[source], target) for source, target in pairs], foreseen)
 
     def explained(self, edges: Sequence[Edge]) -> tuple[Edge, ...]:
@@ -100,7 +100,7 @@ class Pairing:
 
         After frames that were searched for in vain (a hand hides the object), another is likely one more.
         """
-        grown = prior.grown(max(state.steps(view.index, previous), 2))
+        grown = prior.relaxed(max(state.steps(view.index, previous), 2))
         glances, target = (), previous
         while target is not None:
             glances = (*glances, self._pair(state, view, target, grown, briefly=True))
@@ -115,7 +115,7 @@ class Pairing:
     ) -> tuple[Posterior, ...]:
         """Return posteriors of a view that the previous one does not place: in a grown prior, and of other views."""
         steps = state.steps(view.index, odometry.target)
-        grown = prior.grown(max(steps, 2))
+        grown = prior.relaxed(max(steps, 2))
         if steps == 1 and odometry.outcome in _BEYOND:  # the motion may be larger than the prior allows for one step
             wider = self._pair(state, view, odometry.target, grown)
             seconds = odometry.seconds + wider.seconds

@@ -2,7 +2,7 @@
 
 from modeler.priors.axes import AxesPrior as AxesPrior
 from modeler.priors.features import FeaturesPrior as FeaturesPrior
-from modeler.priors.foreseen import ForeseenPrior as ForeseenPrior
+from modeler.priors.foreseen import PredictedProposal as PredictedProposal
 from modeler.priors.general import GeneralPrior as GeneralPrior
 from modeler.priors.held import HeldPrior as HeldPrior
 from modeler.priors.poke import Poke as Poke

@@ -9,7 +9,7 @@ import numpy as np
 from modeler.priors.axis_turn import AxisTurn, angles_and_axes, spread
 from modeler.priors.general import centroid_offset
 from modeler.priors.table import sample_disc
-from modeler.types import AbstractMotion, Array
+from modeler.types import AbstractPoseDensity, Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Axis:
 
 
 @dataclass(frozen=True, eq=False)
-class AboutAxis(AbstractMotion):
+class AboutAxis(AbstractPoseDensity):
     """A turn about an axis that does not shift along it.
 
     Where the axis lies is read off a motion itself, as well as its rotation shows it, and off what was expected. Where

@@ -9,12 +9,12 @@ import numpy as np
 from modeler import se3
 from modeler.priors.directions import across_axis, directions_about
 from modeler.priors.general import centroid_offset
-from modeler.priors.proposal import AbstractGuess, guided
-from modeler.types import AbstractMotion, Array, RayImage
+from modeler.priors.proposal import AbstractProposal, defensive_mixture
+from modeler.types import AbstractPoseDensity, Array, RayImage
 
 
 @dataclass(frozen=True)
-class AxesPrior(AbstractGuess):
+class AxesPrior(AbstractProposal):
     """The long axes of the two surfaces come to lie along each other, either way round; it proposes and is no evidence.
 
     Whatever turns about that axis is left open. Surfaces that are not long say nothing.
@@ -27,7 +27,7 @@ class AxesPrior(AbstractGuess):
     min_elongation: float = 1.6
     """Least ratio of the standard deviations along the first principal axis and the second."""
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source: that of what is known, unless both surfaces are long.
 
         Raises:
@@ -45,11 +45,11 @@ class AxesPrior(AbstractGuess):
             sigma_rad=float(np.radians(self.axes_sigma_deg)),
             sigma_m=self.axes_sigma_m,
         )
-        return guided(known, [aligned])
+        return defensive_mixture(known, [aligned])
 
 
 @dataclass(frozen=True, eq=False)
-class Aligned(AbstractMotion):
+class Aligned(AbstractPoseDensity):
     """A von Mises-Fisher direction of one axis about another's line, any turn about it, a Gaussian centroid."""
 
     source_axis: Array

@@ -10,21 +10,21 @@ from scipy.special import i0e, i1e
 
 from modeler import se3
 from modeler.priors.directions import directions
-from modeler.types import AbstractMotion, Array
+from modeler.types import AbstractPoseDensity, Array
 
 _NODES = 4097
 
 
 @dataclass(frozen=True, eq=False)
-class Bumps(AbstractMotion):
+class KernelMixture(AbstractPoseDensity):
     """A matrix Fisher kernel exp(κ (cos θ - 1)) in the rotation, κ = 1/σ², and a Gaussian in where a point goes.
 
     The kernel's integral over rotations is 8π² e⁻ᵏ (I₀(κ) - I₁(κ)). It needs no angle, so that many bumps cost little.
     """
 
-    motions: Array
+    means: Array
     """(k, 4, 4) target_from_source, the middles of the bumps."""
-    shares: Array
+    weights: Array
     """(k,) weight of each, summing to 1."""
     centre_m: Array
     """(3,) point of the source whose whereabouts the Gaussian holds, as beside an object's centroid."""
@@ -36,7 +36,7 @@ class Bumps(AbstractMotion):
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Draw motions (count, 4, 4)."""
-        middles = self.motions[rng.choice(len(self.shares), count, p=self.shares)]
+        middles = self.means[rng.choice(len(self.weights), count, p=self.weights)]
         angles, cumulative = self._angles
         angle_rad = np.interp(rng.random(count), cumulative, angles)
         vectors = np.concatenate([angle_rad[:, None] * directions(count, rng), np.zeros((count, 3))], axis=1)
@@ -49,7 +49,7 @@ class Bumps(AbstractMotion):
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of motions (n, 4, 4)."""
         rotations, places_m = self._flat(target_from_source)
-        middle_rotations, middle_places_m = self._flat(self.motions)
+        middle_rotations, middle_places_m = self._flat(self.means)
         # 2 (cos θ - 1) = trace(R_middleᵀ R) - 3, and the trace is a sum over elements.
         exponents = 0.5 * self._concentration * (rotations @ middle_rotations.T - 3.0)
         exponents -= (0.5 / self.sigma_m**2) * (
@@ -57,7 +57,7 @@ class Bumps(AbstractMotion):
             - 2.0 * places_m @ middle_places_m.T
             + np.sum(middle_places_m**2, axis=1)
         )
-        exponents += np.log(self.shares)
+        exponents += np.log(self.weights)
         top = exponents.max(axis=1)
         return top + np.log(np.sum(np.exp(exponents - top[:, None]), axis=1)) - self._log_volume
 
@@ -69,7 +69,7 @@ class Bumps(AbstractMotion):
 
     @cached_property
     def _middle_m(self) -> Array:
-        return np.mean(self.motions[:, :3, :3] @ self.centre_m + self.motions[:, :3, 3], axis=0)
+        return np.mean(self.means[:, :3, :3] @ self.centre_m + self.means[:, :3, 3], axis=0)
 
     @property
     def _concentration(self) -> float:

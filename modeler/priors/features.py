@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler.features import fpfh, kabsch, mutual_matches
-from modeler.priors.bumps import Bumps
-from modeler.priors.proposal import AbstractGuess, guided
-from modeler.types import AbstractMotion, Array, RayImage
+from modeler.priors.bumps import KernelMixture
+from modeler.priors.proposal import AbstractProposal, defensive_mixture
+from modeler.types import AbstractPoseDensity, Array, RayImage
 
 _DRAWS = 20_000  # triples looked at
 _JUDGED = 1000  # at most so many of their motions are put to the vote
 
 
 @dataclass(frozen=True)
-class FeaturesPrior(AbstractGuess):
+class FeaturesPrior(AbstractProposal):
     """Triples of matching points lay the surfaces on each other; a bump about each good one proposes, no evidence.
 
     Fast Point Feature Histograms (Rusu, Blodow and Beetz 2009) of thinned surfaces are matched; of many triples of
@@ -38,7 +38,7 @@ class FeaturesPrior(AbstractGuess):
     min_points: int = 30
     """Fewest points a side after thinning; with fewer, features say nothing."""
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source: that of what is known, where no three matches agree.
 
         Raises:
@@ -56,7 +56,7 @@ class FeaturesPrior(AbstractGuess):
         motions, votes = self._motions(first_m[pairs[:, 0]], second_m[pairs[:, 1]], known, self.agreement * voxel_m)
         if not len(motions):
             return known
-        guess = Bumps(
+        guess = KernelMixture(
             motions,
             votes**2 / np.sum(votes**2),
             centre_m=source.centroid_m,
@@ -64,7 +64,7 @@ class FeaturesPrior(AbstractGuess):
             sigma_m=self.features_sigma_m,
             evidence=False,
         )
-        return guided(known, [guess])
+        return defensive_mixture(known, [guess])
 
     def _features(self, view: RayImage, voxel_m: float) -> tuple[Array, Array]:
         """Return the points (n, 3) of a thinned surface and their features (n, 33)."""
@@ -79,7 +79,9 @@ class FeaturesPrior(AbstractGuess):
         points_m, normals = points_m[order], normals[order]
         return points_m, fpfh(points_m, normals, self.feature_radius * voxel_m)
 
-    def _motions(self, source_m: Array, target_m: Array, known: AbstractMotion, reach_m: float) -> tuple[Array, Array]:
+    def _motions(
+        self, source_m: Array, target_m: Array, known: AbstractPoseDensity, reach_m: float
+    ) -> tuple[Array, Array]:
         """Return motions (k, 4, 4) that matches (m, 3) agree with three at a time, and with how many each agrees (k,).
 
         Args:

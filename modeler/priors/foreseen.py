@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from modeler import se3
-from modeler.priors.bumps import Bumps
-from modeler.priors.proposal import guided
-from modeler.types import AbstractMotion, AbstractPrior, PoseGaussian, RayImage
+from modeler.priors.bumps import KernelMixture
+from modeler.priors.proposal import defensive_mixture
+from modeler.types import AbstractPoseDensity, AbstractPrior, PoseGaussian, RayImage
 
 _LEAST_RAD, _LEAST_M = np.radians(2.0), 0.004  # of the guess: a search finds what lies so near by itself
 _WIDER = 2.0  # than the graph says: its covariances hold no systematic error
 
 
 @dataclass(frozen=True)
-class ForeseenPrior(AbstractPrior):
+class PredictedProposal(AbstractPrior):
     """The motion that the poses so far foretell, within what is known; it proposes and is no evidence."""
 
     known: AbstractPrior
@@ -24,7 +24,7 @@ class ForeseenPrior(AbstractPrior):
     expected: PoseGaussian
     """target_from_source of the two views for which it is asked."""
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source.
 
         Raises:
@@ -34,7 +34,7 @@ class ForeseenPrior(AbstractPrior):
         sigma_rad, sigma_m = (
             float(np.sqrt(np.linalg.eigvalsh(c)[-1])) for c in (covariance[:3, :3], covariance[3:, 3:])
         )
-        guess = Bumps(
+        guess = KernelMixture(
             self.expected.mean[None],
             np.ones(1),
             centre_m=source.centroid_m,
@@ -42,8 +42,8 @@ class ForeseenPrior(AbstractPrior):
             sigma_m=max(_WIDER * sigma_m, _LEAST_M),
             evidence=False,
         )
-        return guided(self.known.between(source, target), [guess])
+        return defensive_mixture(self.known.between(source, target), [guess])
 
-    def grown(self, steps: float) -> ForeseenPrior:
+    def relaxed(self, steps: float) -> PredictedProposal:
         """Return the prior within limits that hold for several steps."""
-        return replace(self, known=self.known.grown(steps))
+        return replace(self, known=self.known.relaxed(steps))

@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 
 from modeler import se3
-from modeler.types import AbstractMotion, Array
+from modeler.types import AbstractPoseDensity, Array
 
 
 @dataclass(frozen=True, eq=False)
-class Gaussian(AbstractMotion):
+class Gaussian(AbstractPoseDensity):
     """`mean`'s rotation · exp(ω), and the place of a point: (ω, place - expected) ~ N(0, covariance)."""
 
     mean: Array

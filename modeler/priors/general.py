@@ -8,7 +8,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors.directions import directions
-from modeler.types import AbstractMotion, AbstractPrior, Array, EvenSpread, RayImage
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, EvenSpread, RayImage
 
 _SMALL_DEG = 30.0  # up to this turn limits of the centroids' offset are what they say
 _WIDEST_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of what was seen of it
@@ -23,18 +23,20 @@ class GeneralPrior(AbstractPrior):
     max_offset_m: float = 0.04
     """Largest distance between the target's centroid and the source's, carried over."""
 
-    def between(self, source: RayImage, target: RayImage) -> GeneralMotion:
+    def between(self, source: RayImage, target: RayImage) -> GeneralDensity:
         """Return the density of target_from_source."""
-        return GeneralMotion(source.centroid_m, target.centroid_m, np.deg2rad(self.max_rotation_deg), self.max_offset_m)
+        return GeneralDensity(
+            source.centroid_m, target.centroid_m, np.deg2rad(self.max_rotation_deg), self.max_offset_m
+        )
 
-    def grown(self, steps: float) -> GeneralPrior:
+    def relaxed(self, steps: float) -> GeneralPrior:
         """Return the prior whose limits hold for several steps."""
-        rotation_deg, offset_m = grown_limits(self.max_rotation_deg, self.max_offset_m, steps)
+        rotation_deg, offset_m = relaxed_limits(self.max_rotation_deg, self.max_offset_m, steps)
         return replace(self, max_rotation_deg=rotation_deg, max_offset_m=offset_m)
 
 
 @dataclass(frozen=True, eq=False)
-class GeneralMotion(AbstractMotion):
+class GeneralDensity(AbstractPoseDensity):
     """Uniform over rotations up to a limit and over a ball of centroid offsets."""
 
     source_centroid_m: Array
@@ -81,7 +83,7 @@ class GeneralMotion(AbstractMotion):
         return np.where(inside, -np.log(rotations * offsets), -np.inf)
 
 
-def grown_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -> tuple[float, float]:
+def relaxed_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -> tuple[float, float]:
     """Return the limits of rotation in degrees and of the centroids' offset in m for so many steps (at least 1).
 
     Rotation grows up to what two views can be registered across: beyond, they share so little surface that none at all
@@ -96,7 +98,7 @@ def grown_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -> 
 def turned_offset_m(max_offset_m: float, turn_rad: float) -> float:
     """Return the limit of the centroids' offset in m for a turn of any size: up to 30 degrees what it says itself."""
     share = max(abs(np.remainder(turn_rad + np.pi, 2.0 * np.pi) - np.pi) / np.radians(_SMALL_DEG), 1.0)
-    return grown_limits(_SMALL_DEG, max_offset_m, float(share))[1]
+    return relaxed_limits(_SMALL_DEG, max_offset_m, float(share))[1]
 
 
 def sample_angles(limit_rad: float, count: int, rng: np.random.Generator) -> Array:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.priors.bumps import Bumps
-from modeler.priors.general import GeneralPrior, grown_limits, turned_offset_m
-from modeler.priors.proposal import guided, reach_deg
-from modeler.types import AbstractMotion, AbstractPrior, Array, Edge, Frame, InputError, RayImage, Solution
+from modeler.priors.bumps import KernelMixture
+from modeler.priors.general import GeneralPrior, relaxed_limits, turned_offset_m
+from modeler.priors.proposal import defensive_mixture, reach_deg
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, Frame, InputError, RayImage, Solution
 
 _STEP_DEG = 25.0  # such as the limit of the offset is meant for
 _SAME_TIME_S = 1e-3  # poses and frames that are no farther apart in time belong together
@@ -43,7 +43,7 @@ class HeldPrior(AbstractPrior):
     newest: int | None = None
     """The last frame of a sequence that is being built, from which on motions are evidence; None: no sequence."""
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source.
 
         Raises:
@@ -57,17 +57,17 @@ class HeldPrior(AbstractPrior):
             + unsure_of_source**2
             + unsure_of_target**2
         )
-        moved = Bumps(motion[None], np.ones(1), hand_at_source[:3, 3], float(sigma_rad), float(sigma_m))
+        moved = KernelMixture(motion[None], np.ones(1), hand_at_source[:3, 3], float(sigma_rad), float(sigma_m))
         if self.newest is None or target.index == self.newest:
             return moved
         # What the hand did up to an earlier view counts in the edges between; here it only tells where to look.
         offset_m = turned_offset_m(self.max_offset_m, float(se3.rotation_angle(motion)))
         limits = GeneralPrior(reach_deg(float(np.degrees(sigma_rad))), offset_m).between(source, target)
-        return guided(replace(limits, middle=motion[:3, :3]), [moved])
+        return defensive_mixture(replace(limits, middle=motion[:3, :3]), [moved])
 
-    def grown(self, steps: float) -> HeldPrior:
+    def relaxed(self, steps: float) -> HeldPrior:
         """Return the prior with room for the offset of several steps; their motion is the hand's."""
-        return replace(self, max_offset_m=grown_limits(_STEP_DEG, self.max_offset_m, steps)[1])
+        return replace(self, max_offset_m=relaxed_limits(_STEP_DEG, self.max_offset_m, steps)[1])
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> HeldPrior:
         """Return the prior that knows which frame came last."""

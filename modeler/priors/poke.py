@@ -10,7 +10,7 @@ import numpy as np
 from modeler import se3
 from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M, OnPlane, on_plane
 from modeler.priors.table import TablePrior
-from modeler.types import AbstractMotion, AbstractPrior, Array, InputError, RayImage
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, RayImage
 
 _STEPS = 20  # into which a push is cut
 _PUSHES = 512  # of which the spread of outcomes is told
@@ -56,7 +56,7 @@ class PokePrior(AbstractPrior):
     sigma_height_m: float = WOBBLE_M
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source; after several pushes only that the object is on its table still.
 
         Raises:
@@ -84,7 +84,7 @@ class PokePrior(AbstractPrior):
         outcomes = self._outcomes(pokes[0], earlier, plane)
         mean = outcomes.mean(axis=0)
         covariance = np.cov(outcomes.T) + np.diag([1e-4, 1e-5, 1e-5]) ** 2
-        return PokeMotion(plane, mean, covariance, backwards=source is later)
+        return PokeDensity(plane, mean, covariance, backwards=source is later)
 
     def _between(self, earlier: int, later: int) -> list[Poke]:
         """Return the pushes between two frames.
@@ -127,7 +127,7 @@ class PokePrior(AbstractPrior):
 
 
 @dataclass(frozen=True, eq=False)
-class PokeMotion(AbstractMotion):
+class PokeDensity(AbstractPoseDensity):
     """A Gaussian of turn and shift in the plane, with a Gaussian tilt and lift out of it."""
 
     plane: OnPlane

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from modeler.priors.gaussian import Gaussian, fitted
 from modeler.types import (
-    AbstractMotion,
+    AbstractPoseDensity,
     AbstractPrior,
     Array,
     Edge,
@@ -38,7 +38,7 @@ class ProductPrior(AbstractPrior):
     second: AbstractPrior
     """The other."""
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source.
 
         Raises:
@@ -60,18 +60,18 @@ class ProductPrior(AbstractPrior):
         """Return the axis that all steps share, where either part has one."""
         return self.first.shared_axis(views) or self.second.shared_axis(views)
 
-    def grown(self, steps: float) -> ProductPrior:
+    def relaxed(self, steps: float) -> ProductPrior:
         """Return the product with limits that hold for several steps."""
-        return replace(self, first=self.first.grown(steps), second=self.second.grown(steps))
+        return replace(self, first=self.first.relaxed(steps), second=self.second.relaxed(steps))
 
 
 @dataclass(frozen=True, eq=False)
-class Product(AbstractMotion):
+class Product(AbstractPoseDensity):
     """The normalised product of two densities, drawn by importance from a Gaussian fitted to it and from both."""
 
-    first: AbstractMotion
+    first: AbstractPoseDensity
     """One density."""
-    second: AbstractMotion
+    second: AbstractPoseDensity
     """The other."""
     gaussian: Gaussian
     """Covers the product."""
@@ -100,7 +100,7 @@ class Product(AbstractMotion):
         return known - self.log_volume if self.evidence else known
 
 
-def multiplied(first: AbstractMotion, second: AbstractMotion, centre_m: Array) -> Product | None:
+def multiplied(first: AbstractPoseDensity, second: AbstractPoseDensity, centre_m: Array) -> Product | None:
     """Return the product of two densities; None where they have nothing in common.
 
     A Gaussian is fitted to weighted draws of both, then to weighted draws of itself and both (population Monte Carlo).
@@ -139,10 +139,14 @@ def resampled(weights: Array, count: int, rng: np.random.Generator) -> npt.NDArr
 
 
 def _weighted(
-    first: AbstractMotion, second: AbstractMotion, gaussian: Gaussian | None, count: int, rng: np.random.Generator
+    first: AbstractPoseDensity,
+    second: AbstractPoseDensity,
+    gaussian: Gaussian | None,
+    count: int,
+    rng: np.random.Generator,
 ) -> tuple[Array, Array]:
     """Draw motions (n, 4, 4) from two densities and a Gaussian, with log weights (n,) for the product of the two."""
-    parts: list[tuple[AbstractMotion, float]] = [(first, 0.5), (second, 0.5)]
+    parts: list[tuple[AbstractPoseDensity, float]] = [(first, 0.5), (second, 0.5)]
     if gaussian is not None:
         rest = 0.5 * (1.0 - _GAUSSIAN_SHARE)
         parts = [(first, rest), (second, rest), (gaussian, _GAUSSIAN_SHARE)]

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from modeler.priors.general import grown_limits
+from modeler.priors.general import relaxed_limits
 from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M, OnPlane, on_plane
-from modeler.types import AbstractMotion, AbstractPrior, Array, RayImage
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class TablePrior(AbstractPrior):
     sigma_height_m: float = WOBBLE_M
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
 
-    def between(self, source: RayImage, target: RayImage) -> TableMotion:
+    def between(self, source: RayImage, target: RayImage) -> TableDensity:
         """Return the density of target_from_source.
 
         Raises:
@@ -39,16 +39,16 @@ class TablePrior(AbstractPrior):
             sigma_tilt_rad=np.radians(self.sigma_tilt_deg),
             sigma_lift_m=self.sigma_height_m,
         )
-        return TableMotion(plane, limit_rad, self.max_shift_m)
+        return TableDensity(plane, limit_rad, self.max_shift_m)
 
-    def grown(self, steps: float) -> TablePrior:
+    def relaxed(self, steps: float) -> TablePrior:
         """Return the prior whose limits hold for several steps; what ties the motion to the plane stays."""
-        rotation_deg, shift_m = grown_limits(self.max_rotation_deg, self.max_shift_m, steps)
+        rotation_deg, shift_m = relaxed_limits(self.max_rotation_deg, self.max_shift_m, steps)
         return replace(self, max_rotation_deg=rotation_deg, max_shift_m=shift_m)
 
 
 @dataclass(frozen=True, eq=False)
-class TableMotion(AbstractMotion):
+class TableDensity(AbstractPoseDensity):
     """Uniform turn and shift in a plane, Gaussian tilt and lift out of it."""
 
     plane: OnPlane

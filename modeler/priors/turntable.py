@@ -11,12 +11,12 @@ import numpy as np
 from modeler.priors.about_axis import AboutAxis, Axis
 from modeler.priors.axis_turn import AxisTurn
 from modeler.priors.common_axis import common_axis, turn_sense
-from modeler.priors.general import GeneralPrior, grown_limits, turned_offset_m
+from modeler.priors.general import GeneralPrior, relaxed_limits, turned_offset_m
 from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M, no_plane, support
-from modeler.priors.proposal import guided, reach_deg
+from modeler.priors.proposal import defensive_mixture, reach_deg
 from modeler.priors.table import TablePrior
 from modeler.types import (
-    AbstractMotion,
+    AbstractPoseDensity,
     AbstractPrior,
     Edge,
     Plane,
@@ -74,7 +74,7 @@ class TurntablePrior(AbstractPrior):
     newest: int | None = None
     """The last frame of a sequence that is being built, from which on steps are evidence; None: no sequence."""
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source.
 
         Raises:
@@ -84,19 +84,19 @@ class TurntablePrior(AbstractPrior):
         if plane is None and self.needs_table:
             raise no_plane(source, target)
         axis = self._axis(plane)
-        motion = self._motion(source, target, axis)
+        density = self._motion(source, target, axis)
         if self.learnt is not None or self.sense:
             told = replace(self, step_sign="known", step_deg=self.sense * abs(self.step_deg)) if self.sense else self
-            motion = guided(motion, [told._motion(source, target, self.learnt or axis)])
+            density = defensive_mixture(density, [told._motion(source, target, self.learnt or axis)])
         if self.newest is None or target.index == self.newest:
-            return motion
+            return density
         # The steps that lead to an earlier view count in the edges between; here they only tell where to look.
-        return guided(self._limits(source, target), [motion])
+        return defensive_mixture(self._limits(source, target), [density])
 
-    def grown(self, steps: float) -> TurntablePrior:
+    def relaxed(self, steps: float) -> TurntablePrior:
         """Return the prior with room for the shift of several steps; their turn is counted by the frames' numbers."""
         step_deg = min(max(abs(self.step_deg), 1.0), 180.0)
-        return replace(self, max_shift_m=grown_limits(step_deg, self.max_shift_m, steps)[1])
+        return replace(self, max_shift_m=relaxed_limits(step_deg, self.max_shift_m, steps)[1])
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> TurntablePrior:
         """Return the prior that knows the axis and the sense of turning which the pairs so far have in common."""
@@ -162,7 +162,7 @@ class TurntablePrior(AbstractPrior):
         """Return the largest shift for so many steps: the centroid of what is seen lies before the axis, and turns."""
         return turned_offset_m(self.max_shift_m, float(np.radians(steps * self.step_deg)))
 
-    def _limits(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def _limits(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return motions as far as the steps may reach, on the table where one is seen; all turns within are alike."""
         steps = target.index - source.index
         turn_deg = _on_circle(steps * self.step_deg)
@@ -170,11 +170,11 @@ class TurntablePrior(AbstractPrior):
         whole_deg = min(abs(turn_deg) + either_side_deg, 180.0)
         if support(source, target) is None:
             return GeneralPrior(whole_deg, self._shift_m(steps)).between(source, target)
-        motion = TablePrior(whole_deg, self._shift_m(steps)).between(source, target)
+        density = TablePrior(whole_deg, self._shift_m(steps)).between(source, target)
         if self.step_sign == "unknown" or either_side_deg >= 180.0:
-            return motion
+            return density
         return replace(
-            motion, max_rotation_rad=float(np.radians(either_side_deg)), middle_rad=float(np.radians(turn_deg))
+            density, max_rotation_rad=float(np.radians(either_side_deg)), middle_rad=float(np.radians(turn_deg))
         )
 
 

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.priors.bumps import Bumps
-from modeler.priors.proposal import AbstractGuess, guided
-from modeler.types import AbstractMotion, Array, Edge, RayImage, Solution
+from modeler.priors.bumps import KernelMixture
+from modeler.priors.proposal import AbstractProposal, defensive_mixture
+from modeler.types import AbstractPoseDensity, Array, Edge, RayImage, Solution
 
 _MOST_STEPS = 3.0  # beyond, it is anybody's guess
 
 
 @dataclass(frozen=True)
-class VelocityPrior(AbstractGuess):
+class VelocityPrior(AbstractProposal):
     """Constant velocity within what is known; it proposes and is no evidence."""
 
     velocity_sigma_deg: float = 5.0
@@ -26,7 +26,7 @@ class VelocityPrior(AbstractGuess):
     trajectory: tuple[tuple[int, Array], ...] = field(default=(), compare=False, repr=False)
     """Frame numbers and object_from_camera (4, 4) of the poses so far, in order of frames."""
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source: that of what is known, until two frames have shown a pace.
 
         Raises:
@@ -42,7 +42,7 @@ class VelocityPrior(AbstractGuess):
             return known
         twist = se3.log(se3.inverse(object_from_before) @ object_from_last)
         predicted = se3.inverse(poses[target.index]) @ object_from_last @ se3.exp(pace * twist)
-        guess = Bumps(
+        guess = KernelMixture(
             predicted[None],
             np.ones(1),
             centre_m=source.centroid_m,
@@ -50,7 +50,7 @@ class VelocityPrior(AbstractGuess):
             sigma_m=self.velocity_sigma_m * max(pace, 1.0),
             evidence=False,
         )
-        return guided(known, [guess])
+        return defensive_mixture(known, [guess])
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> VelocityPrior:
         """Return the prior that goes on from the poses so far."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.kernels import mixture
 from modeler.registration.pair import Pair
-from modeler.types import AbstractMotion, Array
+from modeler.types import AbstractPoseDensity, Array
 
 
 @dataclass(frozen=True)
@@ -73,19 +73,25 @@ class Climb:
         )
 
     def places(
-        self, pair: Pair, motion: AbstractMotion, basin: Array, rng: np.random.Generator, *, effective_points: float
+        self,
+        pair: Pair,
+        density: AbstractPoseDensity,
+        basin: Array,
+        rng: np.random.Generator,
+        *,
+        effective_points: float,
     ) -> Array:
         """Return high places (n, 4, 4) that are possible, the highest first.
 
         Args:
             pair: the two views.
-            motion: where to climb.
+            density: where to climb.
             basin: (6,) standard deviations of the basin of a place, beyond which no step is drawn.
             rng: source of all randomness.
             effective_points: most independent measurements that all points are worth, see `Pair.independent`.
         """
-        poses, stage = motion.sample(self.looks, rng), self.first
-        height = partial(_height, pair, motion, effective_points)
+        poses, stage = density.sample(self.looks, rng), self.first
+        height = partial(_height, pair, density, effective_points)
         for following in self.stages:
             poses = self._ahead(pair, poses, height(stage, poses), basin, stage.climbers)
             stage = following
@@ -95,7 +101,7 @@ class Climb:
     def onward(
         self,
         pair: Pair,
-        motion: AbstractMotion,
+        density: AbstractPoseDensity,
         poses: Array,
         basin: Array,
         rng: np.random.Generator,
@@ -104,7 +110,7 @@ class Climb:
     ) -> Array:
         """Return where climbers arrive that set out from places (n, 4, 4) already found; as `places`."""
         stage = self.stages[-1]
-        height = partial(_height, pair, motion, effective_points, stage)
+        height = partial(_height, pair, density, effective_points, stage)
         return self._up(pair, poses, self._spreads(pair, poses, basin, stage.blur), height, rng)
 
     def _ahead(self, pair: Pair, poses: Array, heights: Array, basin: Array, most: int) -> Array:
@@ -142,9 +148,9 @@ class Climb:
         return poses
 
 
-def _height(pair: Pair, motion: AbstractMotion, effective_points: float, stage: Stage, poses: Array) -> Array:
+def _height(pair: Pair, density: AbstractPoseDensity, effective_points: float, stage: Stage, poses: Array) -> Array:
     """Return how high (n,) poses (n, 4, 4) lie (nats); -inf where motion is known not to lead."""
-    heights, possible = np.full(len(poses), -np.inf), np.isfinite(motion.log_evidence(poses))
+    heights, possible = np.full(len(poses), -np.inf), np.isfinite(density.log_evidence(poses))
     if possible.any():
         heights[possible] = pair.tempered(
             poses[possible], stage.blur * pair.size_m, effective_points=effective_points, stride=stage.stride

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.types import AbstractMotion, Array, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, Array, Outcome, PoseGaussian, Posterior, RayImage
 
 _START_SAMPLES = 1000
 _SPACING_POINTS = 400
@@ -91,7 +91,7 @@ class Start:
         return (at_centre.T * weights) @ at_centre
 
 
-def start(source: RayImage, target: RayImage, motion: AbstractMotion, rng: np.random.Generator) -> Start:
+def start(source: RayImage, target: RayImage, density: AbstractPoseDensity, rng: np.random.Generator) -> Start:
     """Return the centre of the prior: the intrinsic mean of its samples.
 
     Its fixed point is sought from the motion that puts the centroids together without turning. Where the prior leaves
@@ -99,7 +99,7 @@ def start(source: RayImage, target: RayImage, motion: AbstractMotion, rng: np.ra
     for a user who knows nothing. For a prior given by centroids and a largest rotation, the two agree within sampling
     error.
     """
-    samples = motion.sample(_START_SAMPLES, rng)
+    samples = density.sample(_START_SAMPLES, rng)
     if len(source.points_m) and len(target.points_m):
         centre_m = source.centroid_m
         guess = se3.translation(target.centroid_m - centre_m)
@@ -188,7 +188,7 @@ class Fit:
 
 def registered(
     views: tuple[RayImage, RayImage],
-    motion: AbstractMotion,
+    density: AbstractPoseDensity,
     rng: np.random.Generator,
     *,
     min_fitness: float,
@@ -198,13 +198,13 @@ def registered(
 
     Args:
         views: source and target.
-        motion: the prior, for where to start.
+        density: the prior, for where to start.
         rng: source of the prior's samples.
         min_fitness: smallest share of matched points that counts as overlap.
         fit: the method, from a start (4, 4); None where too few points are left.
     """
     began = time.perf_counter()
-    begin = start(*views, motion, rng)
+    begin = start(*views, density, rng)
     found = posterior(*views, begin, fit(begin.target_from_source), min_fitness)
     return replace(found, seconds=time.perf_counter() - began)
 

@@ -20,7 +20,7 @@ from modeler.registration.clouds import (
     registered,
     scaled_information,
 )
-from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Posterior, RayImage
 
 _DRAW = 3  # correspondences that fix a motion
 _BATCH = 2_000  # draws between two looks at the stopping rule
@@ -57,13 +57,13 @@ class FpfhRegistrar(AbstractRegistrar):
     """Smallest share of matched points that counts as overlap."""
 
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the motion that most feature matches agree with, and the residual-scaled inverse Hessian there."""
         clouds = Cloud.of(source), Cloud.of(target)
         return registered(
             (source, target),
-            motion,
+            density,
             rng,
             min_fitness=self.min_fitness,
             fit=lambda begin: self.search(*clouds, begin, rng),

@@ -10,7 +10,7 @@ import numpy as np
 from modeler.registration.clouds import Cloud, Fit, registered
 from modeler.registration.fpfh import FpfhRegistrar
 from modeler.registration.icp import IcpRegistrar
-from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Posterior, RayImage
 
 
 @final
@@ -24,7 +24,7 @@ class FpfhIcpRegistrar(AbstractRegistrar):
     """The refinement, with no coarse levels, whose basins are wide enough to leave a good start."""
 
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the local optimum nearest to the feature matches' motion, with its residual-scaled inverse Hessian."""
         clouds = Cloud.of(source), Cloud.of(target)
@@ -33,4 +33,4 @@ class FpfhIcpRegistrar(AbstractRegistrar):
             coarse = self.fpfh.search(*clouds, begin, rng)
             return None if coarse is None else self.icp.refine(*clouds, coarse.target_from_source)
 
-        return registered((source, target), motion, rng, min_fitness=self.icp.min_fitness, fit=fit)
+        return registered((source, target), density, rng, min_fitness=self.icp.min_fitness, fit=fit)

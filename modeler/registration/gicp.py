@@ -9,7 +9,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.registration.clouds import Cloud, Fit, cube_edges_m, registered, residual_variance
-from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Posterior, RayImage
 
 _STEP = 1e-6  # rad and m: a smaller step ends a level
 
@@ -37,12 +37,12 @@ class GicpRegistrar(AbstractRegistrar):
     """Smallest share of matched points that counts as overlap."""
 
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the local optimum nearest to the prior's centre, with its residual-scaled inverse Hessian."""
         return registered(
             (source, target),
-            motion,
+            density,
             rng,
             min_fitness=self.min_fitness,
             fit=lambda begin: self._fit(source, target, begin),

@@ -18,7 +18,7 @@ from modeler.registration.clouds import (
     registered,
     scaled_information,
 )
-from modeler.types import AbstractMotion, AbstractRegistrar, Array, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Posterior, RayImage
 
 _STEP = 1e-6  # rad and m: a smaller step ends a level
 _DAMPING = 1e-9  # share of the mean curvature; only holds directions still that no plane sees
@@ -45,12 +45,12 @@ class IcpRegistrar(AbstractRegistrar):
     """Smallest share of matched points that counts as overlap."""
 
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the local optimum nearest to the prior's centre, with its residual-scaled inverse Hessian."""
         clouds = Cloud.of(source), Cloud.of(target)
         return registered(
-            (source, target), motion, rng, min_fitness=self.min_fitness, fit=lambda begin: self.refine(*clouds, begin)
+            (source, target), density, rng, min_fitness=self.min_fitness, fit=lambda begin: self.refine(*clouds, begin)
         )
 
     def refine(self, source: Cloud, target: Cloud, target_from_source: Array) -> Fit | None:

@@ -12,7 +12,7 @@ from modeler import se3
 from modeler.kernels import mixture
 from modeler.registration.mixture import Gaussians
 from modeler.registration.posterior import FLOOR
-from modeler.types import AbstractMotion, Array
+from modeler.types import AbstractPoseDensity, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
 _PARAMETERS = 28.0  # of one Gaussian more: mean, covariance, share
@@ -98,28 +98,28 @@ class AdaptiveSampler:
     """Samples of the result, at most."""
 
     def run(
-        self, motion: AbstractMotion, log_likelihood: LogLikelihood, centre_m: Array, rng: np.random.Generator
+        self, density: AbstractPoseDensity, log_likelihood: LogLikelihood, centre_m: Array, rng: np.random.Generator
     ) -> Population:
         """Return samples of what is known of a motion × likelihood.
 
         Args:
-            motion: where to draw first, and what is known; its density is normalised, as every motion's is.
+            density: where to draw first, and what is known; its density is normalised, as every density's is.
             log_likelihood: of poses (n, 4, 4), (n,); asked only where what is known allows.
             centre_m: (3,) point of the source about which Gaussians turn.
             rng: source of all randomness.
         """
-        first = motion.sample(self.initial, rng)
+        first = density.sample(self.initial, rng)
         log_count = float(np.log(self.initial))
 
         def weighed(poses: Array, log_density: Array) -> _Drawn:
-            log_known = motion.log_evidence(poses)
+            log_known = density.log_evidence(poses)
             possible = np.isfinite(log_known)
             log_likelihoods = np.full(len(poses), -np.inf)
             if possible.any():
                 log_likelihoods[possible] = log_likelihood(poses[possible])
             return _Drawn(poses, log_likelihoods, log_known + log_likelihoods, log_density)
 
-        drawn, learnt = weighed(first, log_count + motion.log_density(first)), None
+        drawn, learnt = weighed(first, log_count + density.log_density(first)), None
         log_weights = drawn.log_weights
         while (effective := effective_samples(log_weights)) < self.enough and len(drawn.poses) < self.max_draws:
             told = effective >= self.least
@@ -128,8 +128,8 @@ class AdaptiveSampler:
             new = self._fitted(drawn.poses, normalised(power * log_weights), centre_m).times(count)
             learnt = new if learnt is None else learnt.beside(new)
             fresh = new.sample(count, rng)
-            density = np.logaddexp(log_count + motion.log_density(fresh), learnt.log_density(fresh))
-            drawn = drawn.spread_over(new).beside(weighed(fresh, density))
+            log_density = np.logaddexp(log_count + density.log_density(fresh), learnt.log_density(fresh))
+            drawn = drawn.spread_over(new).beside(weighed(fresh, log_density))
             log_weights = drawn.log_weights
         chosen, weights = thinned(normalised(log_weights), self.kept, rng)
         return Population(

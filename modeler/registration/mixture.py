@@ -10,7 +10,7 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import mixture
 from modeler.se3 import rows
-from modeler.types import AbstractMotion, Array
+from modeler.types import AbstractPoseDensity, Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +70,10 @@ class Gaussians:
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureMotion(AbstractMotion):
+class MixtureProposal(AbstractPoseDensity):
     """Gaussians that only propose: what is known of the motion is another's."""
 
-    known: AbstractMotion
+    known: AbstractPoseDensity
     """The independent knowledge."""
     gaussians: Gaussians
     """Where to draw."""

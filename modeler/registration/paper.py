@@ -13,7 +13,7 @@ from modeler.registration.importance import effective_samples, pareto_tail
 from modeler.registration.posterior import failed, intrinsics, weighted_gaussian
 from modeler.registration.visibility import VisibilityRegistrar
 from modeler.se3 import matrices, rows
-from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Outcome, Posterior, RayImage
 
 _SAMPLES, _EVEN_SAMPLES = 200_000, 2_000_000
 _DRAWN = 1 << 22  # motions of an even spread at a time: one byte each
@@ -42,23 +42,23 @@ class PaperRegistrar(AbstractRegistrar):
     """With fewer effective samples the result is called degenerate."""
 
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior of target_from_source; failure is its outcome."""
         started = time.perf_counter()
         if min(len(source.points_m), len(target.points_m)) < 10:
-            return failed(source, target, Outcome.TOO_FEW_POINTS, motion, rng)
+            return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         views = measured(source, self.points, rng), measured(target, self.points, rng)
         kept_poses, kept_weights, drawn = [], [], 0
-        for tried, passing in self._passing(views, motion, rng):
+        for tried, passing in self._passing(views, density, rng):
             drawn += tried
-            log_weights = self.log_weights(passing, views) + _known(motion, passing)
+            log_weights = self.log_weights(passing, views) + _known(density, passing)
             alive = np.isfinite(log_weights)
             kept_poses.append(matrices(passing[alive]))
             kept_weights.append(log_weights[alive])
         poses, log_weights = np.concatenate(kept_poses), np.concatenate(kept_weights)
         if len(poses) == 0:
-            nothing = failed(source, target, Outcome.NO_OVERLAP, motion, rng)
+            nothing = failed(source, target, Outcome.NO_OVERLAP, density, rng)
             return replace(nothing, seconds=time.perf_counter() - started)
         weights = np.exp(log_weights - log_weights.max())
         effective = effective_samples(log_weights)
@@ -93,15 +93,15 @@ class PaperRegistrar(AbstractRegistrar):
         return total
 
     def _passing(
-        self, views: tuple[Measured, Measured], motion: AbstractMotion, rng: np.random.Generator
+        self, views: tuple[Measured, Measured], density: AbstractPoseDensity, rng: np.random.Generator
     ) -> Iterator[tuple[int, Array]]:
         """Yield, batch by batch, how many motions were drawn and those (n, 12) that may have a likelihood."""
         free = FreeSpace.of(*views, self.reach_sigmas, self.reject_below)
-        draws = Draws.of(motion.even_spread(), rng)
+        draws = Draws.of(density.even_spread(), rng)
         samples = self.samples or (_SAMPLES if draws is None else _EVEN_SAMPLES)
         if draws is None:
             for first in range(0, samples, self.batch):
-                poses = rows(motion.sample(min(self.batch, samples - first), rng))
+                poses = rows(density.sample(min(self.batch, samples - first), rng))
                 if first == 0:
                     free = free.ordered(poses[:_PILOT])
                 yield len(poses), poses[free.passes(poses)]
@@ -112,12 +112,12 @@ class PaperRegistrar(AbstractRegistrar):
                 yield count, free.passing(draws, first, count)
 
 
-def _known(motion: AbstractMotion, poses: Array) -> Array | float:
+def _known(density: AbstractPoseDensity, poses: Array) -> Array | float:
     """Return what is known (n,) of poses (n, 12) beyond that they were drawn from the motion: 0 but for a guess."""
-    if motion.evidence:
+    if density.evidence:
         return 0.0
     drawn = matrices(poses)
-    return motion.log_evidence(drawn) - motion.log_density(drawn)
+    return density.log_evidence(drawn) - density.log_density(drawn)
 
 
 def noise(view: RayImage) -> Array:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from modeler import se3
-from modeler.types import AbstractMotion, Array, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, Array, Outcome, PoseGaussian, Posterior, RayImage
 
 FLOOR = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
 """Added to covariances (6, 6) of ξ (rad, m) that few samples tell, which would not be positive definite."""
@@ -26,7 +26,7 @@ def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaus
 
 
 def share_at_limit(
-    motion: AbstractMotion, poses: Array, weights: Array, centre_m: Array, rng: np.random.Generator
+    density: AbstractPoseDensity, poses: Array, weights: Array, centre_m: Array, rng: np.random.Generator
 ) -> float:
     """Return the share of motions (n, 4, 4) that a small step, about 1° and 1 mm, takes out of the prior's support.
 
@@ -35,14 +35,14 @@ def share_at_limit(
     """
     nudges = rng.normal(size=(len(poses), 6)) * np.repeat([np.radians(1.0), 0.001], 3)
     nudged = se3.moved(poses, nudges, centre_m)
-    return float(weights @ ~np.isfinite(motion.log_density(nudged)))
+    return float(weights @ ~np.isfinite(density.log_density(nudged)))
 
 
 def failed(
     source: RayImage,
     target: RayImage,
     outcome: Outcome,
-    motion: AbstractMotion | None = None,
+    density: AbstractPoseDensity | None = None,
     rng: np.random.Generator | None = None,
 ) -> Posterior:
     """Return the posterior of a registration that could not be made: what was known before, or nothing.
@@ -51,14 +51,14 @@ def failed(
         source: first view.
         target: second view.
         outcome: why it could not be made.
-        motion: what was known of the motion, whose mean and covariance are handed on; without it every rotation within
+        density: what was known of the motion, whose mean and covariance are handed on; without it every rotation within
             10 m is within one standard deviation.
-        rng: source of all randomness, with a motion.
+        rng: source of all randomness, with a density.
     """
-    if motion is None or rng is None:
+    if density is None or rng is None:
         pose = PoseGaussian(np.eye(4), np.diag(np.repeat([np.pi, 10.0], 3) ** 2))
     else:
-        pose = weighted_gaussian(motion.sample(_SAMPLES, rng), np.ones(_SAMPLES), source.centroid_m)
+        pose = weighted_gaussian(density.sample(_SAMPLES, rng), np.ones(_SAMPLES), source.centroid_m)
     return Posterior(source=source.index, target=target.index, pose=pose, outcome=outcome, overlap=0.0, seconds=0.0)
 
 

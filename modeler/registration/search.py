@@ -12,7 +12,7 @@ from modeler.kernels.matching import Pull
 from modeler.registration.candidates import Candidates
 from modeler.registration.climb import Climb
 from modeler.registration.pair import Pair
-from modeler.types import AbstractMotion, Array, PoseGaussian
+from modeler.types import AbstractPoseDensity, Array, PoseGaussian
 
 
 @dataclass(frozen=True)
@@ -81,47 +81,47 @@ class Search:
         """Return a search that looks four times as hard."""
         return replace(self, max_starts=4 * self.max_starts, starts_per_basin=4 * self.starts_per_basin)
 
-    def candidates(self, pair: Pair, motion: AbstractMotion, rng: np.random.Generator) -> Candidates:
+    def candidates(self, pair: Pair, density: AbstractPoseDensity, rng: np.random.Generator) -> Candidates:
         """Return what was found, best first; always one at least.
 
         Args:
             pair: the two views.
-            motion: where to look.
+            density: where to look.
             rng: source of all randomness.
         """
-        prior = _gaussian(motion.sample(500, rng), pair.centre_m)
+        prior = _gaussian(density.sample(500, rng), pair.centre_m)
         starts = self._starts(prior, pair.size_m)
-        poses = motion.sample(self.looks_per_start * starts, rng)
+        poses = density.sample(self.looks_per_start * starts, rng)
         # Blunt surfaces match easily; that they do counts as much as how much better they tell the depth than a guess.
         plain, share = pair.log_likelihoods(poses, self.blurs[0] * pair.size_m, stride=8)
         look = plain - np.log(self.blurs[0]) * share * pair.points
         poses = poses[_best(look, starts)]
         poses = self._led(pair, poses, prior, self.blurs[1] * pair.size_m)
         poses = self._survivors(pair, poses, int(self.survivors * starts))
-        blunt = self._ranked(pair, motion, poses, prior, self.blurs[1] * pair.size_m)
+        blunt = self._ranked(pair, density, poses, prior, self.blurs[1] * pair.size_m)
         for blur in self.blurs[2:]:
             poses = self._led(pair, poses, prior, blur * pair.size_m)
         fine_m = self.blurs[-1] * pair.size_m
-        outside = ~np.isfinite(motion.log_evidence(poses))
+        outside = ~np.isfinite(density.log_evidence(poses))
         beyond = poses[outside]
-        poses = motion.sample(starts, rng) if outside.all() else poses[~outside]
+        poses = density.sample(starts, rng) if outside.all() else poses[~outside]
         poses, scores = self._ordered(pair, poses, fine_m)
-        lifted = self._lifted(pair, motion, poses, scores, rng)
+        lifted = self._lifted(pair, density, poses, scores, rng)
         if len(lifted):
             poses, scores = self._ordered(pair, np.concatenate([poses, lifted]), fine_m)
         sharp = self._kept(pair, poses, scores, prior, fine_m)
         search = self
         if self.scores(pair, sharp.poses[:1], self.blurs[2] * pair.size_m)[0] < self.poor:
-            search, sharp = self._higher(pair, motion, sharp, prior, rng)
-        sharp = search._along(pair, motion, sharp, prior)
+            search, sharp = self._higher(pair, density, sharp, prior, rng)
+        sharp = search._along(pair, density, sharp, prior)
         blunt = replace(blunt, blunt=np.ones(len(blunt), dtype=np.bool_))
         if len(beyond) and pair.overlap(sharp.poses[0]) > self.enough_overlap:
-            beyond = self._next_to_possible(pair, motion, beyond, prior)
+            beyond = self._next_to_possible(pair, density, beyond, prior)
         better = search.scores(pair, beyond, fine_m).max() - sharp.scores[0] if len(beyond) else -np.inf
         return replace(sharp.beside(blunt), beyond=float(better), scarce=search is not self)
 
     def _lifted(
-        self, pair: Pair, motion: AbstractMotion, poses: Array, scores: Array, rng: np.random.Generator
+        self, pair: Pair, density: AbstractPoseDensity, poses: Array, scores: Array, rng: np.random.Generator
     ) -> Array:
         """Return better poses for basins that are about to be dropped, though blurred views do not tell them apart.
 
@@ -130,7 +130,7 @@ class Search:
 
         Args:
             pair: the two views.
-            motion: what is possible.
+            density: what is possible.
             poses: (n, 4, 4), best first.
             scores: (n,) how good they are.
             rng: source of all randomness.
@@ -148,41 +148,41 @@ class Search:
         chosen = poses[dropped[apart & (blurred[-1] > blurred[0] - 2.0 * self.negligible)]]
         if not len(chosen):
             return chosen
-        return self.climb.onward(pair, motion, chosen, basin, rng, effective_points=self.effective_points)
+        return self.climb.onward(pair, density, chosen, basin, rng, effective_points=self.effective_points)
 
     def _higher(
-        self, pair: Pair, motion: AbstractMotion, found: Candidates, prior: PoseGaussian, rng: np.random.Generator
+        self, pair: Pair, density: AbstractPoseDensity, found: Candidates, prior: PoseGaussian, rng: np.random.Generator
     ) -> tuple[Search, Candidates]:
         """Return how places are compared, and those of what was found and of what is climbed that are good."""
         fine_m, sparing = self.blurs[-1] * pair.size_m, self._where(scarce=True)
         basin = self._basin(pair.size_m)
         climb = self.climb.thinned(self._starts(prior, pair.size_m) / self.max_starts)
-        high = climb.places(pair, motion, basin, rng, effective_points=self.scarce_points)
+        high = climb.places(pair, density, basin, rng, effective_points=self.scarce_points)
         poses = np.concatenate([found.poses, high])
-        best = sparing._ranked(pair, motion, poses, prior, fine_m)
+        best = sparing._ranked(pair, density, poses, prior, fine_m)
         _, share = pair.log_likelihoods(best.poses[:1], fine_m, stride=2)
         if share[0] < pair.little_overlap:
             return sparing, best
-        return self, self._ranked(pair, motion, poses, prior, fine_m)
+        return self, self._ranked(pair, density, poses, prior, fine_m)
 
     def onward(
-        self, pair: Pair, motion: AbstractMotion, found: Candidates, poses: Array, rng: np.random.Generator
+        self, pair: Pair, density: AbstractPoseDensity, found: Candidates, poses: Array, rng: np.random.Generator
     ) -> Candidates:
         """Return what was found, better poses (n, 4, 4) that are possible, and what lies along their ridges."""
-        prior, fine_m = _gaussian(motion.sample(500, rng), pair.centre_m), self.blurs[-1] * pair.size_m
+        prior, fine_m = _gaussian(density.sample(500, rng), pair.centre_m), self.blurs[-1] * pair.size_m
         search = self._where(scarce=found.scarce)
-        sharp = search._ranked(pair, motion, np.concatenate([poses, found.poses[~found.blunt]]), prior, fine_m)
-        along = search._along(pair, motion, sharp, prior)
+        sharp = search._ranked(pair, density, np.concatenate([poses, found.poses[~found.blunt]]), prior, fine_m)
+        along = search._along(pair, density, sharp, prior)
         return replace(along.beside(found.some(found.blunt)), scarce=found.scarce)
 
     def _where(self, *, scarce: bool) -> Search:
         """Return how places are compared where little surface matches, or enough."""
         return replace(self, effective_points=self.scarce_points) if scarce else self
 
-    def _along(self, pair: Pair, motion: AbstractMotion, found: Candidates, prior: PoseGaussian) -> Candidates:
+    def _along(self, pair: Pair, density: AbstractPoseDensity, found: Candidates, prior: PoseGaussian) -> Candidates:
         """Return candidates and what lies along their ridges, best first."""
         poses = np.concatenate([found.poses, self._walked(pair, found, prior)])
-        return self._ranked(pair, motion, poses, prior, self.blurs[-1] * pair.size_m)
+        return self._ranked(pair, density, poses, prior, self.blurs[-1] * pair.size_m)
 
     def _survivors(self, pair: Pair, poses: Array, most: int) -> Array:
         """Return the best of poses (n, 4, 4), but of each basin no more than a few."""
@@ -223,10 +223,10 @@ class Search:
         return np.repeat([np.deg2rad(self.basin_deg), self.basin * size_m], 3)
 
     def _ranked(
-        self, pair: Pair, motion: AbstractMotion, poses: Array, prior: PoseGaussian, blur_m: float
+        self, pair: Pair, density: AbstractPoseDensity, poses: Array, prior: PoseGaussian, blur_m: float
     ) -> Candidates:
         """Return those of some poses (n, 4, 4) that are possible, good and distinct, best first."""
-        ordered, scores = self._ordered(pair, poses[np.isfinite(motion.log_evidence(poses))], blur_m)
+        ordered, scores = self._ordered(pair, poses[np.isfinite(density.log_evidence(poses))], blur_m)
         return self._kept(pair, ordered, scores, prior, blur_m)
 
     def _ordered(self, pair: Pair, poses: Array, blur_m: float) -> tuple[Array, Array]:
@@ -253,7 +253,7 @@ class Search:
         """Return motions led downhill on matching surface, held by what the prior says of them."""
         return pair.downhill(poses, blur_m, self._pull(pair, prior), steps=self.iterations, stride=4)
 
-    def _next_to_possible(self, pair: Pair, motion: AbstractMotion, poses: Array, prior: PoseGaussian) -> Array:
+    def _next_to_possible(self, pair: Pair, density: AbstractPoseDensity, poses: Array, prior: PoseGaussian) -> Array:
         """Return those of poses (n, 4, 4) beyond what is possible that are not far beyond.
 
         Surface leads a quarter turn round a carton, where other sides of it may match better than the right ones; that
@@ -262,7 +262,7 @@ class Search:
         back = se3.difference(poses, prior.mean, pair.centre_m)
         basins = np.linalg.norm(back / self._basin(pair.size_m), axis=1, keepdims=True)
         nearer = se3.moved(poses, back * np.minimum(self.next_to / np.maximum(basins, 1e-12), 1.0), pair.centre_m)
-        return poses[np.isfinite(motion.log_evidence(nearer))]
+        return poses[np.isfinite(density.log_evidence(nearer))]
 
     def _pull(self, pair: Pair, prior: PoseGaussian) -> Pull:
         """Return what holds motions on their way down: the prior, and some damping."""

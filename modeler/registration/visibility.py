@@ -11,7 +11,7 @@ import numpy as np
 from modeler.registration.candidates import Candidates
 from modeler.registration.importance import AdaptiveSampler, Population
 from modeler.registration.lookup import Lookup
-from modeler.registration.mixture import Gaussians, MixtureMotion
+from modeler.registration.mixture import Gaussians, MixtureProposal
 from modeler.registration.modes import Place, by_place, weighed
 from modeler.registration.pair import Pair
 from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
@@ -19,7 +19,7 @@ from modeler.registration.refinement import Refiner
 from modeler.registration.search import Search
 from modeler.registration.surface import measured_share, spread_points
 from modeler.types import (
-    AbstractMotion,
+    AbstractPoseDensity,
     AbstractRegistrar,
     Mode,
     Outcome,
@@ -108,28 +108,30 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Rotation less sure than this is called ambiguous."""
 
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior of target_from_source; failure is its outcome."""
         started = time.perf_counter()
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
-            return failed(source, target, Outcome.TOO_FEW_POINTS, motion, rng)
+            return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         pair = self.pair(source, target, rng)
-        posterior = self._explored(pair, self.search, motion, rng=rng)
+        posterior = self._explored(pair, self.search, density, rng=rng)
         if not posterior.usable:  # a place may have been missed: look once more, and harder
-            posterior = self._explored(pair, self.search.thorough(), motion, rng=rng)
+            posterior = self._explored(pair, self.search.thorough(), density, rng=rng)
         return replace(posterior, seconds=time.perf_counter() - started)
 
-    def _explored(self, pair: Pair, search: Search, motion: AbstractMotion, *, rng: np.random.Generator) -> Posterior:
+    def _explored(
+        self, pair: Pair, search: Search, density: AbstractPoseDensity, *, rng: np.random.Generator
+    ) -> Posterior:
         """Return the posterior that one search finds."""
         source, target = pair.backward.image, pair.forward.image
-        candidates = search.candidates(pair, motion, rng)
+        candidates = search.candidates(pair, density, rng)
         sampled = [
-            self._sampled_to_the_top(pair, motion, found, rng)
+            self._sampled_to_the_top(pair, density, found, rng)
             for found in by_place(candidates, pair.centre_m)[: self.max_places]
         ]
         strict = min(sampled, key=lambda one: one.noise_m)
-        places = weighed([self._place(pair, motion, one, strict, rng) for one in sampled])
+        places = weighed([self._place(pair, density, one, strict, rng) for one in sampled])
         samples = np.concatenate([place.poses for _, place in places])
         weights = np.concatenate([share * place.weights for share, place in places])
         modes = tuple(Mode(share, place.gaussian(pair.centre_m)) for share, place in places)
@@ -140,7 +142,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         effective = 1.0 / sum(share**2 / place.effective_samples for share, place in places)
         beyond = candidates.beyond > self.max_beyond
         at_limit = (
-            1.0 if beyond else share_at_limit(motion, places[0][1].poses, places[0][1].weights, pair.centre_m, rng)
+            1.0 if beyond else share_at_limit(density, places[0][1].poses, places[0][1].weights, pair.centre_m, rng)
         )
         return Posterior(
             source=source.index,
@@ -158,24 +160,26 @@ class VisibilityRegistrar(AbstractRegistrar):
         )
 
     def _sampled_to_the_top(
-        self, pair: Pair, motion: AbstractMotion, found: Candidates, rng: np.random.Generator
+        self, pair: Pair, density: AbstractPoseDensity, found: Candidates, rng: np.random.Generator
     ) -> _Sampled:
         """Return samples of one place.
 
         Matching surface alone does not lead to the top where free space has a say, at the ends of a tube. Where samples
         come out far above what the search had found, it goes on from the best of them, and they are drawn anew.
         """
-        sampled = self._sampled(pair, motion, found, rng)
+        sampled = self._sampled(pair, density, found, rng)
         for _ in range(self.max_rounds - 1):
             if sampled.rise < self.short_of:
                 break
             order = np.argsort(-sampled.population.log_likelihoods, kind="stable")
             best = sampled.population.poses[order[: self.restarts]]
-            found = self.search.onward(pair, motion, found, best, rng)
-            sampled = self._sampled(pair, motion, found, rng)
+            found = self.search.onward(pair, density, found, best, rng)
+            sampled = self._sampled(pair, density, found, rng)
         return sampled
 
-    def _sampled(self, pair: Pair, motion: AbstractMotion, found: Candidates, rng: np.random.Generator) -> _Sampled:
+    def _sampled(
+        self, pair: Pair, density: AbstractPoseDensity, found: Candidates, rng: np.random.Generator
+    ) -> _Sampled:
         """Return samples around candidates."""
         noise_m = pair.surface_noise_m(found.poses[0], self.search.blurs[-1] * pair.size_m)
         typical = pair.typical_misfit(found.poses[0], noise_m)
@@ -190,12 +194,12 @@ class VisibilityRegistrar(AbstractRegistrar):
             if kind.any():
                 log_weights[kind] += np.log(share) - np.logaddexp.reduce(log_weights[kind])
         gaussians = Gaussians(found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
-        population = self.sampler.run(MixtureMotion(motion, gaussians), likelihood, pair.centre_m, rng)
+        population = self.sampler.run(MixtureProposal(density, gaussians), likelihood, pair.centre_m, rng)
         rise = float(population.log_likelihoods.max() - plain[0])
         return _Sampled(population, noise_m, typical, rise, beside)
 
     def _place(
-        self, pair: Pair, motion: AbstractMotion, one: _Sampled, strict: _Sampled, rng: np.random.Generator
+        self, pair: Pair, density: AbstractPoseDensity, one: _Sampled, strict: _Sampled, rng: np.random.Generator
     ) -> Place:
         """Return one of the places, sharpened by matching surface but where that would leave what is possible.
 
@@ -206,7 +210,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         refined = self.refiner.refine(
             pair, population.poses, population.weights, rng, fine_m=self.search.blurs[-1] * pair.size_m
         )
-        inside = np.isfinite(motion.log_evidence(refined))
+        inside = np.isfinite(density.log_evidence(refined))
         best = int(np.argmax(population.log_likelihoods))
         beside = pair.tempered(
             population.poses[best : best + 1],

@@ -7,6 +7,8 @@ Data meets them in this order: views, motions, posteriors, solution, model; prio
 from modeler.types.arrays import Array as Array
 from modeler.types.arrays import BoolArray as BoolArray
 from modeler.types.arrays import Float32Array as Float32Array
+from modeler.types.densities import AbstractPoseDensity as AbstractPoseDensity
+from modeler.types.densities import EvenSpread as EvenSpread
 from modeler.types.loops import joined_without as joined_without
 from modeler.types.loops import loops_closed as loops_closed
 from modeler.types.model import ACCEPTED as ACCEPTED
@@ -14,8 +16,6 @@ from modeler.types.model import ObjectModel as ObjectModel
 from modeler.types.model import Step as Step
 from modeler.types.modes import as_one as as_one
 from modeler.types.modes import separate as separate
-from modeler.types.motions import AbstractMotion as AbstractMotion
-from modeler.types.motions import EvenSpread as EvenSpread
 from modeler.types.outcomes import InputError as InputError
 from modeler.types.outcomes import Outcome as Outcome
 from modeler.types.posteriors import AbstractRegistrar as AbstractRegistrar

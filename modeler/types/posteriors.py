@@ -10,7 +10,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.types.arrays import Array
-from modeler.types.motions import AbstractMotion
+from modeler.types.densities import AbstractPoseDensity
 from modeler.types.outcomes import Outcome
 from modeler.types.views import RayImage
 
@@ -97,6 +97,6 @@ class AbstractRegistrar(ABC):
 
     @abstractmethod
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior of target_from_source. Failure is the posterior's outcome, never an exception."""

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from modeler.types.motions import AbstractMotion
+from modeler.types.densities import AbstractPoseDensity
 from modeler.types.solution import Edge, Solution
 from modeler.types.views import RayImage
 
@@ -25,14 +25,14 @@ class AbstractPrior(ABC):
     """A nonvisual-information model: parameters with units that say what motions are possible between two views."""
 
     @abstractmethod
-    def between(self, source: RayImage, target: RayImage) -> AbstractMotion:
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source.
 
         Raises:
             InputError: where the views lack what the prior needs (a table, say).
         """
 
-    def grown(self, steps: float) -> AbstractPrior:
+    def relaxed(self, steps: float) -> AbstractPrior:
         """Return the prior with limits that hold for a motion of several steps; itself by default.
 
         A frame is registered with it where frames before it were lost, or where the motion seems to lie beyond.

@@ -130,12 +130,12 @@ def paper_seconds() -> float:
     sequence = open_sequence(bundled("box"))
     frames, sensor = _segmented(sequence), Sensor(*(sequence.sensor() or ()))
     source, target = (sensor.ray_image(*frames[k]) for k in (1, 0))
-    motion = PRIORS["general"].between(source, target)
+    density = PRIORS["general"].between(source, target)
     samples = 100_000
-    PaperRegistrar(samples=1000).register(source, target, motion, rng=np.random.default_rng(0))
+    PaperRegistrar(samples=1000).register(source, target, density, rng=np.random.default_rng(0))
     while True:
         began = time.perf_counter()
-        PaperRegistrar(samples=samples).register(source, target, motion, rng=np.random.default_rng(0))
+        PaperRegistrar(samples=samples).register(source, target, density, rng=np.random.default_rng(0))
         taken = time.perf_counter() - began
         if taken > PAPER_SHORTEST_S or samples >= PAPER_SAMPLES:
             return taken / samples * PAPER_SAMPLES

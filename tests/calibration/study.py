@@ -160,8 +160,8 @@ class Study:
     ) -> Iterator[Trial]:
         source, target = views
         for prior_name, prior in self.priors.items():
-            motion = prior.between(source, target)
-            possible = bool(np.isfinite(motion.log_density(truth[None])[0]))
+            density = prior.between(source, target)
+            possible = bool(np.isfinite(density.log_density(truth[None])[0]))
             for method_name, method in self.methods.items():
                 blank = Trial(
                     half=specimen.half,
@@ -176,7 +176,7 @@ class Study:
                 )
                 if possible:
                     rng = np.random.default_rng([seed, source.index, target.index])
-                    posterior = method.register(source, target, motion, rng=rng)
+                    posterior = method.register(source, target, density, rng=rng)
                     yield judged(blank, posterior, truth, source.centroid_m)
                 else:
                     yield blank

@@ -51,9 +51,9 @@ def _note(kind: Any, notes: int) -> None:
     """Let a registrar tell of every pair that it begins with."""
     register = kind.register
 
-    def noted(self: Any, source: Any, target: Any, motion: Any, *, rng: Any) -> Any:
+    def noted(self: Any, source: Any, target: Any, density: Any, *, rng: Any) -> Any:
         os.write(notes, f"pair {source.index} {target.index}\n".encode())
-        return register(self, source, target, motion, rng=rng)
+        return register(self, source, target, density, rng=rng)
 
     kind.register = noted
 

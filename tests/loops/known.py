@@ -10,7 +10,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.evaluation import true_motion
-from modeler.types import AbstractMotion, AbstractRegistrar, Array, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Outcome, PoseGaussian, Posterior, RayImage
 
 
 @final
@@ -26,7 +26,7 @@ class Known(AbstractRegistrar):
     """Standard deviation of the object's place along each axis."""
 
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior of target_from_source."""
         sigmas = np.repeat([np.radians(self.sigma_deg), self.sigma_m], 3)

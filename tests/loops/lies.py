@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 
 from modeler import se3
-from modeler.types import AbstractMotion, AbstractRegistrar, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, AbstractRegistrar, Outcome, PoseGaussian, Posterior, RayImage
 
 
 @final
@@ -24,10 +24,10 @@ class Lying(AbstractRegistrar):
     """Lies are turned about the object by so much at least; 180 at most."""
 
     def register(
-        self, source: RayImage, target: RayImage, motion: AbstractMotion, *, rng: np.random.Generator
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior of target_from_source, or a lie with the truth's covariance, evidence and overlap."""
-        posterior = self.registrar.register(source, target, motion, rng=rng)
+        posterior = self.registrar.register(source, target, density, rng=rng)
         dice = np.random.default_rng([source.index, target.index])  # the same pairs lie in every run
         if abs(source.index - target.index) == 1 or dice.random() >= self.share:
             return posterior

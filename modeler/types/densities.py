@@ -26,7 +26,7 @@ class EvenSpread:
     """Largest distance between the target's centroid and the source's, carried over."""
 
 
-class AbstractMotion(ABC):
+class AbstractPoseDensity(ABC):
     """What is known of one motion `target_from_source` before the images are compared: a density on SE(3)."""
 
     evidence: bool
