@@ -3,11 +3,12 @@
 # make test       the whole gate: format, lint, types, layers, tests
 # make calibrate  whether stated uncertainties are true, on rendered pairs (many minutes)
 # make bench      speed, against Open3D and the committed baseline
+# make same       COMMIT=…: whether the results are those of another commit, byte by byte
 # make audit      locked packages against published advisories, where these can be reached
 
 BIN := .venv/bin
 
-.PHONY: setup demo test calibrate bench audit
+.PHONY: setup demo test calibrate bench same audit
 
 setup: .venv/.installed
 
@@ -36,6 +37,9 @@ calibrate: setup
 
 bench: setup
 	$(BIN)/python tests/bench
+
+same: setup
+	PYTHONPATH=tests $(BIN)/python -m same_bytes $(COMMIT)
 
 audit: setup
 	.ci/audit
