@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from modeler import se3
 from modeler.fusion import Fuser, own_covariances, surface, tones
 from modeler.fusion.grid import Field, Grid
-from modeler.fusion.stack import posed, spread, stack
+from modeler.fusion.views import posed, spread, stack
 from modeler.kernels import closing, fusion, isosurface, thinning
 from modeler.kernels import votes as voting
 from modeler.kernels.pieces import PIECES
@@ -132,13 +132,13 @@ def test_a_pixel_that_hangs_in_the_air_has_no_surfel():
     assert np.array_equal(np.any(normals != 0.0, axis=1), [False, True])
 
 
-def naive_side(votes, heard, tau_m):
-    """Twin of `votes.spoken_of`."""
-    score = {k: votes[k][1] * (1.01 - abs(votes[k][0]) / tau_m) for k in heard}
-    best = max(heard, key=lambda k: score[k])
+def naive_side(votes, remaining, tau_m):
+    """Twin of `votes.dominant_vote`."""
+    score = {k: votes[k][1] * (1.01 - abs(votes[k][0]) / tau_m) for k in remaining}
+    best = max(remaining, key=lambda k: score[k])
     if votes[best][0] >= 0:
         return best
-    rivals = [k for k in heard if votes[k][0] > 0 and votes[k][2] @ votes[best][2] < voting.AGREE]
+    rivals = [k for k in remaining if votes[k][0] > 0 and votes[k][2] @ votes[best][2] < voting.AGREE]
     rivals = [k for k in rivals if score[k] > 0.3 * score[best]]
     return max(rivals, key=lambda k: score[k], default=best)
 
@@ -178,17 +178,17 @@ def naive_integrate(voxels, tau_m, empty_weight, views):
                 votes.append((along, weights[n] * min(1.0, 1.5 * (1 + along / tau_m) + 1e-3), normals[n], points[n], f))
             elif along > 0 and z < free_m[f, row, column] - tau_m:
                 emptiness += empty_weight
-        heard = list(range(len(votes)))
+        remaining = list(range(len(votes)))
         values[number], totals[number] = (tau_m, emptiness) if emptiness else (0.0, 0.0)
-        while heard:
-            best = naive_side(votes, heard, tau_m)
-            side = [k for k in heard if votes[k][2] @ votes[best][2] > voting.AGREE]
+        while remaining:
+            best = naive_side(votes, remaining, tau_m)
+            side = [k for k in remaining if votes[k][2] @ votes[best][2] > voting.AGREE]
             values[number], totals[number] = tau_m * emptiness, emptiness + sum(votes[k][1] for k in side)
             values[number] = (values[number] + sum(votes[k][1] * votes[k][0] for k in side)) / totals[number]
-            against = [k for k in heard if k not in side and naive_wall(voxel, votes[best], votes[k], views)]
+            against = [k for k in remaining if k not in side and naive_wall(voxel, votes[best], votes[k], views)]
             if len(against) < voting.MANY * len(side):
                 break
-            heard = [k for k in heard if k not in side]
+            remaining = [k for k in remaining if k not in side]
             values[number], totals[number] = tau_m, emptiness
     return values, totals
 
@@ -231,7 +231,7 @@ def test_integration_is_its_twin(seed, one_mind, turned_rad, monkeypatch):
     np.testing.assert_allclose(totals.ravel(), expected_totals, rtol=1e-5)
     np.testing.assert_allclose(values.ravel(), expected_values, rtol=1e-4, atol=1e-8)
     monkeypatch.setattr(voting, "MANY", 1000)  # of the twin alone
-    if one_mind:  # some votes were not heard
+    if one_mind:  # some votes were rejected
         assert np.any(naive_integrate(voxels, tau_m, 0.3, views)[1] != expected_totals)
 
 
@@ -351,7 +351,7 @@ def disagreement_m(views, trajectory):
 def test_views_asked_in_batches_disagree_by_the_same(rng, monkeypatch):
     trajectory, noisy = tabletop.trajectory(POSES), tabletop.views(BRICK, POSES, rng)
     at_once = disagreement_m(noisy, trajectory)
-    monkeypatch.setattr("modeler.fusion.stack.AT_ONCE", 100 * len(POSES))
+    monkeypatch.setattr("modeler.fusion.views.AT_ONCE", 100 * len(POSES))
     assert disagreement_m(noisy, trajectory) == at_once
 
 
@@ -685,7 +685,7 @@ def test_the_smallest_surface_across_an_open_tube_is_flat():
 def test_a_watertight_model_is_closed_and_marks_what_it_made_up():
     for body in (BALL, BRICK, PLATE):
         views, trajectory = tabletop.views(body, POSES), tabletop.trajectory(POSES)
-        model = FUSER.scanned(views, trajectory).model(watertight=True)
+        model = FUSER.volume(views, trajectory).model(watertight=True)
         mesh = trimesh.Trimesh(model.vertices_m, model.triangles, process=False)
         assert mesh.is_watertight
         assert mesh.is_winding_consistent
@@ -698,7 +698,7 @@ def test_a_watertight_model_is_closed_and_marks_what_it_made_up():
         assert np.quantile(np.abs(body.distance(model.vertices_m[~made_up])), 0.95) < 0.5 * VOXEL_M
         assert np.abs(body.distance(model.vertices_m)).max() < 0.025
     # Of a brick, the bottom was made up, and lies where it is.
-    brick = FUSER.scanned(tabletop.views(BRICK, POSES), tabletop.trajectory(POSES)).model(watertight=True)
+    brick = FUSER.volume(tabletop.views(BRICK, POSES), tabletop.trajectory(POSES)).model(watertight=True)
     assert brick.vertex_views is not None
     under = brick.vertices_m[:, 2] < -BRICK.half_m[2] + 1e-3
     core = (np.abs(brick.vertices_m[:, :2]) < 0.04).all(axis=1) & (brick.vertices_m[:, 2] < 0.0)
@@ -715,7 +715,7 @@ def test_one_view_whose_pose_is_off_does_not_hollow_a_watertight_model(off):
     trajectory = tabletop.trajectory(poses)
     trajectory[off] = trajectory[off] @ se3.translation(np.array([0.0, 0.0, 0.03]))
     views = {k: tabletop.view(body, pose, k, table=False) for k, pose in enumerate(poses)}
-    model = FUSER.scanned(views, trajectory).model(watertight=True)
+    model = FUSER.volume(views, trajectory).model(watertight=True)
     volume = trimesh.Trimesh(model.vertices_m, model.triangles, process=False).volume
     assert volume == pytest.approx(8.0 * np.prod(body.half_m), rel=0.05)
 

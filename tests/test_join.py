@@ -236,15 +236,15 @@ def test_exports_that_cannot_be_are_said_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def scanned(body: tabletop.Body, object_from_model: Array, change: Callable[[Array], Array]) -> Any:
+def volume_of(body: tabletop.Body, object_from_model: Array, change: Callable[[Array], Array]) -> Any:
     poses = [change(pose) for pose in tabletop.turntable(8)]
-    return Fuser(voxel_m=0.004).scanned(tabletop.views(body, poses), tabletop.trajectory(poses, object_from_model))
+    return Fuser(voxel_m=0.004).volume(tabletop.views(body, poses), tabletop.trajectory(poses, object_from_model))
 
 
 def test_models_are_laid_on_each_other_from_any_side() -> None:
     brick = tabletop.Box((0.07, 0.05, 0.03))
     moved = se3.exp(np.array([2.0, -0.7, 1.1, 0.2, 0.1, -0.3]))
-    one, other = scanned(brick, np.eye(4), lambda pose: pose), scanned(brick, moved, lambda pose: pose)
+    one, other = volume_of(brick, np.eye(4), lambda pose: pose), volume_of(brick, moved, lambda pose: pose)
     best, *rest = Matcher(rotations=120, judged=15).matches(one, other, (one.model(), other.model()))
     laid = se3.transform(best.target_from_source, other.model().points_m)
     assert np.quantile(np.abs(brick.distance(laid)), 0.95) < 2e-3

@@ -36,7 +36,7 @@ _PATHS: Final = {
 
 
 @dataclass(frozen=True, eq=False)
-class Projection:
+class ProjectedPoints:
     """The points of one view in the image of another."""
 
     pixels: Array
@@ -79,7 +79,7 @@ def drawing(step: Step) -> Drawing:
         yield entities.VISIBILITY_CAPTION, rr.Points2D(below, labels=caption(shown), **style)
 
 
-def caption(shown: Projection) -> str:
+def caption(shown: ProjectedPoints) -> str:
     """Say how many of the points that can be judged are where they may be."""
     judged = max(int(np.sum(shown.verdicts != NO_SAY)), 1)
     agree, hidden, front = (round(100 * np.sum(shown.verdicts == v) / judged) for v in (AGREES, HIDDEN, VIOLATION))
@@ -94,13 +94,13 @@ def areas(view: RayImage) -> npt.NDArray[np.uint8]:
     return picture
 
 
-def projection(source: RayImage, target: RayImage, target_from_source: Array) -> Projection:
+def projection(source: RayImage, target: RayImage, target_from_source: Array) -> ProjectedPoints:
     """Return where points of the source land in the target's image, and whether they may be there.
 
     The verdicts are those of `visibility`, from which an edge's overlap is counted, whatever method found the motion.
     """
     if min(len(source.points_m), len(target.points_m)) == 0:
-        return Projection(np.zeros((0, 2)), np.zeros(0, dtype=np.int8))
+        return ProjectedPoints(np.zeros((0, 2)), np.zeros(0, dtype=np.int8))
     registrar, rng = VisibilityRegistrar(points=_POINTS), np.random.default_rng(0)
     looked_up = registrar.pair(_ready(source), _ready(target), rng).forward
     points_m = se3.transform(target_from_source, looked_up.points[:, :3])
@@ -112,7 +112,7 @@ def projection(source: RayImage, target: RayImage, target_from_source: Array) ->
     pixels = scale * points_m[:, :2] / points_m[:, 2:] + np.array([camera.cx, camera.cy])
     columns, rows = np.rint(pixels).T
     inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
-    return Projection(pixels[inside], verdicts[inside])
+    return ProjectedPoints(pixels[inside], verdicts[inside])
 
 
 def _ready(view: RayImage) -> RayImage:

@@ -10,7 +10,7 @@ from modeler.cli.reopened import reopened
 from modeler.cli.saying import say
 from modeler.export.mesh import TEXTURED
 from modeler.export.texture import TRIANGLES
-from modeler.fusion import Fuser, Scan
+from modeler.fusion import Fuser, FusionVolume
 from modeler.types import InputError, ObjectModel
 
 
@@ -24,11 +24,11 @@ def export(options: Export) -> None:
     report = files.RunFolder(options.run_folder).result()  # a sequence may hold a model.ply as well: the true one
     if not report.get("poses"):
         raise InputError(f"{options.run_folder}: no frame of this run was accepted; report.json says why")
-    scan = _scan(options)
-    if scan is None:
+    volume = _volume(options)
+    if volume is None:
         model = files.read_model(files.mesh_of(options.run_folder))
     else:
-        model = scan.model(watertight=options.watertight)
+        model = volume.model(watertight=options.watertight)
         if not len(model.triangles):
             raise InputError(f"{options.run_folder}: its views give no surface; more of them are needed")
     if options.tint is not None:
@@ -37,10 +37,10 @@ def export(options: Export) -> None:
     if count is not None:
         model = files.simplified(model, count)
     texture = None
-    if options.texture and scan is not None:
-        if not scan.seen.coloured.any():
+    if options.texture and volume is not None:
+        if not volume.views.coloured.any():
             raise InputError(f"{options.run_folder}: its frames have no colour; leave out --texture")
-        model, texture = files.textured(model, scan.painted, scan.texel_m)
+        model, texture = files.textured(model, volume.painted, volume.texel_m)
     if options.bop:
         files.write_bop(model, options.out)
     else:
@@ -65,12 +65,12 @@ def _check(options: Export) -> None:
         raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m between 0 and 1")
 
 
-def _scan(options: Export) -> Scan | None:
+def _volume(options: Export) -> FusionVolume | None:
     """Return the views of the run, where the mesh has to be made anew."""
     if not (options.watertight or options.texture or options.voxel_m is not None):
         return None
     run = reopened(options.run_folder, options.moved.sequence)
-    return run.scan(Fuser(voxel_m=options.voxel_m or run.report["settings"].get("voxel_m")))
+    return run.volume(Fuser(voxel_m=options.voxel_m or run.report["settings"].get("voxel_m")))
 
 
 def _tell(model: ObjectModel, options: Export) -> None:

@@ -102,9 +102,9 @@ def _matches(first: Reopened, second: Reopened) -> list[Match]:
     Raises:
         InputError: where there is none.
     """
-    scans = first.scan(Fuser()), second.scan(Fuser())
-    models = scans[0].model(), scans[1].model()
-    found = Matcher().matches(*scans, models) if all(len(model.points_m) for model in models) else []
+    volumes = first.volume(Fuser()), second.volume(Fuser())
+    models = volumes[0].model(), volumes[1].model()
+    found = Matcher().matches(*volumes, models) if all(len(model.points_m) for model in models) else []
     if not found:
         raise InputError("the models cannot be laid on each other; build both runs from more views")
     return found

@@ -9,7 +9,7 @@ from typing import Any
 
 from modeler.cli.parts import Part, parts_of
 from modeler.export import RunFolder, edges_of, poses_of
-from modeler.fusion import Fuser, Scan, own_covariances
+from modeler.fusion import Fuser, FusionVolume, own_covariances
 from modeler.graph import PoseGraph, solve
 from modeler.rays import Sensor
 from modeler.types import Array, Edge, InputError, RayImage, Solution
@@ -34,9 +34,9 @@ class Reopened:
     parts: tuple[Part, ...]
     """What it was made of: one sequence, or of joined runs all of theirs."""
 
-    def scan(self, fuser: Fuser) -> Scan:
+    def volume(self, fuser: Fuser) -> FusionVolume:
         """Return the views laid together as `modeler build` lays them."""
-        return fuser.scanned(self.views, self.solution.trajectory, own_covariances(self.solution, self.edges))
+        return fuser.volume(self.views, self.solution.trajectory, own_covariances(self.solution, self.edges))
 
 
 def reopened(run: Path, sequences: Sequence[Path] = ()) -> Reopened:

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from modeler.fusion import surface
 from modeler.fusion.grid import FAINT, Field, crossed
-from modeler.fusion.stack import Stack
+from modeler.fusion.views import DepthViews
 from modeler.kernels import closing
 from modeler.types import Array, BoolArray
 
@@ -36,7 +36,7 @@ def without(field: Field, rejected_m: Array, kept_m: Array, reach_m: float) -> F
     return Field(grid, field.values_m, weights, np.argwhere(weights > 0.0))
 
 
-def enclosing(field: Field, seen: Stack, tau_m: float) -> Field:
+def enclosing(field: Field, seen: DepthViews, tau_m: float) -> Field:
     """Return the field with all that is unknown decided: outside or inside.
 
     What views look through or know to be below the table is outside, unless nearly all others have surface in front of
@@ -81,7 +81,7 @@ def enclosing(field: Field, seen: Stack, tau_m: float) -> Field:
     return Field(grid, whole, np.maximum(field.weights, np.float32(FAINT)), crossed(whole))
 
 
-def tables(seen: Stack, corners_m: Array, tau_m: float) -> Array:
+def tables(seen: DepthViews, corners_m: Array, tau_m: float) -> Array:
     """Return normals and offsets (k, 4) of the tables on which the object stands, in the object frame.
 
     Planes that views see are one table where they are less than `tau_m` apart all over a box, given by its corners

@@ -9,10 +9,10 @@ import numpy as np
 
 from modeler import se3
 from modeler.fusion import grid
-from modeler.fusion.cut import SMOOTHED
-from modeler.fusion.growing import Growing
-from modeler.fusion.scan import Scan
-from modeler.fusion.stack import posed, spread, stack
+from modeler.fusion.crop import SMOOTHED
+from modeler.fusion.incremental import IncrementalTsdf
+from modeler.fusion.views import posed, spread, stack
+from modeler.fusion.volume import FusionVolume
 from modeler.types import Array, InputError, ObjectModel, RayImage
 
 
@@ -56,8 +56,8 @@ class Fuser:
     """Loose pieces of the mesh smaller than this share of the largest piece's area are removed."""
 
     def preview(
-        self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array], before: Growing | None = None
-    ) -> Growing:
+        self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array], before: IncrementalTsdf | None = None
+    ) -> IncrementalTsdf:
         """Return a coarse model that costs little more than what has changed since the one before.
 
         Args:
@@ -68,7 +68,7 @@ class Fuser:
         Raises:
             InputError: where no view with surface points has a pose.
         """
-        return (before or Growing(self)).to(views, trajectory)
+        return (before or IncrementalTsdf(self)).to(views, trajectory)
 
     def fuse(
         self,
@@ -90,14 +90,14 @@ class Fuser:
         Raises:
             InputError: where no view with surface points has a pose.
         """
-        return self.scanned(views, trajectory, covariances).model()
+        return self.volume(views, trajectory, covariances).model()
 
-    def scanned(
+    def volume(
         self,
         views: Mapping[int, RayImage],
         trajectory: Mapping[int, Array],
         covariances: Mapping[int, Array] | None = None,
-    ) -> Scan:
+    ) -> FusionVolume:
         """Return the views laid together in one volume, from which models are made; arguments as of `fuse`."""
         pairs = posed(views, trajectory)
         noise_m = float(np.median([view.sigma_r_m for view, _ in pairs]))
@@ -120,7 +120,7 @@ class Fuser:
         limit_m = 0.05 * float(np.linalg.norm(box.shape)) * box.voxel_m
         spread_m, sigma_m = spread(seen, limit_m) or (noise_m, SMOOTHED * noise_m)
         tau_m = self.truncation_m or 3.0 * box.voxel_m + 2.0 * spread_m
-        return Scan(self, seen.carving(tau_m), box, tau_m, box.voxel_m + 2.0 * spread_m, sigma_m)
+        return FusionVolume(self, seen.carving(tau_m), box, tau_m, box.voxel_m + 2.0 * spread_m, sigma_m)
 
     def side_m(self, pairs: list[tuple[RayImage, Array]]) -> float:
         """Return the side of a voxel, before the box is known.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from modeler.fusion.stack import Stack
+from modeler.fusion.views import DepthViews
 from modeler.kernels import fusion, isosurface
 from modeler.types import Array
 
@@ -68,7 +68,7 @@ class Field:
     """(n, 3) voxels with a weight, in ascending order."""
 
 
-def measure(grid: Grid, views: Stack, *, tau_m: float, empty_weight: float) -> Field:
+def measure(grid: Grid, views: DepthViews, *, tau_m: float, empty_weight: float) -> Field:
     """Return the signed distance that the views measure, within ±`tau_m` around the surface."""
     block_m = fusion.SIDE * grid.voxel_m
     blocks = fusion.blocks_near(views.points_m, grid.origin_m, block_m, tau_m, grid.blocks)

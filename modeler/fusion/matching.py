@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.fusion import cloud
-from modeler.fusion.scan import Scan
+from modeler.fusion.volume import FusionVolume
 from modeler.types import Array, ObjectModel
 
 
@@ -48,7 +48,9 @@ class Matcher:
     colour_level: float = 40.0
     """Difference of colours at which they count as different."""
 
-    def matches(self, target: Scan, source: Scan, models: tuple[ObjectModel, ObjectModel]) -> list[Match]:
+    def matches(
+        self, target: FusionVolume, source: FusionVolume, models: tuple[ObjectModel, ObjectModel]
+    ) -> list[Match]:
         """Return different ways to lay the source on the target, best first.
 
         Args:
@@ -84,24 +86,28 @@ class Matcher:
         return distinct
 
     def score(
-        self, target_from_source: Array, target: Scan, source: Scan, models: tuple[ObjectModel, ObjectModel]
+        self,
+        target_from_source: Array,
+        target: FusionVolume,
+        source: FusionVolume,
+        models: tuple[ObjectModel, ObjectModel],
     ) -> float:
         """Return how well the views of both models agree with one lying on the other so, at most 1."""
         forth = self._agreement(models[1], target_from_source, target)
         back = self._agreement(models[0], se3.inverse(target_from_source), source)
         return 0.5 * (forth + back)
 
-    def _agreement(self, model: ObjectModel, scan_from_model: Array, scan: Scan) -> float:
+    def _agreement(self, model: ObjectModel, volume_from_model: Array, volume: FusionVolume) -> float:
         """Return what the views of one model say of the surface of the other, on average."""
         chosen = np.linspace(0, len(model.points_m) - 1, min(self.witnesses, len(model.points_m))).astype(np.int64)
-        points = se3.transform(scan_from_model, model.points_m[chosen])
-        told = scan.asked(points, model.normals[chosen] @ scan_from_model[:3, :3].T)
-        worth = np.where(told.views > 0, 1.0, 0.0)
+        points = se3.transform(volume_from_model, model.points_m[chosen])
+        support = volume.support(points, model.normals[chosen] @ volume_from_model[:3, :3].T)
+        worth = np.where(support.views > 0, 1.0, 0.0)
         if model.colours is not None:
-            off = np.linalg.norm(told.colours.astype(float) - model.colours[chosen].astype(float), axis=1)
+            off = np.linalg.norm(support.colours.astype(float) - model.colours[chosen].astype(float), axis=1)
             alike = np.exp(-((off / self.colour_level) ** 2))
-            worth = np.where((told.views > 0) & told.coloured, 0.5 + 0.5 * alike, worth)
-        return float(np.mean(worth - ((told.views == 0) & (told.emptiness > 0.0))))
+            worth = np.where((support.views > 0) & support.coloured, 0.5 + 0.5 * alike, worth)
+        return float(np.mean(worth - ((support.views == 0) & (support.emptiness > 0.0))))
 
     def _drawn(
         self, pose: Array, tree: KDTree, target_normals: Array, points_m: Array, normals: Array, *, extent_m: float

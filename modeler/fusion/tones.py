@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import laplace, minimum_filter
 
-from modeler.fusion.stack import Stack
+from modeler.fusion.views import DepthViews
 from modeler.kernels import fusion
 from modeler.types import Array
 
@@ -17,7 +17,7 @@ AGREED = 0.1  # colours that differ by more than this (log) show a highlight or 
 LARGEST = 2.5  # factor between exposures
 
 
-def gains(seen: Stack, points_m: Array, normals: Array, *, tau_m: float, near_m: float) -> Array:
+def gains(seen: DepthViews, points_m: Array, normals: Array, *, tau_m: float, near_m: float) -> Array:
     """Return (f, 4): factors on red, green and blue that even out exposure, and the say of each view, 0 without colour.
 
     A point has one colour, each view a gain: both are fitted to the logarithms of what the views show of common points.
@@ -70,7 +70,7 @@ def _evened(logs: Array, shown: Array) -> Array:
     return gain
 
 
-def _sharpness(seen: Stack) -> Array:
+def _sharpness(seen: DepthViews) -> Array:
     """Return the say (f,) of the views: how much fine detail their object shows, against the others; 0 = no colour."""
     say = np.zeros(len(seen.coloured))
     for view in np.flatnonzero(seen.coloured):

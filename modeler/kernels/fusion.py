@@ -91,7 +91,7 @@ def integrate(
             places[voxel, 0] = origin[0] + (blocks[b, 0] * SIDE + voxel // (SIDE * SIDE) + 0.5) * voxel_m
             places[voxel, 1] = origin[1] + (blocks[b, 1] * SIDE + voxel // SIDE % SIDE + 0.5) * voxel_m
             places[voxel, 2] = origin[2] + (blocks[b, 2] * SIDE + voxel % SIDE + 0.5) * voxel_m
-        seen, distance, weight, number, empty = asked(
+        seen, distance, weight, number, empty = collect_votes(
             places, tau_m, index, free_m, poses, lenses, points, normals, weights
         )
         for voxel in range(SIDE**3):
@@ -116,7 +116,7 @@ def integrate(
 
 
 @njit(cache=True)
-def asked(places, tau_m, index, free_m, poses, lenses, points, normals, weights):
+def collect_votes(places, tau_m, index, free_m, poses, lenses, points, normals, weights):
     """Return the votes of the views on places (m, 3), as `votes.blend` takes them, and how many see each empty.
 
     These are how many votes there are (m,), and of each the distance, the weight and the surface point, all (m, f);

@@ -6,7 +6,7 @@ from modeler.kernels.votes import above, project
 
 
 @njit(cache=True, parallel=True)
-def tell(
+def integrate_view(
     sums, origin, voxel_m, tau_m, empty_weight, sign, pose, lens, index, free_m, points, normals, weights, colours
 ):
     """Add to the sums of a box of voxels, in place, what a view says: weight, weighted distance, weighted colour.

@@ -22,8 +22,8 @@ def project(pose, lens, x, y, z):
     return u, v, depth
 
 
-# `fusion.asked`, `blend` and `spoken_of`, which do little else, write the next two out: calls would cost a fifth of
-# their time.
+# `fusion.collect_votes`, `blend` and `dominant_vote`, which do little else, write the next two out: calls would cost
+# a fifth of their time.
 @njit(cache=True)
 def above(x, y, z, points, normals, n):
     """Return how far a place lies above the surface at point `n`, along its normal."""
@@ -38,11 +38,11 @@ def facing(first, i, second, k):
 
 @njit(cache=True)
 def blend(place, seen, distance, weight, number, emptiness, tau_m, views, index, poses, lenses, points, normals):
-    """Return signed distance and weight of a place from its votes. Weights of votes that are not heard become 0.
+    """Return signed distance and weight of a place from its votes. Weights of rejected votes become 0.
 
-    Only votes for the side of the object that is spoken of are averaged, see `spoken_of`. A vote that many contradict
-    is not heard, see `walled_off`: a few pixels at a flat angle, off along their rays by far more than the noise, seem
-    to look out from within the object.
+    Only votes for the side of the object that the dominant vote is for are averaged, see `dominant_vote`. A vote that
+    many contradict is rejected, see `occluding_votes`: a few pixels at a grazing angle, off along their rays by far
+    more than the noise, seem to look out from within the object.
 
     Args:
         place: (3,) in the object frame.
@@ -59,9 +59,9 @@ def blend(place, seen, distance, weight, number, emptiness, tau_m, views, index,
         points: (n, 3).
         normals: (n, 3).
     """
-    heard = seen
+    remaining = seen
     while True:
-        best = spoken_of(seen, distance, weight, number, normals, tau_m)
+        best = dominant_vote(seen, distance, weight, number, normals, tau_m)
         if best < 0:
             return tau_m, emptiness
         side = number[best]
@@ -75,19 +75,21 @@ def blend(place, seen, distance, weight, number, emptiness, tau_m, views, index,
                 total += weight[k]
                 value += weight[k] * distance[k]
                 voices += 1
-        if heard < (1 + MANY) * voices:
+        if remaining < (1 + MANY) * voices:
             return value / total, total
-        against = walled_off(best, place, seen, distance, weight, number, views, index, poses, lenses, points, normals)
+        against = occluding_votes(
+            best, place, seen, distance, weight, number, views, index, poses, lenses, points, normals
+        )
         if against < MANY * voices:
             return value / total, total
         for k in range(seen):
             if weight[k] > 0.0 and facing(normals, side, normals, number[k]) > AGREE:
                 weight[k] = 0.0
-                heard -= 1
+                remaining -= 1
 
 
 @njit(cache=True)
-def spoken_of(seen, distance, weight, number, normals, tau_m):
+def dominant_vote(seen, distance, weight, number, normals, tau_m):
     """Return which vote sets the side of the object that votes speak of, -1 = none; arguments as of `blend`.
 
     A view that sees a place in front of a surface knows that it is empty; one that sees it behind only supposes that it
@@ -112,7 +114,7 @@ def spoken_of(seen, distance, weight, number, normals, tau_m):
 
 
 @njit(cache=True)
-def walled_off(best, place, seen, distance, weight, number, views, index, poses, lenses, points, normals):
+def occluding_votes(best, place, seen, distance, weight, number, views, index, poses, lenses, points, normals):
     """Return how many votes for other sides see surface on the way between a place and the view of the best vote.
 
     Whoever sees the back of a wall looks at it from behind. Arguments as of `blend`.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from modeler.closure import MapView
-from modeler.fusion import Growing
+from modeler.fusion import IncrementalTsdf
 from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.types import Edge, Frame, InputError, ObjectModel, RayImage, Segmentation, Solution
 
@@ -45,7 +45,7 @@ class State:
     """How many frames were searched for in vain since one was last found by it."""
     model: ObjectModel | None = None
     """The newest model."""
-    growing: Growing | None = None
+    growing: IncrementalTsdf | None = None
     """What it grows from while frames still come."""
 
     @property

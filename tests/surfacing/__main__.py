@@ -82,9 +82,9 @@ def _rows(name: str, folder: Path) -> list[dict[str, object]]:
     own = {frame: model_from_object @ pose for frame, pose in run.solution.trajectory.items()}
     rows = []
     for poses, trajectory in (("true", {frame: se3.inverse(truth[frame]) for frame in run.views}), ("own", own)):
-        scan = Fuser().scanned(run.views, trajectory)
+        volume = Fuser().volume(run.views, trajectory)
         for method in METHODS:
-            made, seconds, megabytes = _made(method, run.views, trajectory, scan.box.voxel_m, scan.tau_m)
+            made, seconds, megabytes = _made(method, run.views, trajectory, volume.box.voxel_m, volume.tau_m)
             errors = surface_errors(*made, surface, np.random.default_rng([0, 1])).over(seen)
             rows.append(
                 {

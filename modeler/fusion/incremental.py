@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.fusion import surface
-from modeler.fusion.cut import GREY, colours_at, free_of
-from modeler.fusion.stack import posed
+from modeler.fusion.crop import GREY, colours_at, free_of
+from modeler.fusion.views import posed
 from modeler.kernels import isosurface, preview
 from modeler.kernels.pieces import PIECES
 from modeler.types import Array, ObjectModel, RayImage
@@ -41,14 +41,14 @@ class _Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Growing:
+class IncrementalTsdf:
     """A coarse model that is kept up to date.
 
     Each voxel holds plain sums over the views (Curless and Levoy 1996), so that a view whose pose has moved is taken
     back and added anew without touching the others (Dai et al. 2017, "BundleFusion", section 5).
     """
 
-    how: Fuser
+    fuser: Fuser
     """Parameters."""
     voxel_m: float = 0.0
     """Side of a voxel; 0 = no view yet."""
@@ -59,7 +59,7 @@ class Growing:
     places: Mapping[int, _Place] = field(default_factory=dict)
     """By frame number."""
 
-    def to(self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> Growing:
+    def to(self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> IncrementalTsdf:
         """Return the model with new views added, and with those carried along whose poses have moved most.
 
         Args:
@@ -70,24 +70,24 @@ class Growing:
             InputError: where no view with surface points has a pose.
         """
         pairs = {view.index: (view, pose) for view, pose in posed(views, trajectory) if len(view.points_m)}
-        voxel_m = self.voxel_m or self.how.preview_voxels * self.how.side_m(list(pairs.values()))
+        voxel_m = self.voxel_m or self.fuser.preview_voxels * self.fuser.side_m(list(pairs.values()))
         after = self if self.voxel_m else replace(self, voxel_m=voxel_m)
         new = [frame for frame in pairs if frame not in self.places]
         moved_m = _shifts_m(pairs, self.places)
         moved = sorted((frame for frame in moved_m if moved_m[frame] > 0.5 * voxel_m), key=lambda k: -moved_m[k])
-        moved = moved[: self.how.preview_moves]
+        moved = moved[: self.fuser.preview_moves]
         gone = [frame for frame in self.places if frame not in pairs and frame in views]
         if not (new or moved or gone):
             return self
         low, high = after._box([pairs[frame] for frame in (*new, *moved)])
-        if np.prod(np.subtract(high, low)) > self.how.preview_limit:
-            return Growing(self.how, 1.5 * voxel_m).to(views, trajectory)
+        if np.prod(np.subtract(high, low)) > self.fuser.preview_limit:
+            return IncrementalTsdf(self.fuser, 1.5 * voxel_m).to(views, trajectory)
         after, places = after._grown(low, high), dict(self.places)
         for frame in (*gone, *moved):
-            after._tell(views[frame], places.pop(frame), -1.0)
+            after._integrate(views[frame], places.pop(frame), -1.0)
         for frame in (*new, *moved):
             places[frame] = _Place(pairs[frame][1], low, high, _corners_m(pairs[frame][0]))
-            after._tell(pairs[frame][0], places[frame], 1.0)
+            after._integrate(pairs[frame][0], places[frame], 1.0)
         return replace(after, places=places)
 
     @property
@@ -104,7 +104,7 @@ class Growing:
         known = weights > 0.0
         values = np.where(known, self.sums[..., 1] / np.where(known, weights, 1.0), 0.0).astype(np.float32)
         places, triangles = isosurface.extract(values, weights, np.argwhere(known), PIECES)
-        shown = triangles[surface.large_pieces(places, triangles, self.how.min_piece)]
+        shown = triangles[surface.large_pieces(places, triangles, self.fuser.min_piece)]
         used, shown = surface.compacted(shown, len(places))
         places = places[used]
         vertices_m = (np.array(self.low) + places + 0.5) * self.voxel_m
@@ -124,9 +124,9 @@ class Growing:
         """Return the RGB (n, 3) of the voxels nearest to places in voxels, None where there is no colour at all."""
         if not np.any(self.sums[..., 2] > KNOWN):
             return None
-        told = self.sums[tuple(np.rint(places).astype(np.int64).T)]
-        share = told[:, 2:3]
-        mean = np.where(share > KNOWN, told[:, 3:] / np.maximum(share, KNOWN), GREY)
+        cells = self.sums[tuple(np.rint(places).astype(np.int64).T)]
+        share = cells[:, 2:3]
+        mean = np.where(share > KNOWN, cells[:, 3:] / np.maximum(share, KNOWN), GREY)
         return np.clip(np.rint(mean), 0.0, 255.0).astype(np.uint8)
 
     def _box(self, pairs: list[tuple[RayImage, Array]]) -> tuple[Corner, Corner]:
@@ -140,7 +140,7 @@ class Growing:
             highs.append(UNIT * np.ceil((high_m + border) / unit_m).astype(np.int64))
         return _corner(np.min(lows, axis=0)), _corner(np.max(highs, axis=0))
 
-    def _grown(self, low: Corner, high: Corner) -> Growing:
+    def _grown(self, low: Corner, high: Corner) -> IncrementalTsdf:
         """Return the model with sums of its own, in a box that holds that of before."""
         sums = np.zeros((*np.subtract(high, low), 6), dtype=np.float32)
         if self.sums.size:
@@ -149,20 +149,20 @@ class Growing:
             sums[x : x + nx, y : y + ny, z : z + nz] = self.sums
         return replace(self, low=low, sums=sums)
 
-    def _tell(self, view: RayImage, place: _Place, sign: float) -> None:
+    def _integrate(self, view: RayImage, place: _Place, sign: float) -> None:
         """Add to the sums, in place, what a view says from its place, or take it back."""
-        index, free_m, lens = _images(view, self.how.margin_px)
+        index, free_m, lens = _images(view, self.fuser.margin_px)
         cosine = -np.sum(view.points_m * view.normals, axis=1) / np.linalg.norm(view.points_m, axis=1)
         colours = np.ones((len(view.points_m), 4))
         colours[:, :3] = colours_at(view)
         colours[:, 3] = view.frame.colour is not None
         box = tuple(slice(*ends) for ends in np.subtract((place.low, place.high), self.low).T)
-        preview.tell(
+        preview.integrate_view(
             self.sums[box],
             np.array(place.low) * self.voxel_m,
             self.voxel_m,
             self.tau_m,
-            self.how.empty_weight,
+            self.fuser.empty_weight,
             sign,
             se3.inverse(place.object_from_camera)[:3],
             lens,
@@ -170,7 +170,7 @@ class Growing:
             free_m,
             se3.transform(place.object_from_camera, view.points_m),
             view.normals @ place.object_from_camera[:3, :3].T,
-            np.where(cosine >= self.how.min_cosine, cosine, 0.0),
+            np.where(cosine >= self.fuser.min_cosine, cosine, 0.0),
             colours,
         )
 

@@ -9,8 +9,8 @@ import pytest
 import tabletop
 
 from modeler import se3
-from modeler.fusion.cut import Cut, cut, free_of, pose_variances
-from modeler.fusion.stack import stack
+from modeler.fusion.crop import Crop, crop, free_of, pose_variances
+from modeler.fusion.views import stack
 from modeler.types import Array, RayImage
 
 WHOLE = slice(0, tabletop.CAMERA.height), slice(0, tabletop.CAMERA.width)
@@ -29,11 +29,11 @@ def stepped(step_m: float) -> RayImage:
     return tabletop.seen(frame, np.tile([0.0, 0.0, -1.0], (int(mask.sum()), 1)), 1e-4)
 
 
-def part_of(view: RayImage) -> Cut:
-    return cut(view, WHOLE, margin_px=2, min_cosine=0.15, edge_weight=0.1)
+def part_of(view: RayImage) -> Crop:
+    return crop(view, WHOLE, margin_px=2, min_cosine=0.15, edge_weight=0.1)
 
 
-def weight_image(part: Cut) -> Array:
+def weight_image(part: Crop) -> Array:
     return np.where(part.index >= 0, part.weights[part.index], np.nan)
 
 

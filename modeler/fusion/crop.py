@@ -18,13 +18,13 @@ STEEPEST_RAD = 1.40  # a step between neighbouring pixels steeper than this (80Â
 
 
 @dataclass(frozen=True, eq=False)
-class Cut:
+class Crop:
     """One view cut to a window: its images there, and the surface points seen in it, in camera coordinates."""
 
     index: npt.NDArray[np.int32]
     """(h, w) number of the surface point at a pixel, -1 = none."""
     free_m: npt.NDArray[np.float32]
-    """(h, w), and the next: as in `Stack`."""
+    """(h, w), and the next: as in `DepthViews`."""
     beside_m: npt.NDArray[np.float32]
     colour: npt.NDArray[np.uint8] | None
     """(h, w, 3) RGB."""
@@ -64,8 +64,8 @@ def window(view: RayImage, camera_from_object: Array, corners_m: Array) -> tuple
     return slice(top, bottom), slice(left, right)
 
 
-def cut(view: RayImage, where: tuple[slice, slice], *, margin_px: int, min_cosine: float, edge_weight: float) -> Cut:
-    """Cut a view to a window.
+def crop(view: RayImage, where: tuple[slice, slice], *, margin_px: int, min_cosine: float, edge_weight: float) -> Crop:
+    """Crop a view to a window.
 
     Where the view has no surface point, at silhouettes, on thin parts and at flat angles, small planes through the
     measured depth stand in.
@@ -102,7 +102,7 @@ def cut(view: RayImage, where: tuple[slice, slice], *, margin_px: int, min_cosin
     index = np.full(depth_m.shape, -1, dtype=np.int32)
     index[tuple(pixels.T)] = np.arange(len(pixels))
     around = np.asarray(maximum_filter(mask, size=2 * margin_px + 1, mode="nearest"), dtype=bool)
-    return Cut(
+    return Crop(
         index=index,
         free_m=free_of(depth_m, margin_px),
         beside_m=np.where(measured & ~around, depth_m, 0.0).astype(np.float32),
@@ -127,7 +127,7 @@ def free_of(depth_m: npt.NDArray[np.float32], margin_px: int) -> npt.NDArray[np.
     return np.where(measured, reach_m, 0.0).astype(np.float32)
 
 
-def pose_variances(part: Cut, covariance: Array | None, sigma_r_m: float) -> Array:
+def pose_variances(part: Crop, covariance: Array | None, sigma_r_m: float) -> Array:
     """Return the variances (n,) of points along their normals that the pose's error makes, against a pixel's own.
 
     Args:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.fusion.cut import Cut, cut, pose_variances, window
+from modeler.fusion.crop import Crop, crop, pose_variances, window
 from modeler.kernels import fusion
 from modeler.types import Array, BoolArray, InputError, RayImage
 
@@ -19,7 +19,7 @@ AT_ONCE = 1_000_000  # of these, for the memory it takes
 
 
 @dataclass(frozen=True, eq=False)
-class Stack:
+class DepthViews:
     """Views side by side; see `modeler.kernels.fusion` for how they are looked up. Points are in the object frame."""
 
     index: npt.NDArray[np.int32]
@@ -54,7 +54,7 @@ class Stack:
         """Arguments that every kernel shares."""
         return self.index, self.free_m, self.poses, self.lenses, self.points_m, self.normals, self.weights
 
-    def alone(self, view: int) -> Stack:
+    def alone(self, view: int) -> DepthViews:
         """Return the stack with the images of one view only; the surface points of all stay, by their numbers."""
         here = slice(view, view + 1)
         return replace(
@@ -69,7 +69,7 @@ class Stack:
             planes=self.planes[here],
         )
 
-    def carving(self, tau_m: float) -> Stack:
+    def carving(self, tau_m: float) -> DepthViews:
         """Return the views with empty space that ends behind what is measured beside the object, by a band ±`tau_m`.
 
         Empty space ends a band short of the object's surface, whose place is not known better. Something else that is
@@ -99,7 +99,7 @@ def stack(
     min_cosine: float,
     edge_weight: float,
     covariances: Mapping[int, Array] | None = None,
-) -> Stack:
+) -> DepthViews:
     """Lay views side by side.
 
     Args:
@@ -120,7 +120,7 @@ def stack(
     colour = np.zeros((*size, 3), dtype=np.uint8)
     lenses, told, counts = [], [], []
     for number, ((view, pose), where) in enumerate(zip(pairs, windows, strict=True)):
-        part = cut(view, where, margin_px=margin_px, min_cosine=min_cosine, edge_weight=edge_weight)
+        part = crop(view, where, margin_px=margin_px, min_cosine=min_cosine, edge_weight=edge_weight)
         here = number, *map(slice, part.index.shape)
         index[here] = np.where(part.index >= 0, part.index + sum(counts), -1)
         free_m[here], beside_m[here] = part.free_m, part.beside_m
@@ -135,7 +135,7 @@ def stack(
     # The noise of a triangulating camera grows with z².
     weights = weights * (np.median(depth_m) / depth_m) ** 4
     trust = 1.0 / (1.0 + weights * noise)
-    return Stack(
+    return DepthViews(
         index=index,
         free_m=free_m,
         beside_m=beside_m,
@@ -161,7 +161,7 @@ def _plane(view: RayImage, object_from_camera: Array) -> Array:
 
 
 def _told(
-    part: Cut, object_from_camera: Array, covariance: Array | None, sigma_r_m: float
+    part: Crop, object_from_camera: Array, covariance: Array | None, sigma_r_m: float
 ) -> tuple[Array, Array, Array, Array, Array, npt.NDArray[np.uint8]]:
     """Return points and normals (n, 3) in the object frame, their depths, weights and pose variances (n,), and RGB."""
     return (
@@ -174,7 +174,7 @@ def _told(
     )
 
 
-def spread(views: Stack, limit_m: float) -> tuple[float, float] | None:
+def spread(views: DepthViews, limit_m: float) -> tuple[float, float] | None:
     """Return by how much views disagree about where the surface is, in m: robust standard deviations.
 
     They hold the noise of both views and the error of their poses. None where no two views see the same surface.

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from modeler.fusion.cut import GREY
-from modeler.fusion.stack import Stack
+from modeler.fusion.crop import GREY
+from modeler.fusion.views import DepthViews
 from modeler.kernels import fusion
 from modeler.types import Array
 
 # The noise at a point is that of all points as if so many views had shown it, until its own tell more.
 PRIOR_VIEWS = 3.0
-BATCH = 1 << 18  # points asked at a time
+BATCH = 1 << 18  # points looked up at a time
 
 
 @dataclass(frozen=True, eq=False)
-class Testimony:
+class ViewSupport:
     """What the views say of oriented points, each (n,) or (n, 3)."""
 
     support: Array
@@ -35,8 +35,8 @@ class Testimony:
     """Whether a view has."""
 
 
-def heard(
-    seen: Stack,
+def view_support(
+    views: DepthViews,
     points_m: Array,
     normals: Array,
     *,
@@ -45,11 +45,11 @@ def heard(
     sigma_m: float,
     gains: Array,
     focus: float,
-) -> Testimony:
+) -> ViewSupport:
     """Ask the views about points.
 
     Args:
-        seen: the views.
+        views: the views.
         points_m: (n, 3) in the object frame.
         normals: (n, 3) unit.
         tau_m: half width of the band around the surface.
@@ -64,22 +64,22 @@ def heard(
             np.ascontiguousarray(normals[start : start + BATCH]),
             near_m,
             tau_m,
-            *seen.lookup,
-            seen.colour,
+            *views.lookup,
+            views.colour,
             gains,
             focus,
         )
         for start in range(0, max(len(points_m), 1), BATCH)
     ]
-    told, colours = (np.concatenate(part) for part in zip(*parts, strict=True))
-    support, emptiness, count, first, second = told.T
+    sums, colours = (np.concatenate(part) for part in zip(*parts, strict=True))
+    support, emptiness, count, first, second = sums.T
     found = count > 0.0
     safe = np.where(found, support, 1.0)
     # How well the views agree here, against how well they agree everywhere: a χ² with one degree for the mean.
     misfit = np.maximum(second - first**2 / safe, 0.0) / sigma_m**2
     scale = (PRIOR_VIEWS + misfit) / (PRIOR_VIEWS + np.maximum(count - 1.0, 0.0))
     known = colours[:, 3] > 0.0
-    return Testimony(
+    return ViewSupport(
         support=support,
         emptiness=emptiness,
         views=count.astype(np.int64),

@@ -9,7 +9,7 @@ import pytest
 import tabletop
 
 from modeler import se3
-from modeler.fusion import Fuser, Growing
+from modeler.fusion import Fuser, IncrementalTsdf
 from modeler.kernels import preview
 from modeler.types import Array, InputError, RayImage
 
@@ -28,12 +28,12 @@ def trajectory() -> Mapping[int, Array]:
     return tabletop.trajectory(POSES, None)
 
 
-def grown(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], how: Fuser = FUSER) -> Growing:
+def grown(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], how: Fuser = FUSER) -> IncrementalTsdf:
     """Return a model to which the views came one by one."""
-    growing = Growing(how)
+    tsdf = IncrementalTsdf(how)
     for count in range(1, len(views) + 1):
-        growing = growing.to(dict(list(views.items())[:count]), trajectory)
-    return growing
+        tsdf = tsdf.to(dict(list(views.items())[:count]), trajectory)
+    return tsdf
 
 
 def nudged(trajectory: Mapping[int, Array], seed: int, sigma_m: float = 0.004) -> dict[int, Array]:
@@ -41,19 +41,21 @@ def nudged(trajectory: Mapping[int, Array], seed: int, sigma_m: float = 0.004) -
     return {k: pose @ se3.translation(rng.normal(0.0, sigma_m, size=3)) for k, pose in trajectory.items()}
 
 
-def settled(growing: Growing, views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> tuple[Growing, int]:
+def settled(
+    tsdf: IncrementalTsdf, views: Mapping[int, RayImage], trajectory: Mapping[int, Array]
+) -> tuple[IncrementalTsdf, int]:
     """Return the model when it has followed the poses, and in how many steps."""
     for steps in range(100):
-        after = growing.to(views, trajectory)
-        if after is growing:
-            return growing, steps
-        growing = after
+        after = tsdf.to(views, trajectory)
+        if after is tsdf:
+            return tsdf, steps
+        tsdf = after
     raise AssertionError
 
 
-def off_m(growing: Growing) -> Array:
+def off_m(tsdf: IncrementalTsdf) -> Array:
     """Return how far each vertex of the mesh is from the ball."""
-    return np.abs(BALL.distance(growing.model().vertices_m))
+    return np.abs(BALL.distance(tsdf.model().vertices_m))
 
 
 def test_what_is_added_and_taken_back_leaves_nothing():
@@ -67,7 +69,7 @@ def test_what_is_added_and_taken_back_leaves_nothing():
     origin, pose, lens = np.array([-0.04, -0.06, 0.35]), np.eye(4)[:3], np.array([60.0, 60.0, 9.5, 9.5])
     colours = np.concatenate([rng.integers(0, 256, (360, 3)), np.ones((360, 1))], axis=1).astype(np.float64)
     for sign in (1.0, -1.0):
-        preview.tell(box, origin, 0.01, 0.03, 0.3, sign, pose, lens, *told, colours)
+        preview.integrate_view(box, origin, 0.01, 0.03, 0.3, sign, pose, lens, *told, colours)
         if sign > 0.0:
             assert np.count_nonzero(sums[..., 0]) > 1000
             assert not sums[:2].any()
@@ -82,7 +84,7 @@ def test_distances_are_those_along_the_normal_within_the_band():
     told = (index, np.full((1, 1), 0.5, dtype=np.float32), np.array([[0.0, 0.0, 0.5]]), normal, np.ones(1))
     origin, pose = np.array([-0.0025, -0.0025, 0.4]), np.eye(4)[:3]
     lens, colours = np.array([1.0, 1.0, 0.0, 0.0]), np.array([[10.0, 20.0, 30.0, 1.0]])
-    preview.tell(sums, origin, 0.005, 0.02, 0.3, 1.0, pose, lens, *told, colours)
+    preview.integrate_view(sums, origin, 0.005, 0.02, 0.3, 1.0, pose, lens, *told, colours)
     along = 0.8 * (0.5 - (0.4 + 0.005 * (np.arange(40) + 0.5)))
     inside = np.abs(along) <= 0.02
     expected = np.where(inside, np.minimum(1.0, 1.5 * (1.0 + along / 0.02) + 1e-3), np.where(along > 0.02, 0.3, 0.0))
@@ -97,13 +99,13 @@ def test_distances_are_those_along_the_normal_within_the_band():
 
 
 def test_the_preview_is_the_surface_at_every_step(views, trajectory):
-    growing, triangles = Growing(FUSER), 0
+    tsdf, triangles = IncrementalTsdf(FUSER), 0
     for count in (1, 3, 8):
-        growing = growing.to(dict(list(views.items())[:count]), trajectory)
-        assert len(growing.model().triangles) > triangles
-        triangles = len(growing.model().triangles)
-    model = growing.model()
-    assert np.quantile(off_m(growing), 0.95) < growing.voxel_m
+        tsdf = tsdf.to(dict(list(views.items())[:count]), trajectory)
+        assert len(tsdf.model().triangles) > triangles
+        triangles = len(tsdf.model().triangles)
+    model = tsdf.model()
+    assert np.quantile(off_m(tsdf), 0.95) < tsdf.voxel_m
     np.testing.assert_array_equal(model.points_m, model.vertices_m)
     outwards = np.einsum("nk,nk->n", model.vertex_normals, model.vertices_m - model.vertices_m.mean(axis=0))
     assert np.mean(outwards > 0.0) > 0.98
@@ -117,13 +119,13 @@ def test_a_model_that_followed_the_poses_is_one_made_with_them(views, trajectory
     low = np.maximum(after.low, fresh.low)
     high = np.minimum(np.add(after.low, after.sums.shape[:3]), np.add(fresh.low, fresh.sums.shape[:3]))
 
-    def inner(growing: Growing) -> npt.NDArray[np.float32]:
-        x, y, z = (slice(a - o, b - o) for a, b, o in zip(low, high, growing.low, strict=True))
-        return growing.sums[x, y, z]
+    def inner(tsdf: IncrementalTsdf) -> npt.NDArray[np.float32]:
+        x, y, z = (slice(a - o, b - o) for a, b, o in zip(low, high, tsdf.low, strict=True))
+        return tsdf.sums[x, y, z]
 
     # Views were added when the box was smaller or larger, so that what they saw empty far out may differ.
     near = inner(fresh)[..., 0] > 0.5
-    values = [inner(growing)[..., 1][near] / inner(growing)[..., 0][near] for growing in (after, fresh)]
+    values = [inner(tsdf)[..., 1][near] / inner(tsdf)[..., 0][near] for tsdf in (after, fresh)]
     assert np.mean(np.abs(values[0] - values[1]) > 0.5 * after.voxel_m) < 0.02
     assert np.median(np.abs(values[0] - values[1])) < 0.25 * after.voxel_m  # poses within half a voxel stay
 
@@ -134,32 +136,32 @@ def test_few_views_move_at_a_time_those_that_moved_most_first(views, trajectory)
     shifts_m = dict(zip(views, [0.0, 0.001, 0.02, 0.03, 0.01, 0.0, 0.04, 0.05], strict=True))
     moved = {k: se3.translation(np.array([shifts_m[k], 0.0, 0.0])) @ pose for k, pose in trajectory.items()}
     order = []
-    growing = before
+    tsdf = before
     for _ in range(10):
-        after = growing.to(views, moved)
-        if after is growing:
+        after = tsdf.to(views, moved)
+        if after is tsdf:
             break
-        order.append({k for k in views if after.places[k] is not growing.places[k]})
-        growing = after
+        order.append({k for k in views if after.places[k] is not tsdf.places[k]})
+        tsdf = after
     frames = list(views)
     assert order == [{frames[7], frames[6]}, {frames[3], frames[2]}, {frames[4]}]  # 1 mm is less than half a voxel
 
 
 def test_nothing_new_changes_nothing_and_earlier_models_stay(views, trajectory):
-    growing = grown(views, trajectory)
-    sums = growing.sums.copy()
-    assert growing.to(views, trajectory) is growing
-    growing.to(views, nudged(trajectory, 2, 0.02))
-    np.testing.assert_array_equal(growing.sums, sums)
+    tsdf = grown(views, trajectory)
+    sums = tsdf.sums.copy()
+    assert tsdf.to(views, trajectory) is tsdf
+    tsdf.to(views, nudged(trajectory, 2, 0.02))
+    np.testing.assert_array_equal(tsdf.sums, sums)
 
 
 def test_a_view_that_loses_its_pose_is_taken_back(views, trajectory):
     frames = list(views)
     without = {k: pose for k, pose in trajectory.items() if k != frames[-1]}
-    growing = grown(views, trajectory).to(views, without)
-    assert set(growing.places) == set(frames[:-1])
+    tsdf = grown(views, trajectory).to(views, without)
+    assert set(tsdf.places) == set(frames[:-1])
     fresh = grown({k: views[k] for k in frames[:-1]}, without)
-    assert len(growing.model().triangles) == pytest.approx(len(fresh.model().triangles), rel=0.01)
+    assert len(tsdf.model().triangles) == pytest.approx(len(fresh.model().triangles), rel=0.01)
 
 
 def test_the_voxels_grow_until_the_box_is_small_enough(views, trajectory):
@@ -187,4 +189,4 @@ def test_colours_are_those_of_the_views_and_grey_without(views, trajectory):
 
 def test_without_a_pose_there_is_nothing_to_show(views):
     with pytest.raises(InputError, match="nothing to fuse"):
-        Growing(FUSER).to(views, {})
+        IncrementalTsdf(FUSER).to(views, {})
