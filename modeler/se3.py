@@ -9,7 +9,7 @@ leading axes.
 import numpy as np
 import numpy.typing as npt
 
-from modeler.kernels import moves
+from modeler.kernels import lie_group
 
 Array = npt.NDArray[np.float64]
 
@@ -27,13 +27,13 @@ def hat(vector: Array) -> Array:
 def exp(xi: Array) -> Array:
     """Return the motions (..., 4, 4) of tangent vectors ξ (..., 6)."""
     xi = np.ascontiguousarray(xi, dtype=np.float64)
-    return moves.exponentials(xi.reshape(-1, 6)).reshape(*xi.shape[:-1], 4, 4)
+    return lie_group.exponentials(xi.reshape(-1, 6)).reshape(*xi.shape[:-1], 4, 4)
 
 
 def log(pose: Array) -> Array:
     """Return the tangent vectors ξ (..., 6) of motions (..., 4, 4), with rotation angles in [0, π]."""
     pose = np.ascontiguousarray(pose, dtype=np.float64)
-    return moves.logarithms(pose.reshape(-1, 4, 4)).reshape(*pose.shape[:-2], 6)
+    return lie_group.logarithms(pose.reshape(-1, 4, 4)).reshape(*pose.shape[:-2], 6)
 
 
 def is_rigid(matrix: Array, *, tolerance: float, farthest_m: float) -> bool:
@@ -70,14 +70,14 @@ def moved(pose: Array, xi: Array, about_m: Array) -> Array:
     shape = np.broadcast_shapes(np.shape(pose)[:-2], np.shape(xi)[:-1])
     poses = np.broadcast_to(np.asarray(pose, dtype=np.float64), (*shape, 4, 4)).reshape(-1, 4, 4)
     steps = np.broadcast_to(np.asarray(xi, dtype=np.float64), (*shape, 6)).reshape(-1, 6)
-    return moves.turned(poses, steps, np.asarray(about_m, dtype=np.float64)).reshape(*shape, 4, 4)
+    return lie_group.turned(poses, steps, np.asarray(about_m, dtype=np.float64)).reshape(*shape, 4, 4)
 
 
 def difference(first: Array, second: Array, about_m: Array) -> Array:
     """Return the ξ (..., 6) by which `moved` takes motions (..., 4, 4) to others, about a point (3,)."""
     shape = np.broadcast_shapes(np.shape(first)[:-2], np.shape(second)[:-2])
     one, other = (rows(np.broadcast_to(poses, (*shape, 4, 4))).reshape(-1, 12) for poses in (first, second))
-    return moves.differences(one, other, np.asarray(about_m, dtype=np.float64)).reshape(*shape, 6)
+    return lie_group.differences(one, other, np.asarray(about_m, dtype=np.float64)).reshape(*shape, 6)
 
 
 def adjoint(pose: Array) -> Array:
@@ -125,8 +125,8 @@ def covariance_about(covariance: Array, point_m: Array) -> Array:
     the centre. With `-point_m` it leads back: from about a point to about the origin.
 
     Args:
-        covariance: (..., 6, 6) of ξ, which turns about the origin of what the pose moves.
-        point_m: (3,) of what the pose moves.
+        covariance: (..., 6, 6) of ξ, which turns about the origin of what the pose lie_group.
+        point_m: (3,) of what the pose lie_group.
     """
     about = _carried(covariance, adjoint(translation(-np.asarray(point_m, dtype=np.float64))))
     return 0.5 * (about + np.swapaxes(about, -1, -2))  # rounding alone would leave it a little askew
@@ -152,7 +152,7 @@ def mean(
     weights = np.asarray(weights, dtype=np.float64) / np.sum(weights)
     point_m = np.zeros(3) if about_m is None else np.asarray(about_m, dtype=np.float64)
     begin = poses[int(np.argmax(weights))] if start is None else start
-    centre, covariance = moves.mean(rows(poses), weights, rows(begin), point_m, iterations, 1e-11)
+    centre, covariance = lie_group.mean(rows(poses), weights, rows(begin), point_m, iterations, 1e-11)
     return matrices(centre[None])[0], covariance
 
 

@@ -46,13 +46,15 @@ def paper_density(point_b, a_from_b, ranges_m, intrinsics, noise):
     return k2 * total
 
 
-def visibility(pose, sight, model):
+def visibility(pose, projection, parameters):
     """Log-likelihood of one pose and number of explained points: every point in turn, as `kernels.visibility` says."""
-    fx, fy, cx, cy, width, height = sight.camera.astype(np.float64)
-    low, high, flat, steep = sight.facing.astype(np.float64)
-    cells, points = sight.cells.reshape(int(height), int(width), -1), sight.points.T.astype(np.float64)
-    blur, silhouette_px, dead_px, clearance_m, worst, bend, unmeasured, typical = map(np.float64, model[:-1])
-    hidden = np.exp(np.float64(model.table[0]))
+    fx, fy, cx, cy, width, height = projection.camera.astype(np.float64)
+    low, high, flat, steep = projection.facing.astype(np.float64)
+    cells, points = projection.cells.reshape(int(height), int(width), -1), projection.points.T.astype(np.float64)
+    blur, silhouette_px, dead_band_px, clearance_m, max_point_cost, normal_cost, unmeasured_gain, typical_misfit = map(
+        np.float64, parameters[:-1]
+    )
+    hidden = np.exp(np.float64(parameters.table[0]))
     total, explained = 0.0, 0.0
     for point in points:
         position = pose[:3, :3] @ point[:3] + pose[:3, 3]
@@ -63,27 +65,27 @@ def visibility(pose, sight, model):
         row = int(np.floor(fy * position[1] / position[2] + cy + 0.5))
         inside = position[2] > 0 and 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]
         if not inside or cells[row, column, planes.KIND] == planes.MISSING:
-            total += unmeasured * np.clip((facing - flat) / (steep - flat), 0, 1)
+            total += unmeasured_gain * np.clip((facing - flat) / (steep - flat), 0, 1)
             continue
         cell = cells[row, column].astype(np.float64)
         if cell[planes.KIND] == planes.BACKGROUND:
-            beyond = max(cell[planes.SILHOUETTE] - dead_px, 0.0) / silhouette_px
+            beyond = max(cell[planes.SILHOUETTE] - dead_band_px, 0.0) / silhouette_px
             if position[2] < cell[planes.DEPTH] - clearance_m:
-                total -= min(0.5 * beyond**2, worst)
+                total -= min(0.5 * beyond**2, max_point_cost)
         if cell[planes.KIND] != planes.SURFACE:
             continue
         plane = cell[: planes.NORMAL_Z + 1]
         in_front = plane @ position + cell[planes.DISTANCE]
         agreement = normal @ plane
         square = in_front**2 / (point[6] + cell[planes.VARIANCE] + blur**2)
-        match = typical - 0.5 * square - bend * (1 - agreement)
+        match = typical_misfit - 0.5 * square - normal_cost * (1 - agreement)
         explained += faces * (0.5 * square < 4.5 and agreement > 0.8)
         seen = np.log((1 - hidden) * np.exp(max(match, -700)) + hidden)
         if in_front > 0 and match < np.log(hidden):
-            seen = max(match, -worst)
+            seen = max(match, -max_point_cost)
         total += faces * seen
         if in_front > 0:
-            total -= (1 - faces) * min(0.5 * square, worst)
+            total -= (1 - faces) * min(0.5 * square, max_point_cost)
     return total, explained
 
 

@@ -62,18 +62,20 @@ def test_places_are_apart_and_come_again_with_the_seed(box):
 def test_a_turn_is_found_where_surface_leads_astray(box):
     """Most surface matches with another side of the box, though then it stands in space that was seen to be empty."""
     pair, density, truth = box
-    dragged = Search(led_points=40.0)  # to the middle of the prior, so that few come down near the truth
-    astray = replace(dragged, poor=-np.inf).candidates(pair, density, np.random.default_rng(1))
+    dragged = Search(descent_points=40.0)  # to the middle of the prior, so that few come down near the truth
+    astray = replace(dragged, low_overlap_score=-np.inf).candidates(pair, density, np.random.default_rng(1))
     found = dragged.candidates(pair, density, np.random.default_rng(1))
     assert rotation_error_deg(astray.poses[0], truth) > 45.0
     assert rotation_error_deg(found.poses[0], truth) < 5.0  # samples find the rest of the way
-    assert not found.scarce
+    assert not found.low_overlap
 
 
 def test_an_even_prior_does_not_drag(box):
     """Where little surface holds a motion on its way down, the middle of what is possible is no better than its end."""
     pair, density, truth = box
-    found = replace(Search(), poor=-np.inf).candidates(pair, density, np.random.default_rng(1))  # without a climb
+    found = replace(Search(), low_overlap_score=-np.inf).candidates(
+        pair, density, np.random.default_rng(1)
+    )  # without a climb
     assert rotation_error_deg(found.poses[0], truth) < 5.0
 
 
@@ -81,4 +83,4 @@ def test_what_matches_enough_is_not_climbed(box, monkeypatch):
     source, target, _ = views("box", source=1, target=0)
     pair = VisibilityRegistrar().pair(source, target, np.random.default_rng(0))
     monkeypatch.setattr(Climb, "places", None)
-    assert not Search().candidates(pair, WIDE.between(source, target), np.random.default_rng(1)).scarce
+    assert not Search().candidates(pair, WIDE.between(source, target), np.random.default_rng(1)).low_overlap

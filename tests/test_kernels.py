@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 
 from modeler import kernels, se3
 from modeler.kernels import matching, mixture, paper, patches, planes, ridges, visibility
-from modeler.kernels.sight import Sight, buffers
+from modeler.kernels.projection import Projection, buffers
 from modeler.kernels.silhouette import silhouette_distance
 from modeler.registration.mixture import Gaussians
 from modeler.se3 import matrices, rows
@@ -99,9 +99,9 @@ FACING = np.array([0.1, 0.35, 0.3, 0.7], dtype=np.float32)
 HIDDEN = 0.3
 
 
-def model(blur_m=0.004):
+def parameters(blur_m=0.004):
     numbers = [np.float32(value) for value in (blur_m, 1.5, 1.5, 0.006, 10.0, 2.0, -1.2, 0.4)]
-    return visibility.Model(*numbers, table=visibility.match_table(HIDDEN))
+    return visibility.LikelihoodParameters(*numbers, table=visibility.match_table(HIDDEN))
 
 
 def random_sight(rng, count=40):
@@ -110,14 +110,14 @@ def random_sight(rng, count=40):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = np.hstack([random_points(rng, count), normals, rng.uniform(1e-7, 1e-4, (count, 1))])
     cells = random_cells(rng).reshape(-1, planes.CELL_SIZE)
-    return Sight(np.ascontiguousarray(points.T, dtype=np.float32), cells, CAMERA, FACING)
+    return Projection(np.ascontiguousarray(points.T, dtype=np.float32), cells, CAMERA, FACING)
 
 
-def far_from_borders(sight, poses):
+def far_from_borders(projection, poses):
     """The poses under which no point comes so near to a pixel's border that rounding decides on which side it falls."""
     good = []
     for pose in poses:
-        x, y, z = pose[:3, :3] @ sight.points[:3] + pose[:3, 3:]
+        x, y, z = pose[:3, :3] @ projection.points[:3] + pose[:3, 3:]
         where = np.stack([INTRINSICS[0] * x / z + INTRINSICS[2], INTRINSICS[1] * y / z + INTRINSICS[3]]) + 0.5
         good.append(np.abs(where - np.round(where)).min() > 1e-3)
     return np.array(good)
@@ -126,13 +126,16 @@ def far_from_borders(sight, poses):
 @pytest.mark.parametrize("seed", range(10))
 def test_visibility_is_within_its_bound_of_its_twin(seed):
     rng = np.random.default_rng(seed)
-    sights = random_sight(rng, 40), random_sight(rng, 30)
+    projections = random_sight(rng, 40), random_sight(rng, 30)
     poses = np.stack([random_pose(rng, 0.3) for _ in range(60)])
-    poses = poses[far_from_borders(sights[0], poses) & far_from_borders(sights[1], se3.inverse(poses))]
+    poses = poses[far_from_borders(projections[0], poses) & far_from_borders(projections[1], se3.inverse(poses))]
     assert len(poses) > 20
-    got = visibility.log_likelihoods(rows(poses), *sights, model(), model(0.006))
+    got = visibility.log_likelihoods(rows(poses), *projections, parameters(), parameters(0.006))
     want = [
-        np.add(naive.visibility(pose, sights[0], model()), naive.visibility(se3.inverse(pose), sights[1], model(0.006)))
+        np.add(
+            naive.visibility(pose, projections[0], parameters()),
+            naive.visibility(se3.inverse(pose), projections[1], parameters(0.006)),
+        )
         for pose in poses
     ]
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-4 * 70)
@@ -141,25 +144,41 @@ def test_visibility_is_within_its_bound_of_its_twin(seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_a_walk_along_a_ridge_rates_places_as_the_likelihood_does(seed):
     rng = np.random.default_rng(seed)
-    sights, poses = (random_sight(rng, 40), random_sight(rng, 30)), np.stack([random_pose(rng, 0.3) for _ in range(5)])
-    ground = ridges.Ground(sights[0], sights[1], sights[0], sights[1], model(), model(), 0.5, 7.0, 0.3, -np.inf)
-    room = buffers(sights[0]), buffers(sights[1]), np.empty(12)
+    projections, poses = (
+        (random_sight(rng, 40), random_sight(rng, 30)),
+        np.stack([random_pose(rng, 0.3) for _ in range(5)]),
+    )
+    ground = ridges.RidgeLikelihood(
+        projections[0],
+        projections[1],
+        projections[0],
+        projections[1],
+        parameters(),
+        parameters(),
+        0.5,
+        7.0,
+        0.3,
+        -np.inf,
+    )
+    room = buffers(projections[0]), buffers(projections[1]), np.empty(12)
     got = [ridges.height(row, ground, room) for row in rows(poses)]
-    plain, explained = visibility.log_likelihoods(rows(poses), *sights, model(), model()).T
+    plain, explained = visibility.log_likelihoods(rows(poses), *projections, parameters(), parameters()).T
     np.testing.assert_allclose(got, 0.5 * plain - 7.0 * np.exp(-0.3 * explained), rtol=1e-6)
 
 
 def test_a_walk_keeps_its_strides_and_ends_at_the_floor(rng):
     """Where nothing matches nothing pulls a walker across: it goes straight on, as far as the ground is good."""
-    sights = random_sight(rng), random_sight(rng)
-    empty = [sight._replace(cells=np.zeros_like(sight.cells)) for sight in sights]
+    projections = random_sight(rng), random_sight(rng)
+    empty = [projection._replace(cells=np.zeros_like(projection.cells)) for projection in projections]
     start, spread = random_pose(rng, 0.1), np.diag([0.1, 0.1, 0.1, 0.01, 0.01, 0.01])
     axis, centre_m = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.8])
-    pull = matching.Pull(rows(start), 1e-9 * np.eye(6), np.full(6, 1e-9), 0.2)
+    regulariser = matching.Regulariser(rows(start), 1e-9 * np.eye(6), np.full(6, 1e-9), 0.2)
     for floor, steps in ((np.inf, 0), (-np.inf, 4)):
-        ground = ridges.Ground(empty[0], empty[1], empty[0], empty[1], model(), model(), 0.5, 0.0, 0.3, floor)
+        ground = ridges.RidgeLikelihood(
+            empty[0], empty[1], empty[0], empty[1], parameters(), parameters(), 0.5, 0.0, 0.3, floor
+        )
         visited, counts = ridges.walk(
-            rows(start[None]), spread[None], axis[None], 2.0, ground, centre_m, 0.001, pull, 4
+            rows(start[None]), spread[None], axis[None], 2.0, ground, centre_m, 0.001, regulariser, 4
         )
         assert counts.tolist() == [steps]
     want = [se3.moved(start, number * 0.2 * axis, centre_m) for number in range(1, 5)]
@@ -167,17 +186,17 @@ def test_a_walk_keeps_its_strides_and_ends_at_the_floor(rng):
 
 
 def test_downhill_is_the_step_of_the_held_normal_equations(rng):
-    sights, centre_m = (random_sight(rng), random_sight(rng)), np.array([0.0, 0.0, 0.8])
+    projections, centre_m = (random_sight(rng), random_sight(rng)), np.array([0.0, 0.0, 0.8])
     poses = np.stack([random_pose(rng, 0.1) for _ in range(6)])
     root = rng.normal(size=(6, 6))
-    pull = matching.Pull(rows(random_pose(rng, 0.1)), 100.0 * root @ root.T, np.arange(1.0, 7.0), 0.2)
-    gradients, matrices_ = matching.normal_equations(rows(poses), *sights, centre_m, 0.05)
-    got = matching.descend(rows(poses), *sights, centre_m, 0.05, pull, 1)
+    regulariser = matching.Regulariser(rows(random_pose(rng, 0.1)), 100.0 * root @ root.T, np.arange(1.0, 7.0), 0.2)
+    gradients, matrices_ = matching.normal_equations(rows(poses), *projections, centre_m, 0.05)
+    got = matching.descend(rows(poses), *projections, centre_m, 0.05, regulariser, 1)
     assert np.count_nonzero(np.abs(gradients).max(axis=1)) == len(poses)  # something matches
     for pose, gradient, matrix, there in zip(poses, gradients, matrices_, matrices(got), strict=True):
-        away = se3.difference(matrices(pull.mean[None])[0], pose, centre_m)
-        held = matrix + pull.precision + np.diag(pull.damping)
-        step = np.asarray(np.linalg.solve(held, gradient - pull.precision @ away), dtype=np.float64)
+        away = se3.difference(matrices(regulariser.mean[None])[0], pose, centre_m)
+        held = matrix + regulariser.precision + np.diag(regulariser.damping)
+        step = np.asarray(np.linalg.solve(held, gradient - regulariser.precision @ away), dtype=np.float64)
         step *= min(1.0, 0.2 / np.linalg.norm(step[:3]))
         np.testing.assert_allclose(there, se3.moved(pose, step, centre_m), atol=1e-9)
 
@@ -208,8 +227,8 @@ def test_verdicts_follow_from_where_a_point_lies():
         ([0.0, 0.0, -0.8], towards, visibility.UNKNOWN),
     ]
     points = np.array([[*position, *normal, 1e-6] for position, normal, _ in cases], dtype=np.float32).T.copy()
-    sight = Sight(points, cells.reshape(-1, planes.CELL_SIZE), CAMERA, FACING)
-    verdicts = visibility.classify(rows(np.eye(4)), sight, model(0.001))
+    projection = Projection(points, cells.reshape(-1, planes.CELL_SIZE), CAMERA, FACING)
+    verdicts = visibility.classify(rows(np.eye(4)), projection, parameters(0.001))
     assert verdicts.tolist() == [want for *_, want in cases]
 
 
@@ -267,18 +286,18 @@ def test_compiled_kernels_older_than_any_source_are_dropped(tmp_path):
     assert [path.name for path in cache.iterdir()] == ["b.nbi"]
 
 
-@pytest.mark.parametrize("crowd", [1, 3])
-def test_of_a_crowd_the_first_are_kept(rng, crowd):
+@pytest.mark.parametrize("max_per_basin", [1, 3])
+def test_of_a_crowd_the_first_are_kept(rng, max_per_basin):
     centre_m, sigmas = np.array([0.0, 0.0, 0.8]), np.repeat([0.2, 0.01], 3)
     poses = np.stack([random_pose(rng, 0.2) for _ in range(60)])
-    kept = mixture.uncrowded(rows(poses), sigmas, centre_m, crowd, 1000)
+    kept = mixture.uncrowded(rows(poses), sigmas, centre_m, max_per_basin, 1000)
     near = np.linalg.norm(se3.difference(poses[:, None], poses[None], centre_m) / sigmas, axis=2) <= 1.0
     assert kept[0] == 0
     assert (np.diff(kept) > 0).all()
     for number in range(len(poses)):
         before = kept[kept < number]
-        assert (number in kept) == (near[before, number].sum() < crowd)
-    np.testing.assert_array_equal(mixture.uncrowded(rows(poses), sigmas, centre_m, crowd, 5), kept[:5])
+        assert (number in kept) == (near[before, number].sum() < max_per_basin)
+    np.testing.assert_array_equal(mixture.uncrowded(rows(poses), sigmas, centre_m, max_per_basin, 5), kept[:5])
 
 
 @pytest.mark.parametrize("sigma_rad", [0.01, 0.5, 3.0])
@@ -323,5 +342,5 @@ def test_patches_are_halves_of_halves(rng, count):
 
 def test_kernels_know_that_they_are_compiled():
     rng = np.random.default_rng(0)
-    visibility.log_likelihoods(rows(np.eye(4)[None]), random_sight(rng), random_sight(rng), model(), model())
+    visibility.log_likelihoods(rows(np.eye(4)[None]), random_sight(rng), random_sight(rng), parameters(), parameters())
     assert kernels.compiled()

@@ -72,5 +72,5 @@ def test_a_glance_is_a_smaller_search_of_the_same_likelihood() -> None:
     assert isinstance(glance, VisibilityRegistrar)
     assert (glance.points, glance.min_overlap) == (500, 0.3)
     assert glance.search.max_starts < registrar.search.max_starts
-    assert (glance.max_places, glance.max_rounds) == (1, 1)
+    assert (glance.max_modes, glance.max_rounds) == (1, 1)
     assert glancing(IcpRegistrar()) is None

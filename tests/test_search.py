@@ -14,7 +14,7 @@ from modeler.priors.general import GeneralDensity
 from modeler.rays import Sensor
 from modeler.registration.candidates import Candidates
 from modeler.registration.mixture import Gaussians, MixtureProposal
-from modeler.registration.modes import Place, by_place, weighed
+from modeler.registration.modes import ModeSamples, split_modes, weigh_modes
 from modeler.registration.search import Search
 from modeler.registration.visibility import VisibilityRegistrar
 from modeler.types import Outcome
@@ -33,11 +33,11 @@ def views(name, source, target):
     return *made, true_motion(truth, target=target, source=source)
 
 
-def candidates(poses, sigmas, scores, blunt=None):
+def candidates(poses, sigmas, scores, coarse=None):
     """Candidates with round Gaussians: standard deviations of ξ, the same in rad and m."""
     spreads = np.array(sigmas)[:, None, None] * np.eye(6)
-    blunt = np.zeros(len(poses), dtype=bool) if blunt is None else np.array(blunt)
-    return Candidates(np.stack(poses), np.array(scores, dtype=float), spreads, blunt)
+    coarse = np.zeros(len(poses), dtype=bool) if coarse is None else np.array(coarse)
+    return Candidates(np.stack(poses), np.array(scores, dtype=float), spreads, coarse)
 
 
 def turned(angle_rad):
@@ -51,7 +51,7 @@ def test_the_search_finds_the_motion_in_a_wide_prior(name, rng):
     pair = VisibilityRegistrar().pair(source, target, rng)
     found = Search().candidates(pair, density, rng)
     assert np.isfinite(density.log_density(found.poses)).all()
-    assert (np.diff(found.scores[~found.blunt]) <= 0).all()
+    assert (np.diff(found.scores[~found.coarse]) <= 0).all()
     rolled_deg = min(rotation_error_deg(pose, truth) for pose in found.poses)
     assert rolled_deg < 8.0  # a flashlight's roll is all but free
 
@@ -68,7 +68,7 @@ def test_a_turn_beyond_the_prior_shows(rng):
 
 
 def test_a_stool_may_have_turned_either_way():
-    """Four legs: 40° on and 50° back look alike, and both are found, however near downhill leads to either."""
+    """Four legs: 40° on and 50° back look alike, and both are found, however near descent leads to either."""
     sequence = RenderedSequence(staged(load_specimen("stool"), Condition(step_deg=40.0), frames=2, seed=3660532166))
     made, truth = rendered_views(sequence), sequence.truth()
     target, source = (made[index] for index in sequence.indices)
@@ -77,37 +77,37 @@ def test_a_stool_may_have_turned_either_way():
     for seed in range(3):
         rng = np.random.default_rng(seed)
         found = Search().candidates(VisibilityRegistrar().pair(source, target, rng), density, rng)
-        turned_deg = np.array([rotation_error_deg(pose, right) for pose in found.poses[~found.blunt]])
+        turned_deg = np.array([rotation_error_deg(pose, right) for pose in found.poses[~found.coarse]])
         assert (turned_deg < 3.0).any()
         assert (np.abs(turned_deg - 90.0) < 3.0).any()
 
 
 def test_the_search_goes_on_along_the_ridge_of_a_roll(rng):
-    """From one good pose of a tube the whole of its roll is found, and what was found blunt is kept."""
+    """From one good pose of a tube the whole of its roll is found, and what was found coarse is kept."""
     source, target, truth = views("tube", source=1, target=0)
     density = GeneralPrior().between(source, target)
     pair, search = VisibilityRegistrar().pair(source, target, rng), Search()
-    blunt = candidates([truth @ turned(0.1)], [0.1], [0.0], [True])
-    onward = search.onward(pair, density, blunt, truth[None], rng)
-    rolled_deg = [rotation_error_deg(pose, truth) for pose in onward.poses[~onward.blunt]]
+    coarse = candidates([truth @ turned(0.1)], [0.1], [0.0], [True])
+    onward = search.onward(pair, density, coarse, truth[None], rng)
+    rolled_deg = [rotation_error_deg(pose, truth) for pose in onward.poses[~onward.coarse]]
     assert max(rolled_deg) > 20.0
-    assert onward.blunt.sum() == 1
-    sharp = onward.some(~onward.blunt)
+    assert onward.coarse.sum() == 1
+    sharp = onward.some(~onward.coarse)
     assert sharp.scores[0] >= search.scores(pair, truth[None], search.blurs[-1] * pair.size_m)[0] - 1e-6
     assert sharp.scores[-1] > sharp.scores[0] - search.negligible
 
 
 def test_candidates_that_reach_each_other_share_a_place():
     near, far = turned(0.02), turned(1.5)
-    places = by_place(candidates([np.eye(4), near, far], [0.01, 0.01, 0.01], [3, 2, 1]), np.zeros(3))
+    places = split_modes(candidates([np.eye(4), near, far], [0.01, 0.01, 0.01], [3, 2, 1]), np.zeros(3))
     assert [len(place) for place in places] == [2, 1]
     np.testing.assert_array_equal(places[0].poses[0], np.eye(4))
 
 
 def test_a_blunt_candidate_joins_what_it_covers_and_is_no_place_itself():
     ends = [turned(-0.2), turned(0.2)]
-    alone = by_place(candidates(ends, [0.01, 0.01], [2, 1]), np.zeros(3))
-    joined = by_place(
+    alone = split_modes(candidates(ends, [0.01, 0.01], [2, 1]), np.zeros(3))
+    joined = split_modes(
         candidates([*ends, np.eye(4), turned(2.0)], [0.01, 0.01, 0.1, 0.1], [2, 1, 0, 0], [False, False, True, True]),
         np.zeros(3),
     )
@@ -119,8 +119,8 @@ def test_places_are_weighed_and_those_of_no_weight_dropped(rng):
     here = turned(0.0) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
     there = turned(1.5) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
     even = np.full(200, 1.0 / 200)
-    one = weighed([Place(here, even, 0.0, 200.0, 0.1), Place(there, even, -20.0, 200.0, 0.1)])
-    two = weighed([Place(here, even, 0.0, 200.0, 0.1), Place(there, even, np.log(3.0), 200.0, 0.1)])
+    one = weigh_modes([ModeSamples(here, even, 0.0, 200.0, 0.1), ModeSamples(there, even, -20.0, 200.0, 0.1)])
+    two = weigh_modes([ModeSamples(here, even, 0.0, 200.0, 0.1), ModeSamples(there, even, np.log(3.0), 200.0, 0.1)])
     assert [share for share, _ in one] == [1.0]
     np.testing.assert_allclose([share for share, _ in two], [0.75, 0.25])
     assert rotation_error_deg(two[0][1].gaussian(np.zeros(3)).mean, turned(1.5)) < 1.0

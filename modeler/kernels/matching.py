@@ -7,9 +7,9 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from modeler.kernels.moves import difference, turn
+from modeler.kernels.lie_group import difference, turn
 from modeler.kernels.planes import KIND, NORMAL_X, NORMAL_Y, NORMAL_Z, SURFACE, VARIANCE
-from modeler.kernels.sight import (
+from modeler.kernels.projection import (
     FACES,
     FACING_X,
     FACING_Y,
@@ -34,8 +34,8 @@ _OF_SURFACE = np.float32(SURFACE)
 _ROWS = 9  # of one direction's equations: six derivatives, residual, weight, and room for products
 
 
-class Pull(NamedTuple):
-    """What holds motions that go downhill."""
+class Regulariser(NamedTuple):
+    """What holds descending poses."""
 
     mean: npt.NDArray[np.float64]
     """(12,) rows of the pose at which nothing pulls."""
@@ -58,24 +58,24 @@ def weight_of(points, carried, found, residual, surface_m2, j):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def matches(pose, sight, surface_m):
+def matches(pose, projection, surface_m):
     """Return what each point finds under one pose.
 
     Args:
         pose: (12,) rows of the 3×4 matrix that carries the points into the other camera.
-        sight: the `Sight` of the points.
+        projection: the `Projection` of the points.
         surface_m: noise of the surfaces in m beyond that of points and planes.
 
     Returns:
         (n, 12): position in m, own normal and normal of the surface there, all in the other camera's frame; distance
         in m in front of that surface; weight in 1/m², 0 where nothing matches; how much it faces the camera (0..1).
     """
-    carried, pixels, cells = buffers(sight)
-    look(pose, sight, carried, pixels, cells)
+    carried, pixels, cells = buffers(projection)
+    look(pose, projection, carried, pixels, cells)
     found = np.zeros((pixels.shape[0], 12))
     for j in range(pixels.shape[0]):
         residual = height_over(carried, cells, j)
-        weight = weight_of(sight.points, carried, cells, residual, np.float32(surface_m * surface_m), j)
+        weight = weight_of(projection.points, carried, cells, residual, np.float32(surface_m * surface_m), j)
         for k in range(3):
             found[j, k], found[j, 3 + k] = carried[X + k, j], carried[FACING_X + k, j]
         if weight > ZERO:
@@ -122,7 +122,7 @@ def gather(rows, count, gradient, matrix):
 
 
 @numba.njit(cache=True)
-def workroom(forward, backward):
+def workspace(forward, backward):
     """Return all the room that `equations` needs."""
     most = max(forward.points.shape[1], backward.points.shape[1])
     rows = np.empty((_ROWS, most), dtype=np.float32)
@@ -156,11 +156,11 @@ def equations(pose, forward, backward, centre, surface_m, room, gradient, matrix
 
     Args:
         pose: (12,) rows of target_from_source.
-        forward: the `Sight` of the source's points in the target, and
+        forward: the `Projection` of the source's points in the target, and
         backward: of the target's in the source.
         centre: (3,) point of the source in m.
         surface_m: noise of the surfaces in m beyond that of points and planes.
-        room: of `workroom`.
+        room: of `workspace`.
         gradient: (6,) out.
         matrix: (6, 6) out.
     """
@@ -190,7 +190,7 @@ def normal_equations(poses, forward, backward, centre, surface_m):
     group = 16  # poses that share one room
     gradients, matrices = np.empty((poses.shape[0], 6)), np.empty((poses.shape[0], 6, 6))
     for number in numba.prange((poses.shape[0] + group - 1) // group):
-        room = workroom(forward, backward)
+        room = workspace(forward, backward)
         for i in range(number * group, min((number + 1) * group, poses.shape[0])):
             equations(poses[i], forward, backward, centre, surface_m, room, gradients[i], matrices[i])
     return gradients, matrices
@@ -200,42 +200,42 @@ def normal_equations(poses, forward, backward, centre, surface_m):
 def normal_equation(pose, forward, backward, centre, surface_m):
     """Return the gradient (6,) and the matrix (6, 6) of one pose (12,): to wake other threads would take longer."""
     gradient, matrix = np.empty(6), np.empty((6, 6))
-    equations(pose, forward, backward, centre, surface_m, workroom(forward, backward), gradient, matrix)
+    equations(pose, forward, backward, centre, surface_m, workspace(forward, backward), gradient, matrix)
     return gradient, matrix
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def descend(poses, forward, backward, centre, surface_m, pull, steps):
-    """Return poses (m, 12) after so many damped Gauss-Newton steps, each held by a `Pull`; see `equations`."""
+def descend(poses, forward, backward, centre, surface_m, regulariser, steps):
+    """Return poses (m, 12) after so many damped Gauss-Newton steps, each held by a `Regulariser`; see `equations`."""
     group = 4
     moved = poses.copy()
     for number in numba.prange((poses.shape[0] + group - 1) // group):
-        room, gradient, matrix = workroom(forward, backward), np.empty(6), np.empty((6, 6))
+        room, gradient, matrix = workspace(forward, backward), np.empty(6), np.empty((6, 6))
         step, further, rotation = np.empty(6), np.empty(12), np.empty((3, 3))
         for i in range(number * group, min((number + 1) * group, poses.shape[0])):
             for _ in range(steps):
                 equations(moved[i], forward, backward, centre, surface_m, room, gradient, matrix)
-                held_step(moved[i], pull, centre, gradient, matrix, step)
+                regularised_step(moved[i], regulariser, centre, gradient, matrix, step)
                 turn(moved[i], step, centre, rotation, further)
                 moved[i] = further
     return moved
 
 
 @numba.njit(cache=True)
-def held_step(pose, pull, centre, gradient, matrix, step):
-    """Write the Gauss-Newton step (6,) of a pose (12,) from its normal equations, and a pull; spoils the matrix."""
-    away = difference(pull.mean, pose, centre)
+def regularised_step(pose, regulariser, centre, gradient, matrix, step):
+    """Write the Gauss-Newton step (6,) of a pose (12,) from its normal equations; overwrites the matrix."""
+    away = difference(regulariser.mean, pose, centre)
     for k in range(6):
         step[k] = gradient[k]
         for m in range(6):
-            step[k] -= pull.precision[k, m] * away[m]
-            matrix[k, m] += pull.precision[k, m]
-        matrix[k, k] += pull.damping[k]
+            step[k] -= regulariser.precision[k, m] * away[m]
+            matrix[k, m] += regulariser.precision[k, m]
+        matrix[k, k] += regulariser.damping[k]
     solve_positive(matrix, step)
     angle = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
-    if angle > pull.max_step_rad:
+    if angle > regulariser.max_step_rad:
         for k in range(6):
-            step[k] *= pull.max_step_rad / angle
+            step[k] *= regulariser.max_step_rad / angle
 
 
 @numba.njit(cache=True)

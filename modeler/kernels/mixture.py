@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from modeler.kernels.moves import difference
+from modeler.kernels.lie_group import difference
 
 _NEGLIGIBLE = 40.0  # nats below the best Gaussian
 

@@ -19,7 +19,7 @@ from modeler.kernels.planes import (
     SURFACE,
     VARIANCE,
 )
-from modeler.kernels.sight import (
+from modeler.kernels.projection import (
     FACES,
     FACING_X,
     FACING_Y,
@@ -60,24 +60,24 @@ _PER_STEP = np.float32(TABLE_STEPS / (TABLE_HIGH - TABLE_LOW))
 _OF_SURFACE, _OF_BACKGROUND, _OF_NOTHING = np.float32(SURFACE), np.float32(BACKGROUND), np.float32(MISSING)
 
 
-class Model(NamedTuple):
+class LikelihoodParameters(NamedTuple):
     """What the likelihood takes for granted in one direction; all float32."""
 
     blur_m: np.float32
     """Extra noise of the surfaces."""
     silhouette_px: np.float32
     """Standard deviation of the silhouette."""
-    dead_px: np.float32
+    dead_band_px: np.float32
     """Beside the silhouette so much is no one's."""
     clearance_m: np.float32
     """From so far behind a point, a background is behind it."""
-    worst: np.float32
+    max_point_cost: np.float32
     """Most that one point may cost (nats)."""
-    bend: np.float32
+    normal_cost: np.float32
     """Cost (nats) of normals at right angles."""
-    unmeasured: np.float32
+    unmeasured_gain: np.float32
     """Gain (negative, nats) of a point that should be seen where nothing was measured."""
-    typical: np.float32
+    typical_misfit: np.float32
     """What a typical match loses to its misfit (nats)."""
     table: FloatArray
     """Of `match_table` for the share of hidden points."""
@@ -115,61 +115,61 @@ def agreement_of(carried, found, j):
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
-def score(points, carried, found, model):
+def score(points, carried, found, parameters):
     """Return the log-likelihood of carried points, and how many are explained: all cases of every point, then a choice.
 
     Args:
-        points: (7, n), see `Sight`.
+        points: (7, n), see `Projection`.
         carried: (8, n) and
-        found: (8, n), see `sight.look`.
-        model: see `Model`.
+        found: (8, n), see `projection.look`.
+        parameters: see `LikelihoodParameters`.
     """
-    table, worst = model.table, model.worst
+    table, max_point_cost = parameters.table, parameters.max_point_cost
     log_hidden, last = table[0], np.int32(TABLE_STEPS - 1)
     total, explained = ZERO, ZERO
     for j in range(points.shape[1]):
         faces, kind = carried[FACES, j], found[KIND, j]
         in_front = height_over(carried, found, j)
         agreement = agreement_of(carried, found, j)
-        variance = points[VARIANCE_M2, j] + found[VARIANCE, j] + model.blur_m * model.blur_m
+        variance = points[VARIANCE_M2, j] + found[VARIANCE, j] + parameters.blur_m * parameters.blur_m
         half_square = HALF * in_front * in_front / variance
-        match = model.typical - half_square - model.bend * (ONE - agreement)
+        match = parameters.typical_misfit - half_square - parameters.normal_cost * (ONE - agreement)
         matches = (half_square < HALF * MAX_SIGMAS * MAX_SIGMAS) & (agreement > MIN_AGREEMENT)
         place = (min(max(match, TABLE_LOW), TABLE_HIGH) - TABLE_LOW) * _PER_STEP
         node = min(np.int32(place), last)
         low, high = table[np.uint32(node)], table[np.uint32(node + np.int32(1))]
         seen = low + (place - np.float32(node)) * (high - low)
         # In front of what was measured nothing can hide it.
-        seen = max(match, -worst) if (in_front > ZERO) & (match < log_hidden) else seen
-        on_surface = faces * seen - ((ONE - faces) * min(half_square, worst) if in_front > ZERO else ZERO)
-        beyond = max((found[SILHOUETTE, j] - model.dead_px) / model.silhouette_px, ZERO)
-        in_the_way = carried[Z, j] < found[DEPTH, j] - model.clearance_m
-        in_the_open = -min(HALF * beyond * beyond, worst) if in_the_way else ZERO
+        seen = max(match, -max_point_cost) if (in_front > ZERO) & (match < log_hidden) else seen
+        on_surface = faces * seen - ((ONE - faces) * min(half_square, max_point_cost) if in_front > ZERO else ZERO)
+        beyond = max((found[SILHOUETTE, j] - parameters.dead_band_px) / parameters.silhouette_px, ZERO)
+        in_the_way = carried[Z, j] < found[DEPTH, j] - parameters.clearance_m
+        in_the_open = -min(HALF * beyond * beyond, max_point_cost) if in_the_way else ZERO
         gain = on_surface if kind == _OF_SURFACE else ZERO
         gain = in_the_open if kind == _OF_BACKGROUND else gain
-        gain = model.unmeasured * carried[SHOWS, j] if kind == _OF_NOTHING else gain
+        gain = parameters.unmeasured_gain * carried[SHOWS, j] if kind == _OF_NOTHING else gain
         total += gain
         explained += faces if (kind == _OF_SURFACE) & matches else ZERO
     return total, explained
 
 
 @numba.njit(cache=True, error_model="numpy", forceinline=True)
-def compare(pose, forward, backward, forward_model, backward_model, room):
+def compare(pose, forward, backward, forward_parameters, backward_parameters, room):
     """Return the log-likelihood of one pose (12,) and the number of explained points; see `log_likelihoods`.
 
     Room is handed in: the `buffers` of either direction, and (12,).
     """
     there, back, inverse = room
     look(pose, forward, there[0], there[1], there[2])
-    total, explained = score(forward.points, there[0], there[2], forward_model)
+    total, explained = score(forward.points, there[0], there[2], forward_parameters)
     invert(pose, inverse)
     look(inverse, backward, back[0], back[1], back[2])
-    more, further = score(backward.points, back[0], back[2], backward_model)
+    more, further = score(backward.points, back[0], back[2], backward_parameters)
     return np.float64(total) + np.float64(more), np.float64(explained) + np.float64(further)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def log_likelihoods(poses, forward, backward, forward_model, backward_model):
+def log_likelihoods(poses, forward, backward, forward_parameters, backward_parameters):
     """Return the log-likelihood of each pose, summed over the points of two views, each looked up in the other.
 
     A point that faces the other camera should lie on the surface measured there, but for a share that something
@@ -182,10 +182,10 @@ def log_likelihoods(poses, forward, backward, forward_model, backward_model):
 
     Args:
         poses: (m, 12) float64 rows of the 3×4 matrices that carry the points of `forward` into the other camera.
-        forward: the `Sight` of one view's points in the other, and
+        forward: the `Projection` of one view's points in the other, and
         backward: that of the other's in the one.
-        forward_model: the `Model` of the one direction, and
-        backward_model: of the other.
+        forward_parameters: the `LikelihoodParameters` of the one direction, and
+        backward_parameters: of the other.
 
     Returns:
         (m, 2): log-likelihood; number of points that the other view's surface explains, each as far as it faces it.
@@ -196,24 +196,27 @@ def log_likelihoods(poses, forward, backward, forward_model, backward_model):
         room = buffers(forward), buffers(backward), np.empty(12)
         for i in range(group * block, min((group + 1) * block, poses.shape[0])):
             result[i, LOG_LIKELIHOOD], result[i, EXPLAINED] = compare(
-                poses[i], forward, backward, forward_model, backward_model, room
+                poses[i], forward, backward, forward_parameters, backward_parameters, room
             )
     return result
 
 
 @numba.njit(cache=True)
-def classify(pose, sight, model):
-    """Return the verdict (n,) on each point of a `Sight` under one pose (12,), by a `Model`."""
-    carried, pixels, found = buffers(sight)
-    look(pose, sight, carried, pixels, found)
+def classify(pose, projection, parameters):
+    """Return the verdict (n,) on each point of a `Projection` under one pose (12,), by a `LikelihoodParameters`."""
+    carried, pixels, found = buffers(projection)
+    look(pose, projection, carried, pixels, found)
     verdicts = np.zeros(pixels.shape[0], dtype=np.int8)
     for j in range(pixels.shape[0]):
         if found[KIND, j] == BACKGROUND:
-            if found[SILHOUETTE, j] > model.dead_px and carried[Z, j] < found[DEPTH, j] - model.clearance_m:
+            if (
+                found[SILHOUETTE, j] > parameters.dead_band_px
+                and carried[Z, j] < found[DEPTH, j] - parameters.clearance_m
+            ):
                 verdicts[j] = IN_EMPTY_SPACE
         elif found[KIND, j] == SURFACE:
             in_front = height_over(carried, found, j)
-            variance = sight.points[VARIANCE_M2, j] + found[VARIANCE, j] + model.blur_m * model.blur_m
+            variance = projection.points[VARIANCE_M2, j] + found[VARIANCE, j] + parameters.blur_m * parameters.blur_m
             if in_front > LOOSE_SIGMAS * math.sqrt(variance):
                 verdicts[j] = IN_FRONT
             elif carried[FACES, j] > 0.5:
@@ -224,21 +227,21 @@ def classify(pose, sight, model):
 
 
 @numba.njit(cache=True)
-def excess(pose, sight, blur_m):
-    """Return what surface noise explains the matched points of a `Sight` under one pose (12,).
+def excess(pose, projection, blur_m):
+    """Return what surface noise explains the matched points of a `Projection` under one pose (12,).
 
     Returns:
         Sum in m² of the squared distances from the surface, less the variances of point and plane, over the points that
         are no farther than `LOOSE_SIGMAS` standard deviations, of which `blur_m` is a part; and how many they are.
     """
-    carried, pixels, found = buffers(sight)
-    look(pose, sight, carried, pixels, found)
+    carried, pixels, found = buffers(projection)
+    look(pose, projection, carried, pixels, found)
     total, count = 0.0, 0
     for j in range(pixels.shape[0]):
         if found[KIND, j] != SURFACE or carried[FACES, j] < 0.5:
             continue
         square = np.float64(height_over(carried, found, j)) ** 2
-        known = np.float64(sight.points[VARIANCE_M2, j]) + np.float64(found[VARIANCE, j])
+        known = np.float64(projection.points[VARIANCE_M2, j]) + np.float64(found[VARIANCE, j])
         if square < LOOSE_SIGMAS * LOOSE_SIGMAS * (known + blur_m * blur_m):
             total += square - known
             count += 1

@@ -25,7 +25,7 @@ def glancing(registrar: AbstractRegistrar) -> AbstractRegistrar | None:
         search,
         max_starts=int(_SHARE * search.max_starts),
         starts_per_basin=_SHARE * search.starts_per_basin,
-        poor=-np.inf,
+        low_overlap_score=-np.inf,
     )
     sampler = replace(registrar.sampler, max_draws=int(_SHARE * registrar.sampler.max_draws))
-    return replace(registrar, search=search, sampler=sampler, max_places=1, max_rounds=1)
+    return replace(registrar, search=search, sampler=sampler, max_modes=1, max_rounds=1)

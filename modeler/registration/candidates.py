@@ -17,18 +17,18 @@ class Candidates:
     """Motions to which matching surface leads, each with a Gaussian for its surroundings."""
 
     poses: Array
-    """(k, 4, 4) target_from_source, best first, blunt ones last."""
+    """(k, 4, 4) target_from_source, best first, coarse ones last."""
     scores: Array
     """(k,) how good they are beside each other (nats)."""
     spreads: Array
     """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid."""
 
-    blunt: BoolArray
+    coarse: BoolArray
     """(k,) whether a candidate stands for the surroundings that surface, blurred, leaves open."""
     beyond: float = -np.inf
     """How much better (nats) than the best is what surface leads to beyond the prior's support."""
-    scarce: bool = False
-    """Whether so little surface matches that places were compared as `Search.scarce_points` says."""
+    low_overlap: bool = False
+    """Whether so little surface matches that places were compared as `Search.low_overlap_points` says."""
 
     def __len__(self) -> int:
         """Return how many there are."""
@@ -47,9 +47,9 @@ class Candidates:
             np.concatenate([self.poses, others.poses]),
             np.concatenate([self.scores, others.scores]),
             np.concatenate([self.spreads, others.spreads]),
-            np.concatenate([self.blunt, others.blunt]),
+            np.concatenate([self.coarse, others.coarse]),
             self.beyond,
-            self.scarce,
+            self.low_overlap,
         )
 
     def some(self, chosen: npt.NDArray[np.int64] | BoolArray) -> Candidates:
@@ -58,9 +58,9 @@ class Candidates:
             self.poses[chosen],
             self.scores[chosen],
             self.spreads[chosen],
-            self.blunt[chosen],
+            self.coarse[chosen],
             self.beyond,
-            self.scarce,
+            self.low_overlap,
         )
 
     def distinct(self, centre_m: Array, reach: float) -> Candidates:

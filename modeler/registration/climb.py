@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.kernels import mixture
-from modeler.registration.pair import Pair
+from modeler.registration.pair import PairLikelihood
 from modeler.types import AbstractPoseDensity, Array
 
 
@@ -35,7 +35,7 @@ class Stage:
 class Climb:
     """Climbers set out from many places, and the lower ones are left behind while the surfaces become sharper.
 
-    The way downhill to matching surface leads to where most of it matches. Where two views have little of it in common,
+    Descent to matching surface leads to where most of it matches. Where two views have little of it in common,
     what either saw to be empty says more, and the truth has next to no surface to be led by. So each climber tries
     steps in all directions and takes the best, if it leads up (Rechenberg's (1 + λ) strategy). Steps are drawn as wide
     as matching surface leaves each direction open, so that climbers go along a contact rather than into it. They become
@@ -74,7 +74,7 @@ class Climb:
 
     def places(
         self,
-        pair: Pair,
+        pair: PairLikelihood,
         density: AbstractPoseDensity,
         basin: Array,
         rng: np.random.Generator,
@@ -88,7 +88,7 @@ class Climb:
             density: where to climb.
             basin: (6,) standard deviations of the basin of a place, beyond which no step is drawn.
             rng: source of all randomness.
-            effective_points: most independent measurements that all points are worth, see `Pair.independent`.
+            effective_points: most independent measurements that all points are worth, see `PairLikelihood.independent`.
         """
         poses, stage = density.sample(self.looks, rng), self.first
         height = partial(_height, pair, density, effective_points)
@@ -100,7 +100,7 @@ class Climb:
 
     def onward(
         self,
-        pair: Pair,
+        pair: PairLikelihood,
         density: AbstractPoseDensity,
         poses: Array,
         basin: Array,
@@ -113,12 +113,12 @@ class Climb:
         height = partial(_height, pair, density, effective_points, stage)
         return self._up(pair, poses, self._spreads(pair, poses, basin, stage.blur), height, rng)
 
-    def _ahead(self, pair: Pair, poses: Array, heights: Array, basin: Array, most: int) -> Array:
+    def _ahead(self, pair: PairLikelihood, poses: Array, heights: Array, basin: Array, most: int) -> Array:
         """Return the highest of poses (n, 4, 4), one of each neighbourhood."""
         ordered = poses[np.argsort(-heights, kind="stable")]
         return ordered[mixture.uncrowded(se3.rows(ordered), self.apart * basin, pair.centre_m, 1, most)]
 
-    def _spreads(self, pair: Pair, poses: Array, basin: Array, blur: float) -> Array:
+    def _spreads(self, pair: PairLikelihood, poses: Array, basin: Array, blur: float) -> Array:
         """Return roots (n, 6, 6) of the covariances of ξ about the centre that matching surface leaves poses."""
         _, matrices = pair.normal_equations(poses, blur * pair.size_m, stride=2)
         held = self.local_points / pair.points * matrices + np.diag(basin**-2.0)
@@ -126,7 +126,7 @@ class Climb:
 
     def _up(
         self,
-        pair: Pair,
+        pair: PairLikelihood,
         poses: Array,
         spreads: Array,
         height: Callable[[Array], Array],
@@ -148,7 +148,9 @@ class Climb:
         return poses
 
 
-def _height(pair: Pair, density: AbstractPoseDensity, effective_points: float, stage: Stage, poses: Array) -> Array:
+def _height(
+    pair: PairLikelihood, density: AbstractPoseDensity, effective_points: float, stage: Stage, poses: Array
+) -> Array:
     """Return how high (n,) poses (n, 4, 4) lie (nats); -inf where motion is known not to lead."""
     heights, possible = np.full(len(poses), -np.inf), np.isfinite(density.log_evidence(poses))
     if possible.any():

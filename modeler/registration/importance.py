@@ -19,7 +19,7 @@ _PARAMETERS = 28.0  # of one Gaussian more: mean, covariance, share
 
 
 @dataclass(frozen=True, eq=False)
-class Population:
+class WeightedSamples:
     """Weighted samples, and how they came about."""
 
     poses: Array
@@ -99,7 +99,7 @@ class AdaptiveSampler:
 
     def run(
         self, density: AbstractPoseDensity, log_likelihood: LogLikelihood, centre_m: Array, rng: np.random.Generator
-    ) -> Population:
+    ) -> WeightedSamples:
         """Return samples of what is known of a motion × likelihood.
 
         Args:
@@ -132,7 +132,7 @@ class AdaptiveSampler:
             drawn = drawn.spread_over(new).beside(weighed(fresh, log_density))
             log_weights = drawn.log_weights
         chosen, weights = thinned(normalised(log_weights), self.kept, rng)
-        return Population(
+        return WeightedSamples(
             drawn.poses[chosen],
             weights,
             drawn.log_likelihoods[chosen],

@@ -7,18 +7,18 @@ import numpy as np
 
 from modeler.kernels import matching
 from modeler.kernels import visibility as kernel
-from modeler.kernels.sight import Sight
+from modeler.kernels.projection import Projection
 from modeler.types import Array, RayImage
 
 _OUTLINE = 0.5
 """Error of a silhouette as a share of the lateral noise of its pixels, each of which errs by itself."""
 _SPARED = 0.25
 """Beside it so much is no one's, likewise: points lie a pixel or more inside, since the rim has no plane."""
-FACING = np.array([0.1, 0.35, 0.35, 0.6], dtype=np.float32)  # see `Sight`
+FACING = np.array([0.1, 0.35, 0.35, 0.6], dtype=np.float32)  # see `Projection`
 
 
 @dataclass(frozen=True, eq=False)
-class Lookup:
+class DirectedLikelihood:
     """One direction of the comparison of two views: p(points of one | image of the other, pose)."""
 
     points: Array
@@ -29,20 +29,20 @@ class Lookup:
     """Least error of a smoothed surface in m."""
     hidden_share: float
     """Share of points that face the camera and are hidden by another part of the object."""
-    worst: float
+    max_point_cost: float
     """Most that one point may cost (nats)."""
-    bend: float
+    normal_cost: float
     """Cost (nats) of normals at right angles."""
     measured_share: float
     """Share of pixels around the surface that carry a measurement."""
 
     def verdicts(self, pose: Array) -> np.ndarray:
         """Return the verdict (n,) of `kernels.visibility` on each point under one pose (12,)."""
-        return kernel.classify(pose, self.sight(), self.model(0.0))
+        return kernel.classify(pose, self.projection(), self.model(0.0))
 
     def excess(self, pose: Array, blur_m: float) -> tuple[float, int]:
         """Return the sum in m² of squared distances of matches beyond their variances under a pose (12,); how many."""
-        return kernel.excess(pose, self.sight(), float(np.hypot(blur_m, self.surface_m)))
+        return kernel.excess(pose, self.projection(), float(np.hypot(blur_m, self.surface_m)))
 
     def misfits(self, pose: Array, blur_m: float) -> Array:
         """Return what each match under one pose (12,) loses to distance and normals (nats), (k,)."""
@@ -50,40 +50,40 @@ class Lookup:
         found = found[found[:, matching.WEIGHT] > 0.0]
         variance = found[:, matching.FACING] / found[:, matching.WEIGHT]
         agreement = np.sum(found[:, matching.OWN] * found[:, matching.OTHER], axis=1)
-        return 0.5 * found[:, matching.RESIDUAL] ** 2 / variance + self.bend * (1.0 - agreement)
+        return 0.5 * found[:, matching.RESIDUAL] ** 2 / variance + self.normal_cost * (1.0 - agreement)
 
     def matches(self, pose: Array, surface_m: float) -> Array:
         """Return what each point finds under one pose (12,): `kernels.matching.matches`."""
-        return matching.matches(pose, self.sight(), surface_m)
+        return matching.matches(pose, self.projection(), surface_m)
 
-    def sight(self, stride: int = 1) -> Sight:
+    def projection(self, stride: int = 1) -> Projection:
         """Return what every `stride`-th point meets, as kernels take it."""
         if stride not in self._sights:
             columns = np.ascontiguousarray(self._columns[:, ::stride])
-            self._sights[stride] = Sight(columns, self._cells, self._camera, FACING)
+            self._sights[stride] = Projection(columns, self._cells, self._camera, FACING)
         return self._sights[stride]
 
-    def model(self, blur_m: float, typical: float = 0.5) -> kernel.Model:
+    def model(self, blur_m: float, typical_misfit: float = 0.5) -> kernel.LikelihoodParameters:
         """Return what the likelihood takes for granted where surfaces are blurred by so many m.
 
         Typical is what a good match loses to its misfit (nats), see `misfits`.
         """
         fx = self.image.frame.camera.fx
         lateral_px = max(self.image.sigma_wh * fx, 1.0)
-        return kernel.Model(
+        return kernel.LikelihoodParameters(
             blur_m=np.float32(np.hypot(blur_m, self.surface_m)),
             silhouette_px=np.float32(_OUTLINE * lateral_px + blur_m * fx / self._distance_m),
-            dead_px=np.float32(_SPARED * lateral_px),
+            dead_band_px=np.float32(_SPARED * lateral_px),
             clearance_m=np.float32(3.0 * self.image.sigma_r_m),
-            worst=np.float32(self.worst),
-            bend=np.float32(self.bend),
-            unmeasured=np.float32(np.log(max(self.hidden_share, 1.0 - self.measured_share))),
-            typical=np.float32(typical),
+            max_point_cost=np.float32(self.max_point_cost),
+            normal_cost=np.float32(self.normal_cost),
+            unmeasured_gain=np.float32(np.log(max(self.hidden_share, 1.0 - self.measured_share))),
+            typical_misfit=np.float32(typical_misfit),
             table=self._table,
         )
 
     @cached_property
-    def _sights(self) -> dict[int, Sight]:
+    def _sights(self) -> dict[int, Projection]:
         """By stride: what was made once."""
         return {}
 

@@ -13,7 +13,7 @@ from modeler.types import Array, PoseGaussian
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class ModeSamples:
     """Samples of one place, and how much of the mass is there."""
 
     poses: Array
@@ -32,23 +32,23 @@ class Place:
         return weighted_gaussian(self.poses, self.weights, centre_m)
 
 
-def by_place(found: Candidates, centre_m: Array, *, apart: float = 3.5) -> list[Candidates]:
+def split_modes(found: Candidates, centre_m: Array, *, apart: float = 3.5) -> list[Candidates]:
     """Return the candidates by place, the best place first.
 
     Two candidates share a place where a chain of candidates leads from one to the other, each link within `apart`
-    standard deviations of both its ends, or of a blunt one. A ridge, such as the spin of a can, is one place.
+    standard deviations of both its ends, or of a coarse one. A ridge, such as the spin of a can, is one place.
     """
     near = found.distances(centre_m) <= apart
-    linked = (near & near.T) | (near & found.blunt[:, None] & ~found.blunt)
+    linked = (near & near.T) | (near & found.coarse[:, None] & ~found.coarse)
     linked |= linked.T
     place = np.arange(len(found))
     for number in range(len(found)):  # each takes the name of the best that it hangs together with
         neighbours = np.unique(place[linked[number]])
         place[np.isin(place, neighbours)] = neighbours[0]
-    return [found.some(place == name) for name in np.unique(place[~found.blunt])]
+    return [found.some(place == name) for name in np.unique(place[~found.coarse])]
 
 
-def weighed(places: Sequence[Place], *, least: float = 0.005) -> list[tuple[float, Place]]:
+def weigh_modes(places: Sequence[ModeSamples], *, least: float = 0.005) -> list[tuple[float, ModeSamples]]:
     """Return the places with their shares of the mass, heaviest first; without those that hold less than the least."""
     log_mass = np.array([place.log_mass for place in places])
     mass = np.exp(log_mass - log_mass.max())

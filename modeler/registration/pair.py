@@ -9,7 +9,7 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import matching, ridges
 from modeler.kernels import visibility as kernel
-from modeler.registration.lookup import Lookup
+from modeler.registration.lookup import DirectedLikelihood
 from modeler.se3 import matrices, rows
 from modeler.types import Array
 
@@ -17,12 +17,12 @@ _FEW = 20  # so many matches say nothing of their noise
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class PairLikelihood:
     """p(surface of source | image target, T) · p(surface of target | image source, T)."""
 
-    forward: Lookup
+    forward: DirectedLikelihood
     """The source's points looked up in the target."""
-    backward: Lookup
+    backward: DirectedLikelihood
     """The target's points looked up in the source."""
     size_m: float
     """Standard deviation in m of the surface points of a view: the size of the object."""
@@ -65,9 +65,9 @@ class Pair:
             stride: every so manieth point stands for the others.
             typical: what a good match loses to its misfit (nats), see `typical_misfit`.
         """
-        sights = self.forward.sight(stride), self.backward.sight(stride)
+        projections = self.forward.projection(stride), self.backward.projection(stride)
         models = self.forward.model(blur_m, typical), self.backward.model(blur_m, typical)
-        found = stride * kernel.log_likelihoods(rows(poses), *sights, *models)
+        found = stride * kernel.log_likelihoods(rows(poses), *projections, *models)
         return found[:, kernel.LOG_LIKELIHOOD], found[:, kernel.EXPLAINED] / self.points
 
     def tempered(
@@ -114,33 +114,35 @@ class Pair:
 
     def normal_equations(self, poses: Array, surface_m: float, *, stride: int = 1) -> tuple[Array, Array]:
         """Return gradients (n, 6), matrices (n, 6, 6) of matching surface for ξ of poses (n, 4, 4) about the centre."""
-        sights = self.forward.sight(stride), self.backward.sight(stride)
-        gradients, equations = matching.normal_equations(rows(poses), *sights, self.centre_m, surface_m)
+        projections = self.forward.projection(stride), self.backward.projection(stride)
+        gradients, equations = matching.normal_equations(rows(poses), *projections, self.centre_m, surface_m)
         return stride * gradients, stride * equations
 
     def normal_equation(self, pose: Array, surface_m: float) -> tuple[Array, Array]:
         """Return gradient (6,) and matrix (6, 6) of one pose (4, 4), see `normal_equations`."""
-        sights = self.forward.sight(), self.backward.sight()
-        return matching.normal_equation(rows(pose), *sights, self.centre_m, surface_m)
+        projections = self.forward.projection(), self.backward.projection()
+        return matching.normal_equation(rows(pose), *projections, self.centre_m, surface_m)
 
-    def downhill(self, poses: Array, surface_m: float, pull: matching.Pull, *, steps: int, stride: int) -> Array:
-        """Return poses (n, 4, 4) so many Gauss-Newton steps further down, each held by a pull."""
-        sights = self.forward.sight(stride), self.backward.sight(stride)
-        pull = _for_every(pull, stride)
-        return matrices(matching.descend(rows(poses), *sights, self.centre_m, surface_m, pull, steps))
+    def descend(
+        self, poses: Array, surface_m: float, regulariser: matching.Regulariser, *, steps: int, stride: int
+    ) -> Array:
+        """Return poses (n, 4, 4) so many Gauss-Newton steps further down, each held by a regulariser."""
+        projections = self.forward.projection(stride), self.backward.projection(stride)
+        regulariser = _for_every(regulariser, stride)
+        return matrices(matching.descend(rows(poses), *projections, self.centre_m, surface_m, regulariser, steps))
 
-    def walked(
+    def trace_ridges(
         self,
         poses: Array,
         spreads: Array,
         axes: Array,
         *,
         blur_m: float,
-        pull: matching.Pull,
+        regulariser: matching.Regulariser,
         effective_points: float,
         floor: float,
         stride: float,
-        max_strides: int,
+        max_ridge_steps: int,
     ) -> Array:
         """Return poses (n, 4, 4) on the way from some along their axes, as far as `tempered` is above a floor.
 
@@ -149,30 +151,30 @@ class Pair:
             spreads: (k, 6, 6) lower triangular roots of the covariances of ξ about the centre.
             axes: (k, 6) unit vectors in units of those spreads.
             blur_m: blur of the surfaces in m.
-            pull: what holds a walker on its way across.
+            regulariser: what holds a walker on its way across.
             effective_points: as for `tempered`.
             floor: the least that a place is worth (nats).
             stride: length of a stride in standard deviations.
-            max_strides: at most so many.
+            max_ridge_steps: at most so many.
         """
-        coarse, fine = 4, 2  # every so manieth point leads downhill, and tells how good a place is
-        ground = ridges.Ground(
-            forward=self.forward.sight(coarse),
-            backward=self.backward.sight(coarse),
-            judging_forward=self.forward.sight(fine),
-            judging_backward=self.backward.sight(fine),
-            forward_model=self.forward.model(blur_m),
-            backward_model=self.backward.model(blur_m),
+        coarse, fine = 4, 2  # every fourth point is used for descent, and tells how good a place is
+        ground = ridges.RidgeLikelihood(
+            forward=self.forward.projection(coarse),
+            backward=self.backward.projection(coarse),
+            scoring_forward=self.forward.projection(fine),
+            scoring_backward=self.backward.projection(fine),
+            forward_parameters=self.forward.model(blur_m),
+            backward_parameters=self.backward.model(blur_m),
             per_point=fine * self.independent(effective_points) / self.points,
             no_overlap=self.no_overlap,
             per_explained=fine / (self.points * self.little_overlap),
             floor=float(floor),
         )
-        pull = _for_every(pull, coarse)
+        regulariser = _for_every(regulariser, coarse)
         visited, counts = ridges.walk(
-            rows(poses), spreads, axes, stride, ground, self.centre_m, blur_m, pull, max_strides
+            rows(poses), spreads, axes, stride, ground, self.centre_m, blur_m, regulariser, max_ridge_steps
         )
-        return matrices(visited[np.arange(max_strides) < counts[:, None]])
+        return matrices(visited[np.arange(max_ridge_steps) < counts[:, None]])
 
     def surface_noise_m(self, pose: Array, blur_m: float) -> float:
         """Return the standard deviation in m of matching surfaces' distance, beyond their pixels' noise.
@@ -200,6 +202,6 @@ class Pair:
         return float(matched / max(matched + wrong, 1))
 
 
-def _for_every(pull: matching.Pull, stride: int) -> matching.Pull:
-    """Return the pull beside every `stride`-th point: it is lowered, instead of raising what the points say."""
-    return pull._replace(precision=pull.precision / stride, damping=pull.damping / stride)
+def _for_every(regulariser: matching.Regulariser, stride: int) -> matching.Regulariser:
+    """Return the regulariser beside every `stride`-th point: it is lowered, instead of raising what the points say."""
+    return regulariser._replace(precision=regulariser.precision / stride, damping=regulariser.damping / stride)

@@ -14,8 +14,8 @@ import numpy as np
 
 from modeler import se3
 from modeler.kernels import matching, patches
-from modeler.registration.lookup import Lookup
-from modeler.registration.pair import Pair
+from modeler.registration.lookup import DirectedLikelihood
+from modeler.registration.pair import PairLikelihood
 from modeler.registration.posterior import FLOOR
 from modeler.se3 import rows
 from modeler.types import Array
@@ -32,7 +32,9 @@ class Refiner:
     min_patches: int = 16
     """With fewer patches than this nothing is refined: the scatter of six equations would not be known."""
 
-    def refine(self, pair: Pair, poses: Array, weights: Array, rng: np.random.Generator, *, fine_m: float) -> Array:
+    def refine(
+        self, pair: PairLikelihood, poses: Array, weights: Array, rng: np.random.Generator, *, fine_m: float
+    ) -> Array:
         """Return the refined samples (n, 4, 4): those of posterior × matching surface, if both were Gaussian.
 
         Each sample takes its own Gauss-Newton step, as far as the surface is surer than the samples' spread, and a
@@ -61,7 +63,7 @@ class Refiner:
         return se3.moved(poses, moved, centre_m)
 
     def _information(
-        self, pair: Pair, mode: Array, noise_m: float, spread: Array, centre_m: Array
+        self, pair: PairLikelihood, mode: Array, noise_m: float, spread: Array, centre_m: Array
     ) -> tuple[Array, Array]:
         """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) about the coordinates in it."""
         places, by_own, by_other, residuals, weights = _equations(pair, mode, noise_m, centre_m)
@@ -116,7 +118,7 @@ def seen_alone(size: float) -> float:
     return float(share**2)
 
 
-def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: float) -> tuple[Array, float]:
+def _mode(pair: PairLikelihood, start: Array, spread: Array, centre_m: Array, *, fine_m: float) -> tuple[Array, float]:
     """Return where matching surface and the spread (6, 6) of the samples about their mean settle, and the noise."""
     precision = np.linalg.inv(spread @ spread.T)
     pose, noise_m = start, pair.surface_noise_m(start, fine_m)
@@ -131,14 +133,16 @@ def _mode(pair: Pair, start: Array, spread: Array, centre_m: Array, *, fine_m: f
     return pose, noise_m
 
 
-def _steps(pair: Pair, poses: Array, noise_m: float, spread: Array, centre_m: Array) -> Array:
+def _steps(pair: PairLikelihood, poses: Array, noise_m: float, spread: Array, centre_m: Array) -> Array:
     """Return the Gauss-Newton steps (n, 6) of motions, held by the samples' spread where nothing else holds them."""
     gradient, matrix = pair.normal_equations(poses, noise_m, stride=2)
     held = matrix + np.linalg.inv(spread @ spread.T)
     return np.asarray(np.linalg.solve(held, gradient[:, :, None])[:, :, 0], dtype=np.float64)
 
 
-def _equations(pair: Pair, pose: Array, noise_m: float, centre_m: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _equations(
+    pair: PairLikelihood, pose: Array, noise_m: float, centre_m: Array
+) -> tuple[Array, Array, Array, Array, Array]:
     """Return the matching points' equations in the source's frame, about the centre.
 
     Returns:
@@ -146,7 +150,7 @@ def _equations(pair: Pair, pose: Array, noise_m: float, centre_m: Array) -> tupl
         (n, 6), residuals (n,) in m and weights (n,) in 1/m².
     """
     parts = []
-    directions: list[tuple[Lookup, Array, float]] = [
+    directions: list[tuple[DirectedLikelihood, Array, float]] = [
         (pair.forward, pose, 1.0),
         (pair.backward, se3.inverse(pose), -1.0),
     ]

@@ -9,11 +9,11 @@ from functools import partial
 import numpy as np
 
 from modeler.registration.candidates import Candidates
-from modeler.registration.importance import AdaptiveSampler, Population
-from modeler.registration.lookup import Lookup
+from modeler.registration.importance import AdaptiveSampler, WeightedSamples
+from modeler.registration.lookup import DirectedLikelihood
 from modeler.registration.mixture import Gaussians, MixtureProposal
-from modeler.registration.modes import Place, by_place, weighed
-from modeler.registration.pair import Pair
+from modeler.registration.modes import ModeSamples, split_modes, weigh_modes
+from modeler.registration.pair import PairLikelihood
 from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
 from modeler.registration.refinement import Refiner
 from modeler.registration.search import Search
@@ -35,7 +35,7 @@ from modeler.types import (
 class _Sampled:
     """Samples of one place, and the noise of matching surface with which they were weighed."""
 
-    population: Population
+    population: WeightedSamples
     noise_m: float
     typical: float
     """What a good match loses to its misfit (nats)."""
@@ -58,7 +58,7 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Surface points taken from each view."""
     effective_points: float = 70.0
     """Most independent measurements that the points of both views together are worth where surface matches; see
-    `Pair.independent`."""
+    `PairLikelihood.independent`."""
     compared_points: float = 40.0
     """Likewise where separate places are weighed against each other: sides that are alike differ by what all points of
     one side err by, which averages out in none."""
@@ -72,19 +72,19 @@ class VisibilityRegistrar(AbstractRegistrar):
     Where points go behind the surface seen they lose the log of it. With a lower share the inside of a bowl, hidden
     wherever the bowl has turned, would say that it had not.
     """
-    worst: float = 10.0
+    max_point_cost: float = 10.0
     """Most that one point may cost (nats)."""
-    bend: float = 2.0
+    normal_cost: float = 2.0
     """Cost (nats) of normals at right angles."""
     search: Search = field(default_factory=Search)
     """How the places are found where the posterior has its mass."""
-    max_places: int = 4
+    max_modes: int = 4
     """The best of so many are explored."""
     widening: float = 1.3
     """How much wider than the search's Gaussians the first samples lie."""
-    blunt_share: float = 0.4
+    coarse_share: float = 0.4
     """Share of them that looks farther, as far as surface leaves open when it is blurred."""
-    short_of: float = 3.0
+    restart_gain: float = 3.0
     """Where samples are so much better (nats) than all that the search had found, it goes on from them,"""
     restarts: int = 20
     """from so many of the best,"""
@@ -121,17 +121,17 @@ class VisibilityRegistrar(AbstractRegistrar):
         return replace(posterior, seconds=time.perf_counter() - started)
 
     def _explored(
-        self, pair: Pair, search: Search, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self, pair: PairLikelihood, search: Search, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior that one search finds."""
         source, target = pair.backward.image, pair.forward.image
         candidates = search.candidates(pair, density, rng)
         sampled = [
             self._sampled_to_the_top(pair, density, found, rng)
-            for found in by_place(candidates, pair.centre_m)[: self.max_places]
+            for found in split_modes(candidates, pair.centre_m)[: self.max_modes]
         ]
         strict = min(sampled, key=lambda one: one.noise_m)
-        places = weighed([self._place(pair, density, one, strict, rng) for one in sampled])
+        places = weigh_modes([self._place(pair, density, one, strict, rng) for one in sampled])
         samples = np.concatenate([place.poses for _, place in places])
         weights = np.concatenate([share * place.weights for share, place in places])
         modes = tuple(Mode(share, place.gaussian(pair.centre_m)) for share, place in places)
@@ -160,7 +160,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         )
 
     def _sampled_to_the_top(
-        self, pair: Pair, density: AbstractPoseDensity, found: Candidates, rng: np.random.Generator
+        self, pair: PairLikelihood, density: AbstractPoseDensity, found: Candidates, rng: np.random.Generator
     ) -> _Sampled:
         """Return samples of one place.
 
@@ -169,7 +169,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         """
         sampled = self._sampled(pair, density, found, rng)
         for _ in range(self.max_rounds - 1):
-            if sampled.rise < self.short_of:
+            if sampled.rise < self.restart_gain:
                 break
             order = np.argsort(-sampled.population.log_likelihoods, kind="stable")
             best = sampled.population.poses[order[: self.restarts]]
@@ -178,19 +178,19 @@ class VisibilityRegistrar(AbstractRegistrar):
         return sampled
 
     def _sampled(
-        self, pair: Pair, density: AbstractPoseDensity, found: Candidates, rng: np.random.Generator
+        self, pair: PairLikelihood, density: AbstractPoseDensity, found: Candidates, rng: np.random.Generator
     ) -> _Sampled:
         """Return samples around candidates."""
         noise_m = pair.surface_noise_m(found.poses[0], self.search.blurs[-1] * pair.size_m)
         typical = pair.typical_misfit(found.poses[0], noise_m)
         within, beside = self.effective_points, self.compared_points
-        if found.scarce:
-            within = beside = self.search.scarce_points
+        if found.low_overlap:
+            within = beside = self.search.low_overlap_points
         likelihood = partial(pair.tempered, blur_m=noise_m, effective_points=within, typical=typical)
         plain = likelihood(found.poses)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
-        log_weights = np.where(found.blunt, found.scores, plain + volumes)
-        for kind, share in ((found.blunt, self.blunt_share), (~found.blunt, 1.0 - self.blunt_share)):
+        log_weights = np.where(found.coarse, found.scores, plain + volumes)
+        for kind, share in ((found.coarse, self.coarse_share), (~found.coarse, 1.0 - self.coarse_share)):
             if kind.any():
                 log_weights[kind] += np.log(share) - np.logaddexp.reduce(log_weights[kind])
         gaussians = Gaussians(found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
@@ -199,8 +199,13 @@ class VisibilityRegistrar(AbstractRegistrar):
         return _Sampled(population, noise_m, typical, rise, beside)
 
     def _place(
-        self, pair: Pair, density: AbstractPoseDensity, one: _Sampled, strict: _Sampled, rng: np.random.Generator
-    ) -> Place:
+        self,
+        pair: PairLikelihood,
+        density: AbstractPoseDensity,
+        one: _Sampled,
+        strict: _Sampled,
+        rng: np.random.Generator,
+    ) -> ModeSamples:
         """Return one of the places, sharpened by matching surface but where that would leave what is possible.
 
         Each place was sampled under the noise that it shows itself, which would forgive it everything; beside each
@@ -218,7 +223,7 @@ class VisibilityRegistrar(AbstractRegistrar):
             effective_points=one.compared_points,
             typical=strict.typical,
         )
-        return Place(
+        return ModeSamples(
             np.where(inside[:, None, None], refined, population.poses),
             population.weights,
             population.log_evidence + float(beside[0] - population.log_likelihoods[best]),
@@ -226,24 +231,24 @@ class VisibilityRegistrar(AbstractRegistrar):
             population.pareto_k,
         )
 
-    def pair(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> Pair:
+    def pair(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> PairLikelihood:
         """Return the comparison of two views, at points drawn with `rng`."""
         size_m = 0.5 * (source.size_m + target.size_m)
-        return Pair(
+        return PairLikelihood(
             self._lookup(source, target, size_m, rng),
             self._lookup(target, source, size_m, rng),
             size_m=size_m,
         )
 
-    def _lookup(self, view: RayImage, image: RayImage, size_m: float, rng: np.random.Generator) -> Lookup:
+    def _lookup(self, view: RayImage, image: RayImage, size_m: float, rng: np.random.Generator) -> DirectedLikelihood:
         """Return points of a view to be looked up in another's image."""
-        return Lookup(
+        return DirectedLikelihood(
             spread_points(view, self.points, rng),
             image,
             surface_m=float(np.hypot(self.surface_detail * size_m, self.surface_noise * image.sigma_r_m)),
             hidden_share=self.hidden_share,
-            worst=self.worst,
-            bend=self.bend,
+            max_point_cost=self.max_point_cost,
+            normal_cost=self.normal_cost,
             measured_share=measured_share(image),
         )
 

@@ -13,7 +13,7 @@ import reference
 
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.kernels import visibility
-from modeler.kernels.sight import Sight
+from modeler.kernels.projection import Projection
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import PaperRegistrar, VisibilityRegistrar
@@ -161,10 +161,12 @@ def _counted(work: Callable[[], object]) -> tuple[int, float, float]:
     kernel = visibility.log_likelihoods
     count, spent_s = 0, 0.0
 
-    def counting(poses: Array, forward: Sight, backward: Sight, *models: visibility.Model) -> Array:
+    def counting(
+        poses: Array, forward: Projection, backward: Projection, *parameters: visibility.LikelihoodParameters
+    ) -> Array:
         nonlocal count, spent_s
         began = time.perf_counter()
-        result = kernel(poses, forward, backward, *models)
+        result = kernel(poses, forward, backward, *parameters)
         spent_s += time.perf_counter() - began
         count += len(poses) * (forward.points.shape[1] + backward.points.shape[1])
         return result

@@ -25,7 +25,7 @@ CARRIED_ROWS = 8
 FloatArray = npt.NDArray[np.float32]
 
 
-class Sight(NamedTuple):
+class Projection(NamedTuple):
     """What one view's points meet in the other."""
 
     points: FloatArray
@@ -50,12 +50,12 @@ def invert(pose, inverse):
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
-def carry(pose, sight, carried, pixels):
+def carry(pose, projection, carried, pixels):
     """Carry points into the other camera: straight-line code over rows of numbers, which compilers turn into vectors.
 
     Args:
         pose: (12,) rows of the 3×4 matrix.
-        sight: the points and the other camera.
+        projection: the points and the other camera.
         carried: (8, n) out: position, normal, how much the point faces the camera (0..1), and how much it is to be
             relied on that the camera measures it (0..1).
         pixels: (n,) out: number of the pixel it falls on, row by row; -1 outside the image or behind the camera.
@@ -63,9 +63,9 @@ def carry(pose, sight, carried, pixels):
     p0, p1, p2, p3 = np.float32(pose[0]), np.float32(pose[1]), np.float32(pose[2]), np.float32(pose[3])
     p4, p5, p6, p7 = np.float32(pose[4]), np.float32(pose[5]), np.float32(pose[6]), np.float32(pose[7])
     p8, p9, p10, p11 = np.float32(pose[8]), np.float32(pose[9]), np.float32(pose[10]), np.float32(pose[11])
-    points, (fx, fy, cx, cy, width, height) = sight.points, sight.camera
-    low, per_range = sight.facing[0], ONE / (sight.facing[1] - sight.facing[0])
-    flat, per_turn = sight.facing[2], ONE / (sight.facing[3] - sight.facing[2])
+    points, (fx, fy, cx, cy, width, height) = projection.points, projection.camera
+    low, per_range = projection.facing[0], ONE / (projection.facing[1] - projection.facing[0])
+    flat, per_turn = projection.facing[2], ONE / (projection.facing[3] - projection.facing[2])
     for j in range(points.shape[1]):
         a, b, c, d, e, f = points[0, j], points[1, j], points[2, j], points[3, j], points[4, j], points[5, j]
         x = p0 * a + p1 * b + p2 * c + p3
@@ -99,15 +99,15 @@ def fetch(pixels, cells, found):
 
 
 @numba.njit(cache=True, forceinline=True)
-def look(pose, sight, carried, pixels, found):
+def look(pose, projection, carried, pixels, found):
     """Carry points by a pose (12,), and copy what lies there: `carry`, then `fetch`."""
-    carry(pose, sight, carried, pixels)
-    fetch(pixels, sight.cells, found)
+    carry(pose, projection, carried, pixels)
+    fetch(pixels, projection.cells, found)
 
 
 @numba.njit(cache=True, forceinline=True)
-def buffers(sight):
+def buffers(projection):
     """Return room for what `look` finds: carried (8, n), pixels (n,), cells (8, n)."""
-    count = sight.points.shape[1]
+    count = projection.points.shape[1]
     carried, pixels = np.empty((CARRIED_ROWS, count), dtype=np.float32), np.empty(count, dtype=np.int32)
     return carried, pixels, np.empty((CELL_SIZE, count), dtype=np.float32)
