@@ -9,9 +9,9 @@ import pytest
 from commanded import BOX
 
 from modeler import priors, se3
-from modeler.cli import nonvisual
-from modeler.cli.building import comes_back, ends_without, other_step, sense_in_doubt
-from modeler.cli.interrupt import Interrupt
+from modeler.cli import compose
+from modeler.cli.advice import comes_back, ends_without, other_step, sense_in_doubt
+from modeler.cli.console import Interrupt
 from modeler.cli.options import PriorOptions
 from modeler.types import ACCEPTED, Outcome
 from sequences import open_sequence
@@ -19,10 +19,10 @@ from sequences import open_sequence
 
 def test_a_step_between_numbers_that_leave_some_out_is_told_as_a_step_between_frames() -> None:
     options, whole = PriorOptions(prior="turntable", step_deg=-10.0), open_sequence(BOX)
-    assert nonvisual.told(options, whole) == ("turntable", "")
-    _, remark = nonvisual.told(options, whole.select(every=3))
+    assert compose.told(options, whole) == ("turntable", "")
+    _, remark = compose.told(options, whole.select(every=3))
     assert remark == "frame numbers go up by 3: -10° from one number to the next is -30° from frame to frame"
-    assert nonvisual.told(PriorOptions(prior="table"), whole.select(every=3)) == ("table", "")
+    assert compose.told(PriorOptions(prior="table"), whole.select(every=3)) == ("table", "")
 
 
 @pytest.mark.parametrize(

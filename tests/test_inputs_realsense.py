@@ -306,7 +306,7 @@ def test_recording_a_live_camera_needs_an_end(
 ) -> None:
     camera = StandIn(small_frames(3))
     monkeypatch.setattr(
-        "modeler.cli.converting.open_sequence",
+        "sequences.open_sequence",
         lambda path, *_: begin(camera, 2) if str(path) == "realsense:" else open_sequence(path),
     )
     assert main(["convert", "realsense:", "--out", str(tmp_path / "bop")]) == 2
@@ -320,10 +320,10 @@ def test_a_camera_that_is_unplugged_leaves_what_it_gave(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, command: tuple[str, ...]
 ) -> None:
     camera, out = StandIn(small_frames(3), lasts=3), tmp_path / "out"
-    for module in ("modeler.cli.converting.open_sequence", "modeler.cli.building.open_sequence"):
-        monkeypatch.setattr(
-            module, lambda path, *_: begin(camera, 2) if str(path) == "realsense:" else open_sequence(path)
-        )
+    monkeypatch.setattr(
+        "sequences.open_sequence",
+        lambda path, *_: begin(camera, 2) if str(path) == "realsense:" else open_sequence(path),
+    )
     assert main([command[0], "realsense:", "--out", str(out), *command[1:]]) in (0, 3)
     assert "modeler: stand-in: gives no image: going on with the frames so far\n" in capsys.readouterr().err
     if command[0] == "convert":

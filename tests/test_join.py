@@ -14,7 +14,7 @@ import trimesh
 
 from modeler import se3
 from modeler.cli import main
-from modeler.cli.reopened import reopened
+from modeler.cli.inputs import reopened
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.fusion import Fuser, Matcher
 from modeler.graph import PoseGraph, solve

@@ -10,14 +10,14 @@ import sys
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from kills.trials import KINDS, SAME, Trials
 
-from modeler.cli import building, main
-from modeler.cli.remembered import Remembered
-from modeler.export import Pairs, RunFolder, alone
+from modeler.cli import build, main
+from modeler.export import Pairs, Remembered, RunFolder, RunMeta, alone
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar
@@ -121,7 +121,7 @@ def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(
 ) -> None:
     folder, write = tmp_path / "run", RunFolder.write
 
-    def pressed(self: RunFolder, step: building.Any, meta: building.RunMeta) -> dict:
+    def pressed(self: RunFolder, step: Any, meta: RunMeta) -> dict:
         if step.frame.index == 0:
             signal.raise_signal(signal.SIGINT)
         return write(self, step, meta)
@@ -198,15 +198,15 @@ def test_what_is_said_to_be_saved_is_on_the_disk(
 def test_ctrl_c_before_the_first_frame_ends_the_program(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Pressed(building.Interrupt):
+    class Pressed(build.Interrupt):
         @property
         def asked(self) -> bool:
             return True
 
-        def until(self, items: building.Any) -> building.Any:
+        def until(self, items: Any) -> Any:
             return iter(())
 
-    monkeypatch.setattr(building, "Interrupt", Pressed)
+    monkeypatch.setattr(build, "Interrupt", Pressed)
     assert main(["build", str(scene), "--out", str(tmp_path / "run"), *QUICK]) == 130
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from modeler.cli.nonvisual import prior, prior_name
+from modeler.cli.compose import chosen_prior, prior_name
 from modeler.cli.options import PriorOptions
 from modeler.priors import (
     AxesPrior,
@@ -76,7 +76,7 @@ def test_the_sequence_says_what_is_known_unless_it_is_asked_otherwise(
     motion: Mapping[str, object] | None, given: dict[str, Any], name: str
 ) -> None:
     assert prior_name(PriorOptions(**given), Telling(motion)) == name
-    prior(PriorOptions(**given), Telling(motion))
+    chosen_prior(PriorOptions(**given), Telling(motion))
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_the_sequence_says_what_is_known_unless_it_is_asked_otherwise(
     ],
 )
 def test_names_joined_by_plus_hold_together(name: str, expected: object) -> None:
-    assert prior(PriorOptions(prior=name), TURNTABLE) == expected
+    assert chosen_prior(PriorOptions(prior=name), TURNTABLE) == expected
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_names_joined_by_plus_hold_together(name: str, expected: object) -> None
     ],
 )
 def test_a_bare_step_may_turn_either_way(given: dict[str, Any], sequence: Telling | None, sign: str) -> None:
-    found = prior(PriorOptions(prior="turntable", **given), sequence)
+    found = chosen_prior(PriorOptions(prior="turntable", **given), sequence)
     assert isinstance(found, TurntablePrior)
     assert found.step_sign == sign
 
@@ -119,7 +119,7 @@ def test_a_robots_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "robot.txt"
     path.write_text("# time tx ty tz qx qy qz qw\n0 1 2 3 0 0 0 1\n0.5 1 2 4 0 0 1 0\n")
     sequence = Telling({"kind": "held"}, path)
-    found = prior(PriorOptions(held_sigma_deg=2.0), sequence)
+    found = chosen_prior(PriorOptions(held_sigma_deg=2.0), sequence)
     assert isinstance(found, HeldPrior)
     assert (found.held_sigma_deg, found.name) == (2.0, str(path))
     np.testing.assert_array_equal(found.times_s, [0.0, 0.5])
@@ -130,12 +130,12 @@ def test_a_robots_file_is_read(tmp_path: Path) -> None:
 
 def test_pokes_are_read() -> None:
     expected = Poke((0.0, 0.1, 0.8), (1.0, 0.0, 0.0), 0.03)
-    found = prior(PriorOptions(), Telling({"kind": "poke", "pokes": {"3": POKE}}))
+    found = chosen_prior(PriorOptions(), Telling({"kind": "poke", "pokes": {"3": POKE}}))
     assert found == PokePrior(pokes={3: expected})
     given = PriorOptions(
         prior="poke", poke_point_m=expected.point_m, poke_direction=(1.0, 0.0, 0.0), poke_length_m=0.03
     )
-    assert prior(given, None) == PokePrior(expected)
+    assert chosen_prior(given, None) == PokePrior(expected)
 
 
 @pytest.mark.parametrize(
@@ -171,4 +171,4 @@ def test_pokes_are_read() -> None:
 )
 def test_what_cannot_be_used_is_told_in_a_line(options: PriorOptions, sequence: Telling | None, says: str) -> None:
     with refused(says):
-        prior(options, sequence)
+        chosen_prior(options, sequence)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from modeler.cli.console import Console
-from modeler.cli.reading import reading
+from modeler.cli.inputs import reading
 from modeler.pipeline import ACCEPTED
 from modeler.types import Outcome, Segmentation, Solution, Step
 from sequences import bundled, open_sequence

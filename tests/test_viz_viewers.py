@@ -207,7 +207,7 @@ def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp
 
 def test_a_run_that_is_terminated_leaves_a_whole_recording_and_no_server(tmp_path: Path) -> None:
     program = (
-        "import sys, pathlib, time; from modeler.cli.interrupt import terminable; from turning_box import steps;"
+        "import sys, pathlib, time; from modeler.cli.console import terminable; from turning_box import steps;"
         "from viz.stream import open_stream\n"
         "with terminable():\n"
         "    stream = open_stream('box', save=pathlib.Path(sys.argv[1]), web=True)\n"

@@ -1,21 +1,66 @@
 """The command line: the composition root, the only module that sees everything.
 
-Each command is a frozen dataclass whose fields are its options; `run` returns the exit status. What is heavy is
-imported when a command runs, so that help appears at once.
+Each command is a frozen dataclass whose fields are its options; `run` returns the exit status. Heavy imports stand
+inside functions, so that help appears at once.
 """
 
+import contextlib
 import io
 import logging
 import os
+import re
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
+from importlib import metadata
+from itertools import takewhile
+from typing import Annotated, Any, Union
 
-from modeler.cli.interrupt import terminable
-from modeler.cli.saying import say
-from modeler.cli.usage import Command, parsed
+import tyro
+
+from modeler.cli.build import Build
+from modeler.cli.calibrate_sensor import CalibrateSensor
+from modeler.cli.console import say
+from modeler.cli.console import terminable as terminable
+from modeler.cli.convert import Convert
+from modeler.cli.evaluate import Evaluate
+from modeler.cli.export import Export
+from modeler.cli.info import Info
+from modeler.cli.join import Join
+from modeler.cli.register import Register
+from modeler.cli.render import Render
+from modeler.cli.report import Report
+from modeler.cli.view import View
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it."""
+
+Command = Build | Info | Convert | CalibrateSensor | Register | Evaluate | Render | View | Report | Export | Join
+
+COMMANDS: dict[str, type[Command]] = {
+    "build": Build,
+    "info": Info,
+    "convert": Convert,
+    "calibrate-sensor": CalibrateSensor,
+    "register": Register,
+    "evaluate": Evaluate,
+    "render": Render,
+    "view": View,
+    "report": Report,
+    "export": Export,
+    "join": Join,
+}
+_STYLE = (
+    tyro.conf.OmitSubcommandPrefixes,
+    tyro.conf.OmitArgPrefixes,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.DisallowNone,
+)
+_DESCRIPTION = (
+    "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr. "
+    "--version prints the version."
+)
+_HELP_INDENT = " " * 8  # of an option's description in the parser's error box
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -54,9 +99,61 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
-def _close_stdout() -> None:
-    """Say nothing more there, at exit either."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def parsed(arguments: Sequence[str]) -> Command:
+    """Return the command that the arguments (after the program's name) ask for.
+
+    Raises:
+        SystemExit: with status 0 after help or version, with 2 and one line on stderr for what is no command.
+    """
+    name, *others = arguments or ("",)
+    if name == "help":
+        name, others = (others[0], ["--help"]) if others[:1] and others[0] in COMMANDS else ("--help", [])
+    if name == "--version":
+        print(f"modeler {metadata.version('modeler')}")
+        raise SystemExit(0)
+    if name in ("-h", "--help"):
+        return tyro.cli(_overview(), prog="modeler", description=_DESCRIPTION, args=["--help"], config=_STYLE)
+    if name not in COMMANDS:
+        near = get_close_matches(name, COMMANDS, n=1)
+        kind = "option" if name.startswith("-") else "command"
+        wrong = f"unknown {kind} '{name}'" if name else "no command given"
+        hint = f"did you mean '{near[0]}'?" if near else f"the commands are {', '.join(COMMANDS)};"
+        say(f"{wrong}; {hint} see modeler --help")
+        raise SystemExit(2)
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            return tyro.cli(COMMANDS[name], prog=f"modeler {name}", args=others, config=_STYLE)
+    except SystemExit as ending:
+        if ending.code:
+            say(f"{_one_line(box.getvalue())}; see modeler {name} --help")
+        raise
+
+
+def _overview() -> Any:
+    """Return the type that is any of the commands, each described by its first sentence."""
+    commands = COMMANDS.items()
+    return Union[  # noqa: UP007
+        tuple(Annotated[c, tyro.conf.subcommand(name, description=_first_sentence(c))] for name, c in commands)
+    ]
+
+
+def _first_sentence(command: type[Command]) -> str:
+    return (command.__doc__ or "").split("\n\n", maxsplit=1)[0]
+
+
+def _one_line(box: str) -> str:
+    """Return the parser's error box as one line: its first section and the options it suggests, without their help."""
+    rows = [re.sub(r"\x1b\[[0-9;]*m|\[/?bold\]", "", row).strip("│|╭╮╰╯").rstrip() for row in box.splitlines()[1:]]
+    sections = [[]]
+    for row in rows:
+        if row and not row.strip("─+- "):
+            sections.append([])
+        elif not row.startswith(_HELP_INDENT):
+            sections[-1].append(row)
+    lines = [" ".join(" ".join(takewhile(bool, section)).split()) for section in sections]
+    kept = [line for number, line in enumerate(lines) if line and (not number or line.startswith("Perhaps"))]
+    return "; ".join(line.rstrip(".") for line in kept)
 
 
 def _run(command: Command) -> int:
@@ -69,3 +166,8 @@ def _run(command: Command) -> int:
     except InputError as error:
         say(str(error).strip().removesuffix("."))
         return 2
+
+
+def _close_stdout() -> None:
+    """Say nothing more there, at exit either."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

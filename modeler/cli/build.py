@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from modeler.cli.console import Console, Interrupt, say
 from modeler.cli.options import FrameOptions, MethodOptions, ObjectOptions, PriorOptions, default
+
+if TYPE_CHECKING:
+    from modeler.export import RunFolder, RunMeta
+    from modeler.pipeline import Modeler
+    from modeler.segmentation import Scene
+    from modeler.types import AbstractPrior
+    from sequences import AbstractSequence
 
 
 @dataclass(frozen=True)
@@ -47,10 +57,49 @@ class Build:
     where: ObjectOptions = field(default_factory=ObjectOptions)
 
     def run(self) -> int:
-        """Build the model; status 3 where it is not to be trusted, as report.json then says."""
-        from modeler.cli.building import build
+        """Run the loop into a run folder; status 3 where the model is not to be trusted, as report.json then says.
 
-        return build(self)
+        Raises:
+            InputError: where the input or the folder cannot be used.
+        """
+        from modeler.cli import compose
+        from modeler.cli.advice import comes_back
+        from modeler.export import Remembered, RunFolder, RunMeta, alone
+        from viz.ending import ends_whole
+
+        began_s = time.perf_counter()
+        _check(self)
+        whole, frames = _opened(self)
+        modeler = compose.modeler(whole, self.prior, self.method, self.where)
+        modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=self.voxel_m))
+        prior, remark = compose.told(self.prior, whole)
+        meta = RunMeta(
+            sequence=str(self.sequence),
+            seed=self.method.seed,
+            prior=prior,
+            settings=self.settings(),
+            closure_expected=comes_back(frames, self.prior.step_deg, modeler.closer.max_angle_deg),
+        )
+        if self.resume and RunFolder(self.out).finished(meta):
+            say("the run had come to its end; --overwrite makes it anew")
+            return _told(RunFolder(self.out).report(), self, modeler.prior)
+        scene = compose.scene(modeler, whole)
+        with alone(self.out):
+            before = RunFolder(self.out).changed_versions(meta) if self.resume else ()
+            folder = RunFolder.open(self.out, overwrite=self.overwrite, resume=self.resume)
+            glance = None if modeler.glance is None else Remembered(modeler.glance, folder.pairs, meta.versions)
+            registrar = Remembered(modeler.registrar, folder.pairs, meta.versions)
+            modeler = replace(modeler, registrar=registrar, glance=glance)
+            if before:
+                say(f"was begun with {', '.join(before)}: pairs are registered anew")
+            if remark:
+                say(remark)
+            report = _run(self, modeler, (frames, scene), folder, meta, began_s=began_s)
+            folder.finish()
+        recording = folder.path / "recording.rrd"
+        if not ends_whole(recording):
+            say(f"{recording}: is cut off (is the disk full?); the rest is whole")
+        return _told(report, self, modeler.prior)
 
     def settings(self) -> dict[str, object]:
         """Return what the results depend on besides sequence, seed and the prior's name, as report.json records it."""
@@ -58,3 +107,115 @@ class Build:
         parts["voxel_m"] = self.voxel_m
         parts["sensor"] = None if self.sensor is None else str(self.sensor)
         return {name: value for name, value in parts.items() if name not in ("prior", "seed") and value is not None}
+
+
+def _check(options: Build) -> None:
+    """Refuse options that contradict each other or nobody can mean.
+
+    Raises:
+        InputError: where they do.
+    """
+    from modeler.types import InputError
+    from viz.viewer import reachable
+
+    if options.resume and options.overwrite:
+        raise InputError("--resume keeps what --overwrite deletes; give one of them")
+    if options.voxel_m is not None and not 0.0 < options.voxel_m < 1.0:
+        raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m between 0 and 1")
+    if options.connect is not None:
+        reachable(options.connect)  # refuses what is no address; whether somebody listens is asked when there is news
+
+
+def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
+    """Return the sequence and what was selected of it; what cannot be read is found before anything is made.
+
+    Raises:
+        InputError: where something cannot be read.
+    """
+    from modeler.cli.inputs import watched
+    from sequences import SensedSequence, frame_range, open_sequence, read_noise, survey
+
+    path = options.sequence
+    whole = watched(path, options.idle_s) if options.watch else open_sequence(path)
+    whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
+    frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
+    if not frames.live:
+        for doubt in survey(frames, truth=False).doubts:
+            say(doubt)
+    return whole, frames
+
+
+def _run(
+    options: Build,
+    modeler: Modeler,
+    seen: tuple[AbstractSequence, Scene],
+    folder: RunFolder,
+    meta: RunMeta,
+    *,
+    began_s: float,
+) -> Mapping[str, Any]:
+    """Show and write every step, and return the last report.
+
+    Raises:
+        InputError: where a frame cannot be read or a file cannot be written.
+        KeyboardInterrupt: where somebody asked for an end before the first frame.
+    """
+    from modeler.cli.inputs import while_it_lasts
+    from viz.stream import open_stream
+
+    frames, scene = seen
+    stream = open_stream(
+        frames.name,
+        save=folder.path / "recording.rrd",
+        spawn=options.view,
+        web=options.web,
+        connect=options.connect,
+        facts={"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings},
+    )
+    seconds = {"scene": time.perf_counter() - began_s, "registration": 0.0, "total": 0.0}
+    report: Mapping[str, Any] = {}
+    try:
+        with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
+            wanted = frames.until(lambda: interrupt.asked)
+            coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
+            steps = modeler.run(
+                coming,
+                scene,
+                hurry=lambda: interrupt.asked,
+                ending=console.ending,
+                seeking=console.seeking,
+            )
+            for step in steps:
+                seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
+                seconds["total"] = time.perf_counter() - began_s
+                meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
+                report = folder.write(step, meta)
+                stream(step)
+                console(step)
+    finally:
+        stream.close()
+    if not report:
+        raise KeyboardInterrupt
+    return report
+
+
+def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
+    """Say on stderr what came out, and return the exit status."""
+    from modeler.cli.advice import ends_without, other_step, sense_in_doubt
+    from modeler.types import ACCEPTED
+
+    accepted = sum(frame["outcome"] == ACCEPTED for frame in report["frames"])
+    loop = "loop closed" if report["closed"] else "no loop closed"
+    took = f"{report['seconds'].get('total', 0.0):.0f} s"
+    frames = "1 frame" if len(report["frames"]) == 1 else f"{len(report['frames'])} frames"
+    say(f"{accepted} of {frames}, {loop}, {took}: {options.out}")
+    if report["reasons"]:
+        first, *others = sorted(report["reasons"], key=lambda reason: "left out" in reason)  # those were told above
+        more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
+        say(f"not to be trusted: {first}{more}")
+        if sense_in_doubt(report["reasons"], prior):
+            say("that the table turns the way round that was told is taken for granted; else give --step-sign unknown")
+    for remark in (other_step(report["edges"], prior), ends_without(report["frames"])):
+        if remark:
+            say(remark)
+    return 0 if report["trustworthy"] else 3

@@ -1,17 +1,58 @@
-"""Options to components."""
+"""From options, and what a sequence says of itself, to components."""
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
 from modeler import registration
-from modeler.cli import nonvisual
 from modeler.cli.options import Method, MethodOptions, ObjectOptions, PriorOptions
 from modeler.closure import Closer
 from modeler.fusion import Fuser
 from modeler.pipeline import Modeler, glancing
+from modeler.priors import (
+    AxesPrior,
+    FeaturesPrior,
+    GeneralPrior,
+    HeldPrior,
+    Poke,
+    PokePrior,
+    ProductPrior,
+    TablePrior,
+    TurntablePrior,
+    VelocityPrior,
+)
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
-from modeler.types import AbstractRegistrar, InputError
+from modeler.types import AbstractPrior, AbstractRegistrar, InputError
 from sequences import AbstractSequence
+from sequences.files.folders import frame_number
+from sequences.pictures.tum import trajectory
+
+_GIVEN = {
+    "general": ("max_rotation_deg", "max_offset_m"),
+    "table": ("max_rotation_deg", "max_shift_m"),
+    "turntable": (
+        "step_deg",
+        "step_sigma_deg",
+        "step_sign",
+        "axis_direction",
+        "axis_point_m",
+        "axis_sigma_deg",
+        "axis_sigma_m",
+        "max_shift_m",
+    ),
+    "held": ("held_sigma_deg", "held_sigma_m", "max_gap_s", "max_offset_m"),
+    "poke": ("poke_point_m", "poke_direction", "poke_length_m"),
+    "velocity": ("velocity_sigma_deg", "velocity_sigma_m"),
+    "axes": (),
+    "features": (),
+}
+_GUESSES = ("velocity", "axes", "features")
 
 
 def modeler(
@@ -27,7 +68,7 @@ def modeler(
     return Modeler(
         segmenter=segmenter(where),
         sensor=Sensor() if noise is None else Sensor(*noise),
-        prior=nonvisual.prior(prior_options, sequence),
+        prior=chosen_prior(prior_options, sequence),
         registrar=chosen,
         glance=glancing(chosen),
         closer=Closer(),
@@ -77,3 +118,183 @@ def registrar(method: Method) -> AbstractRegistrar:
             return registration.FpfhRegistrar()
         case "fpfh-icp":
             return registration.FpfhIcpRegistrar()
+
+
+def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> AbstractPrior:
+    """Return the prior asked for.
+
+    Args:
+        options: as given.
+        sequence: what it is for; None: several.
+
+    Raises:
+        InputError: where there is no such prior, a parameter cannot be used, or the sequence lacks what it needs.
+    """
+    name = prior_name(options, sequence)
+    parts = name.split("+")
+    for part in parts:
+        if part not in _GIVEN:
+            raise InputError(
+                f"--prior {name}: there is no prior {part!r}; there are {', '.join(map(repr, _GIVEN))}, "
+                "and several joined by +"
+            )
+        if parts.count(part) > 1:
+            raise InputError(f"--prior {name} names {part} twice; name each once")
+    known = [part for part in parts if part not in _GUESSES] or ["general"]
+    accepted = {parameter for part in (*parts, *known) for parameter in _GIVEN[part]}
+    given = options.given(name, accepted, _GIVEN)
+    of = {part: {key: value for key, value in given.items() if key in _GIVEN[part]} for part in _GIVEN}
+    if {"table", "turntable"} <= set(known):  # the axis is the table's normal: to multiply would count the table twice
+        if "max_rotation_deg" in given:
+            raise InputError(
+                "--max-rotation-deg is no parameter of a turntable on its table; --step-deg tells the turn."
+            )
+        known.remove("table")
+        of["turntable"]["needs_table"] = True
+    found = [_known(part, of[part], sequence) for part in known]
+    result = found[0]
+    for other in found[1:]:
+        result = ProductPrior(result, other)
+    for guess in (part for part in parts if part in _GUESSES):
+        result = _guess(guess, of[guess], result)
+    return result
+
+
+def prior_name(options: PriorOptions, sequence: AbstractSequence | None) -> str:
+    """Return the name of the prior asked for; without one, what the sequence says if that is enough, else `general`."""
+    if options.prior is not None:
+        return options.prior
+    motion = {} if sequence is None else sequence.motion or {}
+    kind = str(motion.get("kind"))
+    enough: Mapping[str, Callable[[], object]] = {
+        "table": lambda: True,
+        "turntable": lambda: options.step_deg is not None or _number(motion.get("step_deg")),
+        "held": lambda: sequence is not None and sequence.robot_path is not None,
+        "poke": lambda: isinstance(motion.get("pokes"), dict),
+    }
+    # Parameters of another prior, given by hand, say more than the file.
+    fits = options.parameters().keys() <= set(_GIVEN.get(kind, ()))
+    return kind if fits and kind in enough and enough[kind]() else "general"
+
+
+def told(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
+    """Return the name of the prior, and in words what was chosen or assumed without being asked for."""
+    name, said = prior_name(options, sequence), []
+    if options.prior is None and name != "general":
+        said.append(f"prior {name}, as sequence.json says")
+    step_deg = _number((sequence.motion or {}).get("step_deg"))
+    if "turntable" in name.split("+") and options.step_deg is None and step_deg is not None:
+        said.append(f"step {step_deg:g}°, as sequence.json says")
+    step_deg = step_deg if options.step_deg is None else options.step_deg
+    apart = min((late - early for early, late in itertools.pairwise(sequence.indices)), default=1)
+    if "turntable" in name.split("+") and step_deg is not None and apart > 1:
+        said.append(
+            f"frame numbers go up by {apart}: {step_deg:g}° from one number to the next is {apart * step_deg:g}° from "
+            "frame to frame"
+        )
+    return name, "; ".join((*said, *sequence.notes))
+
+
+def _known(name: str, given: dict[str, Any], sequence: AbstractSequence | None) -> AbstractPrior:
+    """Return a prior that is evidence, by its name."""
+    match name:
+        case "table":
+            return TablePrior(**given)
+        case "turntable":
+            return _turntable(given, {} if sequence is None else sequence.motion or {})
+        case "held":
+            return _held(given, sequence)
+        case "poke":
+            return _poke(given, sequence)
+        case _:
+            return GeneralPrior(**given)
+
+
+def _guess(name: str, given: dict[str, Any], known: AbstractPrior) -> AbstractPrior:
+    """Return a prior that only proposes, within what is known."""
+    match name:
+        case "velocity":
+            return VelocityPrior(known, **given)
+        case "axes":
+            return AxesPrior(known)
+        case _:
+            return FeaturesPrior(known)
+
+
+def _turntable(given: dict[str, Any], motion: Mapping[str, object]) -> TurntablePrior:
+    """Return a turntable, its step as given, else as `sequence.json` says.
+
+    A step told without an axis does not say which way round it is, unless it is negative or agrees with the file.
+    """
+    step_deg, sigma_deg = _number(motion.get("step_deg")), _number(motion.get("sigma_deg"))
+    given = dict(given)
+    if "step_deg" not in given:
+        if not step_deg:
+            raise InputError("--prior turntable needs the turn from frame to frame; give --step-deg")
+        given["step_deg"] = step_deg
+        if sigma_deg is not None and sigma_deg > 0.0:
+            given.setdefault("step_sigma_deg", sigma_deg)
+    agreed = step_deg is not None and step_deg * given["step_deg"] > 0.0
+    meant = given["step_deg"] < 0.0 or "axis_direction" in given or agreed
+    given.setdefault("step_sign", "known" if meant else "unknown")
+    return TurntablePrior(**given)
+
+
+def _held(given: dict[str, Any], sequence: AbstractSequence | None) -> HeldPrior:
+    """Return the hand of a sequence."""
+    if sequence is None:
+        raise InputError("--prior held reads the robot.txt of one sequence; give one sequence at a time")
+    if sequence.robot_path is None:
+        raise InputError(
+            f"{sequence.name}: has no robot.txt for --prior held; write lines `time tx ty tz qx qy qz qw` of "
+            "camera_from_hand there, or use another prior"
+        )
+    poses = trajectory(sequence.robot_path)
+    if not poses:
+        raise InputError(f"{sequence.robot_path}: holds no pose; write lines `time tx ty tz qx qy qz qw`.")
+    times_s, hands = np.array([time for time, _ in poses]), np.array([pose for _, pose in poses])
+    return HeldPrior(times_s, hands, name=str(sequence.robot_path), **given)
+
+
+def _poke(given: dict[str, Any], sequence: AbstractSequence | None) -> PokePrior:
+    """Return the push that is given, or those that `sequence.json` tells."""
+    if given:
+        missing = [name for name in _GIVEN["poke"] if name not in given]
+        if missing:
+            raise InputError(f"--prior poke needs --{missing[0].replace('_', '-')} as well; give all three")
+        return PokePrior(Poke(given["poke_point_m"], given["poke_direction"], given["poke_length_m"]))
+    told = None if sequence is None or sequence.motion is None else sequence.motion.get("pokes")
+    if sequence is None or not isinstance(told, dict) or not told:
+        raise InputError("--prior poke needs --poke-point-m, --poke-direction and --poke-length-m; give them")
+    return PokePrior(pokes=dict(_one_poke(f"{sequence.name}: sequence.json", *one) for one in told.items()))
+
+
+def _one_poke(where: str, frame: str, entry: object) -> tuple[int, Poke]:
+    """Return a push as `sequence.json` has it, and the first frame after it; `where` is for messages."""
+    number = frame_number(frame)
+    if number is None:
+        raise InputError(f"{where}: poke {frame!r} is not told by a frame number; use the first frame after it")
+    values = entry if isinstance(entry, dict) else {}
+    point_m, direction, length_m = (values.get(name) for name in ("point_m", "direction", "length_m"))
+    threes = [
+        tuple(map(_number, three)) if isinstance(three, list) and len(three) == 3 else (None,)
+        for three in (point_m, direction)
+    ]
+    length_m = _number(length_m)
+    if any(None in three for three in threes) or not any(threes[1]) or length_m is None or not 0.0 < length_m <= 10.0:
+        raise InputError(
+            f'{where}: poke {frame!r} must be {{"point_m": [x, y, z], "direction": [x, y, z], "length_m": l}} '
+            "in camera coordinates; correct it there"
+        )
+    return number, Poke(threes[0], threes[1], length_m)  # pyright: ignore[reportArgumentType]
+
+
+def _number(value: object) -> float | None:
+    """Return a finite number; None where the value is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:  # whole numbers of a file may have any number of digits
+        return None
+    return number if math.isfinite(number) else None

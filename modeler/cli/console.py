@@ -1,21 +1,98 @@
-"""What a run says on stderr while it runs: a bar where somebody watches, and which frames are left out."""
+"""What a command says on stderr: messages, a progress bar where somebody watches, and what Ctrl-C does."""
 
 from __future__ import annotations
 
+import contextlib
 import re
-from types import TracebackType
+import signal
+import sys
+from collections.abc import Iterable, Iterator
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING, TypeVar
 
-from rich.console import Console as Terminal
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
-from modeler import kernels
-from modeler.types import Outcome, Step, loops_closed
+    from modeler.types import Step
 
+T = TypeVar("T")
+
+TERMINATED = 128 + signal.SIGTERM
+"""Exit status after SIGTERM, as shells have it."""
 _ONE_BY_ONE = 3  # frames left out in a row that are told as they come
+
+
+def say(words: str) -> None:
+    """Tell a person something in one line; names in inputs shall not steer the terminal."""
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(words.split()))
+    print("modeler:", line, file=sys.stderr)
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """Let a request to terminate end the program as an error would, so that it puts in order what it leaves."""
+    before = signal.signal(signal.SIGTERM, _leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(TERMINATED)
+
+
+class Interrupt:
+    """While it is entered, the first Ctrl-C ends the iteration `until`, the second the program."""
+
+    def __init__(self) -> None:
+        self.ended_early = False
+        """Whether there were more items."""
+        self._asked = False
+        self._before = signal.getsignal(signal.SIGINT)
+
+    def __enter__(self) -> Interrupt:
+        """Listen to Ctrl-C."""
+        self._before = signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Hand Ctrl-C back."""
+        signal.signal(signal.SIGINT, self._before)
+
+    @property
+    def asked(self) -> bool:
+        """Whether Ctrl-C was pressed."""
+        return self._asked
+
+    def until(self, items: Iterable[T]) -> Iterator[T]:
+        """Yield items until Ctrl-C."""
+        for item in items:
+            if self._asked:
+                self.ended_early = True
+                return
+            yield item
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self._asked = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        say("finishing with the frames so far; Ctrl-C again stops at once")
 
 
 def bar() -> Progress:
     """Return a progress bar on stderr, which shows nothing where that is no terminal."""
+    from rich.console import Console as Terminal
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
     terminal = Terminal(stderr=True, highlight=False, soft_wrap=True)
     columns = (
         TextColumn("modeler:"),
@@ -44,6 +121,8 @@ class Console:
 
     def __enter__(self) -> Console:
         """Show the bar."""
+        from modeler import kernels
+
         self._bar.start()
         if self._bar.console.is_terminal and not kernels.compiled():
             self._say("the first registration on this machine compiles for about a minute")
@@ -55,6 +134,8 @@ class Console:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Leave the bar as it stands, and tell in how many frames something else may have been taken for the object."""
+        from modeler.types import Outcome
+
         self._bar.stop()
         self._release()
         if self._unsure:
@@ -63,6 +144,8 @@ class Console:
 
     def __call__(self, step: Step) -> None:
         """Tell of a step."""
+        from modeler.types import Outcome, loops_closed
+
         loops = loops_closed([edge for edge in step.edges_so_far if edge.accepted])
         frame, accepted = step.frame.index, step.accepted
         again, self._placed[frame] = frame in self._placed, accepted

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
+from modeler.cli.console import bar, say
 from modeler.cli.options import SEED, FrameOptions, Method, ObjectOptions, PriorOptions, default
+
+if TYPE_CHECKING:
+    from modeler.cli.inputs import Part
+    from modeler.experiment import ModelScore, Pairing, Summary
+    from modeler.types import AbstractRegistrar, Array
+    from sequences import AbstractSequence
+    from sequences.rendering.mesh import Mesh
+
+_SAME_M = 1e-5  # to which files of one surface agree
 
 
 @dataclass(frozen=True)
@@ -48,7 +60,254 @@ class Evaluate:
     where: ObjectOptions = field(default_factory=ObjectOptions)
 
     def run(self) -> int:
-        """Run the experiment."""
-        from modeler.cli.evaluating import evaluate
+        """Run the experiment, write its results and print a table.
 
-        return evaluate(self)
+        Of several runs those that cannot be judged are left out, each with a line on stderr, and the status is 2.
+
+        Raises:
+            InputError: where an option, a sequence or the folder cannot be used.
+        """
+        from modeler.types import InputError
+
+        if not self.sequences:
+            raise InputError("no sequence to evaluate; name at least one folder")
+        if self.points is not None and self.points < 1:
+            raise InputError(f"--points {self.points} leaves nothing; give a whole number from 1 on")
+        runs = [path for path in self.sequences if (path / "report.json").is_file()]
+        if not runs:
+            return _evaluate_pairs(self)
+        if len(runs) < len(self.sequences):
+            lacking = next((path for path in self.sequences if not path.exists()), None)
+            if lacking is not None:
+                raise InputError(f"{lacking}: no such folder; give folders of runs")
+            raise InputError("sequences and run folders are evaluated apart; give one kind at a time")
+        return _evaluate_models(runs, self.out, self.seed)
+
+
+def _evaluate_pairs(options: Evaluate) -> int:
+    """Register pairs of frames by each method, write their errors, print a table and return the exit status."""
+    from modeler import experiment
+    from modeler.cli import compose
+    from modeler.experiment import Experiment, Pairing
+    from sequences import frame_range, open_sequence
+    from viz import figures
+
+    kept = frame_range(options.selection.frames)
+    recorded = [open_sequence(path).select(options.selection.every, kept) for path in options.sequences]
+    for sequence in recorded:
+        compose.check_region(options.where, sequence)
+    # Tables are compared with each other: all sequences have the same prior, `general` if none is asked for.
+    prior = replace(options.prior, prior=options.prior.prior or "general")
+    plan = Experiment(
+        methods=_methods(options.methods),
+        prior=compose.chosen_prior(prior, recorded[0] if len(recorded) == 1 else None),
+        pairing=Pairing(_offsets(options.offsets), both_ways=options.both_ways, closed=options.closed),
+        segmenter=compose.segmenter(options.where),
+        points=options.points,
+        learn=options.learn,
+        seed=options.seed,
+    )
+    _check_offsets(plan.pairing, recorded)
+    with bar() as progress:
+        task = progress.add_task("", total=sum(plan.size(sequence) for sequence in recorded))
+        rows = experiment.evaluate(
+            recorded,
+            plan,
+            options.out,
+            draw=figures.rotation_errors,
+            told=lambda trial: progress.update(task, advance=1, description=f"{trial.sequence}, {trial.method}"),
+        )
+    print(table(rows))
+    return 0
+
+
+def table(rows: Sequence[Summary]) -> str:
+    """Return summaries as text in columns; what nothing is known of is left out."""
+    measured = tuple(f"{what} {share}" for what in ("deg", "mm") for share in ("50 %", "90 %", "max"))
+    heading = ("sequence", "method", "apart", "pairs", "usable", "right", *measured)
+    cells = [
+        (
+            row.sequence,
+            row.method,
+            str(row.offset),
+            str(row.pairs),
+            str(row.usable),
+            "" if row.successes is None else str(row.successes),
+            *(
+                _number(value, 2)
+                for errors in (row.rotation_error_deg, row.translation_error_mm)
+                for value in (errors.median, errors.ninth_decile, errors.largest)
+            ),
+            _number(row.median_nees, 1),
+            _number(row.loop_deg, 2),
+            _number(row.turned_deg, 0),
+            _number(row.seconds, 2),
+        )
+        for row in rows
+    ]
+    lines = [(*heading, "NEES", "loop deg", "of", "s"), *cells]
+    told = [number for number, column in enumerate(zip(*lines, strict=True)) if any(column[1:])]
+    return columns([tuple(line[number] for number in told) for line in lines], left=2)
+
+
+def _number(value: float, digits: int) -> str:
+    return "" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def columns(lines: Sequence[tuple[str, ...]], *, left: int) -> str:
+    """Return lines of cells as text in columns, the first `left` of them flush left, the others right."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(
+            f"{cell:<{width}}" if number < left else f"{cell:>{width}}" for number, (cell, width) in enumerate(pairs)
+        )
+        for pairs in (list(zip(line, widths, strict=True)) for line in lines)
+    )
+
+
+def _methods(names: str) -> dict[str, AbstractRegistrar]:
+    """Return registrars by name from a list with commas."""
+    from modeler.cli import compose
+    from modeler.types import InputError
+
+    known: dict[str, Method] = {name: name for name in get_args(Method)}
+    chosen = [name.strip() for name in names.split(",")]
+    for name in chosen:
+        if name not in known:
+            raise InputError(f"--methods {names}: there is no method {name!r}; there are {', '.join(known)}")
+    return {name: compose.registrar(known[name]) for name in chosen}
+
+
+def _check_offsets(pairing: Pairing, recorded: Sequence[AbstractSequence]) -> None:
+    """Refuse frames so far apart that no sequence has two of them.
+
+    Raises:
+        InputError: where they are.
+    """
+    from modeler.types import InputError
+
+    for offset in pairing.offsets:
+        alone = replace(pairing, offsets=(offset,))
+        if not any(True for sequence in recorded for _ in alone.pairs(sequence.indices)):
+            most = max(map(len, recorded))
+            raise InputError(f"--offsets {offset}: no pair of frames is so far apart in {most} frames; give less")
+
+
+def _offsets(text: str) -> tuple[int, ...]:
+    """Return whole numbers from a list with commas."""
+    from modeler.types import InputError
+
+    offsets = text.split(",")
+    if not all(offset.strip().isdecimal() and int(offset) > 0 for offset in offsets):
+        raise InputError(f"--offsets {text} is no list of whole numbers from 1 on; write for instance 1,2,3")
+    return tuple(dict.fromkeys(int(offset) for offset in offsets))
+
+
+def _evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> int:
+    """Judge the models of runs, write `models.json` and `models.csv`, print a table and return the exit status.
+
+    Args:
+        runs: run folders of sequences whose poses and surface are known.
+        out: folder, made where there is none.
+        seed: of the points drawn on the surfaces.
+
+    Raises:
+        InputError: where none can be judged, with the reason of the first, or the results cannot be written.
+    """
+    from modeler.experiment import models_csv, models_json
+    from modeler.export import write_atomically
+    from modeler.types import InputError
+
+    scores, left_out = [], []
+    for path in runs:
+        try:
+            scores += _scores(path, seed)
+        except InputError as error:
+            if len(runs) == 1:
+                raise
+            left_out.append(f"{path} is left out: {str(error).removesuffix('.')}")
+    if not scores:
+        raise InputError(left_out[0])
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made ({error.strerror}); choose another folder with --out") from error
+    write_atomically(out / "models.json", models_json(scores, seed))
+    write_atomically(out / "models.csv", models_csv(scores))
+    print(columns(_models_table(scores), left=3))
+    for line in left_out:
+        say(line)
+    return 2 if left_out else 0
+
+
+def _scores(path: Path, seed: int) -> list[ModelScore]:
+    """Judge the model of one run.
+
+    Raises:
+        InputError: where something cannot be read, or is not known.
+    """
+    from modeler.cli.inputs import reopened
+    from modeler.experiment import Modelled, model_scores
+    from modeler.export import mesh_of, read_model
+    from modeler.fusion import Fuser
+
+    run = reopened(path)
+    truth, mesh = _truth(path, run.parts)
+    modelled = Modelled(
+        name=str(path),
+        model=read_model(mesh_of(path)),
+        views=run.views,
+        trajectory=run.solution.trajectory,
+        camera_from_model=truth,
+        truth=(mesh.vertices_m, mesh.triangles),
+    )
+    return model_scores(modelled, Fuser(voxel_m=run.report["settings"].get("voxel_m")), seed)
+
+
+def _truth(run: Path, parts: Sequence[Part]) -> tuple[dict[int, Array], Mesh]:
+    """Return the true camera_from_model (4, 4) by frame number, and the true surface.
+
+    Raises:
+        InputError: where a part of the run does not know them, or parts that were joined know different surfaces.
+    """
+    from modeler.types import InputError
+    from sequences import true_mesh
+
+    poses: dict[int, Array] = {}
+    meshes: list[Mesh] = []
+    for part in parts:
+        truth = part.truth()
+        if truth is None:
+            raise InputError(f"{part.sequence.name}: has no ground truth to compare with; add scene_gt.json.")
+        poses |= truth
+        meshes.append(true_mesh(part.sequence))
+    first = meshes[0].vertices_m
+    for part, mesh in zip(parts, meshes, strict=True):
+        if mesh.vertices_m.shape != first.shape or abs(mesh.vertices_m - first).max() > _SAME_M:
+            raise InputError(
+                f"{run}: {parts[0].sequence.name} and {part.sequence.name}, of which it is joined, have different true "
+                "surfaces; evaluate the runs it joins"
+            )
+    return poses, meshes[0]
+
+
+def _models_table(scores: Sequence[ModelScore]) -> list[tuple[str, ...]]:
+    """Return heading and rows of a table of scores."""
+    heading = ("model", "poses", "over", "frames", "max deg", "accuracy mm", "completeness mm", "F 3 mm", "F 5 mm")
+    return [
+        heading,
+        *(
+            (
+                score.run,
+                score.poses,
+                score.over,
+                str(score.frames),
+                f"{score.rotation_error_deg:.2f}",
+                f"{score.accuracy_mm:.2f}",
+                f"{score.completeness_mm:.2f}",
+                f"{score.f_3mm:.3f}",
+                f"{score.f_5mm:.3f}",
+            )
+            for score in scores
+        ),
+    ]

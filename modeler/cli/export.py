@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from modeler.cli.options import IdleSeed, MovedOptions, default
+from modeler.cli.console import say
+from modeler.cli.options import MovedOptions, default
+
+if TYPE_CHECKING:
+    from modeler.fusion import FusionVolume
+    from modeler.types import ObjectModel
 
 
 @dataclass(frozen=True)
@@ -37,11 +42,81 @@ class Export:
     voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("as the data")] = None
     """Side of a voxel: detail of the mesh."""
     moved: MovedOptions = field(default_factory=MovedOptions)
-    randomness: IdleSeed = field(default_factory=IdleSeed)
 
     def run(self) -> int:
-        """Write the mesh."""
-        from modeler.cli.exporting import export
+        """Write the mesh.
 
-        export(self)
+        Raises:
+            InputError: where options exclude each other, or something cannot be read or written.
+        """
+        from modeler import export as files
+        from modeler.export.texture import TRIANGLES
+        from modeler.types import InputError
+
+        _check(self)
+        report = files.RunFolder(self.run_folder).result()  # a sequence may hold a model.ply as well: the true one
+        if not report.get("poses"):
+            raise InputError(f"{self.run_folder}: no frame of this run was accepted; report.json says why")
+        volume = _volume(self)
+        if volume is None:
+            model = files.read_model(files.mesh_of(self.run_folder))
+        else:
+            model = volume.model(watertight=self.watertight)
+            if not len(model.triangles):
+                raise InputError(f"{self.run_folder}: its views give no surface; more of them are needed")
+        if self.tint is not None:
+            model = files.tinted(model, self.tint)
+        count = self.triangles or (TRIANGLES if self.texture else None)
+        if count is not None:
+            model = files.simplified(model, count)
+        texture = None
+        if self.texture and volume is not None:
+            if not volume.views.coloured.any():
+                raise InputError(f"{self.run_folder}: its frames have no colour; leave out --texture")
+            model, texture = files.textured(model, volume.painted, volume.texel_m)
+        if self.bop:
+            files.write_bop(model, self.out)
+        else:
+            files.write_mesh(model, self.out, texture, object_from_upright=files.model_upright(report))
+        _tell(model, self)
         return 0
+
+
+def _check(options: Export) -> None:
+    """Refuse options that exclude each other before anything is worked out."""
+    from modeler.export import format_of
+    from modeler.export.mesh import TEXTURED
+    from modeler.types import InputError
+
+    suffix = format_of(options.out)
+    if options.texture and (options.bop or suffix not in TEXTURED):
+        raise InputError(f"{options.out}: --texture goes with {' and '.join(TEXTURED)} alone; choose another --out")
+    if options.texture and options.tint is not None:
+        raise InputError("--texture and --tint are two ways to colour; give one of them")
+    if options.tint is not None and suffix == ".stl":
+        raise InputError(f"{options.out}: STL carries no colour for --tint; choose another --out")
+    if options.bop and suffix != ".ply":
+        raise InputError(f"{options.out}: BOP models are PLY files; give --out a name such as obj_000001.ply")
+    if options.triangles is not None and options.triangles < 4:
+        raise InputError(f"--triangles {options.triangles} is too few for a solid; give at least 4")
+    if options.voxel_m is not None and not 0.0 < options.voxel_m < 1.0:
+        raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m between 0 and 1")
+
+
+def _volume(options: Export) -> FusionVolume | None:
+    """Return the views of the run, where the mesh has to be made anew."""
+    if not (options.watertight or options.texture or options.voxel_m is not None):
+        return None
+    from modeler.cli.inputs import reopened
+    from modeler.fusion import Fuser
+
+    run = reopened(options.run_folder, options.moved.sequence)
+    return run.volume(Fuser(voxel_m=options.voxel_m or run.report["settings"].get("voxel_m")))
+
+
+def _tell(model: ObjectModel, options: Export) -> None:
+    """Say on stderr what was written, and how much of it nobody saw."""
+    made_up = ""
+    if options.watertight and model.vertex_views is not None:
+        made_up = f", {100.0 * float((model.vertex_views == 0).mean()):.0f} % of the vertices made up"
+    say(f"{len(model.triangles)} triangles{made_up}: {options.out}")

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from modeler.cli.input_options import InputOptions
-from modeler.cli.options import IdleSeed
+from modeler.cli.options import InputOptions
+
+if TYPE_CHECKING:
+    from modeler.types import Camera
+    from sequences import AbstractSequence, Survey
 
 
 @dataclass(frozen=True)
@@ -24,10 +27,91 @@ class Info:
     json: bool = False
     """Print a JSON object instead of lines."""
     given: InputOptions = field(default_factory=InputOptions)
-    randomness: IdleSeed = field(default_factory=IdleSeed)
 
     def run(self) -> int:
-        """Print what was found; status 2 where the input cannot be used."""
-        from modeler.cli.informing import inform
+        """Print what was found.
 
-        return inform(self)
+        Raises:
+            InputError: where the input cannot be used.
+        """
+        from json import dumps
+
+        from modeler.cli.inputs import reading
+        from sequences import open_sequence, survey
+
+        sequence = open_sequence(self.input, self.given.stated())
+        with reading() as watched:
+            found = survey(watched(sequence.recorded(), "reading"))
+        if self.json:
+            print(dumps(record(sequence, found), allow_nan=False))
+        else:
+            print("\n".join(f"{what:14}{said}" for what, said in rows(sequence, found)))
+        return 0
+
+
+def record(sequence: AbstractSequence, found: Survey) -> dict[str, object]:
+    """Return what was found as JSON has it."""
+    camera, sensor, motion = found.cameras[0], sequence.sensor(), sequence.motion
+    return {
+        "name": sequence.name,
+        "format": sequence.layout,
+        "frames": list(found.indices),
+        "seconds": found.times_s[-1] - found.times_s[0],
+        "resolution": [camera.width, camera.height],
+        "resolutions": [list(size) for size in _sizes(found.cameras)],
+        "intrinsics": [[c.fx, c.fy, c.cx, c.cy] for c in found.cameras],
+        "depth_unit": sequence.depth_unit,
+        "depth_m": dict(zip(("1%", "50%", "99%"), found.range_m, strict=True)),
+        "measured": found.measured,
+        "masks": found.masks,
+        "colour": found.colours,
+        "ground_truth": found.truths,
+        "sensor": None if sensor is None else {"sigma_wh": sensor[0], "sigma_r_m": sensor[1]},
+        "motion": None if motion is None else dict(motion),
+        "missing": list(found.missing),
+        "notes": [*found.doubts, *sequence.notes],
+    }
+
+
+def rows(sequence: AbstractSequence, found: Survey) -> list[tuple[str, str]]:
+    """Return what was found as (what, in words)."""
+    from sequences.base import span
+
+    total = len(found.indices)
+    low, middle, high = found.range_m
+    sensor, motion = sequence.sensor(), sequence.motion
+    timed = (
+        f", {found.times_s[-1] - found.times_s[0]:.3g} s" if found.times_s != tuple(map(float, found.indices)) else ""
+    )
+    lines = [
+        ("sequence", sequence.name),
+        ("format", sequence.layout),
+        ("frames", span(found.indices) + timed),
+        ("resolution", ", ".join(f"{width} x {height}" for width, height in _sizes(found.cameras)[:4])),
+        ("intrinsics", _intrinsics(found.cameras)),
+        ("depth unit", sequence.depth_unit),
+        (
+            "depth range",
+            f"{low:.3f} to {high:.3f} m, median {middle:.3f} m; {found.measured:.0%} of the pixels measured",
+        ),
+        ("masks", f"{found.masks} of {total}"),
+        ("colour", f"{found.colours} of {total}"),
+        ("ground truth", f"{found.truths} of {total}"),
+    ]
+    if sensor is not None:
+        lines.append(("sensor noise", f"{sensor[0]:.3g} across (w, h), {sensor[1] * 1000.0:.3g} mm along the ray"))
+    if motion is not None:
+        lines.append(("motion", ", ".join(f"{key} {value}" for key, value in motion.items())))
+    lines += [("missing", what) for what in found.missing]
+    return lines + [("note", note) for note in (*found.doubts, *sequence.notes)]
+
+
+def _sizes(cameras: tuple[Camera, ...]) -> list[tuple[int, int]]:
+    """Return (width, height) of the images, each once."""
+    return list(dict.fromkeys((camera.width, camera.height) for camera in cameras))
+
+
+def _intrinsics(cameras: tuple[Camera, ...]) -> str:
+    first = cameras[0]
+    words = f"fx {first.fx:.2f}, fy {first.fy:.2f}, cx {first.cx:.2f}, cy {first.cy:.2f} px"
+    return words if len(cameras) == 1 else f"{words} in the first frame; {len(cameras)} different ones"

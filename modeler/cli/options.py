@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from sequences import Given
 
 
 def default(text: str) -> object:
@@ -30,14 +33,6 @@ SEED = tyro.constructors.PrimitiveConstructorSpec(
     str_from_instance=lambda seed: [str(seed)],
 )
 """How a seed is read, by every command alike."""
-
-
-@dataclass(frozen=True)
-class IdleSeed:
-    """What every command takes, so that scripts may give it to all."""
-
-    seed: Annotated[int, SEED] = 0
-    """Without effect: this command draws nothing at random."""
 
 
 @dataclass(frozen=True)
@@ -193,6 +188,32 @@ class MethodOptions:
     """visibility: ours. paper: Wüthrich et al. 2012. The others are baselines."""
     seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same result, to the bit."""
+
+
+@dataclass(frozen=True)
+class InputOptions:
+    """What counts more than what the input says."""
+
+    intrinsics: Annotated[
+        tuple[float, float, float, float] | None, tyro.conf.arg(metavar="FX FY CX CY"), default("as the input says")
+    ] = None
+    """Intrinsics of the depth camera in px."""
+    depth_scale_mm: Annotated[float | None, tyro.conf.arg(metavar="MM"), default("as the input says")] = None
+    """Millimetres per unit of stored depth."""
+    depth_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), default("the only one")] = None
+    """Topic of the depth images in a ROS bag."""
+    colour_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), default("the one aligned to depth")] = None
+    """Topic of the colour images in a ROS bag."""
+
+    def stated(self) -> Given:
+        """Return them as readers take them.
+
+        Raises:
+            InputError: where one cannot be.
+        """
+        from sequences import Given
+
+        return Given(self.intrinsics, self.depth_scale_mm, self.depth_topic, self.colour_topic)
 
 
 def _flag(name: str) -> str:

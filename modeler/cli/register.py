@@ -9,8 +9,8 @@ from typing import Annotated
 
 import tyro
 
+from modeler.cli.console import say
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
-from modeler.cli.saying import say
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Register:
 
     def run(self) -> int:
         """Register the pair; status 3 where the result would not become an edge."""
-        from modeler.cli import compose, nonvisual
+        from modeler.cli import compose
         from modeler.export import edge_record
         from modeler.types import Edge, InputError, Solution
         from sequences import open_sequence
@@ -53,7 +53,7 @@ class Register:
         edge = Edge(posterior, "odometry", posterior.usable, posterior.outcome.advice)
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}
         print(json.dumps(record, allow_nan=False))
-        _, remark = nonvisual.told(self.prior, sequence)
+        _, remark = compose.told(self.prior, sequence)
         said = [f"{posterior.outcome.label} after {posterior.seconds:.2f} s", *([remark] if remark else [])]
         say("; ".join(said))
         return 0 if posterior.usable else 3

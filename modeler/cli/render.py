@@ -24,7 +24,7 @@ class Render:
 
     def run(self) -> int:
         """Render the sequence."""
-        from modeler.cli.reading import reading
+        from modeler.cli.inputs import reading
         from sequences.rendering.recipe import load_recipe
         from sequences.rendering.renderer import render
 

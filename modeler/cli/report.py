@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from modeler.cli.options import IdleSeed, MovedOptions, default
-from modeler.cli.saying import say
+from modeler.cli.console import say
+from modeler.cli.options import MovedOptions, default
 
 if TYPE_CHECKING:
     from modeler.types import Array
@@ -28,7 +28,6 @@ class Report:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html"), default("RUN/report.html")] = None
     """Page to write."""
     moved: MovedOptions = field(default_factory=MovedOptions)
-    randomness: IdleSeed = field(default_factory=IdleSeed)
 
     def run(self) -> int:
         """Write the page."""
@@ -56,7 +55,7 @@ def _truth(run: Path, sequences: tuple[Path, ...]) -> Mapping[int, Array] | None
     Raises:
         InputError: where a sequence is not to be found, or is another than the run was made from.
     """
-    from modeler.cli.parts import parts_of
+    from modeler.cli.inputs import parts_of
 
     poses: dict[int, Array] = {}
     for part in parts_of(run, sequences):

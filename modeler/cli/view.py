@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from modeler.cli.options import IdleSeed
-from modeler.cli.saying import say
+from modeler.cli.console import say
 
 
 @dataclass(frozen=True)
@@ -20,7 +19,6 @@ class View:
     """Run folder, as `modeler build` makes it."""
     web: bool = False
     """Serve the viewer in the browser, on 127.0.0.1 only, until Ctrl-C."""
-    randomness: IdleSeed = field(default_factory=IdleSeed)
 
     def run(self) -> int:
         """Open the viewer; in the browser, wait until the user is done."""

@@ -8,6 +8,7 @@ from modeler.export.mesh import format_of as format_of
 from modeler.export.mesh import mesh_of as mesh_of
 from modeler.export.mesh import write_mesh as write_mesh
 from modeler.export.pairs import Pairs as Pairs
+from modeler.export.pairs import Remembered as Remembered
 from modeler.export.ply import ply_bytes as ply_bytes
 from modeler.export.reading import edges_of as edges_of
 from modeler.export.reading import poses_of as poses_of

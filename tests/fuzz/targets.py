@@ -20,9 +20,8 @@ import test_inputs_ros as ros
 
 import sequences
 from modeler import se3
-from modeler.cli import converting
 from modeler.cli.convert import Convert
-from modeler.cli.reopened import solved
+from modeler.cli.inputs import solved
 from modeler.export import RunFolder, edges_of, poses_of
 from modeler.types import Camera, Frame
 from sequences import open_sequence, read_noise, survey, write_bop
@@ -226,7 +225,7 @@ def _reopen(path: Path) -> None:
 
 
 def _poses(path: Path) -> None:
-    converting.convert(Convert(path, path.parent / "poses.json"))
+    Convert(path, path.parent / "poses.json").run()
 
 
 _MODES = bags.rosbag2.CompressionMode

@@ -20,7 +20,7 @@ import numpy as np
 import sequences
 from modeler import se3
 from modeler.cli import main as modeler
-from modeler.cli.reopened import reopened
+from modeler.cli.inputs import reopened
 from modeler.evaluation import TrueSurface, laid, surface_errors
 from modeler.export import write_atomically
 from modeler.fusion import Fuser

@@ -1,0 +1,240 @@
+"""What commands take in: sequences with a bar, sequences that are still being written, and finished runs."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol, final
+
+from modeler.cli import compose
+from modeler.cli.console import bar, say
+from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.export import RunFolder, edges_of, poses_of
+from modeler.fusion import Fuser, FusionVolume, own_covariances
+from modeler.graph import PoseGraph, solve
+from modeler.rays import Sensor
+from modeler.types import ACCEPTED, Array, Edge, Frame, InputError, RayImage, Solution
+from sequences import AbstractSequence, Patience, SensedSequence, open_sequence, read_noise, watch
+from sequences.base import AbstractDerived
+
+_ALIKE = 0.02  # share by which the number of an object's points may change with the version of a library
+
+
+@final
+@dataclass(frozen=True)
+class ToldSequence(AbstractDerived):
+    """Another sequence that tells of every frame it is asked for."""
+
+    told: Callable[[], None]
+    """Called after each frame."""
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`."""
+        frame = self.whole.frame(index)
+        self.told()
+        return frame
+
+
+class Watched(Protocol):
+    """From a sequence to the same sequence, watched."""
+
+    def __call__(self, sequence: AbstractSequence, what: str = "", /) -> AbstractSequence:
+        """Add a bar for a sequence, with what is done with its frames in a word."""
+        ...
+
+
+def while_it_lasts(camera: AbstractSequence) -> Iterator[Frame]:
+    """Yield the frames of a camera; one that fails ends them with a line on stderr, for they cannot be had again."""
+    try:
+        yield from camera
+    except InputError as error:
+        say(f"{str(error).rstrip('.')}: going on with the frames so far")
+
+
+@contextmanager
+def reading() -> Iterator[Watched]:
+    """Show a bar on stderr for each sequence handed in, as its frames are taken; nothing where that is no terminal.
+
+    A sequence that is still being written is left alone.
+    """
+    with bar() as progress:
+
+        def watched(sequence: AbstractSequence, what: str = "", /) -> AbstractSequence:
+            if sequence.live:
+                return sequence
+            task = progress.add_task(what, total=len(sequence))
+            return ToldSequence(sequence, lambda: progress.advance(task))
+
+        yield watched
+
+
+def watched(path: Path, idle_s: float) -> AbstractSequence:
+    """Return the sequence that another program is writing at a path, once it has begun.
+
+    Args:
+        path: where it writes.
+        idle_s: the sequence is over after so many seconds in which nothing came.
+
+    Raises:
+        InputError: where nothing readable comes.
+    """
+    if not 0.0 < idle_s < math.inf:
+        raise InputError(f"--idle-s {idle_s:g} is out of range; give a positive number of seconds")
+    say(f"waiting for frames in {path}")
+    return watch(path, patience=Patience(idle_s))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A run as it was built, and the sequence that it was made from."""
+
+    run: Path
+    """Its folder, or that of the run which it is a part of."""
+    report: Mapping[str, Any]
+    """What it said of itself, under its own frame numbers."""
+    sequence: AbstractSequence
+    """The sequence."""
+    offset: int = 0
+    """What its frame numbers are counted on from in the joined run."""
+
+    @property
+    def accepted(self) -> tuple[int, ...]:
+        """Numbers, its own, of the frames that became part of the model."""
+        return tuple(record["id"] for record in self.report["frames"] if record["outcome"] == ACCEPTED)
+
+    def truth(self) -> dict[int, Array] | None:
+        """Return the true camera_from_model (4, 4) by frame number of the joined run; None where it is not known."""
+        truth = self.sequence.truth()
+        return None if truth is None else {frame + self.offset: pose for frame, pose in truth.items()}
+
+    def views(self, frames: Sequence[int]) -> dict[int, RayImage]:
+        """Return views, made again, by frame number of the joined run.
+
+        Args:
+            frames: numbers, its own, of accepted frames.
+
+        Raises:
+            InputError: where the sequence shows something else than when the run was made.
+        """
+        settings = self.report["settings"]
+        roi = settings.get("roi")
+        limits = ObjectOptions(roi=None if roi is None else tuple(roi), max_depth_m=settings.get("max_depth_m"))
+        modeler = compose.modeler(self.sequence, PriorOptions(prior="general"), MethodOptions(), limits)
+        scene, views = compose.scene(modeler, self.sequence), {}
+        points = {record["id"]: record["points"] for record in self.report["frames"]}
+        for frame in frames:
+            _, view = modeler.view(self.sequence.frame(frame), scene)
+            if view is None or abs(len(view.points_m) - points[frame]) > _ALIKE * points[frame]:
+                raise InputError(
+                    f"{self.sequence.name}: frame {frame} shows something else than the one that {self.run} was made "
+                    "from, or another version finds the object otherwise there; say where that sequence is with "
+                    "--sequence, or build the run again"
+                )
+            views[frame + self.offset] = renumbered(view, self.offset)
+        return views
+
+    def check(self) -> None:
+        """Look at the first and the last frame.
+
+        Raises:
+            InputError: where the sequence shows something else than when the run was made.
+        """
+        self.views(sorted({*self.accepted[:1], *self.accepted[-1:]}))
+
+
+def parts_of(run: Path, moved: Sequence[Path] = ()) -> tuple[Part, ...]:
+    """Return what a run was made of: itself, or the runs that it joins.
+
+    Args:
+        run: run folder.
+        moved: where the sequences are now, in order; none: where they were.
+
+    Raises:
+        InputError: where a folder holds no run, or a sequence is not to be found.
+    """
+    places = deque(moved) if moved else None
+    found = _parts(run, places)
+    if places:
+        raise InputError(
+            f"--sequence is given {len(moved)} times where {run} was made from {len(found)}; give each once"
+        )
+    return found
+
+
+def _parts(run: Path, places: deque[Path] | None) -> tuple[Part, ...]:
+    report = RunFolder(run).result()
+    settings = report["settings"]
+    if "joined" in settings:
+        first, second = (_parts(Path(part), places) for part in settings["joined"])
+        moved = (replace(part, offset=part.offset + int(settings["offset"])) for part in second)
+        return (*first, *moved)
+    if places is not None and not places:
+        raise InputError(f"--sequence is given too few times; say where the sequence of {run} is, too, in order")
+    where = Path(report["sequence"]) if places is None else places.popleft()
+    if not where.exists():
+        raise InputError(f"{where}: the sequence of {run} is not there; say where it is with --sequence")
+    whole = open_sequence(where)
+    whole = SensedSequence(whole, read_noise(Path(settings["sensor"]))) if "sensor" in settings else whole
+    return (Part(run, report, whole),)
+
+
+def renumbered(view: RayImage, offset: int) -> RayImage:
+    """Return a view with another frame number."""
+    return replace(view, frame=replace(view.frame, index=view.frame.index + offset))
+
+
+@dataclass(frozen=True, eq=False)
+class Reopened:
+    """Views, edges and poses of a finished run."""
+
+    name: str
+    """Of the object or sequence."""
+    report: Mapping[str, Any]
+    """What the run said of itself."""
+    sensor: Sensor
+    """Noise of the camera."""
+    views: Mapping[int, RayImage]
+    """Accepted views by frame number."""
+    edges: tuple[Edge, ...]
+    """Every edge, as it was judged."""
+    solution: Solution
+    """The poses, solved again from the edges."""
+    parts: tuple[Part, ...]
+    """What it was made of: one sequence, or of joined runs all of theirs."""
+
+    def volume(self, fuser: Fuser) -> FusionVolume:
+        """Return the views laid together as `modeler build` lays them."""
+        return fuser.volume(self.views, self.solution.trajectory, own_covariances(self.solution, self.edges))
+
+
+def reopened(run: Path, moved: Sequence[Path] = ()) -> Reopened:
+    """Return a run with its views, made from the sequence again with the run's settings.
+
+    Args:
+        run: run folder.
+        moved: where its sequence is now, of joined runs all of theirs in order; none: where they were.
+
+    Raises:
+        InputError: where the folder holds no finished run, or a sequence is not to be found or is another.
+    """
+    report, parts = RunFolder(run).result(), parts_of(run, moved)
+    poses = {frame: pose.mean for frame, pose in poses_of(report).items()}
+    if not poses:
+        raise InputError(f"{run}: no frame was accepted; build the run again")
+    views = {frame: view for part in parts for frame, view in part.views(part.accepted).items()}
+    if not poses.keys() <= views.keys():
+        raise InputError(f"{run}: its parts have changed since they were joined; join them again")
+    edges, noise = edges_of(report), parts[0].sequence.sensor()
+    sensor = Sensor() if noise is None else Sensor(*noise)
+    return Reopened(parts[0].sequence.name, report, sensor, views, edges, solved(edges, poses), parts)
+
+
+def solved(edges: tuple[Edge, ...], poses: Mapping[int, Array]) -> Solution:
+    """Return the solution of edges, its poses where they were before."""
+    solution = solve(PoseGraph(edges=edges, first=min(poses)), poses)
+    return replace(solution, trajectory={frame: poses[frame] for frame in solution.trajectory if frame in poses})
