@@ -125,8 +125,8 @@ def covariance_about(covariance: Array, point_m: Array) -> Array:
     the centre. With `-point_m` it leads back: from about a point to about the origin.
 
     Args:
-        covariance: (..., 6, 6) of ξ, which turns about the origin of what the pose lie_group.
-        point_m: (3,) of what the pose lie_group.
+        covariance: (..., 6, 6) of ξ, which turns about the origin of what the pose moves.
+        point_m: (3,) of what the pose moves.
     """
     about = _carried(covariance, adjoint(translation(-np.asarray(point_m, dtype=np.float64))))
     return 0.5 * (about + np.swapaxes(about, -1, -2))  # rounding alone would leave it a little askew
