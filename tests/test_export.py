@@ -25,8 +25,8 @@ from modeler.export import (
     write_bop,
     write_mesh,
 )
-from modeler.export.ply import cloud_ply, mesh_ply
-from modeler.export.tints import MADE_UP_RGB
+from modeler.export.formats import cloud_ply, mesh_ply
+from modeler.export.mesh import MADE_UP_RGB
 from modeler.types import (
     Array,
     InputError,

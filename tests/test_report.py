@@ -16,8 +16,8 @@ from turning_box import CENTRE_M, COUNT, HALF_M, LOST, object_from_camera, steps
 from modeler import se3
 from modeler.cli import main
 from modeler.export import RunFolder, RunMeta
-from modeler.export.ply import mesh_ply
-from modeler.export.tints import MADE_UP_RGB
+from modeler.export.formats import mesh_ply
+from modeler.export.mesh import MADE_UP_RGB
 from modeler.types import Array, InputError
 from sequences import bundled
 from viz.report import write_page

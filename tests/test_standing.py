@@ -10,7 +10,7 @@ from turning_box import steps
 
 from modeler import se3
 from modeler.export import RunMeta, model_upright, report_of, write_mesh
-from modeler.export.checking import fault
+from modeler.export.reading import fault
 from modeler.export.run_folder import frame_record
 from modeler.export.standing import ring_upright, upright
 from modeler.types import Array, ObjectModel, Plane, Step

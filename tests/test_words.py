@@ -11,7 +11,7 @@ from rings import OBJECT_M, edge, measured, ring, spin, turntable
 from modeler import se3
 from modeler.export import edge_record, g2o_text
 from modeler.export.reading import edges_of
-from modeler.export.words import undetermined
+from modeler.export.report import undetermined
 from modeler.graph import PoseGraph, solve
 from modeler.types import Array, Camera, Frame, Mode, Outcome, Plane, PoseGaussian, Posterior, RayImage, Solution
 

@@ -10,8 +10,8 @@ import numpy.typing as npt
 import rerun as rr
 
 from modeler import se3
+from modeler.export.mesh import MADE_UP_RGB
 from modeler.export.standing import upright
-from modeler.export.tints import MADE_UP_RGB
 from modeler.types import Array, ObjectModel, Posterior, RayImage, Step
 from viz import entities
 from viz.drawings import CLEAR, Drawing

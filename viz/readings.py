@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import rerun as rr
 
-from modeler.export.words import undetermined
+from modeler.export.report import undetermined
 from modeler.types import Array, Edge, PoseGaussian, Posterior, Step
 from viz import certainty, entities, poses
 from viz.drawings import Drawing

@@ -1,19 +1,37 @@
-"""The fused mesh in the formats of other programs."""
+"""The fused mesh in the formats of other programs, simplified, coloured by what is known of it, or as a BOP model."""
 
 from __future__ import annotations
 
 import io
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, Final, Literal
 
 import numpy as np
+from scipy.spatial import ConvexHull, KDTree, QhullError
+from scipy.spatial.distance import pdist
 
 from modeler.export.files import write_atomically
-from modeler.export.ply import mesh_ply
+from modeler.export.formats import mesh_ply, ply_bytes
 from modeler.export.texture import Texture
 from modeler.types import Array, InputError, ObjectModel
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 TEXTURED = (".obj", ".glb")
+MODELS_INFO = "models_info.json"
+"""BOP's list of models, beside them."""
+
+Tint = Literal["views", "sigma"]
+MADE_UP_RGB: Final = (230, 90, 200)
+"""Of surface that nobody saw, wherever it is shown."""
+MOST_VIEWS: Final = 12
+"""Views at the end of the scale."""
+MOST_SIGMA_M: Final = 2e-3
+"""Standard deviation at the end of the scale."""
+
+_TRIES = (1.0, 0.98, 0.95, 0.9, 0.8)  # of the number of triangles asked for, until no edge of three triangles is left
 
 
 def mesh_of(source: Path) -> Path:
@@ -142,3 +160,143 @@ def _stl(model: ObjectModel) -> bytes:
     faces = np.zeros(len(corners), dtype=[("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("spare", "<u2")])
     faces["normal"], faces["corners"] = normals, corners
     return b"binary STL, metres".ljust(80) + np.uint32(len(corners)).tobytes() + faces.tobytes()
+
+
+def simplified(model: ObjectModel, triangles: int) -> ObjectModel:
+    """Return the model with at most so many triangles, closed where it was closed.
+
+    Edges are collapsed in the order of the least quadric error (Garland and Heckbert 1997, "Surface simplification
+    using quadric error metrics"). Colours, views and deviations are those of the nearest old vertex.
+
+    Raises:
+        InputError: where the number is too small for a solid.
+    """
+    import open3d as o3d
+
+    if triangles < 4:
+        raise InputError(f"--triangles {triangles} is too few for a solid; give at least 4")
+    if len(model.triangles) <= triangles:
+        return model
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(model.vertices_m), o3d.utility.Vector3iVector(model.triangles.astype(np.int32))
+    )
+    closed = not len(mesh.get_non_manifold_edges(allow_boundary_edges=False))
+    fewer = mesh
+    for share in _TRIES:
+        fewer = mesh.simplify_quadric_decimation(int(share * triangles))
+        fewer.remove_degenerate_triangles()
+        fewer.remove_unreferenced_vertices()
+        if not len(fewer.get_non_manifold_edges(allow_boundary_edges=not closed)):
+            break
+    fewer.compute_vertex_normals()
+    vertices_m = np.asarray(fewer.vertices)
+    if not len(fewer.triangles):
+        raise InputError(f"--triangles {triangles} leaves nothing of the mesh; ask for more")
+    _, nearest = KDTree(model.vertices_m).query(vertices_m)
+    return replace(
+        model,
+        vertices_m=vertices_m,
+        triangles=np.asarray(fewer.triangles, dtype=np.int64),
+        vertex_normals=np.asarray(fewer.vertex_normals),
+        vertex_colours=None if model.vertex_colours is None else model.vertex_colours[nearest],
+        vertex_views=None if model.vertex_views is None else model.vertex_views[nearest],
+        vertex_sigmas_m=None if model.vertex_sigmas_m is None else model.vertex_sigmas_m[nearest],
+    )
+
+
+def tinted(model: ObjectModel, tint: Tint) -> ObjectModel:
+    """Return the model with vertices coloured by how well they are known; what is made up is pink.
+
+    Args:
+        model: with `vertex_views` and `vertex_sigmas_m`.
+        tint: "views": how many views saw a vertex, dark = 1, yellow = 12 and more. "sigma": its standard deviation,
+            dark = 0, yellow = 2 mm and more.
+
+    Raises:
+        InputError: where the model does not tell.
+    """
+    views, sigmas_m = model.vertex_views, model.vertex_sigmas_m
+    if views is None or sigmas_m is None:
+        raise InputError("the model does not tell who saw its vertices; build it again with this version")
+    rgb = sigma_rgb(sigmas_m) if tint == "sigma" else _scale_rgb(views / MOST_VIEWS)
+    rgb[views == 0] = MADE_UP_RGB
+    return replace(model, vertex_colours=np.rint(rgb).astype(np.uint8))
+
+
+def sigma_rgb(sigmas_m: Array) -> Array:
+    """Return colours (v, 3) of standard deviations (v,), from dark (0) to yellow (`MOST_SIGMA_M` and more).
+
+    What has none, surface that is made up, is pink.
+    """
+    rgb = _scale_rgb(np.where(np.isfinite(sigmas_m), sigmas_m, 0.0) / MOST_SIGMA_M)
+    rgb[~np.isfinite(sigmas_m)] = MADE_UP_RGB
+    return rgb
+
+
+def _scale_rgb(shares: Array) -> Array:
+    """Return colours (v, 3), 0 to 255, of places (v,) on the scale, 0 to 1."""
+    from matplotlib import colormaps
+
+    return 255.0 * colormaps["cividis"](np.clip(shares, 0.0, 1.0))[:, :3]
+
+
+def write_bop(model: ObjectModel, out: Path) -> None:
+    """Write a mesh in mm, its origin in the centre of its box, with its entry in `models_info.json` beside it.
+
+    The entry has the diameter and the box as BOP defines them, and `origin_m`: where in the object frame of the run the
+    model's origin lies. Entries of other objects stay.
+
+    Args:
+        model: the mesh.
+        out: PLY file whose name ends in the number of the object (`obj_000001.ply`); without a number it is object 1.
+
+    Raises:
+        InputError: where the name is not that of a PLY file, or a file cannot be read or written.
+    """
+    if out.suffix.lower() != ".ply":
+        raise InputError(f"{out}: BOP models are PLY files; give --out a name such as obj_000001.ply")
+    digits = re.search(r"(\d+)$", out.stem)
+    number = str(int(digits.group(1))) if digits else "1"
+    low, high = model.vertices_m.min(axis=0), model.vertices_m.max(axis=0)
+    origin_m = 0.5 * (low + high)
+    places_mm = 1000.0 * (model.vertices_m - origin_m)
+    path = out.with_name(MODELS_INFO)
+    entries = _entries(path)
+    size_mm = 1000.0 * (high - low)
+    entries[number] = {
+        "diameter": _diameter(places_mm),
+        **{f"min_{axis}": float(value) for axis, value in zip("xyz", -0.5 * size_mm, strict=True)},
+        **{f"size_{axis}": float(value) for axis, value in zip("xyz", size_mm, strict=True)},
+        "origin_m": origin_m.tolist(),
+    }
+    write_atomically(out, ply_bytes(places_mm, model.vertex_normals, model.vertex_colours, model.triangles))
+    write_atomically(path, json.dumps(dict(sorted(entries.items(), key=lambda entry: int(entry[0]))), indent=2) + "\n")
+
+
+def _entries(path: Path) -> dict[str, Any]:
+    """Return the entries of other objects, by their numbers, in a `models_info.json` whose folder is made if need be.
+
+    Raises:
+        InputError: where it cannot be read, or is no such file.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        entries = json.loads(path.read_text()) if path.exists() else {}
+    except OSError as error:
+        raise InputError(
+            f"{path.parent}: cannot be used ({error.strerror}); choose another place with --out"
+        ) from error
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be read ({error}); mend it or choose another folder") from error
+    if not isinstance(entries, dict) or not all(number.isdecimal() for number in entries):
+        raise InputError(f"{path}: lists no objects by their numbers; mend it or choose another folder")
+    return entries
+
+
+def _diameter(points: Array) -> float:
+    """Return the largest distance between two points (n, 3)."""
+    try:
+        points = points[ConvexHull(points).vertices]
+    except QhullError:  # flat
+        points = np.unique(points, axis=0)
+    return float(pdist(points).max()) if len(points) > 1 else 0.0

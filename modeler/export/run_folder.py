@@ -8,13 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from modeler.export.checking import fault
 from modeler.export.files import PART, settle, settle_soon, write_atomically
-from modeler.export.g2o import g2o_text
+from modeler.export.formats import cloud_ply, g2o_text, mesh_ply, tum_text
 from modeler.export.pairs import Pairs
-from modeler.export.ply import cloud_ply, mesh_ply
+from modeler.export.reading import fault
 from modeler.export.report import FrameRecord, RunMeta, frame_record, report_of
-from modeler.export.tum import tum_text
 from modeler.types import InputError, Step
 
 _REPORT = "report.json"

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.export import read_model
-from modeler.export.tints import sigma_rgb
+from modeler.export.mesh import sigma_rgb
 from modeler.types import Array, InputError
 from viz.clouds import coarsened
 

@@ -16,8 +16,8 @@ from PIL import Image
 
 from modeler import evaluation, se3
 from modeler.export import write_atomically
+from modeler.export.mesh import MOST_SIGMA_M
 from modeler.export.standing import model_upright
-from modeler.export.tints import MOST_SIGMA_M
 from modeler.types import ACCEPTED, Array, loops_closed
 from viz.pictures import look_at, shade
 from viz.report import plots
