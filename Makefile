@@ -1,6 +1,7 @@
 # make setup      prepare .venv (quick when it is there)
 # make demo       model the bundled box sequence into runs/demo
 # make test       the whole gate: format, lint, types, layers, tests
+# make test-slow  the tests that take long, which make test leaves out
 # make calibrate  whether stated uncertainties are true, on rendered pairs (many minutes)
 # make bench      speed, against Open3D and the committed baseline
 # make same       COMMIT=…: whether the results are those of another commit, byte by byte
@@ -8,7 +9,7 @@
 
 BIN := .venv/bin
 
-.PHONY: setup demo test calibrate bench same audit
+.PHONY: setup demo test test-slow calibrate bench same audit
 
 setup: .venv/.installed
 
@@ -31,6 +32,9 @@ test: setup
 	$(BIN)/basedpyright
 	$(BIN)/lint-imports
 	$(BIN)/pytest
+
+test-slow: setup
+	$(BIN)/pytest -m slow
 
 calibrate: setup
 	PYTHONPATH=tests $(BIN)/python -m calibration

@@ -11,10 +11,12 @@ SOURCES = [path for package in ("modeler", "sequences", "viz") for path in sorte
 
 
 @cache
+def tree(path: Path) -> ast.Module:
+    """Return a file as parsed."""
+    return ast.parse(path.read_text())
+
+
+@cache
 def nodes(path: Path) -> list[ast.AST]:
     """Return all nodes of a file that tests of layers and of security look at: imports and calls."""
-    return [
-        node
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Import | ast.ImportFrom | ast.Call)
-    ]
+    return [node for node in ast.walk(tree(path)) if isinstance(node, ast.Import | ast.ImportFrom | ast.Call)]

@@ -1,0 +1,70 @@
+"""What the sources keep to: layers, one home for each heavy library, short files, no comparison of arrays."""
+
+from __future__ import annotations
+
+import ast
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sources import ROOT, SOURCES, nodes, tree
+
+MAX_LINES = 500
+HOLDS_ARRAYS = re.compile(r"^(?!Callable).*(Array|ndarray)")
+HOMES = {"gtsam": "modeler/graph/", "numba": "modeler/kernels/", "rerun": "viz/", "tyro": "modeler/cli/"}
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Yield the top-level names that a file imports anywhere in it."""
+    for node in nodes(path):
+        if isinstance(node, ast.Import):
+            yield from (name.name.partition(".")[0] for name in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
+            yield node.module.partition(".")[0]
+
+
+@pytest.mark.parametrize("library", HOMES)
+def test_each_heavy_library_has_one_home(library: str) -> None:
+    homes = {str(path.relative_to(ROOT)) for path in SOURCES if library in imported(path)}
+    assert homes
+    assert [home for home in homes if not home.startswith(HOMES[library])] == []
+
+
+def test_every_module_has_a_layer() -> None:
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    layered = {name.strip() for contract in contracts for row in contract.get("layers", []) for name in row.split("|")}
+    parts = {
+        path.stem for path in (ROOT / "modeler").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert {f"modeler.{part}" for part in parts - {"__init__", "__main__"}} <= layered
+
+
+def test_no_file_is_long() -> None:
+    long = {
+        str(path.relative_to(ROOT)): lines for path in SOURCES if (lines := path.read_text().count("\n")) > MAX_LINES
+    }
+    assert long == {}
+
+
+def comparing(module: ast.Module) -> Iterator[tuple[str, str]]:
+    """Yield class and annotation of fields that hold arrays and would be compared: arrays have no single truth."""
+    for made in (node for node in ast.walk(module) if isinstance(node, ast.ClassDef)):
+        decorators = " ".join(ast.unparse(decorator) for decorator in made.decorator_list)
+        if "dataclass(" not in decorators or "eq=False" in decorators:
+            continue
+        for line in (line for line in made.body if isinstance(line, ast.AnnAssign)):
+            annotated = ast.unparse(line)
+            if HOLDS_ARRAYS.search(ast.unparse(line.annotation)) and "compare=False" not in annotated:
+                yield made.name, annotated
+
+
+def test_no_dataclass_compares_its_arrays() -> None:
+    assert [found for path in SOURCES for found in comparing(tree(path))] == []
+
+
+def test_comparisons_of_arrays_are_found() -> None:
+    held = "@dataclass(frozen=True)\nclass Held:\n    poses: Mapping[int, Array]\n"
+    assert [name for name, _ in comparing(ast.parse(held))] == ["Held"]
+    assert not list(comparing(ast.parse(held.replace("frozen=True", "frozen=True, eq=False"))))
