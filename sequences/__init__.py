@@ -6,17 +6,17 @@ from modeler.types import InputError
 from sequences.base import AbstractSequence as AbstractSequence
 from sequences.base import frame_range as frame_range
 from sequences.bop import BopSequence as BopSequence
+from sequences.bop import true_mesh as true_mesh
 from sequences.bop import write_bop as write_bop
-from sequences.given import Given as Given
-from sequences.live.watch import Patience as Patience
-from sequences.live.watch import watch as watch
-from sequences.noise import NoiseModel as NoiseModel
-from sequences.noise import SensedSequence as SensedSequence
-from sequences.noise import read_noise as read_noise
-from sequences.recognise import open_sequence as open_sequence
+from sequences.intrinsics import Overrides as Overrides
+from sequences.noise_model import CalibratedSequence as CalibratedSequence
+from sequences.noise_model import NoiseModel as NoiseModel
+from sequences.noise_model import read_noise as read_noise
+from sequences.opening import open_sequence as open_sequence
 from sequences.survey import Survey as Survey
 from sequences.survey import survey as survey
-from sequences.true_mesh import true_mesh as true_mesh
+from sequences.watch import WatchLimits as WatchLimits
+from sequences.watch import watch as watch
 
 
 def bundled(name: str) -> Path:

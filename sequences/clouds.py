@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Array, Camera, Frame, InputError
-from sequences.files.broken import told
-from sequences.files.folders import pictures
-from sequences.files.images import MAX_PIXELS
-from sequences.given import Given, Intrinsics, sane
-from sequences.pictures.colour_depth import told_numbers
+from sequences.image_files import MAX_PIXELS
+from sequences.image_folders import frame_numbers
+from sequences.input_files import input_errors, list_images
+from sequences.intrinsics import Intrinsics, Overrides, sane
 from sequences.recording import AbstractRecording
 
 SUFFIXES = (".pcd", ".ply")
@@ -104,21 +103,21 @@ class CloudSequence(AbstractRecording):
     def _camera(self) -> Camera:
         path = self.clouds[self.indices[0]]
         points, _ = _points(path)
-        intrinsics = fitted(points, path) if self.given is None else self.given
+        intrinsics = fit_intrinsics(points, path) if self.given is None else self.given
         return Camera(points.shape[1], points.shape[0], *intrinsics)
 
 
-def open_clouds(path: Path, given: Given) -> CloudSequence:
+def open_clouds(path: Path, overrides: Overrides) -> CloudSequence:
     """Open a folder of organised clouds, or one such file.
 
     Raises:
         InputError: where it is not readable as such.
     """
-    found = pictures(path, SUFFIXES, path) if path.is_dir() else {path.stem: path}
-    numbers = told_numbers(list(found)) or {stem: place for place, stem in enumerate(found)}
+    found = list_images(path, SUFFIXES, path) if path.is_dir() else {path.stem: path}
+    numbers = frame_numbers(list(found)) or {stem: place for place, stem in enumerate(found)}
     clouds = dict(sorted((numbers[stem], cloud) for stem, cloud in found.items()))
-    unit_mm = 1000.0 if given.depth_scale_mm is None else given.depth_scale_mm
-    return CloudSequence(path, clouds, unit_mm, given.intrinsics)
+    unit_mm = 1000.0 if overrides.depth_scale_mm is None else overrides.depth_scale_mm
+    return CloudSequence(path, clouds, unit_mm, overrides.intrinsics)
 
 
 def organised(path: Path) -> tuple[int, int]:
@@ -160,7 +159,7 @@ def organised(path: Path) -> tuple[int, int]:
 _PLY_SIZES = ("num_cols|width|cols", "num_rows|height|rows")
 
 
-def fitted(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
+def fit_intrinsics(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
     """Return the intrinsics of the camera that saw points (h, w, 3), by least squares over all of them.
 
     Raises:
@@ -188,7 +187,7 @@ def fitted(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
 def _points(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8] | None]:
     """Return the points (h, w, 3) of a cloud, NaN where there is none, and their colours (h, w, 3)."""
     width, height = organised(path)
-    with told(path, "cloud", "save it anew"):
+    with input_errors(path, "cloud", "save it anew"):
         points, colours = _read_pcd(path) if path.suffix.lower() == ".pcd" else _read_ply(path)
     if points.shape != (width * height, 3):
         raise InputError(f"{path}: is cut off or broken, {len(points)} points could be read; save it anew.")

@@ -1,16 +1,21 @@
-"""Sequences that lie on a disk, and the `sequence.json` beside them that says more."""
+"""Sequences stored on disk, and those of two streams whose images are paired by time."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Generic, TypeVar, final
 
-from modeler.types import InputError
+import numpy as np
+import numpy.typing as npt
+
+from modeler.types import Array, Frame, InputError
 from sequences.base import AbstractSequence, span
-from sequences.files.folders import inside
-from sequences.files.json_input import Node, read_tree
+from sequences.input_files import Node, inside, read_tree
+from sequences.lens import Lens
 
 
 @dataclass(frozen=True)
@@ -70,3 +75,116 @@ class AbstractRecording(AbstractSequence):
     def _meta(self) -> Node | None:
         path = inside(self.path / "sequence.json", self.path) if self._is_folder else self.path.with_suffix(".json")
         return read_tree(path) if path.is_file() else None
+
+
+Stamp = TypeVar("Stamp")
+"""By what a stream finds one of its images again."""
+MAX_APART_S = 0.02
+"""Depth and colour farther apart in time than this are no pair (the TUM benchmark's own tool has the same)."""
+
+
+@final
+@dataclass(frozen=True)
+class ImagePair(Generic[Stamp]):
+    """A depth image, and the colour image that was taken with it."""
+
+    time_s: float
+    """Time of the depth image in s."""
+    depth: Stamp
+    """The depth image."""
+    colour: Stamp | None
+    """The colour image; None where none is near enough in time."""
+
+
+@dataclass(frozen=True)
+class AbstractStreams(AbstractRecording, Generic[Stamp]):
+    """A stream of depth images, one of colour images beside it, and a lens to be straightened."""
+
+    lens: Lens
+    """The depth camera."""
+    pairs: Mapping[int, ImagePair[Stamp]]
+    """By frame number: places in order of time."""
+    remarks: tuple[str, ...]
+    """What the reader assumed or left out."""
+
+    @abstractmethod
+    def seen_m(self, index: int, stamp: Stamp) -> npt.NDArray[np.float32]:
+        """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured.
+
+        Args:
+            index: frame number, for messages.
+            stamp: which image of the stream.
+
+        Raises:
+            InputError: where it cannot be read.
+        """
+
+    @abstractmethod
+    def aligned(self, index: int, stamp: Stamp, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
+        """Return colour (h, w, 3) as RGB at the pixels of a depth image (h, w) without distortion; None without.
+
+        Args:
+            index: frame number, for messages.
+            stamp: which image of the stream.
+            depth_m: the depth image.
+
+        Raises:
+            InputError: where it cannot be read.
+        """
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Frame numbers, ascending."""
+        return tuple(self.pairs)
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`, without the lens's distortion."""
+        pair = self.pairs.get(index)
+        if pair is None:
+            raise self.absent(index)
+        depth_m = self.lens.straight(self.seen_m(index, pair.depth), float("nan"))
+        colour = None if pair.colour is None else self.aligned(index, pair.colour, depth_m)
+        return Frame(index, pair.time_s, depth_m, self.lens.camera, None, colour)
+
+    def truth(self) -> dict[int, Array] | None:
+        """Return None: cameras do not tell the object's pose."""
+        return None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the reader assumed, or left out."""
+        return self.remarks
+
+
+def paired(
+    depth: Sequence[tuple[float, Stamp]], colour: Sequence[tuple[float, Stamp]]
+) -> tuple[dict[int, ImagePair[Stamp]], list[str]]:
+    """Return depth images, each with the colour image nearest in time, and in words how many have none.
+
+    Args:
+        depth: times in s, ascending, and images; their places become the frame numbers.
+        colour: likewise; empty where there is none, of which nothing is said.
+    """
+    partners = nearest([time_s for time_s, _ in depth], [time_s for time_s, _ in colour], MAX_APART_S)
+    pairs = {
+        index: ImagePair(time_s, image, None if partner is None else colour[partner][1])
+        for index, ((time_s, image), partner) in enumerate(zip(depth, partners, strict=True))
+    }
+    alone = partners.count(None)
+    said = f"{alone} depth images have no colour image within {MAX_APART_S * 1000:g} ms"
+    return pairs, [said] if colour and alone else []
+
+
+def nearest(times_s: Sequence[float], others_s: Sequence[float], limit_s: float) -> list[int | None]:
+    """Return for each time the place of the nearest other time within a limit; None where there is none."""
+    if not others_s:
+        return [None] * len(times_s)
+    all_s = np.asarray(others_s, dtype=np.float64)
+    order = np.argsort(all_s, kind="stable")
+    right = np.searchsorted(all_s[order], times_s).clip(1, len(all_s)) if len(all_s) > 1 else np.ones(len(times_s), int)
+    found: list[int | None] = []
+    for time_s, after in zip(times_s, right.tolist(), strict=True):
+        candidates = [int(order[place]) for place in (after - 1, after) if place < len(all_s)]
+        best = min(candidates, key=lambda place: abs(others_s[place] - time_s))
+        found.append(best if abs(others_s[best] - time_s) <= limit_s else None)
+    return found

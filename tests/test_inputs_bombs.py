@@ -23,12 +23,11 @@ from test_inputs_clouds import WRITERS as CLOUDS
 
 from modeler.cli import main
 from sequences import open_sequence
-from sequences.ros import unpacking
-from sequences.ros.bag import Bag
-from sequences.ros.unpacking import from_bz2, from_lz4, from_zstd
+from sequences.ros import bag
+from sequences.ros.bag import Bag, from_bz2, from_lz4, from_zstd
 
 MEGABYTE = 1 << 20
-PACKERS: dict[str, Callable[[bytes], bytes]] = {"lz4": lz4.frame.compress, "zstd": unpacking.zstd.compress}
+PACKERS: dict[str, Callable[[bytes], bytes]] = {"lz4": lz4.frame.compress, "zstd": bag.zstd.compress}
 UNPACKERS = {
     "bz2": (bz2.compress, from_bz2),
     "lz4": (lz4.frame.compress, from_lz4),
@@ -71,7 +70,7 @@ def test_what_was_packed_comes_out_unless_it_is_too_much(kind: str) -> None:
     with pytest.raises(ValueError, match="more than"):
         unpack(packed, len(content) - 1)
     for cut in (0, 1, len(packed) // 2, len(packed) - 1):
-        with pytest.raises((ValueError, OSError, RuntimeError, EOFError, unpacking.zstd.ZstdError)):
+        with pytest.raises((ValueError, OSError, RuntimeError, EOFError, bag.zstd.ZstdError)):
             unpack(packed[:cut])
     assert unpack(pack(b"")) == b""
 
@@ -139,7 +138,7 @@ def test_chunks_of_ros_1_are_bounded(
 def test_a_packed_file_of_a_bag_is_bounded(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(unpacking, "MAX_BYTES", 3 * MEGABYTE)
+    monkeypatch.setattr(bag, "MAX_BYTES", 3 * MEGABYTE)
     path = Recorder(packed=rosbag2.CompressionMode.FILE).write(tmp_path / "s", small_frames(2))
     assert len(open_sequence(path)) == 2
     next(path.glob("*.zstd")).write_bytes(PACKERS["zstd"](bytes(4 * MEGABYTE)))

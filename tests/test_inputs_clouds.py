@@ -11,7 +11,7 @@ from recordings import small_frames
 
 from modeler.cli import main
 from modeler.types import Frame, InputError
-from sequences import Given, open_sequence
+from sequences import Overrides, open_sequence
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_millimetres_are_told(tmp_path: Path, frames: list[Frame], capsys: pytes
     write_pcd(tmp_path / "s.pcd", far, "binary")
     assert main(["info", str(tmp_path / "s.pcd")]) == 2
     assert "it looks like millimetres; correct the depth scale (a thousandth of it)" in capsys.readouterr().err
-    read = open_sequence(tmp_path / "s.pcd", Given(depth_scale_mm=1.0)).frame(0)
+    read = open_sequence(tmp_path / "s.pcd", Overrides(depth_scale_mm=1.0)).frame(0)
     np.testing.assert_allclose(read.depth_m, frames[0].depth_m, rtol=1e-5)
 
 

@@ -12,7 +12,7 @@ from PIL import Image
 from recordings import WRITERS, save, write_open3d, write_tum
 
 from modeler.types import Frame, InputError
-from sequences import Given, open_sequence, survey, write_bop
+from sequences import Overrides, open_sequence, survey, write_bop
 
 
 @pytest.fixture(params=WRITERS)
@@ -23,7 +23,7 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path, frames: list[Frame], 
 
 
 def test_what_a_person_says_counts_more(folder: Path) -> None:
-    sequence = open_sequence(folder, Given(intrinsics=(100.0, 101.0, 80.0, 60.0), depth_scale_mm=0.4))
+    sequence = open_sequence(folder, Overrides(intrinsics=(100.0, 101.0, 80.0, 60.0), depth_scale_mm=0.4))
     plain = open_sequence(folder)
     unit = 0.2 if folder.name == "TUM RGB-D" else 1.0
     for first, second in zip(plain, sequence, strict=True):
@@ -92,7 +92,7 @@ def test_the_unit_of_depth_that_stands_beside_the_intrinsics_counts(
     sequence = open_sequence(tmp_path / "s")
     assert sequence.layout == "folder of pictures"
     assert sequence.depth_unit == f"{unit} (camera.json)"
-    given = open_sequence(tmp_path / "s", Given(depth_scale_mm=3.0))
+    given = open_sequence(tmp_path / "s", Overrides(depth_scale_mm=3.0))
     ratio = np.nanmedian(given.frame(0).depth_m / sequence.frame(0).depth_m)
     assert ratio == pytest.approx(3.0 / float(unit.split()[0]), rel=1e-5)
     (tmp_path / "s" / "camera.json").write_text(json.dumps({**told, "depth_scale": 30}))

@@ -17,12 +17,10 @@ from recorded.kinect import calibration
 from modeler import se3
 from modeler.cli import main
 from modeler.types import Camera, InputError
-from sequences import Given, open_sequence
-from sequences.alignment import Alignment
-from sequences.files.json_input import Node
-from sequences.kinect.calibration import colour_from_depth, colour_lens, depth_lens
-from sequences.kinect.sequence import KinectSequence, Matroska
-from sequences.lens import Lens
+from sequences import Overrides, open_sequence
+from sequences.input_files import Node
+from sequences.kinect import KinectSequence, Matroska, colour_from_depth, colour_lens, depth_lens
+from sequences.lens import Alignment, Lens
 
 WIDTH, HEIGHT = 320, 288  # NFOV_2X2BINNED
 COLOUR_SIZE = (1280, 720)
@@ -122,7 +120,7 @@ def test_a_recording_of_the_makers_library_is_read(tmp_path: Path) -> None:
                 np.array([[(column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z, z]]),
             )[0]
             lens = sequence.alignment.colour
-            w, h = lens.bent(np.array(there[0] / there[2]), np.array(there[1] / there[2]))
+            w, h = lens.distort(np.array(there[0] / there[2]), np.array(there[1] / there[2]))
             at = round(float(h) * lens.camera.fy + lens.camera.cy), round(float(w) * lens.camera.fx + lens.camera.cx)
             if 0 <= at[0] < recording.COLOUR[1] and 0 <= at[1] < recording.COLOUR[0]:  # else it is lent
                 expected = scene.colour(number, *recording.COLOUR)[at].astype(int)
@@ -139,7 +137,7 @@ def test_cameras_see_points_where_the_makers_library_does() -> None:
         lenses = depth_lens(node, tuple(mode["depth_size"]), None), colour_lens(node, tuple(mode["colour_size"]))
         for name, lens, pose in zip(("depth", "colour"), lenses, (np.eye(4), COLOUR_FROM_DEPTH), strict=True):
             there = se3.transform(pose, points_m)
-            w, h = lens.bent(there[:, 0] / there[:, 2], there[:, 1] / there[:, 2])
+            w, h = lens.distort(there[:, 0] / there[:, 2], there[:, 1] / there[:, 2])
             camera = lens.camera
             ours = np.stack([w * camera.fx + camera.cx, h * camera.fy + camera.cy], axis=1)
             np.testing.assert_allclose(ours, mode[name], atol=2e-3)
@@ -180,7 +178,7 @@ def test_a_recording_without_colour_is_read_and_converted(tmp_path: Path) -> Non
     assert open_sequence(tmp_path / "s.mkv").frame(0).colour is None
     assert main(["convert", str(tmp_path / "s.mkv"), "--out", str(tmp_path / "bop")]) == 0
     assert len(open_sequence(tmp_path / "bop")) == 3
-    given = open_sequence(tmp_path / "s.mkv", Given(intrinsics=(250.0, 250.0, 160.0, 144.0), depth_scale_mm=0.5))
+    given = open_sequence(tmp_path / "s.mkv", Overrides(intrinsics=(250.0, 250.0, 160.0, 144.0), depth_scale_mm=0.5))
     assert given.frame(0).camera.fx == 250.0
     assert given.depth_unit == "0.5 mm (--depth-scale-mm)"
 
@@ -230,7 +228,7 @@ def test_images_larger_than_their_track_are_bounded(tmp_path: Path, monkeypatch:
     container.close()
     stamp = Matroska(tmp_path / "s.mkv").stamps("COLOR")[1][1]
     assert Matroska(tmp_path / "s.mkv").picture("COLOR", stamp, "image 1").shape == (240, 320, 3)
-    monkeypatch.setattr("sequences.kinect.sequence.MAX_PIXELS", 64 * 48)
+    monkeypatch.setattr("sequences.kinect.MAX_PIXELS", 64 * 48)
     with pytest.raises(InputError, match=r"s\.mkv: is not a readable recording"):
         Matroska(tmp_path / "s.mkv").picture("COLOR", stamp, "image 1")
 

@@ -21,10 +21,9 @@ from scipy.spatial.transform import Rotation
 from modeler.cli import main
 from modeler.export import RunFolder
 from modeler.types import Camera, Frame, InputError
-from sequences import Given, NoiseModel, SensedSequence, open_sequence, survey
+from sequences import CalibratedSequence, NoiseModel, Overrides, open_sequence, survey
 from sequences.lens import Lens, known
-from sequences.live.realsense import open_camera
-from sequences.live.sequence import AbstractCamera, begin
+from sequences.live import AbstractCamera, begin, open_camera
 from sequences.ros.sequence import RosSequence
 
 TURN = Rotation.from_rotvec([0.1, 0.3, -0.2]).as_matrix()
@@ -130,7 +129,7 @@ def assert_read(path: Path, count: int) -> None:
             z = raw[row, column] * recording.UNIT_M
             point = np.array([(column - camera.cx) / focal_px * z, (row - camera.cy) / focal_px * z, z])
             there = motion[:3, :3] @ point + motion[:3, 3]
-            w, h = lens.bent(np.array(there[0] / there[2]), np.array(there[1] / there[2]))
+            w, h = lens.distort(np.array(there[0] / there[2]), np.array(there[1] / there[2]))
             u, v = (recording.COLOUR[2] * np.array([w, h]) + [lens.camera.cx, lens.camera.cy]).round().astype(int)
             np.testing.assert_array_equal(frame.colour[row, column], picture[v, u])
 
@@ -182,7 +181,7 @@ def test_the_makers_library_sees_points_where_our_lens_does(rs: Any, model: str)
     camera = Camera(640, 480, 385.0, 384.0, 320.0, 240.0)
     ours = known(camera, recording.BEND, model.replace("_", " ").title(), "here")
     for x, y in itertools.product(np.linspace(-0.8, 0.8, 9), np.linspace(-0.6, 0.6, 7)):
-        w, h = ours.bent(np.array(x), np.array(y))
+        w, h = ours.distort(np.array(x), np.array(y))
         theirs = rs.rs2_project_point_to_pixel(intrinsics, [x, y, 1.0])
         np.testing.assert_allclose([w * 385.0 + 320.0, h * 384.0 + 240.0], theirs, atol=0.02)
 
@@ -243,7 +242,7 @@ def test_images_are_taken_when_they_are_asked_for() -> None:
 
 def test_a_live_camera_stays_live_whatever_it_is_wrapped_in() -> None:
     camera = StandIn(small_frames(3))
-    sensed = SensedSequence(begin(camera, first=2), NoiseModel(0.5, 500.0, 0.001, (0.0, 0.0, 0.0)))
+    sensed = CalibratedSequence(begin(camera, first=2), NoiseModel(0.5, 500.0, 0.001, (0.0, 0.0, 0.0)))
     assert sensed.live
     assert [frame.index for frame in sensed.recorded()] == [0, 1]
     assert len(camera.taken) == 2  # to look at what it has shown takes nothing from it
@@ -268,13 +267,13 @@ def test_a_camera_of_the_makers_library_is_read_while_it_runs(
     recording.record(rs, path, 14, pause_s=0.05)
     context = rs.context()
     with pytest.raises(InputError, match=r"realsense: no camera is plugged in"):
-        open_camera("123", Given(), context)
+        open_camera("123", Overrides(), context)
     played = context.load_device(str(path))
     with pytest.raises(InputError, match=r"realsense:123: no such camera is plugged in; there is 0123456789\."):
-        open_camera("123", Given(), context)
-    monkeypatch.setattr("sequences.live.realsense.PATIENCE_MS", 500)
-    monkeypatch.setattr("sequences.live.sequence.FIRST", 4)
-    sequence = open_camera("0123456789", Given(), context)
+        open_camera("123", Overrides(), context)
+    monkeypatch.setattr("sequences.live.PATIENCE_MS", 500)
+    monkeypatch.setattr("sequences.live.FIRST", 4)
+    sequence = open_camera("0123456789", Overrides(), context)
     assert (sequence.name, sequence.depth_unit) == ("Software D455", "0.25 mm (the camera)")
     frames: list[Frame] = []
     with pytest.raises(InputError, match=r"Software D455: gives no image .*; plug it in anew"):

@@ -20,11 +20,11 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.cli import main
 from modeler.types import Camera, Frame, InputError
-from sequences import Given, open_sequence
+from sequences import Overrides, open_sequence
 from sequences.lens import Lens
-from sequences.ros import images as ros_images
+from sequences.ros import messages
+from sequences.ros.bag import zstd
 from sequences.ros.sequence import RosSequence
-from sequences.ros.unpacking import zstd
 
 SUFFIXES = (".bag", ".mcap", ".db3", "")
 
@@ -99,7 +99,7 @@ def test_colour_is_optional_and_must_be_aligned(tmp_path: Path, frames: list[Fra
     other = open_sequence(Recorder(colour_scale=1.2).write(tmp_path / "other.bag", frames))
     assert other.frame(0).colour is None
     assert other.notes == ("colour of /camera/rgb/image_raw is not aligned to depth and is left out",)
-    forced = open_sequence(tmp_path / "other.bag", Given(colour_topic="/camera/rgb/image_raw"))
+    forced = open_sequence(tmp_path / "other.bag", Overrides(colour_topic="/camera/rgb/image_raw"))
     assert forced.frame(0).colour is not None
 
 
@@ -169,9 +169,9 @@ def test_several_depth_topics_need_a_choice(tmp_path: Path, frames: list[Frame])
     Two("16UC1", "32FC1", names=named("/a/depth_one", "/a/depth_two")).write(both, frames)
     with pytest.raises(InputError, match=r"/a/depth_one, /a/depth_two; convert with --depth-topic"):
         open_sequence(both)
-    assert "topic /a/depth_two" in open_sequence(both, Given(depth_topic="/a/depth_two")).layout
+    assert "topic /a/depth_two" in open_sequence(both, Overrides(depth_topic="/a/depth_two")).layout
     with pytest.raises(InputError, match="/c holds no depth images"):
-        open_sequence(both, Given(depth_topic="/c"))
+        open_sequence(both, Overrides(depth_topic="/c"))
 
 
 class Two(Recorder):
@@ -221,7 +221,7 @@ def test_distortion_is_taken_out(tmp_path: Path) -> None:
     lens = Lens(camera, (-0.35, 0.12, 0.003, -0.002))
     w, h = camera.rays()
     for _ in range(100):  # rays whose bent image the pixels are
-        bent_w, bent_h = lens.bent(w, h)
+        bent_w, bent_h = lens.distort(w, h)
         straight_w, straight_h = camera.rays()
         w, h = w + straight_w - bent_w, h + straight_h - bent_h
     depth_m = (1.0 / (1.2 - 0.6 * w + 0.3 * h)).astype(np.float32)
@@ -281,7 +281,7 @@ def test_recordings_without_what_is_needed_are_one_line(
 ) -> None:
     no_info = Recorder(camera_info=False).write(tmp_path / "no_info.bag", frames)
     assert "no camera_info belongs to /camera/depth/image_raw" in fails(no_info, capsys)
-    assert open_sequence(no_info, Given(intrinsics=(140.0, 140.0, 80.0, 60.0))).frame(0).camera.fx == 140.0
+    assert open_sequence(no_info, Overrides(intrinsics=(140.0, 140.0, 80.0, 60.0))).frame(0).camera.fx == 140.0
     flat = [dataclasses.replace(f, depth_m=np.full_like(f.depth_m, np.nan)) for f in frames]
     assert "all is 0 or NaN" in fails(Recorder("32FC1").write(tmp_path / "nan.bag", flat), capsys)
     large = [dataclasses.replace(f, depth_m=f.depth_m * 1000.0) for f in frames]
@@ -365,10 +365,10 @@ def test_mcap_of_other_systems_says_so(tmp_path: Path, capfd: pytest.CaptureFixt
     ],
 )
 def test_packed_chroma_that_is_not_what_it_says_is_one_line(told: str, data: bytes, says: str) -> None:
-    message = SimpleNamespace(__msgtype__=ros_images.PACKED, format=told, data=np.frombuffer(data, np.uint8))
-    assert ros_images.is_colour(message)
+    message = SimpleNamespace(__msgtype__=messages.PACKED, format=told, data=np.frombuffer(data, np.uint8))
+    assert messages.is_colour(message)
     with pytest.raises(InputError, match=says):
-        ros_images.colour(message, "here")
+        messages.colour(message, "here")
 
 
 @pytest.mark.parametrize(("encoding", "order"), [("yuv422", (1, 0, 3, 2)), ("YUYV", (0, 1, 2, 3))])
@@ -379,11 +379,11 @@ def test_colour_that_shares_chroma_is_read(encoding: str, order: tuple[int, ...]
     y_u_y_v = np.array([[y, u, y, v] for y, u, v in colours], np.uint8)
     data = np.tile(np.pad(y_u_y_v[:, order].ravel(), (0, 3)), 2)
     message = SimpleNamespace(
-        __msgtype__=ros_images.IMAGE, encoding=encoding, height=2, width=8, step=19, is_bigendian=0, data=data
+        __msgtype__=messages.IMAGE, encoding=encoding, height=2, width=8, step=19, is_bigendian=0, data=data
     )
-    assert ros_images.is_colour(message)
-    assert not ros_images.is_depth(message)
-    picture = ros_images.colour(message, "here")
+    assert messages.is_colour(message)
+    assert not messages.is_depth(message)
+    picture = messages.colour(message, "here")
     expected = np.repeat(np.array(list(colours.values())), 2, axis=0)
     assert np.abs(picture.astype(int) - expected).max() <= 2
 

@@ -11,11 +11,10 @@ import pytest
 
 from modeler.cli import main
 from modeler.types import Frame, InputError
-from sequences import NoiseModel, SensedSequence, bundled, open_sequence, read_noise, write_bop
-from sequences.noise.across import borders, pooled_px
-from sequences.noise.calibrate import Calibration, calibrate
-from sequences.noise.model import noise_text, object_distance_m
-from sequences.rendering.depth_noise import gaussian_field
+from sequences import CalibratedSequence, NoiseModel, bundled, open_sequence, read_noise, write_bop
+from sequences.noise_calibration import Calibration, borders, calibrate, pooled_px
+from sequences.noise_model import noise_text, object_distance_m
+from sequences.rendering.depth_sensor import gaussian_field
 from sequences.rendering.recipe import load_recipe
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.trajectory import Tabletop
@@ -52,7 +51,7 @@ def test_noise_along_the_ray_is_that_of_the_renderer(still: RenderedSequence, me
     assert camera.disparity is not None
     focal_baseline = still.recipe.view.focal_px * abs(camera.baseline_m)
     off = []
-    for one in measured.classes:
+    for one in measured.bins:
         slope = (one.angle_rad / (np.pi / 2.0 - one.angle_rad)) ** 2
         noise_px = camera.disparity.sigma_px * (1.0 + camera.disparity.slope_gain * slope)
         true_m = one.distance_m**2 / focal_baseline * np.hypot(noise_px, camera.disparity.quantum_px / np.sqrt(12.0))
@@ -61,7 +60,7 @@ def test_noise_along_the_ray_is_that_of_the_renderer(still: RenderedSequence, me
         )
     assert len(off) > 8
     np.testing.assert_allclose(off, 1.0, atol=0.15)
-    assert max(one.distance_m for one in measured.classes) > 1.4 * min(one.distance_m for one in measured.classes)
+    assert max(one.distance_m for one in measured.bins) > 1.4 * min(one.distance_m for one in measured.bins)
 
 
 def test_noise_across_the_ray_is_that_of_the_renderer(still: RenderedSequence, measured: Calibration) -> None:
@@ -110,7 +109,7 @@ def test_what_is_stored_is_what_is_used(
     assert stored == measured.model
     record = json.loads(path.read_text())
     assert record["frames"] == FRAMES
-    assert len(record["along"]) == len(measured.classes)
+    assert len(record["along"]) == len(measured.bins)
     assert (
         main(["convert", str(bundled("box")), "--sensor", str(path), "--frames", "0:2", "--out", str(tmp_path / "b")])
         == 0
@@ -122,7 +121,7 @@ def test_what_is_stored_is_what_is_used(
 
 def test_a_sequence_takes_the_noise_that_was_measured() -> None:
     whole = open_sequence(bundled("box"))
-    sensed = SensedSequence(whole, MODEL)
+    sensed = CalibratedSequence(whole, MODEL)
     assert sensed.sensor() == MODEL.at(object_distance_m(whole.frame(0)))
     part = sensed.select(every=5)
     assert part.indices == (0, 5, 10)

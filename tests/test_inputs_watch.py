@@ -13,9 +13,9 @@ import pytest
 from recordings import small_frames, write_bundlesdf, write_tum
 
 from modeler.types import Frame, InputError
-from sequences import BopSequence, Patience, open_sequence, watch, write_bop
+from sequences import BopSequence, WatchLimits, open_sequence, watch, write_bop
 
-QUICK = Patience(idle_s=1.0, settle_s=0.2, first=2)
+QUICK = WatchLimits(idle_s=1.0, settle_s=0.2, first=2)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_a_list_that_grows_is_followed(
     (tmp_path / "s" / "depth.txt").write_text("\n".join(lines[:4]))
     writing(write)
     began = time.monotonic()
-    sequence = watch(tmp_path / "s", patience=Patience(idle_s=15.0, settle_s=0.05, first=2))
+    sequence = watch(tmp_path / "s", patience=WatchLimits(idle_s=15.0, settle_s=0.05, first=2))
     assert [frame.index for frame in sequence] == [0, 1, 2, 3, 4]
     assert time.monotonic() - began < 10.0  # `done` ends it, not patience
 
@@ -112,7 +112,7 @@ def test_what_was_there_before_comes_first_and_selection_holds(tmp_path: Path, f
 
 def test_it_ends_when_asked(tmp_path: Path, frames: list[Frame]) -> None:
     write_bop(tmp_path / "s", frames)
-    sequence = watch(tmp_path / "s", patience=Patience(idle_s=60.0, settle_s=0.0, first=1))
+    sequence = watch(tmp_path / "s", patience=WatchLimits(idle_s=60.0, settle_s=0.0, first=1))
     taken: list[int] = []
     for frame in sequence.until(lambda: len(taken) == 2):
         taken.append(frame.index)
@@ -128,7 +128,7 @@ def test_an_ordinary_sequence_is_not_live(tmp_path: Path, frames: list[Frame]) -
 
 
 def test_nothing_or_nothing_readable_is_one_line(tmp_path: Path, frames: list[Frame]) -> None:
-    brief = Patience(idle_s=0.3, settle_s=0.05, first=2)
+    brief = WatchLimits(idle_s=0.3, settle_s=0.05, first=2)
     with pytest.raises(InputError, match="no such folder"):
         watch(tmp_path / "nowhere", patience=brief)
     write_bop(tmp_path / "s", frames)

@@ -11,7 +11,7 @@ from refusal import refused
 
 from modeler import se3
 from modeler.types import InputError
-from sequences.rendering.mesh import ply_bytes
+from sequences.rendering.meshes import ply_bytes
 from sequences.rendering.recipe import Recipe, Viewpoint, load_recipe
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.shapes import Box, Cylinder, MeshFile, Sphere

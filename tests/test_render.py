@@ -12,7 +12,7 @@ from calibration.specimens import load_specimen
 from modeler import se3
 from modeler.types import Camera, Frame, InputError
 from sequences import bundled, open_sequence
-from sequences.rendering.mesh import Mesh
+from sequences.rendering.meshes import Mesh
 from sequences.rendering.recipe import Mosaic, Recipe, Table, Viewpoint, Wall, load_recipe
 from sequences.rendering.renderer import RenderedSequence, render
 from sequences.rendering.shapes import Box, Compound, Part, Sphere

@@ -5,15 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sequences.rendering.depth_noise import (
+from sequences.rendering.depth_sensor import (
+    EXACT,
+    DepthSensor,
     DisparityNoise,
+    Exposure,
     GrazingLoss,
     LateralJitter,
     MixedPixels,
     RandomLoss,
     gaussian_field,
 )
-from sequences.rendering.depth_sensor import EXACT, DepthSensor, Exposure
 from sequences.rendering.recipe import Recipe, Viewpoint
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.shapes import AnyShape, Box, Compound, Part

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from calibration.specimens import load_specimen, recipe_names
 
-from sequences.rendering.mesh import Mesh, ply_bytes
+from sequences.rendering.meshes import Mesh, outer_surface, ply_bytes
 from sequences.rendering.shapes import (
     AnyShape,
     Box,
@@ -21,9 +21,8 @@ from sequences.rendering.shapes import (
     Part,
     Sphere,
     Torus,
+    ear_clipped,
 )
-from sequences.rendering.surface import outer_surface
-from sequences.rendering.sweeps import ear_clipped
 
 PI = np.pi
 L_OUTLINE = ((0.0, 0.0), (0.14, 0.0), (0.14, 0.025), (0.025, 0.025), (0.025, 0.09), (0.0, 0.09))

@@ -133,11 +133,11 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
         InputError: where something cannot be read.
     """
     from modeler.cli.inputs import watched
-    from sequences import SensedSequence, frame_range, open_sequence, read_noise, survey
+    from sequences import CalibratedSequence, frame_range, open_sequence, read_noise, survey
 
     path = options.sequence
     whole = watched(path, options.idle_s) if options.watch else open_sequence(path)
-    whole = whole if options.sensor is None else SensedSequence(whole, read_noise(options.sensor))
+    whole = whole if options.sensor is None else CalibratedSequence(whole, read_noise(options.sensor))
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     if not frames.live:
         for doubt in survey(frames, truth=False).doubts:

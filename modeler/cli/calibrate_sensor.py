@@ -13,7 +13,7 @@ from modeler.cli.console import say
 from modeler.cli.options import InputOptions
 
 if TYPE_CHECKING:
-    from sequences.noise.calibrate import Calibration
+    from sequences.noise_calibration import Calibration
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class CalibrateSensor:
         from modeler.cli.inputs import reading
         from modeler.export import write_atomically
         from sequences import open_sequence
-        from sequences.noise.calibrate import calibrate
-        from sequences.noise.model import noise_text, object_distance_m
+        from sequences.noise_calibration import calibrate
+        from sequences.noise_model import noise_text, object_distance_m
 
         sequence = open_sequence(self.input, self.given.stated())
         with reading() as watched:
@@ -71,7 +71,7 @@ def _facts(name: str, found: Calibration, sensor: dict[str, float]) -> dict[str,
                 "sigma_m": math.sqrt(one.variance_m2),
                 "pixels": one.pixels,
             }
-            for one in found.classes
+            for one in found.bins
         ],
         "across": [
             {"distance_m": one.depth_m, "sigma_px": math.sqrt(one.variance_px2), "length_px": one.length}
@@ -84,7 +84,7 @@ def _table(found: Calibration) -> list[str]:
     """Return what was measured, a line for each distance and angle, beside what the model says."""
     lines = [f"across the ray  {found.model.lateral_px:.2f} px, from {len(found.borders)} borders", "along the ray"]
     lines.append("  distance   angle    pixels   measured      model")
-    for one in found.classes:
+    for one in found.bins:
         model_m = float(found.model.sigma_r_m(one.distance_m, one.angle_rad))
         lines.append(
             f"  {one.distance_m:6.2f} m  {math.degrees(one.angle_rad):5.0f}°  {one.pixels:8d}  "

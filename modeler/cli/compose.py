@@ -30,8 +30,8 @@ from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import AbstractPrior, AbstractRegistrar, InputError
 from sequences import AbstractSequence
-from sequences.files.folders import frame_number
-from sequences.pictures.tum import trajectory
+from sequences.image_folders import trajectory
+from sequences.input_files import frame_number
 
 _GIVEN = {
     "general": ("max_rotation_deg", "max_offset_m"),

@@ -46,7 +46,7 @@ class Convert:
         """
         from modeler.cli.inputs import reading, while_it_lasts
         from modeler.types import InputError
-        from sequences import SensedSequence, frame_range, open_sequence, read_noise, survey, write_bop
+        from sequences import CalibratedSequence, frame_range, open_sequence, read_noise, survey, write_bop
 
         if (self.input / "report.json").is_file():
             if self.sensor is not None or self.selection != FrameOptions() or self.given != InputOptions():
@@ -55,7 +55,7 @@ class Convert:
         if self.out.suffix in (".json", ".txt"):
             raise InputError(f"{self.input}: is no folder of a run, whose poses {self.out} could hold; give one")
         whole = open_sequence(self.input, self.given.stated())
-        whole = whole if self.sensor is None else SensedSequence(whole, read_noise(self.sensor))
+        whole = whole if self.sensor is None else CalibratedSequence(whole, read_noise(self.sensor))
         kept = frame_range(self.selection.frames)
         sequence = whole.select(self.selection.every, kept)
         if sequence.live and kept.stop is None:
@@ -102,7 +102,7 @@ def _poses(run: Path, out: Path) -> int:
     from modeler import se3
     from modeler.export import RunFolder, poses_of, tum_text, write_atomically
     from modeler.types import InputError
-    from sequences.bop.entries import pose_entry
+    from sequences.bop import pose_entry
 
     report = RunFolder(run).result()
     poses = {frame: pose.mean for frame, pose in poses_of(report).items()}

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from modeler.experiment import ModelScore, Pairing, Summary
     from modeler.types import AbstractRegistrar, Array
     from sequences import AbstractSequence
-    from sequences.rendering.mesh import Mesh
+    from sequences.rendering.meshes import Mesh
 
 _SAME_M = 1e-5  # to which files of one surface agree
 

@@ -18,7 +18,7 @@ from modeler.fusion import Fuser, FusionVolume, own_covariances
 from modeler.graph import PoseGraph, solve
 from modeler.rays import Sensor
 from modeler.types import ACCEPTED, Array, Edge, Frame, InputError, RayImage, Solution
-from sequences import AbstractSequence, Patience, SensedSequence, open_sequence, read_noise, watch
+from sequences import AbstractSequence, CalibratedSequence, WatchLimits, open_sequence, read_noise, watch
 from sequences.base import AbstractDerived
 
 _ALIKE = 0.02  # share by which the number of an object's points may change with the version of a library
@@ -85,7 +85,7 @@ def watched(path: Path, idle_s: float) -> AbstractSequence:
     if not 0.0 < idle_s < math.inf:
         raise InputError(f"--idle-s {idle_s:g} is out of range; give a positive number of seconds")
     say(f"waiting for frames in {path}")
-    return watch(path, patience=Patience(idle_s))
+    return watch(path, patience=WatchLimits(idle_s))
 
 
 @final
@@ -179,7 +179,7 @@ def _parts(run: Path, places: deque[Path] | None) -> tuple[Part, ...]:
     if not where.exists():
         raise InputError(f"{where}: the sequence of {run} is not there; say where it is with --sequence")
     whole = open_sequence(where)
-    whole = SensedSequence(whole, read_noise(Path(settings["sensor"]))) if "sensor" in settings else whole
+    whole = CalibratedSequence(whole, read_noise(Path(settings["sensor"]))) if "sensor" in settings else whole
     return (Part(run, report, whole),)
 
 

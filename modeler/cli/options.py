@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from sequences import Given
+    from sequences import Overrides
 
 
 def default(text: str) -> object:
@@ -205,15 +205,15 @@ class InputOptions:
     colour_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), default("the one aligned to depth")] = None
     """Topic of the colour images in a ROS bag."""
 
-    def stated(self) -> Given:
+    def stated(self) -> Overrides:
         """Return them as readers take them.
 
         Raises:
             InputError: where one cannot be.
         """
-        from sequences import Given
+        from sequences import Overrides
 
-        return Given(self.intrinsics, self.depth_scale_mm, self.depth_topic, self.colour_topic)
+        return Overrides(self.intrinsics, self.depth_scale_mm, self.depth_topic, self.colour_topic)
 
 
 def _flag(name: str) -> str:

@@ -1,10 +1,11 @@
-"""ROS 1 and ROS 2 bags, and MCAP files of either, by the rosbags library: topics and their messages, without ROS."""
+"""ROS 1 and ROS 2 bags and MCAP files, read by the rosbags library: topics and their messages, without ROS."""
 
 from __future__ import annotations
 
 import bz2
 import io
 import struct
+import sys
 import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -23,13 +24,106 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from modeler.types import InputError
-from sequences.files.broken import told
-from sequences.files.folders import entries, inside
-from sequences.ros.unpacking import check_file, from_bz2, from_lz4, from_zstd, is_zstd, of_size
+from sequences.input_files import entries, input_errors, inside
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
+
+
+MAX_BYTES = 1 << 30
+"""Chunks and messages that would unpack to more are refused."""
+MAX_RATIO = 100
+"""So are larger files that would unpack to more than so many times their size: depth images are not so dull."""
+_PIECE = 1 << 20
+_ZSTD = b"\x28\xb5\x2f\xfd"  # what its files begin with
+
+
+def from_bz2(data: bytes, most: int = MAX_BYTES) -> bytes:
+    """Return what was packed.
+
+    Raises:
+        ValueError: where that is more than `most` bytes, or cut off.
+    """
+    unpacker = bz2.BZ2Decompressor()
+    return _whole(unpacker.decompress(data, most + 1), ended=unpacker.eof, most=most)
+
+
+def from_lz4(data: bytes, most: int = MAX_BYTES) -> bytes:
+    """Return what was packed.
+
+    Raises:
+        ValueError: where that is more than `most` bytes, or cut off.
+    """
+    unpacker = lz4.frame.LZ4FrameDecompressor()
+    unpacked = unpacker.decompress(data, most + 1)
+    return _whole(unpacked, ended=bool(unpacker.eof), most=most)
+
+
+def from_zstd(data: bytes, most: int = MAX_BYTES) -> bytes:
+    """Return what was packed.
+
+    Raises:
+        ValueError: where that is more than `most` bytes, cut off, or not packed by zstd.
+    """
+    unpacked, ended = b"", False
+    while data:
+        unpacker = zstd.ZstdDecompressor()
+        try:
+            unpacked += unpacker.decompress(data, most + 1 - len(unpacked))
+        except zstd.ZstdError as error:
+            raise ValueError(str(error)) from None
+        ended, data = unpacker.eof, unpacker.unused_data
+        if not ended or len(unpacked) > most:
+            break
+    return _whole(unpacked, ended=ended, most=most)
+
+
+def is_zstd(data: bytes) -> bool:
+    """Return whether something is packed by zstd."""
+    return bytes(data[: len(_ZSTD)]) == _ZSTD
+
+
+def of_size(unpack: Callable[[bytes, int], bytes]) -> Callable[[bytes, int], bytes]:
+    """Return what unpacks to a size that is told beforehand, if it is one that may be."""
+
+    def bounded(data: bytes, size: int) -> bytes:
+        if size > MAX_BYTES:
+            raise ValueError(f"a chunk would unpack to {size >> 20} MB, more than {MAX_BYTES >> 20} MB")
+        return unpack(data, size)
+
+    return bounded
+
+
+def check_file(path: Path) -> None:
+    """Refuse a file packed by zstd that would unpack to something enormous; other files may be what they are.
+
+    Raises:
+        ValueError: where it would.
+    """
+    with path.open("rb") as file:
+        if not is_zstd(file.read(len(_ZSTD))):
+            return
+    left = max(MAX_BYTES, MAX_RATIO * path.stat().st_size)
+    with zstd.open(path, "rb") as file:
+        while piece := file.read(_PIECE):
+            left -= len(piece)
+            if left < 0:
+                raise ValueError(f"{path.name} would unpack to more than {MAX_RATIO} times its size")
+
+
+def _whole(unpacked: bytes, *, ended: bool, most: int) -> bytes:
+    if len(unpacked) > most:
+        raise ValueError(f"a chunk would unpack to more than it says, or than {MAX_BYTES >> 20} MB")
+    if not ended:
+        raise ValueError("a chunk is cut off")
+    return unpacked
+
 
 _MCAP = b"\x89MCAP0\r\n\x01"  # what its files begin with: the format, and that a header follows
 _PROFILE_AT = 21  # behind the header's length and that of the profile's name
@@ -90,7 +184,7 @@ class Bag:
         Raises:
             InputError: where the bag is broken.
         """
-        with told(self.path, "bag", self._advice):
+        with input_errors(self.path, "bag", self._advice):
             stamp = Stamp(-1)
             for count, (connection, received_ns, data) in enumerate(self._reader.messages(self._of(topic))):
                 if count == most:
@@ -105,7 +199,7 @@ class Bag:
         Raises:
             InputError: where the bag is broken.
         """
-        with told(self.path, "bag", self._advice):
+        with input_errors(self.path, "bag", self._advice):
             start = stamp.received_ns
             found = self._reader.messages(self._of(topic), start=start, stop=start + 1)
             for place, (connection, _, data) in enumerate(found):
@@ -135,7 +229,7 @@ class Bag:
     @cached_property
     def _reader(self) -> rosbag1.Reader | rosbag2.Reader:
         """Return the open reader, which is closed when this bag is forgotten."""
-        with told(self.path, "bag", self._advice):
+        with input_errors(self.path, "bag", self._advice):
             if self._is_bag:
                 reader = rosbag1.Reader(self.path)
                 reader.open()

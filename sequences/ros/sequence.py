@@ -1,20 +1,177 @@
-"""Depth images in bags of ROS 1 and ROS 2 and in MCAP files, RealSense's recordings among them."""
+"""Depth images in bags of ROS 1 and ROS 2 and in MCAP files, RealSense recordings among them."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types import InputError
-from sequences.given import Given
-from sequences.lens import Lens
-from sequences.ros import images, topics
+from modeler.types import Camera, InputError
+from sequences.intrinsics import Overrides
+from sequences.lens import Alignment, Lens
+from sequences.recording import AbstractStreams, paired
+from sequences.ros import messages
 from sequences.ros.bag import Bag, Stamp
-from sequences.streams import AbstractStreams, paired
+from sequences.ros.metadata import realsense_colour_from_depth, realsense_lens, realsense_unit_mm, static_transform
+
+
+def first_images(bag: Bag) -> dict[str, Any]:
+    """Return the first message of each topic of images."""
+    kinds = (messages.IMAGE, messages.PACKED)
+    found = {}
+    for topic in sorted(topic for topic, kind in bag.types.items() if kind in kinds):
+        for _, message in bag.messages(topic, most=1):
+            found[topic] = message
+    return found
+
+
+def choose_depth_topic(bag: Bag, first: Mapping[str, Any], overrides: Overrides) -> str:
+    """Return the topic of depth images.
+
+    Raises:
+        InputError: where there is none or nothing tells which.
+    """
+    found = [topic for topic, message in first.items() if messages.is_depth(message)]
+    if overrides.depth_topic is not None:
+        if overrides.depth_topic not in found:
+            raise InputError(f"{bag.path}: {overrides.depth_topic} holds no depth images; {_listed(found)}.")
+        return overrides.depth_topic
+    for better in (
+        [topic for topic in found if "depth" in topic.lower()],
+        [topic for topic in found if not topic.endswith("compressedDepth")],
+        [topic for topic in found if "aligned" in topic or "registered" in topic],  # colour comes with it
+    ):
+        found = better or found
+    if not found:
+        raise InputError(f"{bag.path}: holds no depth images (16UC1 or 32FC1); its image topics are: {_names(first)}.")
+    if len(found) > 1:
+        raise InputError(f"{bag.path}: {_listed(found)}; convert with --depth-topic.")
+    return found[0]
+
+
+def depth_lens(bag: Bag, topic: str, image: Any, overrides: Overrides) -> Lens:
+    """Return the camera of a topic.
+
+    Raises:
+        InputError: where nothing tells it.
+    """
+    if overrides.intrinsics is not None:
+        if image.__msgtype__ == messages.IMAGE:
+            return Lens(Camera(int(image.width), int(image.height), *overrides.intrinsics), ())
+        height, width = messages.depth_m(image, 1.0, f"{bag.path}: {topic}").shape
+        return Lens(Camera(width, height, *overrides.intrinsics), ())
+    known = _camera(bag, topic)
+    if known is None:
+        raise InputError(
+            f"{bag.path}: no camera_info belongs to {topic}; record it too, or convert with --intrinsics FX FY CX CY."
+        )
+    return known
+
+
+def _camera(bag: Bag, topic: str) -> Lens | None:
+    """Return what the first camera_info message beside a topic of images says; None where there is none."""
+    infos = [other for other, kind in bag.types.items() if kind == messages.CAMERA]
+    bare = re.sub(r"/(compressedDepth|compressed|theora)$", "", topic)
+    parent = bare.rsplit("/", 1)[0]
+    wanted = (f"{parent}/camera_info", f"{parent.rsplit('/', 1)[0]}/info/camera_info", f"{bare}/camera_info")
+    for info in (name for name in wanted if name in infos):
+        for _, message in bag.messages(info, most=1):
+            known = messages.lens(message, f"{bag.path}: {info}", ros1=bag.is_ros1)
+            return Lens(known.camera, ()) if "rect" in bare.rsplit("/", 1)[1] else known
+    return realsense_lens(bag, topic)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ColourSource:
+    """Where colour comes from."""
+
+    topic: str
+    """Topic of the images."""
+    alignment: Alignment | None
+    """Where their camera is; None where they have the depth camera's pixels."""
+
+
+def colour_source(
+    bag: Bag, first: Mapping[str, Any], depth: tuple[str, Lens], overrides: Overrides
+) -> tuple[ColourSource | None, list[str]]:
+    """Return where colour comes from that is or can be aligned to depth, and what is said of other colour.
+
+    Args:
+        bag: the bag.
+        first: the first image of each topic.
+        depth: topic and camera of the depth images.
+        overrides: what a person says.
+
+    Raises:
+        InputError: where the topic asked for holds none.
+    """
+    found = [topic for topic, message in first.items() if messages.is_colour(message)]
+    if overrides.colour_topic is not None:
+        if overrides.colour_topic not in found:
+            raise InputError(f"{bag.path}: {overrides.colour_topic} holds no colour images; there are {_names(found)}.")
+        return ColourSource(overrides.colour_topic, _beside(bag, first, overrides.colour_topic, depth)), []
+    cameras, left = {}, []
+    for topic in found:
+        try:
+            cameras[topic] = _camera(bag, topic)
+        except InputError as error:  # depth is enough
+            left.append(f"colour of {topic} is left out: {str(error).removeprefix(f'{bag.path}: ')}")
+    aligned = [topic for topic, camera in cameras.items() if _same(camera, depth[1])]
+    for better in (
+        [topic for topic in aligned if "color" in topic or "rgb" in topic or "colour" in topic],
+        [topic for topic in aligned if first[topic].__msgtype__ == messages.IMAGE],
+    ):
+        aligned = better or aligned
+    if aligned:
+        return ColourSource(aligned[0], None), []
+    for topic in (name for name in cameras if "color" in name.lower() or "rgb" in name):
+        alignment = _beside(bag, first, topic, depth)
+        if alignment is not None:
+            return ColourSource(topic, alignment), []
+    return None, (left + [f"colour of {topic} is not aligned to depth and is left out" for topic in cameras])[:3]
+
+
+def _beside(bag: Bag, first: Mapping[str, Any], topic: str, depth: tuple[str, Lens]) -> Alignment | None:
+    """Return where the camera of a colour topic is; None where nothing tells it."""
+    camera, motion = _camera(bag, topic), realsense_colour_from_depth(bag, topic, depth[0])
+    if motion is None:
+        motion = static_transform(bag, first[topic].header.frame_id, first[depth[0]].header.frame_id)
+    return None if camera is None or motion is None else Alignment(depth[1].camera, camera, motion)
+
+
+def _same(one: Lens | None, other: Lens) -> bool:
+    """Return whether two cameras see the same thing at every pixel."""
+    if one is None:
+        return False
+    ours, theirs = one.camera, other.camera
+    alike = np.allclose([ours.fx, ours.fy, ours.cx, ours.cy], [theirs.fx, theirs.fy, theirs.cx, theirs.cy], atol=0.5)
+    return (ours.width, ours.height) == (theirs.width, theirs.height) and bool(alike)
+
+
+def choose_unit(bag: Bag, topic: str, image: Any, overrides: Overrides) -> tuple[float, str]:
+    """Return the millimetres in one unit of 16-bit depth, and the unit in words."""
+    if overrides.depth_scale_mm is not None:
+        return overrides.depth_scale_mm, f"{overrides.depth_scale_mm:g} mm (--depth-scale-mm)"
+    if image.__msgtype__ == messages.IMAGE and image.encoding in messages.METRES:
+        return 1000.0, "m (32FC1)"
+    found = realsense_unit_mm(bag, topic)
+    if found is not None:
+        return found[0], f"{found[0]:g} mm ({found[1]})"
+    return 1.0, "1 mm (16UC1)"
+
+
+def _listed(topics: list[str]) -> str:
+    return f"depth images are in {_names(topics)}" if topics else "there are none"
+
+
+def _names(topics: Iterable[str]) -> str:
+    return ", ".join(topics) or "none"
 
 
 @final
@@ -26,7 +183,7 @@ class RosSequence(AbstractStreams[Stamp]):
     """The open bag."""
     depth_topic: str
     """Topic of the depth images."""
-    colour: topics.Colour | None
+    colour: ColourSource | None
     """Where colour comes from."""
     unit_mm: float
     """Millimetres per unit of 16-bit depth."""
@@ -36,7 +193,7 @@ class RosSequence(AbstractStreams[Stamp]):
     def seen_m(self, index: int, stamp: Stamp) -> npt.NDArray[np.float32]:
         """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured."""
         where = f"{self.path}: {self.depth_topic}, image {index}"
-        depth_m = images.depth_m(self.bag.message(self.depth_topic, stamp), self.unit_mm, where)
+        depth_m = messages.depth_m(self.bag.message(self.depth_topic, stamp), self.unit_mm, where)
         self._check_size(where, depth_m.shape, self.lens)
         return depth_m
 
@@ -45,7 +202,7 @@ class RosSequence(AbstractStreams[Stamp]):
         if self.colour is None:
             return None
         where = f"{self.path}: {self.colour.topic}, for image {index}"
-        picture = images.colour(self.bag.message(self.colour.topic, stamp), where)
+        picture = messages.colour(self.bag.message(self.colour.topic, stamp), where)
         alignment = self.colour.alignment
         self._check_size(where, picture.shape[:2], self.lens if alignment is None else alignment.colour)
         return self.lens.straight(picture) if alignment is None else alignment.aligned(depth_m, picture)
@@ -71,18 +228,18 @@ class RosSequence(AbstractStreams[Stamp]):
             )
 
 
-def open_ros(path: Path, given: Given) -> RosSequence:
+def open_ros(path: Path, overrides: Overrides) -> RosSequence:
     """Open a bag. Which topics hold depth and aligned colour is told from their messages.
 
     Raises:
         InputError: where it is no bag, or lacks depth images or their camera.
     """
     bag = Bag(path)
-    first = topics.first_images(bag)
-    depth_topic = topics.depth_topic(bag, first, given)
-    lens = topics.depth_lens(bag, depth_topic, first[depth_topic], given)
-    colour, left = topics.colour_source(bag, first, (depth_topic, lens), given)
-    unit_mm, unit = topics.unit(bag, depth_topic, first[depth_topic], given)
+    first = first_images(bag)
+    depth_topic = choose_depth_topic(bag, first, overrides)
+    lens = depth_lens(bag, depth_topic, first[depth_topic], overrides)
+    colour, left = colour_source(bag, first, (depth_topic, lens), overrides)
+    unit_mm, unit = choose_unit(bag, depth_topic, first[depth_topic], overrides)
     times = _times(bag, depth_topic)
     if not times:
         raise InputError(f"{path}: holds no message of {depth_topic}; record it anew.")

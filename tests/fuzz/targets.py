@@ -25,7 +25,7 @@ from modeler.cli.inputs import solved
 from modeler.export import RunFolder, edges_of, poses_of
 from modeler.types import Camera, Frame
 from sequences import open_sequence, read_noise, survey, write_bop
-from sequences.pictures.tum import trajectory
+from sequences.image_folders import trajectory
 from sequences.rendering.recipe import load_recipe
 
 

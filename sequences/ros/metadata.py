@@ -1,7 +1,4 @@
-"""What RealSense's own recorder writes into bags besides images: units of depth, its cameras, and where they are.
-
-It has recorded bags of ROS 1, with messages, and since version 2.58 of ROS 2, with texts `key=value;key=value`.
-"""
+"""Metadata of bags: static transforms, and what the RealSense recorder writes besides images."""
 
 from __future__ import annotations
 
@@ -9,21 +6,74 @@ import re
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.types import Array, Camera, InputError
-from sequences.given import sane
+from sequences.intrinsics import sane
 from sequences.lens import Lens, known
-from sequences.ros import frames
 from sequences.ros.bag import Bag
 
-FARTHEST_M = 10.0
+STATIC = "tf2_msgs/msg/TFMessage"
+FARTHEST_M = 1e4
+"""No robot is larger."""
+MOST = 1000
+"""Messages of fixed transforms that are read; drivers send one or a few."""
+
+
+def static_transform(bag: Bag, target: str, source: str) -> Array | None:
+    """Return target_from_source (4, 4), in m, between two frames; None where no fixed transforms lead there.
+
+    Args:
+        bag: with a topic `tf_static`.
+        target: `frame_id` of one image.
+        source: `frame_id` of another.
+    """
+    if not target or not source:
+        return None
+    steps: dict[str, list[tuple[str, Array]]] = {}
+    for topic in (name for name, kind in bag.types.items() if kind == STATIC and name.endswith("tf_static")):
+        for _, message in bag.messages(topic, most=MOST):
+            for stamped in message.transforms:
+                parent, child = _name(stamped.header.frame_id), _name(stamped.child_frame_id)
+                parent_from_child = transform_pose(stamped.transform)
+                if parent_from_child is not None:
+                    steps.setdefault(child, []).append((parent, parent_from_child))
+                    steps.setdefault(parent, []).append((child, se3.inverse(parent_from_child)))
+    found, front = {_name(source): np.eye(4)}, [_name(source)]
+    while front:
+        here = front.pop(0)
+        for there, there_from_here in steps.get(here, []):
+            if there not in found:
+                found[there] = there_from_here @ found[here]
+                front.append(there)
+    return found.get(_name(target))
+
+
+def transform_pose(transform: Any) -> Array | None:
+    """Return the motion (4, 4), in m, that a `geometry_msgs/Transform` is; None where it is none."""
+    turn, shift = transform.rotation, transform.translation
+    quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64)
+    offset_m = np.array([shift.x, shift.y, shift.z], dtype=np.float64)
+    small = bool((np.abs(quaternion) < 2.0).all() and (np.abs(offset_m) < FARTHEST_M).all())  # not so of NaN
+    if not small or not 0.9 < float(np.linalg.norm(quaternion)) < 1.1:
+        return None
+    motion = se3.translation(offset_m)
+    motion[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    return motion
+
+
+def _name(frame_id: str) -> str:
+    return str(frame_id).removeprefix("/")
+
+
+FARTHEST_CAMERA_M = 10.0
 """No two cameras of one device are so far apart."""
 TEXT = "std_msgs/msg/String"
 _STREAM = r"(/device_\d+/sensor_\d+)/\w+"
 
 
-def unit_mm(bag: Bag, topic: str) -> tuple[float, str] | None:
+def realsense_unit_mm(bag: Bag, topic: str) -> tuple[float, str] | None:
     """Return the millimetres in one unit of depth and the topic that says so; None where nothing does."""
     sensor = re.match(_STREAM, topic)
     if sensor is None:
@@ -37,7 +87,7 @@ def unit_mm(bag: Bag, topic: str) -> tuple[float, str] | None:
     return None
 
 
-def lens(bag: Bag, topic: str) -> Lens | None:
+def realsense_lens(bag: Bag, topic: str) -> Lens | None:
     """Return the camera of a topic where a text tells it, as versions 2.58 write it; None where none does.
 
     Raises:
@@ -59,7 +109,7 @@ def lens(bag: Bag, topic: str) -> Lens | None:
     return None
 
 
-def colour_from_depth(bag: Bag, colour_topic: str, depth_topic: str) -> Array | None:
+def realsense_colour_from_depth(bag: Bag, colour_topic: str, depth_topic: str) -> Array | None:
     """Return the motion (4, 4), in m, from the depth to the colour camera; None where nothing tells it.
 
     Raises:
@@ -84,14 +134,14 @@ def _from_reference(bag: Bag, topic: str) -> Array | None:
 
 def _pose(message: Any, where: str) -> Array:
     if message.__msgtype__ == "geometry_msgs/msg/Transform":
-        found = frames.pose(message)
+        found = transform_pose(message)
         pose = np.full((4, 4), np.nan) if found is None else found
     else:
         said = _said(message)
         # Matrices of the camera's library stand column by column.
         pose = se3.translation(_numbers(said.get("translation", ""), 3))
         pose[:3, :3] = _numbers(said.get("rotation", ""), 9).reshape(3, 3).T
-    if not se3.is_rigid(pose, tolerance=1e-3, farthest_m=FARTHEST_M):
+    if not se3.is_rigid(pose, tolerance=1e-3, farthest_m=FARTHEST_CAMERA_M):
         raise InputError(f"{where}: is no rigid motion; record it anew.")
     return pose
 

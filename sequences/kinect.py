@@ -1,4 +1,4 @@
-"""Recordings of the Azure Kinect and of cameras that write its format (.mkv), by the PyAV library."""
+"""Recordings of the Azure Kinect and of cameras that write its format (.mkv), read by the PyAV library."""
 
 from __future__ import annotations
 
@@ -13,14 +13,95 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types import InputError
-from sequences.alignment import Alignment
-from sequences.files.broken import told
-from sequences.files.images import MAX_PIXELS, Packed, metres, read_colour
-from sequences.files.json_input import Node
-from sequences.given import Given
-from sequences.kinect.calibration import colour_from_depth, colour_lens, depth_lens
-from sequences.streams import AbstractStreams, paired
+from modeler import se3
+from modeler.types import Array, Camera, InputError
+from sequences.image_files import MAX_PIXELS, EmbeddedImage, metres, read_colour
+from sequences.input_files import Node, input_errors
+from sequences.intrinsics import Intrinsics, Overrides, sane
+from sequences.lens import Alignment, Lens, coefficients
+from sequences.recording import AbstractStreams, paired
+
+DEPTH, COLOUR = "CALIBRATION_CameraPurposeDepth", "CALIBRATION_CameraPurposePhotoVideo"
+Size = tuple[int, int]
+_MODELS = tuple(f"CALIBRATION_LensDistortionModel{name}" for name in ("BrownConrady", "Rational6KT"))
+"""Those that the maker's library takes; they differ by less than a tenth of a pixel, in a tangential term."""
+_DEPTH_MODES: dict[Size, tuple[Size, Size]] = {  # image: (binned sensor, corner of the image in it)
+    (320, 288): ((512, 512), (96, 90)),
+    (640, 576): ((1024, 1024), (192, 180)),
+    (512, 512): ((512, 512), (0, 0)),
+    (1024, 1024): ((1024, 1024), (0, 0)),
+}
+
+
+def depth_lens(calibration: Node, size: Size, intrinsics: Intrinsics | None) -> Lens:
+    """Return the depth camera for images of (width, height).
+
+    Raises:
+        InputError: where the size is of no mode of the camera, or the calibration lacks something.
+    """
+    if intrinsics is not None:
+        return Lens(Camera(*size, *intrinsics), ())
+    if size not in _DEPTH_MODES:
+        raise InputError(
+            f"{calibration.path}: depth of {size[0]} x {size[1]} pixels is of no mode of the Azure Kinect; "
+            "convert with --intrinsics FX FY CX CY."
+        )
+    return _lens(calibration, DEPTH, size, *_DEPTH_MODES[size])
+
+
+def colour_lens(calibration: Node, size: Size) -> Lens:
+    """Return the colour camera for images of (width, height): the sensor of 4 : 3, cropped above and below for 16 : 9.
+
+    Raises:
+        InputError: where the calibration lacks something.
+    """
+    whole = size[0], size[0] * 3 // 4
+    return _lens(calibration, COLOUR, size, whole, (0, (whole[1] - size[1]) // 2))
+
+
+def colour_from_depth(calibration: Node) -> Array:
+    """Return the motion (4, 4), in m, that takes points of the depth camera to the colour camera.
+
+    Raises:
+        InputError: where the calibration lacks something.
+    """
+    return _camera_from_device(calibration, COLOUR) @ se3.inverse(_camera_from_device(calibration, DEPTH))
+
+
+def _lens(calibration: Node, purpose: str, size: Size, sensor: Size, corner: Size) -> Lens:
+    intrinsics = _camera(calibration, purpose).need("Intrinsics")
+    model = intrinsics.get("ModelType")
+    if model is not None and model.value not in _MODELS:
+        raise model.fault(f"one of {', '.join(_MODELS)}")
+    entry = intrinsics.need("ModelParameters")
+    cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = (float(value) for value in entry.numbers(14))
+    pixels = (
+        fx * sensor[0],
+        fy * sensor[1],
+        cx * sensor[0] - corner[0] - 0.5,  # from the corner of the first pixel to its centre
+        cy * sensor[1] - corner[1] - 0.5,
+    )
+    if not sane(pixels):
+        raise entry.fault("the 14 parameters of a lens")
+    return Lens(Camera(*size, *pixels), coefficients([k1, k2, p1, p2, k3, k4, k5, k6]))
+
+
+def _camera_from_device(calibration: Node, purpose: str) -> Array:
+    entry = _camera(calibration, purpose).need("Rt")
+    rotation = entry.need("Rotation").numbers(9).reshape(3, 3)
+    if np.abs(rotation).max() > 2.0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+        raise entry.need("Rotation").fault("a rotation matrix, row by row")
+    pose = se3.translation(entry.need("Translation").numbers(3))
+    pose[:3, :3] = rotation
+    return pose
+
+
+def _camera(calibration: Node, purpose: str) -> Node:
+    for entry in calibration.need("CalibrationInformation").need("Cameras").elements():
+        if entry.need("Purpose").value == purpose:
+            return entry
+    raise InputError(f"{calibration.path}: its calibration knows no {purpose}; record it anew.")
+
 
 ADVICE = "pip install 'modeler[kinect]'"
 _AGAIN = "record or copy it anew"
@@ -69,7 +150,7 @@ class KinectSequence(AbstractStreams[int]):
         return f"{self.unit_mm:g} mm ({'of the format' if self.unit_mm == 1.0 else '--depth-scale-mm'})"
 
 
-def open_kinect(path: Path, given: Given) -> KinectSequence:
+def open_kinect(path: Path, overrides: Overrides) -> KinectSequence:
     """Open a recording.
 
     Raises:
@@ -80,7 +161,7 @@ def open_kinect(path: Path, given: Given) -> KinectSequence:
     size = file.size("DEPTH")
     if size is None:
         raise InputError(f"{path}: has no DEPTH track; record with depth (k4arecorder --depth-mode NFOV_UNBINNED).")
-    lens = depth_lens(calibration, size, given.intrinsics)
+    lens = depth_lens(calibration, size, overrides.intrinsics)
     stamps, colours, colour_size = file.stamps("DEPTH"), [], file.size("COLOR")
     if not stamps:
         raise InputError(f"{path}: its DEPTH track holds no image; record it anew.")
@@ -88,7 +169,7 @@ def open_kinect(path: Path, given: Given) -> KinectSequence:
     if colour_size is not None:
         colours = file.stamps("COLOR")
         alignment = Alignment(lens.camera, colour_lens(calibration, colour_size), colour_from_depth(calibration))
-    unit_mm = 1.0 if given.depth_scale_mm is None else given.depth_scale_mm
+    unit_mm = 1.0 if overrides.depth_scale_mm is None else overrides.depth_scale_mm
     pairs, left = paired(stamps, colours)
     return KinectSequence(path, lens, pairs, tuple(left), file, alignment, unit_mm)
 
@@ -107,7 +188,7 @@ class Matroska:
         Raises:
             InputError: where nothing of the kind is attached.
         """
-        with told(self.path, "recording", _AGAIN):
+        with input_errors(self.path, "recording", _AGAIN):
             for attached in self._container.streams.attachments:
                 if attached.name == "calibration.json":
                     return json.loads(bytes(attached.data).rstrip(b"\0").decode("utf-8-sig"))
@@ -115,13 +196,13 @@ class Matroska:
 
     def size(self, title: str) -> tuple[int, int] | None:
         """Return the (width, height) of a track; None where there is none."""
-        with told(self.path, "recording", _AGAIN):
+        with input_errors(self.path, "recording", _AGAIN):
             track = self._track(title)
             return None if track is None else (int(track.width), int(track.height))
 
     def stamps(self, title: str) -> list[tuple[float, int]]:
         """Return the times in s and time stamps of a track's images, in order, each once."""
-        with told(self.path, "recording", _AGAIN):
+        with input_errors(self.path, "recording", _AGAIN):
             track = self._track(title)
             if track is None or track.time_base is None:
                 return []
@@ -131,7 +212,7 @@ class Matroska:
 
     def packet(self, title: str, stamp: int) -> bytes:
         """Return the bytes of one image."""
-        with told(self.path, "recording", _AGAIN):
+        with input_errors(self.path, "recording", _AGAIN):
             return bytes(self._find(title, stamp))
 
     def picture(self, title: str, stamp: int, where: str) -> npt.NDArray[np.uint8]:
@@ -140,11 +221,11 @@ class Matroska:
         Raises:
             InputError: where it cannot be decoded.
         """
-        with told(self.path, "recording", _AGAIN):
+        with input_errors(self.path, "recording", _AGAIN):
             packet = self._find(title, stamp)
             content = bytes(packet)
             if content[:2] == b"\xff\xd8":
-                return read_colour(Packed(content, where))
+                return read_colour(EmbeddedImage(content, where))
             for image in packet.decode():
                 return np.asarray(image.to_ndarray(format="rgb24"), dtype=np.uint8)
         raise InputError(f"{where}: cannot be decoded; record it anew.")

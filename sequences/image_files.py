@@ -1,4 +1,6 @@
-"""Depth, colour and mask pictures on disk."""
+"""Depth, colour and mask images on disk."""
+
+from __future__ import annotations
 
 import contextlib
 import io
@@ -25,7 +27,7 @@ _KINDS = {"L": "an 8-bit picture", "P": "an 8-bit picture", "RGB": "a colour pic
 
 @final
 @dataclass(frozen=True)
-class Packed:
+class EmbeddedImage:
     """A picture that lies within another file."""
 
     content: bytes
@@ -37,14 +39,14 @@ class Packed:
         return self.where
 
 
-def _open(path: Path | Packed, formats: tuple[str, ...]) -> Image.Image:
+def _open(path: Path | EmbeddedImage, formats: tuple[str, ...]) -> Image.Image:
     """Return a picture fully decoded."""
     wanted = " or ".join(formats)
     try:
         with warnings.catch_warnings(), _unlogged():
             warnings.simplefilter("ignore")  # what is wrong with a picture is told below, in one line
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            source = io.BytesIO(path.content) if isinstance(path, Packed) else path
+            source = io.BytesIO(path.content) if isinstance(path, EmbeddedImage) else path
             with Image.open(source, formats=formats) as picture:
                 if picture.width * picture.height > MAX_PIXELS:
                     raise Image.DecompressionBombError
@@ -86,7 +88,7 @@ def _quiet() -> Iterator[None]:
         os.close(nowhere)
 
 
-def picture_size(path: Path) -> tuple[int, int]:
+def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of a picture as its header says.
 
     Raises:
@@ -101,7 +103,7 @@ def picture_size(path: Path) -> tuple[int, int]:
         raise InputError(f"{path}: is not a readable picture ({type(error).__name__}); replace it.") from None
 
 
-def read_depth(path: Path | Packed) -> npt.NDArray[np.uint16]:
+def read_depth(path: Path | EmbeddedImage) -> npt.NDArray[np.uint16]:
     """Return a 16-bit PNG or TIFF (h, w) in raw units; 0 = no measurement.
 
     Raises:
@@ -128,7 +130,7 @@ def read_mask(path: Path) -> BoolArray:
     return pixels != 0
 
 
-def read_colour(path: Path | Packed) -> npt.NDArray[np.uint8]:
+def read_colour(path: Path | EmbeddedImage) -> npt.NDArray[np.uint8]:
     """Return a PNG, JPEG or TIFF, in colour or grey, as RGB (h, w, 3).
 
     Raises:
@@ -141,7 +143,7 @@ def read_colour(path: Path | Packed) -> npt.NDArray[np.uint8]:
     return np.array(picture.convert("RGB"))
 
 
-def write_picture(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
+def write_image(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
     """Write pixels as the suffix says: PNG as small as it gets, or JPEG at quality 85."""
     picture = Image.fromarray(np.ascontiguousarray(pixels))
     if path.suffix == ".jpg":
@@ -168,25 +170,25 @@ def check_size(path: Path, found: tuple[int, ...], depth: tuple[int, ...]) -> No
         )
 
 
-def fitted(path: Path, colour: npt.NDArray[np.uint8], depth: tuple[int, ...]) -> npt.NDArray[np.uint8]:
+def resize_to_depth(path: Path, colour: npt.NDArray[np.uint8], depth: tuple[int, ...]) -> npt.NDArray[np.uint8]:
     """Return colour (h, w, 3) in the size of its depth image, shrunk where it is finer and of the same shape.
 
     Raises:
         InputError: where it is of another shape, or coarser.
     """
     height, width = depth
-    if finer(colour.shape[1::-1], (width, height)):
+    if is_finer(colour.shape[1::-1], (width, height)):
         return np.array(Image.fromarray(colour).resize((width, height), Image.Resampling.BOX))
     check_size(path, colour.shape[:2], depth)
     return colour
 
 
-def finer(colour: tuple[int, ...], depth: tuple[int, ...]) -> bool:
+def is_finer(colour: tuple[int, ...], depth: tuple[int, ...]) -> bool:
     """Return whether colour has more pixels than depth, each (width, height), and the same shape to the pixel."""
     return colour[0] > depth[0] and abs(colour[0] * depth[1] / depth[0] - colour[1]) < 1.0
 
 
-def check_alike(path: Path, size: tuple[int, ...], alike: Path, said: str) -> None:
+def check_same_size(path: Path, size: tuple[int, ...], alike: Path, said: str) -> None:
     """Refuse a depth image of another size than one with the same intrinsics.
 
     Args:
@@ -198,6 +200,6 @@ def check_alike(path: Path, size: tuple[int, ...], alike: Path, said: str) -> No
     Raises:
         InputError: where it is.
     """
-    width, height = picture_size(alike)
+    width, height = image_size(alike)
     if size != (height, width):
         raise InputError(f"{path}: is {size[1]} x {size[0]} pixels where {alike.name} is {width} x {height}, {said}.")

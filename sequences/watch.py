@@ -11,8 +11,8 @@ from typing import final
 
 from modeler.types import Frame, InputError
 from sequences.base import AbstractDerived, AbstractSequence, check_every
-from sequences.given import Given
-from sequences.recognise import open_sequence
+from sequences.intrinsics import Overrides
+from sequences.opening import open_sequence
 from sequences.survey import survey
 
 END = "done"
@@ -23,7 +23,7 @@ POLL_S = 0.05
 
 @final
 @dataclass(frozen=True)
-class Patience:
+class WatchLimits:
     """How long to wait for what."""
 
     idle_s: float = 10.0
@@ -44,9 +44,9 @@ class WatchedSequence(AbstractDerived):
 
     path: Path
     """The folder, in any layout of pictures."""
-    given: Given = field(default_factory=Given)
+    overrides: Overrides = field(default_factory=Overrides)
     """What a person says of it."""
-    patience: Patience = field(default_factory=Patience)
+    patience: WatchLimits = field(default_factory=WatchLimits)
     """How long to wait."""
     every: int = 1
     """Keep the first frame and every so many-th after it."""
@@ -77,7 +77,7 @@ class WatchedSequence(AbstractDerived):
             InputError: where what is there when it ends cannot be read.
         """
         wanted = -1
-        for frame in arriving(self.path, self.given, self.patience, self.stop):
+        for frame in arriving(self.path, self.overrides, self.patience, self.stop):
             if self.kept.stop is not None and frame.index >= self.kept.stop:
                 return
             if not self._wants(frame.index):
@@ -109,7 +109,7 @@ class WatchedSequence(AbstractDerived):
         return (low is None or index >= low) and (high is None or index < high)
 
 
-def arriving(path: Path, given: Given, patience: Patience, stop: Callable[[], bool]) -> Iterator[Frame]:
+def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Callable[[], bool]) -> Iterator[Frame]:
     """Yield frames of ascending numbers, each once it is complete, until none has come for a while.
 
     Raises:
@@ -124,7 +124,7 @@ def arriving(path: Path, given: Given, patience: Patience, stop: Callable[[], bo
         settled = ended or now - changed_s >= patience.settle_s
         fault = None
         try:
-            for frame in _after(last, path, given, with_newest=settled):
+            for frame in _after(last, path, overrides, with_newest=settled):
                 yield frame
                 last, came_s = frame.index, time.monotonic()  # which the taker may have spent long with
                 if stop():
@@ -138,26 +138,26 @@ def arriving(path: Path, given: Given, patience: Patience, stop: Callable[[], bo
         time.sleep(POLL_S)
 
 
-def watch(path: str | Path, given: Given | None = None, patience: Patience | None = None) -> WatchedSequence:
+def watch(path: str | Path, overrides: Overrides | None = None, patience: WatchLimits | None = None) -> WatchedSequence:
     """Wait for the first frames in a folder, which need not be there yet, and return the sequence that they begin.
 
     Raises:
         InputError: where no readable frame comes in time.
     """
-    path, given, patience = Path(path), given or Given(), patience or Patience()
+    path, overrides, patience = Path(path), overrides or Overrides(), patience or WatchLimits()
     first: list[int] = []
-    for frame in arriving(path, given, patience, lambda: len(first) == patience.first):
+    for frame in arriving(path, overrides, patience, lambda: len(first) == patience.first):
         first.append(frame.index)
     if not first:
         raise InputError(f"{path}: no frame has come in {patience.idle_s:g} s; start the program that writes them.")
-    seen = open_sequence(path, given).select(frames=slice(None, first[-1] + 1))
+    seen = open_sequence(path, overrides).select(frames=slice(None, first[-1] + 1))
     survey(seen, truth=False)
-    return WatchedSequence(seen, path, given, patience)
+    return WatchedSequence(seen, path, overrides, patience)
 
 
-def _after(last: int, path: Path, given: Given, *, with_newest: bool) -> Iterator[Frame]:
+def _after(last: int, path: Path, overrides: Overrides, *, with_newest: bool) -> Iterator[Frame]:
     """Read the frames whose numbers follow `last`."""
-    sequence = open_sequence(path, given)
+    sequence = open_sequence(path, overrides)
     indices = sequence.indices if with_newest else sequence.indices[:-1]
     return (sequence.frame(index) for index in indices if index > last)
 

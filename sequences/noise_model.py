@@ -1,17 +1,19 @@
-"""What a depth camera's noise is, as a function of distance and angle: measured, stored in a file, looked up."""
+"""The noise of a depth camera as a function of distance and angle, and sequences of a camera with known noise."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import final
 
 import numpy as np
 
 from modeler.types import Array, Frame
-from sequences.files.json_input import Node, read_tree
+from sequences.base import AbstractDerived
+from sequences.input_files import Node, read_tree
 
 MAX_ANGLE_RAD = np.radians(85.0)
 """Beyond, where the model's noise would grow without bounds, it stays as it is here."""
@@ -105,3 +107,28 @@ def object_distance_m(frame: Frame) -> float:
     inside = measured if frame.mask is None else measured & frame.mask
     share = 25.0 if frame.mask is None else 50.0
     return float(np.percentile(frame.depth_m[inside], share)) if inside.any() else 1.0
+
+
+@final
+@dataclass(frozen=True)
+class CalibratedSequence(AbstractDerived):
+    """Another sequence, of a camera with this noise."""
+
+    noise: NoiseModel
+    """The camera's noise."""
+
+    def sensor(self) -> tuple[float, float]:
+        """Return the noise `(sigma_wh, sigma_r_m)` at the distance of the object in the first frame."""
+        return self._at_object
+
+    def select(self, every: int = 1, frames: slice | None = None) -> CalibratedSequence:
+        """Return a part of the sequence."""
+        return replace(self, whole=self.whole.select(every, frames))
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Read the frames in order."""
+        return iter(self.whole)
+
+    @cached_property
+    def _at_object(self) -> tuple[float, float]:
+        return self.noise.at(object_distance_m(self.whole.frame(self.whole.indices[0])))

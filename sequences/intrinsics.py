@@ -1,7 +1,8 @@
-"""Intrinsics as programs write them beside their pictures."""
+"""Intrinsics: as the user overrides them, and as programs write them beside their images."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -9,9 +10,48 @@ from typing import final
 import numpy as np
 
 from modeler.types import Array, InputError
-from sequences.files.folders import inside
-from sequences.files.json_input import Node, read_text, read_tree
-from sequences.given import Given, Intrinsics, sane
+from sequences.input_files import Node, inside, read_text, read_tree
+
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy in px."""
+
+
+@dataclass(frozen=True)
+class Overrides:
+    """Facts that take precedence over what the reader would find or assume."""
+
+    intrinsics: Intrinsics | None = None
+    """fx, fy, cx, cy of the depth camera in px."""
+    depth_scale_mm: float | None = None
+    """Millimetres per unit of stored depth."""
+    depth_topic: str | None = None
+    """Topic of the depth images in a ROS bag."""
+    colour_topic: str | None = None
+    """Topic of the colour images in a ROS bag."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            InputError: where they cannot be.
+        """
+        if self.intrinsics is not None and not sane(self.intrinsics):
+            shown = " ".join(f"{value:g}" for value in self.intrinsics)
+            raise InputError(
+                f"--intrinsics {shown} are those of no camera; give FX FY CX CY in px, FX and FY at least 1."
+            )
+        if self.depth_scale_mm is not None and not 1e-6 <= self.depth_scale_mm <= 1e3:
+            raise InputError(
+                f"--depth-scale-mm {self.depth_scale_mm:g} is out of range; give the millimetres in one unit of depth."
+            )
+
+
+def sane(intrinsics: Intrinsics) -> bool:
+    """Return whether numbers can be the intrinsics of a camera."""
+    fx, fy, cx, cy = intrinsics
+    finite = all(math.isfinite(value) for value in intrinsics)
+    return finite and min(fx, fy) >= 1.0 and max(fx, fy, abs(cx), abs(cy)) <= 1e6
+
 
 NAMES = (
     "cam_K.txt",
@@ -29,7 +69,7 @@ NAMES = (
 
 @final
 @dataclass(frozen=True)
-class Told:
+class CameraFacts:
     """What is told of the camera of a folder of pictures."""
 
     intrinsics: Intrinsics
@@ -41,15 +81,15 @@ class Told:
     size: tuple[int, int] | None = None
     """Width and height in px of the images that the file is of, where it says so."""
 
-    def unit(self, given: Given, usual: tuple[float, str]) -> tuple[float, str]:
+    def unit(self, overrides: Overrides, usual: tuple[float, str]) -> tuple[float, str]:
         """Return the millimetres per unit of depth, and who says so.
 
         Args:
-            given: what counts more.
+            overrides: what counts more.
             usual: what holds where nobody says anything.
         """
-        if given.depth_scale_mm is not None:
-            return given.depth_scale_mm, "--depth-scale-mm"
+        if overrides.depth_scale_mm is not None:
+            return overrides.depth_scale_mm, "--depth-scale-mm"
         return usual if self.unit_mm is None else (self.unit_mm, self.by)
 
     def doubts(self, size: tuple[int, int]) -> list[str]:
@@ -62,23 +102,23 @@ class Told:
         ]
 
 
-def find_intrinsics(folder: Path, given: Given) -> Told | None:
+def find_intrinsics(folder: Path, overrides: Overrides) -> CameraFacts | None:
     """Return what is told of the camera of a folder of pictures; None where nobody tells its intrinsics.
 
     Args:
         folder: where to look.
-        given: what counts more.
+        overrides: what counts more.
 
     Raises:
         InputError: where a file of intrinsics cannot be read.
     """
-    if given.intrinsics is not None:
-        return Told(given.intrinsics, "--intrinsics")
+    if overrides.intrinsics is not None:
+        return CameraFacts(overrides.intrinsics, "--intrinsics")
     for name in NAMES:
         path = folder / name
         if path.exists():
             inside(path, folder)
-            return _from_json(read_tree(path), name) if path.suffix == ".json" else Told(_from_text(path), name)
+            return _from_json(read_tree(path), name) if path.suffix == ".json" else CameraFacts(_from_text(path), name)
     return None
 
 
@@ -107,13 +147,13 @@ def _from_text(path: Path) -> Intrinsics:
     return found
 
 
-def _from_json(node: Node, name: str) -> Told:
+def _from_json(node: Node, name: str) -> CameraFacts:
     """Read what Open3D writes (columns of the matrix in turn), a matrix in rows, or fx, fy, cx, cy by name."""
     scale = node.get("depth_scale")
     node = next((within for key in _WITHIN if (within := node.get(key)) is not None), node)
     width, height = node.get("width"), node.get("height")
     size = None if width is None or height is None else (int(width.number(1.0, 1e5)), int(height.number(1.0, 1e5)))
-    return Told(_pinhole(node), name, None if scale is None else _unit_mm(scale), size)
+    return CameraFacts(_pinhole(node), name, None if scale is None else _unit_mm(scale), size)
 
 
 def _unit_mm(scale: Node) -> float:

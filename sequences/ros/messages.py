@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.types import Camera, InputError
-from sequences.files.images import MAX_PIXELS, Packed, read_colour, read_depth
-from sequences.given import sane
+from sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour, read_depth
+from sequences.intrinsics import sane
 from sequences.lens import Lens, known
-from sequences.ros.unpacking import MAX_BYTES, from_zstd
+from sequences.ros.bag import MAX_BYTES, from_zstd
 
 IMAGE, PACKED, CAMERA = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 MILLIMETRES = ("16UC1", "mono16")
@@ -63,7 +63,7 @@ def depth_m(message: Any, unit_mm: float, where: str) -> npt.NDArray[np.float32]
     elif "32FC1" in message.format:
         raise InputError(f"{where}: holds packed 32FC1 depth, which is lossy; record the raw topic or 16UC1.")
     else:
-        raw = read_depth(Packed(bytes(message.data[_PACKED_DEPTH_HEADER:]), where))
+        raw = read_depth(EmbeddedImage(bytes(message.data[_PACKED_DEPTH_HEADER:]), where))
     return np.where(raw == 0, np.float32(np.nan), (raw * (unit_mm / 1000.0)).astype(np.float32))
 
 
@@ -79,7 +79,7 @@ def colour(message: Any, where: str) -> npt.NDArray[np.uint8]:
     if packed is not None:
         return colour(_unpacked(message, packed, where), where)
     if not _is_raw(message):
-        return read_colour(Packed(bytes(message.data), where))
+        return read_colour(EmbeddedImage(bytes(message.data), where))
     if message.encoding in YUV:
         return _from_yuv(_rows(message, 2, where), YUV[message.encoding])
     channels = COLOURS[message.encoding]

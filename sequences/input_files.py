@@ -1,11 +1,14 @@
-"""Values from JSON and TOML files that people wrote, with faults that say where they are."""
+"""Input files and folders: opened, listed and parsed, with one-line errors that name the place."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -13,6 +16,95 @@ from typing import final
 import numpy as np
 
 from modeler.types import Array, InputError
+
+
+@contextmanager
+def input_errors(path: Path, what: str, advice: str) -> Iterator[None]:
+    """Turn whatever a library raises at a file into one line.
+
+    Args:
+        path: the file.
+        what: what it should be, as in "bag".
+        advice: what to do where it is none.
+
+    Raises:
+        InputError: in place of anything else.
+    """
+    try:
+        yield
+    except (InputError, GeneratorExit):
+        raise
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: is no complete {what} ({short_message(error, path)}); copy all of it.") from None
+    except OSError as error:
+        why = error.strerror or short_message(error, path)
+        raise InputError(f"{path}: cannot be read ({why}); check the path and its permissions.") from None
+    except Exception as error:  # a broken file can make a library raise anything
+        raise InputError(f"{path}: is not a readable {what} ({short_message(error, path)}); {advice}.") from None
+
+
+def short_message(error: Exception, path: Path) -> str:
+    """Return what an error says, short and without the file's name."""
+    words = " ".join(str(error).split()).replace(str(path), "the file") or type(error).__name__
+    return words if len(words) <= 120 else words[:117] + "..."
+
+
+def entries(folder: Path) -> list[Path]:
+    """Return what lies in a folder by name; nothing where there is no such folder.
+
+    Raises:
+        InputError: where it may not be read.
+    """
+    try:
+        return sorted(folder.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions.") from None
+
+
+def list_images(folder: Path, suffixes: tuple[str, ...], root: Path) -> dict[str, Path]:
+    """Return the pictures of a folder by name without ending; hidden files are none.
+
+    Args:
+        folder: where; a folder that is not there has none.
+        suffixes: endings in small letters, such as `.png`.
+        root: the sequence that the folder belongs to.
+
+    Raises:
+        InputError: where the folder may not be read, two pictures share a name, or a link leads out of the sequence.
+    """
+    found: dict[str, Path] = {}
+    for path in entries(inside(folder, root)):
+        if path.suffix.lower() not in suffixes or path.name.startswith("."):
+            continue
+        if path.stem in found:
+            raise InputError(f"{path}: there is {found[path.stem].name} too; remove one of them.")
+        found[path.stem] = inside(path, root) if path.is_symlink() else path
+    return found
+
+
+def first_folder(root: Path, names: tuple[str, ...]) -> Path | None:
+    """Return the first of some folders that is there."""
+    return next((root / name for name in names if (root / name).is_dir()), None)
+
+
+def inside(path: Path, root: Path) -> Path:
+    """Return the path, which must stay in its sequence.
+
+    Raises:
+        InputError: where it does not, by a link or by `..`.
+    """
+    target, home = os.path.realpath(path), os.path.realpath(root)
+    if os.path.commonpath([target, home]) != home:
+        raise InputError(f"{path}: leads out of the sequence, to {target}; put the file itself there.")
+    return path
+
+
+def frame_number(stem: str) -> int | None:
+    """Return the frame number that a name is; None where it is none, or too long to be one."""
+    return int(stem) if stem.isascii() and stem.isdigit() and len(stem) <= 9 else None
+
 
 MAX_BYTES = 64_000_000
 """Larger text is refused."""

@@ -1,4 +1,4 @@
-"""From a path to the reader of what lies there."""
+"""The reader of a path, chosen by what lies there."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import difflib
 from pathlib import Path
 
 from modeler.types import InputError
-from sequences import clouds
 from sequences.base import AbstractSequence
-from sequences.bop.sequence import BopSequence
-from sequences.files.folders import entries
-from sequences.given import Given
-from sequences.live.realsense import SCHEME, open_camera
-from sequences.pictures.colour_depth import COLOUR_FOLDERS, open_colour_depth
-from sequences.pictures.tum import open_tum
+from sequences.bop import BopSequence
+from sequences.clouds import SUFFIXES as CLOUD_SUFFIXES
+from sequences.clouds import open_clouds
+from sequences.image_folders import COLOUR_FOLDERS, open_colour_depth, open_tum
+from sequences.input_files import entries
+from sequences.intrinsics import Overrides
+from sequences.live import SCHEME, open_camera
 
 FORMATS = (
     "a folder with depth/ (BOP, TUM RGB-D, Open3D, BundleSDF, your own), organised clouds, a ROS bag, a RealSense "
@@ -23,23 +23,23 @@ FORMATS = (
 BAGS = (".bag", ".mcap", ".db3")
 
 
-def open_sequence(path: str | Path, given: Given | None = None) -> AbstractSequence:
+def open_sequence(path: str | Path, overrides: Overrides | None = None) -> AbstractSequence:
     """Open the sequence at a path; what it is stored as is told from the path.
 
     Args:
         path: a folder or a file, or `realsense:` for a live camera.
-        given: what a person says of it.
+        overrides: what a person says of it.
 
     Raises:
         InputError: where it does not hold a readable sequence.
     """
-    path, given = Path(path), given or Given()
+    path, overrides = Path(path), overrides or Overrides()
     if not _is_text(path):
         raise InputError(f"{path}: its name is not UTF-8; rename it.")
     if str(path).startswith(SCHEME):
-        return open_camera(str(path).removeprefix(SCHEME), given)
+        return open_camera(str(path).removeprefix(SCHEME), overrides)
     try:
-        return _open(path, given)
+        return _open(path, overrides)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
 
@@ -53,29 +53,29 @@ def _meant(path: Path) -> str:
     return ""
 
 
-def _open(path: Path, given: Given) -> AbstractSequence:
+def _open(path: Path, overrides: Overrides) -> AbstractSequence:
     if not path.exists():
         raise InputError(f"{path}: no such folder or file; {_meant(path)}give {FORMATS}.")
     if path.suffix.lower() in BAGS or (path / "metadata.yaml").exists():
         from sequences.ros.sequence import open_ros
 
-        return open_ros(path, given)
+        return open_ros(path, overrides)
     if (path / "report.json").is_file():
         raise InputError(f"{path}: is the folder of a run; give the sequence it was made from, or convert its poses.")
     if path.is_file() and path.suffix.lower() == ".mkv":
-        from sequences.kinect.sequence import open_kinect
+        from sequences.kinect import open_kinect
 
-        return open_kinect(path, given)
-    if (path.is_file() and path.suffix.lower() in clouds.SUFFIXES) or _holds_clouds(path):
-        return clouds.open_clouds(path, given)
+        return open_kinect(path, overrides)
+    if (path.is_file() and path.suffix.lower() in CLOUD_SUFFIXES) or _holds_clouds(path):
+        return open_clouds(path, overrides)
     if not path.is_dir():
         raise InputError(f"{path}: a file of this kind holds no sequence; give {FORMATS}.")
     if (path / "scene_camera.json").exists():
-        return BopSequence(path, given)
+        return BopSequence(path, overrides)
     if (path / "depth.txt").exists():
-        return open_tum(path, given)
+        return open_tum(path, overrides)
     if (path / "depth").is_dir():
-        return open_colour_depth(path, given)
+        return open_colour_depth(path, overrides)
     raise InputError(f"{path}: {_advice(path)}")
 
 
@@ -91,7 +91,7 @@ def _holds_clouds(path: Path) -> bool:
     """Return whether a folder holds clouds and no depth images."""
     if not path.is_dir() or any((path / mark).exists() for mark in ("scene_camera.json", "depth.txt", "depth")):
         return False
-    return any(entry.suffix.lower() in clouds.SUFFIXES for entry in entries(path))
+    return any(entry.suffix.lower() in CLOUD_SUFFIXES for entry in entries(path))
 
 
 def _folders(path: Path) -> list[str]:

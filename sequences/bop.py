@@ -1,0 +1,378 @@
+"""Sequences in the layout of the BOP benchmark (its `bop_datasets_format.md`): one scene folder, one object."""
+
+from __future__ import annotations
+
+import glob
+import json
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.types import Array, BoolArray, Camera, Frame, InputError
+from sequences.base import AbstractSequence
+from sequences.image_files import check_same_size, check_size, metres, read_colour, read_depth, read_mask, write_image
+from sequences.input_files import Node, entries, frame_number, inside, read_tree
+from sequences.intrinsics import Intrinsics, Overrides, of_matrix
+from sequences.recording import AbstractRecording
+from sequences.rendering.meshes import Mesh, read_mesh
+
+
+def intrinsics(node: Node) -> Intrinsics:
+    """Return (fx, fy, cx, cy) in px of one entry of `scene_camera.json`.
+
+    Raises:
+        InputError: where `cam_K` is missing or is not the matrix of a pinhole camera.
+    """
+    entry = node.need("cam_K")
+    found = of_matrix(entry.numbers(9).reshape(3, 3))
+    if found is None:
+        raise entry.fault("[fx, 0, cx, 0, fy, cy, 0, 0, 1] in px with fx and fy of at least 1")
+    return found
+
+
+def depth_scale_mm(node: Node) -> float:
+    """Return the millimetres per unit of depth of one entry of `scene_camera.json`.
+
+    Raises:
+        InputError: where it is missing or absurd; 1000 would be units per metre mistaken for it.
+    """
+    return node.need("depth_scale").number(1e-6, 100.0)
+
+
+def camera_from_model(node: Node) -> Array:
+    """Return the pose (4, 4), in m, of one object of `scene_gt.json`.
+
+    Raises:
+        InputError: where rotation or translation is missing or the rotation is none.
+    """
+    entry = node.need("cam_R_m2c")
+    written = entry.numbers(9).reshape(3, 3)
+    if np.abs(written).max() > 2.0:
+        raise entry.fault("a rotation matrix, row by row")
+    left, stretch, right = np.linalg.svd(written)
+    if np.abs(stretch - 1.0).max() > 1e-2 or np.linalg.det(written) < 0.0:
+        raise entry.fault("a rotation matrix, row by row")
+    pose = se3.translation(node.need("cam_t_m2c").numbers(3) / 1000.0)
+    pose[:3, :3] = left @ right  # the rotation nearest to the rounded digits
+    return pose
+
+
+def camera_entry(matrix: Array, scale_mm: float) -> dict[str, object]:
+    """Return the entry of `scene_camera.json` for intrinsics (3, 3) in px."""
+    return {"cam_K": [float(value) for value in matrix.ravel()], "depth_scale": scale_mm}
+
+
+def pose_entry(pose: Array) -> dict[str, object]:
+    """Return the entry of `scene_gt.json` for camera_from_model (4, 4) in m."""
+    rotation, shift = pose[:3, :3].ravel(), pose[:3, 3] * 1000.0
+    return {"cam_R_m2c": [float(v) for v in rotation], "cam_t_m2c": [float(v) for v in shift], "obj_id": 1}
+
+
+@final
+@dataclass(frozen=True)
+class BopSequence(AbstractRecording):
+    """A BOP scene folder, the onboarding layouts among them.
+
+    Of several objects the first (`mask_visib/*_000000.png`, first ground truth) counts.
+    Opening checks the layout, the intrinsics and `sequence.json`; pictures and ground truth are read when asked for.
+    """
+
+    overrides: Overrides = field(default_factory=Overrides)
+    """What counts more than the folder."""
+
+    def __post_init__(self) -> None:
+        """Check everything that can be checked without decoding a picture.
+
+        Raises:
+            InputError: where the folder is no readable scene.
+        """
+        _ = self._depth_paths, self._intrinsics, self._times_s, self.name, self.sensor(), self.motion
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Frame numbers, ascending: the frames that have a depth image."""
+        return tuple(self._depth_paths)
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`, depth in m and NaN where nothing was measured."""
+        if index not in self._depth_paths:
+            raise self.absent(index)
+        path = self._depth_paths[index]
+        raw = read_depth(path)
+        matrix, scale_mm = self._intrinsics[index]
+        alike = self._depth_paths[self._first_with[matrix]]
+        if alike != path:
+            check_same_size(path, raw.shape, alike, "with the same cam_K; give each size its own in scene_camera.json")
+        camera = Camera(raw.shape[1], raw.shape[0], *matrix)
+        mask, colour = self._mask(index, raw.shape), self._colour(index, raw.shape)
+        return Frame(index, self._times_s[index], metres(raw, scale_mm), camera, mask, colour)
+
+    def truth(self) -> dict[int, Array] | None:
+        """Return the true camera_from_model (4, 4), in m, by frame number; None without `scene_gt.json`."""
+        path = self.path / "scene_gt.json"
+        if not path.is_file():
+            return None
+        objects = {index: node.elements() for index, node in read_tree(inside(path, self.path)).frames().items()}
+        firsts = {index: objects[index][0] for index in self.indices if objects.get(index)}
+        names = {
+            index: json.dumps(node.items()["obj_id"].value) for index, node in firsts.items() if node.get("obj_id")
+        }
+        for index, name in names.items():
+            at = next(iter(names))
+            if name != names[at]:
+                raise InputError(
+                    f"{path}: the first object of frame {at} is {names[at]}, of frame {index} {name}; "
+                    "list the same object first in every frame."
+                )
+        return {index: camera_from_model(node) for index, node in firsts.items()} or None
+
+    @property
+    def layout(self) -> str:
+        """What the sequence is stored as."""
+        return "BOP scene folder"
+
+    @property
+    def depth_unit(self) -> str:
+        """What one unit of stored depth is."""
+        scales = sorted({scale for _, scale in self._intrinsics.values()})
+        source = "scene_camera.json" if self.overrides.depth_scale_mm is None else "--depth-scale-mm"
+        return f"{' or '.join(f'{scale:g}' for scale in scales[:3])} mm ({source})"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the reader left out."""
+        left = [index for index in self._colour_paths if index not in self._depth_paths]
+        return (f"{len(left)} colour images have no depth image and are left out",) if left else ()
+
+    @cached_property
+    def _depth_paths(self) -> dict[int, Path]:
+        if not self.path.is_dir():
+            raise InputError(f"{self.path}: no such folder; give a BOP scene folder with depth/ and scene_camera.json.")
+        paths = _numbered(self.path, "depth", (".png", ".tif", ".tiff"))
+        if not paths:
+            raise InputError(f"{self.path / 'depth'}: holds no depth image; put 000000.png, 000001.png, ... there.")
+        return dict(sorted(paths.items()))
+
+    @cached_property
+    def _colour_paths(self) -> dict[int, Path]:
+        kinds = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+        return _numbered(self.path, "rgb", kinds) or _numbered(self.path, "gray", kinds)
+
+    @cached_property
+    def _intrinsics(self) -> dict[int, tuple[tuple[float, float, float, float], float]]:
+        path = self.path / "scene_camera.json"
+        nodes = read_tree(inside(path, self.path)).frames()
+        missing = [index for index in self.indices if index not in nodes]
+        if missing:
+            raise InputError(f"{path}: says nothing of frame {missing[0]}; add its cam_K and depth_scale.")
+        given_k, given_mm = self.overrides.intrinsics, self.overrides.depth_scale_mm
+        return {
+            index: (
+                intrinsics(nodes[index]) if given_k is None else given_k,
+                depth_scale_mm(nodes[index]) if given_mm is None else given_mm,
+            )
+            for index in self.indices
+        }
+
+    @cached_property
+    def _times_s(self) -> dict[int, float]:
+        node = None if self._meta is None else self._meta.get("timestamps_s")
+        if node is None:
+            return {index: float(index) for index in self.indices}
+        given = node.frames()
+        missing = [index for index in self.indices if index not in given]
+        if missing:
+            raise InputError(f"{node.path}: {node.where} lacks frame {missing[0]}; give every frame a time, or none.")
+        times = {index: given[index].number() for index in self.indices}
+        late = [i for i, j in zip(self.indices[1:], self.indices[:-1], strict=True) if times[i] <= times[j]]
+        if late:
+            raise InputError(f"{node.path}: {node.where} does not grow at frame {late[0]}; times must increase.")
+        return times
+
+    @cached_property
+    def _first_with(self) -> dict[tuple[float, float, float, float], int]:
+        """The first frame with each intrinsics: all of them must have its size."""
+        return {self._intrinsics[index][0]: index for index in reversed(self.indices)}
+
+    def _mask(self, index: int, size: tuple[int, ...]) -> BoolArray | None:
+        path = self.path / "mask_visib" / f"{self._depth_paths[index].stem}_000000.png"
+        if not path.is_file():
+            return None
+        mask = read_mask(inside(path, self.path))
+        check_size(path, mask.shape, size)
+        return mask
+
+    def _colour(self, index: int, size: tuple[int, ...]) -> npt.NDArray[np.uint8] | None:
+        path = self._colour_paths.get(index)
+        if path is None:
+            return None
+        colour = read_colour(path)
+        check_size(path, colour.shape[:2], size)
+        return colour
+
+
+def _numbered(root: Path, name: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Return the pictures of a folder of a sequence by the number that is their name."""
+    found: dict[int, Path] = {}
+    for path in entries(inside(root / name, root)):
+        number = frame_number(path.stem)
+        if path.suffix.lower() not in suffixes or number is None:
+            continue
+        if number in found:
+            raise InputError(f"{path}: is frame {number}, and so is {found[number].name}; remove one of them.")
+        found[number] = inside(path, root) if path.is_symlink() else path
+    return found
+
+
+def write_bop(
+    folder: Path,
+    frames: Iterable[Frame],
+    truth: Mapping[int, Array] | None = None,
+    meta: Mapping[str, object] | None = None,
+    *,
+    depth_scale_mm: float = 0.1,
+    colour_suffix: str = ".png",
+    files: Mapping[str, bytes] | None = None,
+) -> None:
+    """Write frames as a BOP scene folder; it appears complete or not at all.
+
+    Args:
+        folder: where to write; it may exist if it is empty.
+        frames: what to write, each taken once.
+        truth: camera_from_model (4, 4), in m, by frame number.
+        meta: entries of `sequence.json`; the frames' times are added.
+        depth_scale_mm: millimetres per unit of depth; with 0.1 depth reaches to 6.55 m.
+        colour_suffix: `.png`, or `.jpg` for small files.
+        files: more files by name, such as `model.ply` and `robot.txt`.
+
+    Raises:
+        InputError: where the folder is not empty or cannot be written, or depth does not fit into 16 bits.
+    """
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: exists already; remove it or give another --out.")
+    partial = folder.parent / f".{folder.name}.{os.getpid()}.partial"
+    try:
+        _tidy(folder)
+        partial.mkdir(parents=True)
+        _fill(partial, frames, truth, meta or {}, depth_scale_mm=depth_scale_mm, colour_suffix=colour_suffix)
+        for name, content in (files or {}).items():
+            (partial / name).write_bytes(content)
+        os.replace(partial, folder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}); check space and permissions.") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _tidy(folder: Path) -> None:
+    """Remove what programs that were killed have left of the folder beside it."""
+    for left in folder.parent.glob(f".{glob.escape(folder.name)}.*.partial"):
+        process = left.name.split(".")[-2]
+        try:
+            os.kill(int(process), 0)
+        except (ProcessLookupError, OverflowError):
+            shutil.rmtree(left, ignore_errors=True)
+        except (ValueError, PermissionError):
+            pass  # not ours, or still at it
+
+
+def _fill(
+    folder: Path,
+    frames: Iterable[Frame],
+    truth: Mapping[int, Array] | None,
+    meta: Mapping[str, object],
+    *,
+    depth_scale_mm: float,
+    colour_suffix: str,
+) -> None:
+    cameras: dict[str, object] = {}
+    times_s: dict[str, float] = {}
+    for frame in frames:
+        camera, stem = frame.camera, f"{frame.index:06d}"
+        matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+        cameras[str(frame.index)] = camera_entry(matrix, depth_scale_mm)
+        times_s[str(frame.index)] = frame.time_s
+        _picture(folder / "depth" / f"{stem}.png", _raw_depth(frame, depth_scale_mm))
+        if frame.mask is not None:
+            _picture(folder / "mask_visib" / f"{stem}_000000.png", frame.mask.astype(np.uint8) * np.uint8(255))
+        if frame.colour is not None:
+            _picture(folder / "rgb" / f"{stem}{colour_suffix}", frame.colour)
+    _json(folder / "scene_camera.json", cameras)
+    if truth is not None:
+        _json(folder / "scene_gt.json", {str(index): [pose_entry(pose)] for index, pose in truth.items()})
+    _json(folder / "sequence.json", {**meta, "timestamps_s": times_s}, indent=1)
+
+
+def _raw_depth(frame: Frame, depth_scale_mm: float) -> npt.NDArray[np.uint16]:
+    """Return depth in units of the file; 0 where nothing was measured."""
+    measured = np.isfinite(frame.depth_m)
+    units = np.rint(np.where(measured, frame.depth_m, 0.0) * (1000.0 / depth_scale_mm))
+    if units.max(initial=0.0) > np.iinfo(np.uint16).max or units.min(initial=0.0) < 0.0:
+        raise InputError(
+            f"frame {frame.index}: depth up to {units.max() * depth_scale_mm / 1000.0:.2f} m does not fit into 16 bits "
+            f"of {depth_scale_mm:g} mm; use a coarser unit or a shorter range."
+        )
+    return np.where(measured, np.maximum(units, 1.0), 0.0).astype(np.uint16)
+
+
+def _picture(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
+    path.parent.mkdir(exist_ok=True)
+    write_image(path, pixels)
+
+
+def _json(path: Path, content: Mapping[str, object], indent: int | None = None) -> None:
+    if indent is None:  # one line a frame keeps the file both small and readable
+        lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
+        text = f"{{\n{lines}\n}}\n"
+    else:
+        text = json.dumps(content, indent=indent) + "\n"
+    path.write_text(text, encoding="utf-8")
+
+
+_MM = 1e-3
+
+
+def true_mesh(sequence: AbstractSequence) -> Mesh:
+    """Return the true surface in m, in the model frame of `sequence.truth()`.
+
+    That is `model.ply` of the sequence, in m, as the renderer writes it; else, of a BOP scene, the model of its object
+    in the dataset's `models` folder, in mm.
+
+    Raises:
+        InputError: where there is none or it cannot be read.
+    """
+    if sequence.model_path is not None:
+        return read_mesh(sequence.model_path, 1.0)
+    if isinstance(sequence, BopSequence):
+        found = _of_dataset(sequence.path)
+        if found is not None:
+            return read_mesh(found, _MM)
+    raise InputError(
+        f"{sequence.name}: has no true surface to compare with; put model.ply (m) beside its frames, or BOP's models "
+        "folder (mm) beside its split"
+    )
+
+
+def _of_dataset(scene: Path) -> Path | None:
+    """Return the model of a scene's first object, beside the scene or its split."""
+    truth = scene / "scene_gt.json"
+    if not truth.is_file():
+        return None
+    objects = [node.elements() for node in read_tree(truth).frames().values()]
+    number = next((first[0].need("obj_id").value for first in objects if first), None)
+    if not isinstance(number, int):
+        return None
+    name, place = f"obj_{number:06d}.ply", scene.resolve()
+    candidates = [
+        folder / models / name for folder in (place, *place.parents[:2]) for models in ("models", "models_eval")
+    ]
+    return next((path for path in candidates if path.is_file()), None)

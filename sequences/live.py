@@ -1,0 +1,290 @@
+"""Live cameras: the sequence of frames of a running camera, and RealSense cameras."""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.types import Array, Camera, Frame, InputError
+from sequences.base import AbstractSequence, check_every, span
+from sequences.image_files import metres
+from sequences.intrinsics import Overrides
+from sequences.lens import Lens, coefficients
+
+FIRST = 10
+"""So many frames are taken before anything is said of the sequence."""
+
+
+PATIENCE = 100
+"""So often may a camera give the same image."""
+
+
+class AbstractCamera(ABC):
+    """A camera that is running."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What it is called."""
+
+    @property
+    @abstractmethod
+    def lens(self) -> Lens:
+        """The depth camera."""
+
+    @property
+    @abstractmethod
+    def unit_mm(self) -> float:
+        """Millimetres per unit of depth."""
+
+    @abstractmethod
+    def take(self) -> tuple[float, npt.NDArray[np.uint16], npt.NDArray[np.uint8] | None]:
+        """Return time in s, raw depth (h, w), and colour (h, w, 3) of the depth camera's pixels, of the newest image.
+
+        Raises:
+            InputError: where the camera gives none.
+        """
+
+
+@final
+@dataclass(frozen=True)
+class LiveSequence(AbstractSequence):
+    """What a camera sees from now on, an image whenever one is asked for, until it is told to stop."""
+
+    camera: AbstractCamera
+    """The running camera."""
+    seen: tuple[Frame, ...]
+    """What it saw first."""
+    every: int = 1
+    """Keep the first image and every so many-th after it."""
+    kept: slice = field(default_factory=lambda: slice(None, None))
+    """Keep these frame numbers."""
+    stop: Callable[[], bool] = lambda: False
+    """Asked before each image: whether to come to an end."""
+
+    @property
+    def name(self) -> str:
+        """What the camera is called."""
+        return self.camera.name
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Numbers of the first frames."""
+        return tuple(frame.index for frame in self.seen)
+
+    @property
+    def live(self) -> bool:
+        """True: more frames come."""
+        return True
+
+    def recorded(self) -> AbstractSequence:
+        """Return the sequence of the first frames alone."""
+        return replace(self, stop=lambda: True)
+
+    def frame(self, index: int) -> Frame:
+        """Return one of the first frames."""
+        for frame in self.seen:
+            if frame.index == index:
+                return frame
+        raise InputError(f"{self.name}: frame {index} is not kept; the first ones are {span(self.indices)}.")
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the first frames and then what the camera sees whenever the next is asked for."""
+        low, high = self.kept.start or 0, self.kept.stop
+        frames = itertools.chain(self.seen, self._coming())
+        yield from itertools.islice(frames, low, high, self.every)
+
+    def until(self, stop: Callable[[], bool]) -> LiveSequence:
+        """Return the sequence that ends when it is asked to."""
+        return replace(self, stop=stop)
+
+    def select(self, every: int = 1, frames: slice | None = None) -> LiveSequence:
+        """Return a part of the sequence.
+
+        Raises:
+            InputError: where nothing is left.
+        """
+        check_every(every)
+        return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
+
+    def truth(self) -> dict[int, Array] | None:
+        """Return None: a camera does not know."""
+        return None
+
+    def sensor(self) -> tuple[float, float] | None:
+        """Return None: a camera does not say."""
+        return None
+
+    @property
+    def motion(self) -> None:
+        """None: nothing is known."""
+        return None
+
+    @property
+    def layout(self) -> str:
+        """What the sequence comes from."""
+        return "live camera"
+
+    @property
+    def depth_unit(self) -> str:
+        """What one unit of depth is."""
+        return f"{self.camera.unit_mm:g} mm (the camera)"
+
+    def _coming(self) -> Iterator[Frame]:
+        last = self.seen[-1]
+        while not self.stop():
+            last = _next(self.camera, last.index + 1, last.time_s)
+            yield last
+
+
+def begin(camera: AbstractCamera, first: int | None = None) -> LiveSequence:
+    """Return what a camera sees from now on."""
+    seen: list[Frame] = []
+    for number in range(FIRST if first is None else first):
+        seen.append(_next(camera, number, seen[-1].time_s if seen else None))
+    return LiveSequence(camera, tuple(seen))
+
+
+def _next(camera: AbstractCamera, number: int, after_s: float | None) -> Frame:
+    """Return the first image that is not the one of `after_s` again, as it may come with another colour image."""
+    for _ in range(PATIENCE):
+        time_s, raw, colour = camera.take()
+        if time_s != after_s:
+            lens = camera.lens
+            depth_m = lens.straight(metres(raw, camera.unit_mm), float("nan"))
+            return Frame(number, time_s, depth_m, lens.camera, None, None if colour is None else lens.straight(colour))
+    raise InputError(f"{camera.name}: gives the same image again and again; plug it in anew.")
+
+
+SCHEME = "realsense:"
+"""What a path begins with that means a camera; its serial number may follow."""
+ADVICE = "a RealSense camera is read by its maker's library; pip install 'modeler[realsense]'"
+WARM_UP = 30
+"""Images after which exposure has settled."""
+PATIENCE_MS = 5000
+
+
+def open_camera(serial: str, overrides: Overrides, context: Any = None) -> LiveSequence:
+    """Start a camera.
+
+    Args:
+        serial: its serial number; empty for the only one.
+        overrides: what counts more than what the camera says.
+        context: where to look for cameras; everywhere without it.
+
+    Raises:
+        InputError: where the library is not installed, or no such camera gives images.
+    """
+    try:
+        library = importlib.import_module("pyrealsense2")
+    except ImportError:
+        raise InputError(f"{SCHEME}{serial}: {ADVICE}.") from None
+    camera = RealsenseCamera.start(library, serial, overrides, context)
+    for _ in range(WARM_UP if context is None else 0):
+        camera.take()
+    return begin(camera)
+
+
+def _check_present(rs: Any, context: Any, serial: str) -> None:
+    """Refuse a camera that is not there, for which the library would wait long."""
+    devices = list(context.query_devices())
+    if not devices:
+        raise InputError(f"{SCHEME.removesuffix(':')}: no camera is plugged in; connect one to a USB 3 port.")
+    number = rs.camera_info.serial_number
+    present = [device.get_info(number) for device in devices if device.supports(number)]
+    if serial and serial not in present:
+        raise InputError(f"{SCHEME}{serial}: no such camera is plugged in; there is {', '.join(present) or 'another'}.")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class RealsenseCamera(AbstractCamera):
+    """A camera that streams depth and colour."""
+
+    pipeline: Any
+    """Gives the images."""
+    align: Any
+    """Brings colour to the depth camera's pixels."""
+    model: str
+    """What the camera is."""
+    depth: Lens
+    """The depth camera."""
+    scale_mm: float
+    """Millimetres per unit."""
+
+    @classmethod
+    def start(cls, rs: Any, serial: str, overrides: Overrides, context: Any) -> RealsenseCamera:
+        """Start the camera with a serial number, or the only one.
+
+        Args:
+            rs: the library.
+            serial: may be empty.
+            overrides: what counts more than what the camera says.
+            context: where to look for cameras; None for everywhere.
+
+        Raises:
+            InputError: where it cannot be started.
+        """
+        where = f"{SCHEME}{serial}"
+        try:
+            context = rs.context() if context is None else context
+            _check_present(rs, context, serial)
+            pipeline, config = rs.pipeline(context), rs.config()
+            if serial:
+                config.enable_device(serial)
+            config.enable_stream(rs.stream.depth)
+            # With two arguments, the library would take the format for the number of a stream.
+            config.enable_stream(rs.stream.color, rs.format.rgb8, 0)
+            if not config.can_resolve(rs.pipeline_wrapper(pipeline)):
+                config.disable_stream(rs.stream.color)  # some cameras have none
+            profile = pipeline.start(config)
+            device = profile.get_device()
+            stream = profile.get_stream(rs.stream.depth).as_video_stream_profile()
+            intrinsics = stream.get_intrinsics()
+            unit_mm = 1000.0 * device.first_depth_sensor().get_depth_scale()
+            model = device.get_info(rs.camera_info.name) if device.supports(rs.camera_info.name) else "RealSense"
+        except RuntimeError as error:
+            raise InputError(f"{where}: cannot be started ({' '.join(str(error).split())}); plug it in anew.") from None
+        found = (intrinsics.fx, intrinsics.fy, intrinsics.ppx, intrinsics.ppy)
+        camera = Camera(intrinsics.width, intrinsics.height, *(overrides.intrinsics or found))
+        bend = () if overrides.intrinsics else coefficients(intrinsics.coeffs)
+        scale_mm = unit_mm if overrides.depth_scale_mm is None else overrides.depth_scale_mm
+        running = cls(pipeline, rs.align(rs.stream.depth), model, Lens(camera, bend), scale_mm)
+        weakref.finalize(running, pipeline.stop)
+        return running
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        return self.model
+
+    @property
+    def lens(self) -> Lens:
+        """The depth camera."""
+        return self.depth
+
+    @property
+    def unit_mm(self) -> float:
+        """Millimetres per unit of depth."""
+        return self.scale_mm
+
+    def take(self) -> tuple[float, npt.NDArray[np.uint16], npt.NDArray[np.uint8] | None]:
+        """Return the newest image; older ones that nobody asked for are lost."""
+        try:
+            frames = self.align.process(self.pipeline.wait_for_frames(PATIENCE_MS))
+            depth, colour = frames.get_depth_frame(), frames.get_color_frame()
+            raw = np.asanyarray(depth.get_data()).astype(np.uint16)
+            picture = np.array(colour.get_data(), dtype=np.uint8) if colour else None
+            return float(depth.get_timestamp()) / 1000.0, raw, picture
+        except RuntimeError as error:
+            raise InputError(
+                f"{self.model}: gives no image ({' '.join(str(error).split())}); plug it in anew."
+            ) from None
