@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.spatial import KDTree
 
 from modeler import se3
@@ -84,11 +85,9 @@ class Start:
     """Root mean square shift of `centre_m`, per axis."""
 
     @property
-    def information(self) -> Array:
-        """(6, 6) information of the spread about ξ at the start: isotropic about `centre_m`."""
-        at_centre = se3.adjoint(se3.translation(-self.centre_m))
-        weights = np.repeat([self.sigma_rad, self.sigma_m], 3) ** -2.0
-        return (at_centre.T * weights) @ at_centre
+    def sigmas(self) -> Array:
+        """(6,) standard deviations of ξ about `centre_m`: rad, then m."""
+        return np.repeat([self.sigma_rad, self.sigma_m], 3)
 
 
 def start(source: RayImage, target: RayImage, density: AbstractPoseDensity, rng: np.random.Generator) -> Start:
@@ -154,18 +153,19 @@ def plane_residuals(matches: Matches, pose: Array) -> tuple[Array, Array]:
     return np.sum(gaps * matches.partners.normals, axis=1), jacobian
 
 
-def scaled_information(residuals: Array, weights: Array, jacobian: Array) -> Array:
-    """Return the information (6, 6) of a least-squares fit whose noise is judged by its own residuals.
+def whitened_jacobian(residuals: Array, weights: Array, jacobian: Array) -> Array:
+    """Return a least-squares fit's Jacobian (n, 6), divided by the noise that the residuals themselves show.
 
-    The usual practice, which takes neighbouring residuals for independent and partners for true: it is over-confident
-    by orders of magnitude, and the negative control of calibration for that reason.
+    The usual practice assumes independent residuals and correct matches. It is over-confident by orders of magnitude,
+    and therefore the negative control in the calibration study.
 
     Args:
         residuals: (n,) in m.
         weights: (n,) between 0 and 1.
         jacobian: (n, 6) by ξ.
     """
-    return (jacobian.T * weights) @ jacobian / residual_variance(float(weights @ residuals**2), float(np.sum(weights)))
+    variance = residual_variance(float(weights @ residuals**2), float(np.sum(weights)))
+    return np.sqrt(weights / variance)[:, None] * jacobian
 
 
 def residual_variance(squares: float, count: float) -> float:
@@ -180,8 +180,8 @@ class Fit:
 
     target_from_source: Array
     """(4, 4)."""
-    information: Array
-    """(6, 6) about ξ, from the surfaces alone; may be singular."""
+    jacobian: Array
+    """(n, 6) whitened Jacobian by ξ, from the surfaces alone: JᵀJ is the information, which may be singular."""
     fitness: float
     """Share of the source's points that have a partner."""
 
@@ -215,13 +215,21 @@ def posterior(source: RayImage, target: RayImage, begin: Start, fit: Fit | None,
     Directions without information keep the prior's spread, so that the covariance is positive definite.
     """
     if fit is None:
-        pose = PoseGaussian(begin.target_from_source, _inverse(begin.information))
-        return Posterior(source.index, target.index, pose, Outcome.TOO_FEW_POINTS, 0.0, information=np.zeros((6, 6)))
-    pose = PoseGaussian(fit.target_from_source, _inverse(fit.information + begin.information))
+        pose = PoseGaussian(begin.target_from_source, _covariance(np.zeros((0, 6)), begin))
+        return Posterior(source.index, target.index, pose, Outcome.TOO_FEW_POINTS, 0.0)
+    pose = PoseGaussian(fit.target_from_source, _covariance(fit.jacobian, begin))
     outcome = Outcome.CONVERGED if fit.fitness >= min_fitness else Outcome.NO_OVERLAP
-    return Posterior(source.index, target.index, pose, outcome, fit.fitness, information=fit.information)
+    return Posterior(source.index, target.index, pose, outcome, fit.fitness)
 
 
-def _inverse(information: Array) -> Array:
-    covariance = np.linalg.inv(information)
+def _covariance(jacobian: Array, begin: Start) -> Array:
+    """Return the covariance (6, 6) of ξ under a whitened Jacobian (n, 6) and the prior's spread.
+
+    By QR of the two stacked, about the object's centre. Surfaces may be 10¹⁴ times as informative as the prior, and to
+    form and invert the sum of the informations would lose the prior's to rounding.
+    """
+    about_centre = jacobian @ se3.adjoint(se3.translation(begin.centre_m))
+    upper = np.linalg.qr(np.vstack([about_centre, np.diag(1.0 / begin.sigmas)]), mode="r")
+    root = se3.adjoint(se3.translation(begin.centre_m)) @ solve_triangular(upper, np.eye(6))
+    covariance = root @ root.T
     return 0.5 * (covariance + covariance.T)

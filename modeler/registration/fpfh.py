@@ -18,7 +18,7 @@ from modeler.registration.clouds import (
     matched,
     plane_residuals,
     registered,
-    scaled_information,
+    whitened_jacobian,
 )
 from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Posterior, RayImage
 
@@ -93,10 +93,10 @@ class FpfhRegistrar(AbstractRegistrar):
             source.points_m[pairs[:, 0]], target.points_m[pairs[:, 1]], _Score(scored, tree, reach_m), rng
         )
         if pose is None:
-            return Fit(otherwise, np.zeros((6, 6)), 0.0)
+            return Fit(otherwise, np.zeros((0, 6)), 0.0)
         matches = matched(source.points_m, target, tree, pose, reach_m)
         residuals, jacobian = plane_residuals(matches, pose)
-        return Fit(pose, scaled_information(residuals, np.ones(len(residuals)), jacobian), matches.fitness)
+        return Fit(pose, whitened_jacobian(residuals, np.ones(len(residuals)), jacobian), matches.fitness)
 
     def _ransac(self, source_m: Array, target_m: Array, score: _Score, rng: np.random.Generator) -> Array | None:
         best, best_score, drawn, needed = None, -np.inf, 0, np.inf

@@ -58,7 +58,7 @@ class GicpRegistrar(AbstractRegistrar):
         target_from_centred = se3.translation(target.centroid_m)
         pose = se3.inverse(target_from_centred) @ target_from_source @ source_from_centred
         centred = source.points_m - source.centroid_m, target.points_m - target.centroid_m
-        information, fitness = None, 0.0
+        jacobian, fitness = None, 0.0
         for voxel_m in cube_edges_m(Cloud.of(source), Cloud.of(target), self.voxels):
             (thin_source, _), (thin_target, tree) = (
                 small_gicp.preprocess_points(points, voxel_m, self.neighbours) for points in centred
@@ -78,9 +78,10 @@ class GicpRegistrar(AbstractRegistrar):
                 translation_epsilon=_STEP,
             )
             pose, fitness = result.T_target_source, result.num_inliers / thin_source.size()
-            information = result.H / residual_variance(2.0 * result.error, result.num_inliers)
-        if information is None:
+            curvatures, axes = np.linalg.eigh(result.H / residual_variance(2.0 * result.error, result.num_inliers))
+            jacobian = np.sqrt(np.maximum(curvatures, 0.0))[:, None] * axes.T
+        if jacobian is None:
             return None
         centred_from_source = se3.inverse(source_from_centred)
-        adjoint = se3.adjoint(centred_from_source)
-        return Fit(target_from_centred @ pose @ centred_from_source, adjoint.T @ information @ adjoint, fitness)
+        jacobian = jacobian @ se3.adjoint(centred_from_source)
+        return Fit(target_from_centred @ pose @ centred_from_source, jacobian, fitness)

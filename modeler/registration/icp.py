@@ -16,7 +16,7 @@ from modeler.registration.clouds import (
     matched,
     plane_residuals,
     registered,
-    scaled_information,
+    whitened_jacobian,
 )
 from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Posterior, RayImage
 
@@ -86,7 +86,7 @@ class IcpRegistrar(AbstractRegistrar):
         pose = pose @ se3.inverse(source_from_centred)
         matches = matched(source.points_m, target, tree, pose, reach_m)
         residuals, jacobian = plane_residuals(matches, pose)
-        return Fit(pose, scaled_information(residuals, _tukey(residuals / reach_m), jacobian), matches.fitness)
+        return Fit(pose, whitened_jacobian(residuals, _tukey(residuals / reach_m), jacobian), matches.fitness)
 
 
 def _tukey(ratios: Array) -> Array:
