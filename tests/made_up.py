@@ -23,6 +23,7 @@ from modeler.types import (
     Posterior,
     RayImage,
     Segmentation,
+    Stated,
     Step,
 )
 
@@ -44,7 +45,7 @@ def an_edge(target: int, source: int, rng: np.random.Generator, kind: EdgeKind =
     factor = rng.normal(size=(6, 6)) * 0.003 + 0.004 * np.eye(6)
     pose = PoseGaussian(se3.exp(step + 0.005 * rng.normal(size=6)), factor @ factor.T)
     posterior = Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.81, effective_samples=1234.5)
-    return Edge(replace(posterior, **changes), kind, True, "made up")
+    return Edge(replace(posterior, **changes), kind, True, Stated("made up"))
 
 
 def made_up_steps(count: int = 4, *, closure: bool = True) -> list[Step]:
@@ -68,7 +69,7 @@ def made_up_steps(count: int = 4, *, closure: bool = True) -> list[Step]:
                 view=view,
                 posteriors=tuple(edge.posterior for edge in edges),
                 edges=tuple(edges),
-                outcome="accepted",
+                left_out=None,
                 solution=solve(graph, {}),
                 model=ball(),
                 edges_so_far=graph.edges,

@@ -34,6 +34,7 @@ from modeler.types import (
     Posterior,
     RayImage,
     Solution,
+    Stated,
 )
 
 NORMAL = np.array([0.1, -0.8, -0.6]) / np.linalg.norm([0.1, -0.8, -0.6])
@@ -107,7 +108,10 @@ def edges(camera: Array, count: int = 5, noise: float = 1.0, seed: int = 0) -> t
         )
         found.append(
             Edge(
-                Posterior(k + 1, k, pose, outcome=Outcome.CONVERGED, overlap=0.9), "odometry", accepted=True, reason=""
+                Posterior(k + 1, k, pose, outcome=Outcome.CONVERGED, overlap=0.9),
+                "odometry",
+                accepted=True,
+                reason=Stated(""),
             )
         )
     return tuple(found)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.graph import PoseGraph
-from modeler.types import Array, Edge, EdgeKind, Mode, Outcome, PoseGaussian, Posterior
+from modeler.types import Array, Edge, EdgeKind, Mode, Outcome, PoseGaussian, Posterior, Stated
 
 OBJECT_M = np.array([0.05, 0.02, 0.8])
 
@@ -22,7 +22,7 @@ def edge(
     modes: Sequence[Mode] = (),
 ) -> Edge:
     posterior = Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.8, modes=tuple(modes))
-    return Edge(posterior, kind, accepted, "made up")
+    return Edge(posterior, kind, accepted, Stated("made up"))
 
 
 def covariance(rng: np.random.Generator, sigma_rad: float = 0.01, sigma_m: float = 0.002) -> Array:

@@ -59,7 +59,7 @@ def test_a_registration_is_held_against_the_way_there_as_long_as_that_is() -> No
         posterior, [(1.0, foretold)], length=4, centroid_m=centroid_m
     )  # 6, 5, 4, 3, 2
     assert found.distance == pytest.approx(over_four.distance)
-    assert found.off_deg == pytest.approx(1.0, abs=0.8)
+    assert found.angle_deg == pytest.approx(1.0, abs=0.8)
 
 
 def test_what_turned_away_on_the_way_came_back_whatever_the_frames_numbers() -> None:

@@ -8,7 +8,7 @@ from closing import ABOUT_OBJECT, COVARIANCE, REGULAR_DEG, Run, told, witnessed
 
 from modeler import se3
 from modeler.closure import Closer, MapView
-from modeler.types import Outcome, PoseGaussian, Posterior
+from modeler.types import ConfirmedBy, JoinsPrevious, LowEvidence, Outcome, PoseGaussian, Posterior
 
 
 def test_previous_view_is_not_believed_after_lost_frames_where_the_images_contradict_it() -> None:
@@ -19,7 +19,7 @@ def test_previous_view_is_not_believed_after_lost_frames_where_the_images_contra
     map_view = MapView(run.views, solution, run.graph.edges)
     assert Closer().placement([doubtful], map_view, steps=1)[0] is doubtful
     assert Closer().placement([doubtful], map_view, steps=4)[0] is None
-    assert Closer().judge([doubtful], map_view, steps=4)[0].reason.startswith("the images contradict it")
+    assert isinstance(Closer().judge([doubtful], map_view, steps=4)[0].reason, LowEvidence)
     assert Closer().placement([witnessed(doubtful, -30.0)], map_view, steps=4)[0] is not None
 
 
@@ -88,7 +88,7 @@ def test_far_from_where_the_motion_led_the_previous_view_is_believed_only_with_a
     assert [edge.accepted for edge in run.judged[11]].count(True) == (2 if believed else 0)
     if believed:
         assert run.tried[11][:2] == (6, 5)  # the nearest to where the previous view puts it
-        assert run.judged[11][0].reason == "joins the previous view: converged, overlap 0.80, frame 5 agrees"
+        assert run.judged[11][0].reason == JoinsPrevious(Outcome.CONVERGED, 0.8, ConfirmedBy(5))
 
 
 def test_a_view_seen_from_far_round_places_a_frame_only_with_a_witness() -> None:

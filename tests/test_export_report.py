@@ -16,7 +16,9 @@ from modeler.export import (
 )
 from modeler.types import (
     Outcome,
+    Stated,
     Step,
+    explain,
 )
 
 
@@ -53,7 +55,9 @@ def _spoilt(change: Callable[[Step], Step], meta: RunMeta, path: Path) -> dict[s
 
 def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
     lost = "no overlap: The views share too little surface"
-    report = _spoilt(lambda step: replace(step, outcome=lost) if step.frame.index == 7 else step, META, tmp_path)
+    report = _spoilt(
+        lambda step: replace(step, left_out=Stated(lost)) if step.frame.index == 7 else step, META, tmp_path
+    )
     assert (report["trustworthy"], report["reasons"]) == (False, [f"frame 7 was left out: {lost}"])
 
     report = _spoilt(lambda step: step, replace(META, closure_expected=True), tmp_path)
@@ -61,7 +65,9 @@ def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
     assert "no loop was closed" in report["reasons"][0]
 
     def refuse(step: Step) -> Step:
-        edges = [replace(edge, accepted=edge.kind == "odometry", reason="it lies") for edge in step.edges_so_far]
+        edges = [
+            replace(edge, accepted=edge.kind == "odometry", reason=Stated("it lies")) for edge in step.edges_so_far
+        ]
         return replace(step, edges_so_far=tuple(edges))
 
     report = _spoilt(refuse, META, tmp_path)
@@ -138,7 +144,7 @@ def test_posteriors_come_back_from_the_report_to_the_bit(tmp_path: Path) -> None
     for edge, back in zip(edges, edges_of(report), strict=True):
         posterior = back.posterior
         assert (back.source, back.target, back.kind) == (edge.source, edge.target, edge.kind)
-        assert (back.accepted, back.reason) == (edge.accepted, edge.reason)
+        assert (back.accepted, explain(back.reason)) == (edge.accepted, explain(edge.reason))
         np.testing.assert_array_equal(posterior.pose.mean, edge.posterior.pose.mean)
         np.testing.assert_array_equal(posterior.pose.covariance, edge.posterior.pose.covariance)
         assert posterior.outcome is edge.posterior.outcome

@@ -31,6 +31,7 @@ from modeler.types import (
     Posterior,
     RayImage,
     Solution,
+    Stated,
 )
 from sequences.bop import BopSequence
 
@@ -576,7 +577,7 @@ def test_own_covariances_do_not_know_of_drift(rng):
 
     def edge(target, source, *, accepted=True):
         pose = PoseGaussian(se3.exp(rng.normal(size=6)), covariance)
-        return Edge(Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.9), "odometry", accepted, "")
+        return Edge(Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.9), "odometry", accepted, Stated(""))
 
     edges = [edge(2, 5), edge(5, 6), edge(6, 9, accepted=False), edge(2, 6)]
     solution = Solution(trajectory={k: np.eye(4) for k in (2, 5, 6)}, outliers=(edges[3],))

@@ -19,7 +19,7 @@ from modeler.export import RunFolder, RunMeta, alone
 from modeler.fusion import Fuser, Matcher
 from modeler.graph import PoseGraph, solve
 from modeler.rays import Sensor
-from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Segmentation, Step
+from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Segmentation, Stated, Step
 from sequences import BopSequence, write_bop
 from sequences.rendering.recipe import Recipe, Table, Viewpoint
 from sequences.rendering.renderer import RenderedSequence
@@ -64,7 +64,7 @@ def true_run(sequence: RenderedSequence, scene: Path, path: Path) -> None:
     for before, after in [*zip(sequence.indices, sequence.indices[1:], strict=False), (0, sequence.indices[-1])]:
         pose = PoseGaussian(truth[before] @ se3.inverse(truth[after]), COVARIANCE)
         kind = "odometry" if after - before == 1 else "closure"
-        edges.append(Edge(Posterior(after, before, pose, Outcome.CONVERGED, overlap=0.9), kind, True, "true"))
+        edges.append(Edge(Posterior(after, before, pose, Outcome.CONVERGED, overlap=0.9), kind, True, Stated("true")))
     solution = solve(PoseGraph(tuple(edges), first=0), {})
     folder = RunFolder.open(path)
     meta = RunMeta(sequence=str(scene), seed=0, prior="turntable")
@@ -77,7 +77,7 @@ def true_run(sequence: RenderedSequence, scene: Path, path: Path) -> None:
             view=view,
             posteriors=(),
             edges=(),
-            outcome="accepted",
+            left_out=None,
             solution=solution,
             model=Fuser().fuse(views, solution.trajectory) if last else None,
             edges_so_far=tuple(edges),

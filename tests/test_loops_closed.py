@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-from modeler.types import Edge, EdgeKind, Outcome, PoseGaussian, Posterior, loops_closed
+from modeler.types import Edge, EdgeKind, Outcome, PoseGaussian, Posterior, Stated, loops_closed
 
 
 def edge(source: int, target: int, kind: EdgeKind = "odometry") -> Edge:
-    return Edge(Posterior(source, target, PoseGaussian(np.eye(4), np.eye(6)), Outcome.CONVERGED, 1.0), kind, True, "")
+    return Edge(
+        Posterior(source, target, PoseGaussian(np.eye(4), np.eye(6)), Outcome.CONVERGED, 1.0), kind, True, Stated("")
+    )
 
 
 CHAIN = [edge(1, 0), edge(2, 1), edge(3, 2)]

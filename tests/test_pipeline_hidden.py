@@ -8,13 +8,13 @@ from test_pipeline import FRAMES, Oracle, modeler, run, trajectory_error
 from modeler.pipeline import glancing
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.segmentation import Scene
-from modeler.types import Step
+from modeler.types import Reason, Step
 
 HIDDEN = frozenset({2, 3, 4, 5})
 
 
-def outcomes(steps: list[Step]) -> list[tuple[int, bool, str]]:
-    return [(step.frame.index, step.accepted, step.outcome) for step in steps]
+def outcomes(steps: list[Step]) -> list[tuple[int, bool, Reason | None]]:
+    return [(step.frame.index, step.accepted, step.left_out) for step in steps]
 
 
 def test_after_one_frame_searched_for_in_vain_others_that_are_hidden_are_only_glanced_at() -> None:

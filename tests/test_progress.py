@@ -15,8 +15,7 @@ import pytest
 
 from modeler.cli.console import Console
 from modeler.cli.inputs import reading
-from modeler.pipeline import ACCEPTED
-from modeler.types import Outcome, Segmentation, Solution, Step
+from modeler.types import Failed, Outcome, PriorRefused, Segmentation, Solution, Stated, Step, explain
 from sequences import bundled, open_sequence
 
 COMMAND = [sys.executable, "-m", "modeler", "info", str(bundled("tube"))]
@@ -51,12 +50,12 @@ def test_a_frame_left_out_is_told_once_and_so_is_that_it_was_placed(capfd: pytes
         view=None,
         posteriors=(),
         edges=(),
-        outcome="too few points",
+        left_out=Stated("too few points"),
         solution=Solution(),
         model=None,
     )
     with Console(2, None) as console:
-        for step in (lost, lost, replace(lost, outcome=ACCEPTED)):
+        for step in (lost, lost, replace(lost, left_out=None)):
             console(step)
     assert (
         capfd.readouterr().err == "modeler: frame 0 is left out: too few points\nmodeler: frame 0 is placed after all\n"
@@ -67,22 +66,22 @@ def test_what_to_do_about_frames_left_out_is_told_once(capfd: pytest.CaptureFixt
     frame = next(iter(open_sequence(bundled("tube"))))
     few, unsure = Outcome.TOO_FEW_POINTS, Outcome.UNSURE_MASK
     nothing = Segmentation(np.zeros_like(frame.depth_m, dtype=bool), None, few)
-    lost = Step(frame, nothing, None, (), (), "", Solution(), None)
+    lost = Step(frame, nothing, None, (), (), None, Solution(), None)
     outcomes = [
-        f"{few.label}: {few.advice}",
-        f"{few.label}: {few.advice}",
-        f"{unsure.label}: {unsure.advice}",
-        "frames 3 and 2 show no plane; show it",
-        "frames 4 and 2 show no plane; show it",
+        Failed(few),
+        Failed(few),
+        Failed(unsure),
+        PriorRefused("frames 3 and 2 show no plane; show it"),
+        PriorRefused("frames 4 and 2 show no plane; show it"),
     ]
     with Console(5, None) as console:
         for number, outcome in enumerate(outcomes):
-            console(replace(lost, frame=replace(frame, index=number), outcome=outcome))
+            console(replace(lost, frame=replace(frame, index=number), left_out=outcome))
     assert capfd.readouterr().err.splitlines() == [
-        f"modeler: frame 0 is left out: {outcomes[0]}",
+        f"modeler: frame 0 is left out: {explain(outcomes[0])}",
         f"modeler: frame 1 is left out: {few.label}",
-        f"modeler: frame 2 is left out: {outcomes[2]}",
-        f"modeler: frame 3 is left out: {outcomes[3]}",
+        f"modeler: frame 2 is left out: {explain(outcomes[2])}",
+        f"modeler: frame 3 is left out: {explain(outcomes[3])}",
         "modeler: frame 4 is left out: frames 4 and 2 show no plane",
     ]
 
@@ -91,11 +90,11 @@ def test_frames_that_are_left_out_in_a_row_are_told_together(capfd: pytest.Captu
     frame = next(iter(open_sequence(bundled("tube"))))
     few = Outcome.TOO_FEW_POINTS
     nothing = Segmentation(np.zeros_like(frame.depth_m, dtype=bool), None, few)
-    lost = Step(frame, nothing, None, (), (), f"{few.label}: {few.advice}", Solution(), None)
+    lost = Step(frame, nothing, None, (), (), Failed(few), Solution(), None)
     with Console(12, None) as console:
         for number in range(12):
-            outcome = ACCEPTED if number in (0, 9) else lost.outcome
-            console(replace(lost, frame=replace(frame, index=number), outcome=outcome))
+            outcome = None if number in (0, 9) else lost.left_out
+            console(replace(lost, frame=replace(frame, index=number), left_out=outcome))
     assert capfd.readouterr().err.splitlines() == [
         f"modeler: frame 1 is left out: {few.label}: {few.advice}",
         f"modeler: frame 2 is left out: {few.label}",

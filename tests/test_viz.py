@@ -15,7 +15,7 @@ from PIL import Image
 from streamed import MERGED, Recording, drawn, read, record
 from turning_box import CENTRE_M, HALF_M, LOST, steps
 
-from modeler.types import Outcome, Plane, PoseGaussian, Segmentation, Solution, Step
+from modeler.types import Failed, Outcome, Plane, PoseGaussian, Segmentation, Solution, Step
 from viz import blueprint, clouds, entities, images
 from viz.stream import open_stream
 
@@ -188,7 +188,7 @@ def odd_steps(run: list[Step]) -> list[Step]:
     unknown = Solution(step.solution.trajectory, {1: np.full((6, 6), np.nan)}, {})
     posterior = step.posteriors[0]
     lost = replace(posterior, pose=PoseGaussian(posterior.pose.mean, np.full((6, 6), np.inf)))
-    bare = Step(blind, nothing, None, (), (), Outcome.TOO_FEW_POINTS.label, Solution(), None)
+    bare = Step(blind, nothing, None, (), (), Failed(Outcome.TOO_FEW_POINTS), Solution(), None)
     return [
         bare,
         replace(bare, last=True),

@@ -16,6 +16,7 @@ from modeler.types import (
     Camera,
     Edge,
     EdgeKind,
+    Failed,
     Frame,
     ObjectModel,
     Outcome,
@@ -24,6 +25,7 @@ from modeler.types import (
     RayImage,
     Segmentation,
     Solution,
+    Stated,
     Step,
 )
 
@@ -63,7 +65,7 @@ def steps(count: int = 5, *, width: int = 96, lost: int | None = None, colour: b
             view=view,
             posteriors=tuple(posteriors),
             edges=tuple(judged),
-            outcome="accepted" if found else Outcome.NO_OVERLAP.label,
+            left_out=None if found else Failed(Outcome.NO_OVERLAP),
             solution=Solution(trajectory, dict(covariances), dict(chain)),
             model=_model(views, trajectory, colour=colour),
             edges_so_far=tuple(edges),
@@ -104,7 +106,9 @@ def _registrations(
             seconds=0.2 + 0.01 * index,
         )
         posteriors.append(posterior)
-        edges.append(Edge(posterior, kind, accepted, "converged" if accepted else "disagrees with the graph by 5 sd"))
+        edges.append(
+            Edge(posterior, kind, accepted, Stated("converged" if accepted else "disagrees with the graph by 5 sd"))
+        )
     return posteriors, edges
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from modeler.export.report import undetermined
-from modeler.types import Array, Edge, PoseGaussian, Posterior, Step
+from modeler.types import ACCEPTED, Array, Edge, PoseGaussian, Posterior, Step, explain
 from viz import certainty, entities, poses
 from viz.drawings import Drawing
 
@@ -65,11 +65,15 @@ def words(step: Step) -> Drawing:
     """Yield what happened to the frame in words, and a line for the log for each pair."""
     level = rr.TextLogLevel.INFO if step.accepted else rr.TextLogLevel.WARN
     if not step.edges:
-        yield entities.LOG, rr.TextLog(f"frame {step.frame.index}: {step.outcome}", level=level)
+        yield entities.LOG, rr.TextLog(f"frame {step.frame.index}: {_outcome(step)}", level=level)
     for edge in step.edges:
         level = rr.TextLogLevel.INFO if edge.accepted else rr.TextLogLevel.WARN
         yield entities.LOG, rr.TextLog(pair_words(edge, step), level=level)
     yield entities.NOW, rr.TextDocument(now_words(step), media_type=rr.MediaType.MARKDOWN)
+
+
+def _outcome(step: Step) -> str:
+    return ACCEPTED if step.left_out is None else explain(step.left_out)
 
 
 def pair_words(edge: Edge, step: Step) -> str:
@@ -77,7 +81,7 @@ def pair_words(edge: Edge, step: Step) -> str:
     posterior = edge.posterior
     verdict = edge.kind if edge.accepted else f"{edge.kind} rejected"
     if not edge.accepted and posterior.usable:  # else the outcome is the reason
-        verdict += f" ({edge.reason})"
+        verdict += f" ({explain(edge.reason)})"
     known = ", ".join(certainty.words(posterior, _centre_m(step)))
     return f"{edge.source} → {edge.target} {verdict}: {posterior.outcome.label}; {known}"
 
@@ -93,7 +97,7 @@ def now_words(step: Step) -> str:
         if left is not None and len(left) > 1:
             lines.append(f"  - all edges together leave to its modes {', '.join(f'{100 * w:.0f}%' for w in left)}")
     if not step.edges:
-        lines.append("- The first view of the object." if step.accepted else f"- {step.outcome}")
+        lines.append("- The first view of the object." if step.accepted else f"- {_outcome(step)}")
     kinds = [edge.kind for edge in step.edges_so_far if poses.takes_part(edge, step)]
     for edge in step.solution.outliers:
         lines.append(f"- {edge.source} → {edge.target} {edge.kind} is left out, for all other edges contradict it.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import signal
 import sys
 from collections.abc import Iterable, Iterator
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from modeler.types import Step
+    from modeler.types import Reason, Step
 
 T = TypeVar("T")
 
@@ -153,8 +152,8 @@ class Console:
             self._unsure.add(frame)
         description = f"{len(step.views)} joined, {loops} {'loop' if loops == 1 else 'loops'} closed"
         self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=description)
-        if not accepted and not again:
-            self._tell(frame, f"left out: {self._why(step.outcome)}")
+        if step.left_out is not None and not again:
+            self._tell(frame, f"left out: {self._why(step.left_out)}")
         elif accepted and again:
             self._tell(frame, "placed after all")
         elif accepted:
@@ -190,13 +189,15 @@ class Console:
             self._say(f"frames {self._held[0]} to {self._held[-1]} are {self._told}")
         self._told, self._aloud, self._held = "", 0, []
 
-    def _why(self, outcome: str) -> str:
+    def _why(self, reason: Reason) -> str:
         """Return why a frame was left out, with what to do about it where that has not been said yet."""
-        what, *advice = re.split(": |; ", outcome, maxsplit=1)
-        if not advice or advice[0] not in self._advised:
-            self._advised.update(advice)
-            return outcome
-        return what
+        from modeler.types import advice, explain, summary
+
+        what_to_do = advice(reason)
+        if what_to_do in self._advised:
+            return summary(reason)
+        self._advised.update([what_to_do] if what_to_do else [])
+        return explain(reason)
 
     def _say(self, text: str) -> None:
         self._bar.console.print(f"modeler: {text}", markup=False)

@@ -186,16 +186,16 @@ def _judged(posterior: Posterior, guess: Array) -> Edge:
     import numpy as np
 
     from modeler import se3
-    from modeler.types import Edge
+    from modeler.types import Edge, Failed, Stated
 
     off = se3.inverse(guess) @ posterior.pose.mean
     away = float(se3.rotation_angle(off)) > _FARTHEST_RAD
     lasting = replace(posterior, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
     if not posterior.usable:
-        return Edge(lasting, "closure", False, f"{posterior.outcome.label}: {posterior.outcome.advice}")
+        return Edge(lasting, "closure", False, Failed(posterior.outcome))
     if away:
-        return Edge(lasting, "closure", False, "lies elsewhere than the models laid on each other")
-    return Edge(lasting, "closure", True, "joins the runs")
+        return Edge(lasting, "closure", False, Stated("lies elsewhere than the models laid on each other"))
+    return Edge(lasting, "closure", True, Stated("joins the runs"))
 
 
 def _facing(first: Reopened, second: Reopened, target_from_source: Array, count: int) -> list[tuple[int, int]]:
@@ -294,7 +294,7 @@ def _step(view: RayImage, *, solution: Solution, views: Mapping[int, RayImage]) 
     """Return a step of one view that is part of the model."""
     import numpy as np
 
-    from modeler.types import ACCEPTED, Outcome, Segmentation, Step
+    from modeler.types import Outcome, Segmentation, Step
 
     mask = view.frame.mask if view.frame.mask is not None else np.isfinite(view.frame.depth_m)
     return Step(
@@ -303,7 +303,7 @@ def _step(view: RayImage, *, solution: Solution, views: Mapping[int, RayImage]) 
         view=view,
         posteriors=(),
         edges=(),
-        outcome=ACCEPTED,
+        left_out=None,
         solution=solution,
         model=None,
         views=views,

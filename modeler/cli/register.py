@@ -34,7 +34,7 @@ class Register:
         """Register the pair; status 3 where the result would not become an edge."""
         from modeler.cli import compose
         from modeler.export import edge_record
-        from modeler.types import Edge, InputError, Solution
+        from modeler.types import Edge, InputError, Solution, Stated
         from sequences import open_sequence
 
         if self.source == self.target:
@@ -50,7 +50,7 @@ class Register:
                 raise InputError(f"{self.sequence}: frame {index} has {outcome.label}. {outcome.advice}")
             views.append(view)
         posterior = modeler.register(*views)
-        edge = Edge(posterior, "odometry", posterior.usable, posterior.outcome.advice)
+        edge = Edge(posterior, "odometry", posterior.usable, Stated(posterior.outcome.advice))
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}
         print(json.dumps(record, allow_nan=False))
         _, remark = compose.told(self.prior, sequence)

@@ -8,16 +8,25 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from modeler import se3
-from modeler.closure.consistency import Agreement, Thresholds, flaw, modes, open_turn, thresholds_from
+from modeler.closure.consistency import Thresholds, flaw, modes, open_turn, thresholds_from
 from modeler.closure.consistency_model import ConsistencyModel
 from modeler.closure.extrapolation import came_back, composed
 from modeler.closure.information_gain import InformationGain
 from modeler.closure.map_view import MapView
 from modeler.closure.paths import ShortestPaths
 from modeler.closure.relocaliser import Relocaliser
-from modeler.types import Edge, EdgeKind, PoseGaussian, Posterior, Solution
+from modeler.types import (
+    Consistency,
+    Edge,
+    EdgeKind,
+    NotPlaced,
+    OpenRotation,
+    PoseGaussian,
+    Posterior,
+    Reason,
+    Solution,
+)
 
-_NOWHERE = "neither the previous view nor another one places the frame with certainty"
 _LEAST_CHANCE = 0.02  # that a view is in reach: one that comes back after a turn that nothing told tells very much
 _NO_NEWS = 0.5  # of a sigma: who knows a turn better learns little of it, and what else an edge tells is welcome
 _SPAN_POWER = 6.0  # an edge over 25° tells half as much as one over none, over 50° a fourteenth
@@ -133,7 +142,7 @@ class Closer:
 
     def placement(
         self, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1
-    ) -> tuple[Posterior | None, str]:
+    ) -> tuple[Posterior | None, Reason]:
         """Return the posterior that places a frame, and why: the previous view's, or else another's. See `Relocaliser`.
 
         Args:
@@ -166,7 +175,7 @@ class Closer:
             elif (found := flaw(posterior, thresholds if number or steps > 1 else None)) is not None:
                 edge = Edge(posterior, kind, accepted=False, reason=found)
             elif base is None:
-                edge = Edge(posterior, kind, accepted=False, reason=_NOWHERE)
+                edge = Edge(posterior, kind, accepted=False, reason=NotPlaced())
             elif (
                 found := self._open(posterior, self.predicted_motion(base, posterior.target, map_view.solution))
             ) is not None:
@@ -189,14 +198,13 @@ class Closer:
         agreed = self.consistency_model.agreement(posterior, [(1.0, foretold)], length=length, centroid_m=centroid_m)
         return _judged(posterior, kind, agreed)
 
-    def _open(self, posterior: Posterior, foretold: PoseGaussian) -> str | None:
+    def _open(self, posterior: Posterior, foretold: PoseGaussian) -> Reason | None:
         """Return what keeps a registration out that tells too little of a turn nobody else tells of; None: nothing."""
         sigma_rad, axis = open_turn(posterior)
         known_rad = float(np.sqrt(axis @ foretold.covariance[:3, :3] @ axis))
         if np.degrees(sigma_rad) <= self.max_open_deg or known_rad <= _NO_NEWS * sigma_rad:
             return None
-        sigma_deg = np.degrees(sigma_rad)
-        return f"it leaves a turn open by ±{sigma_deg:.0f}°, of which the edges that placed the frames know as much"
+        return OpenRotation(float(np.degrees(sigma_rad)))
 
     def _back(self, target: int, source: int, reach: ShortestPaths, map_view: MapView) -> bool:
         return came_back(target, source, reach, map_view, away_deg=self.away_deg)
@@ -210,8 +218,6 @@ class Closer:
         )
 
 
-def _judged(posterior: Posterior, kind: EdgeKind, agreed: Agreement) -> Edge:
+def _judged(posterior: Posterior, kind: EdgeKind, found: Consistency) -> Edge:
     """Return an edge that is accepted where it agrees with the others."""
-    agreeing = "closes the loop" if kind == "closure" else "spans several steps"
-    verdict = agreeing if agreed.agrees else "contradicts the chain"
-    return Edge(posterior, kind, agreed.agrees, f"{verdict}: {agreed.words}")
+    return Edge(posterior, kind, found.consistent, found)

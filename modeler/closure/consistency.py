@@ -9,7 +9,20 @@ from itertools import islice, product
 import numpy as np
 
 from modeler import se3
-from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Solution
+from modeler.types import (
+    Array,
+    Consistency,
+    Degenerate,
+    Edge,
+    Failed,
+    LowEvidence,
+    LowOverlap,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    Reason,
+    Solution,
+)
 
 RADIUS = 4.7390  # √χ²₆(0.999): Mahalanobis distance that 1 of 1000 true closures exceeds
 _RECENT, _FEWEST = 30, 5  # edges whose evidence tells what is usual
@@ -50,21 +63,20 @@ def thresholds_from(edges: Sequence[Edge], solution: Solution, *, min_overlap: f
     return Thresholds(min_overlap, usual, usual - max(drop_nats, 8.0 * scatter))
 
 
-def flaw(posterior: Posterior, thresholds: Thresholds | None = None) -> str | None:
+def flaw(posterior: Posterior, thresholds: Thresholds | None = None) -> Reason | None:
     """Return what keeps a posterior out of the graph whatever the others say; None: nothing."""
     if not posterior.usable:
-        return f"{posterior.outcome.label}: {posterior.outcome.advice}"
+        return Failed(posterior.outcome)
     pose = posterior.pose
     if not (np.isfinite(pose.mean).all() and np.isfinite(pose.covariance).all()):
-        return "the posterior is not finite: the registration broke down"
+        return Degenerate(finite=False)
     variances = np.linalg.eigvalsh(pose.covariance)
     if variances[0] <= 1e-15 * variances[-1]:
-        return "the covariance is not positive definite: the registration is degenerate"
+        return Degenerate(finite=True)
     if thresholds is not None and not posterior.overlap >= thresholds.min_overlap:
-        return f"the overlap {posterior.overlap:.2f} is below {thresholds.min_overlap:.2f}"
+        return LowOverlap(posterior.overlap, thresholds.min_overlap)
     if thresholds is not None and posterior.log_evidence < thresholds.least_nats:
-        usual = thresholds.usual_nats
-        return f"the images contradict it: log evidence {posterior.log_evidence:.0f}, of others {usual:.0f}"
+        return LowEvidence(posterior.log_evidence, thresholds.usual_nats)
     return None
 
 
@@ -83,32 +95,6 @@ def stands(posterior: Posterior, thresholds: Thresholds) -> bool:
     return posterior.outcome is Outcome.CONVERGED and flaw(posterior, thresholds) is None
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """How far a registration is from what the graph predicts."""
-
-    distance: float
-    """Mahalanobis distance, of the nearest modes where there are several."""
-    off_deg: float
-    """Angle between the two."""
-    off_m: float
-    """Distance between the two at the object."""
-    weight: float
-    """Share (0..1) of the posterior's mass in modes that agree."""
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the registration may be true if the prediction is."""
-        return self.distance <= RADIUS and self.weight >= _LEAST_WEIGHT
-
-    @property
-    def words(self) -> str:
-        """The agreement as a report has it."""
-        sizes = f"{self.off_deg:.1f}° and {1000.0 * self.off_m:.1f} mm from its prediction"
-        words = f"{sizes}, distance {self.distance:.1f} of {RADIUS:.1f} allowed"
-        return words if self.weight == 1.0 else f"{words}, {100.0 * self.weight:.0f} % of the modes' mass agrees"
-
-
 def modes(posterior: Posterior) -> list[tuple[float, PoseGaussian]]:
     """Return the separate modes of a posterior with their weights, heaviest first; itself where it has but one."""
     return [(mode.weight, mode.pose) for mode in posterior.modes] or [(1.0, posterior.pose)]
@@ -121,7 +107,7 @@ def agreement(
     systematic: Array,
     scale: float,
     centroid_m: Array,
-) -> Agreement:
+) -> Consistency:
     """Compare a posterior, mode by mode, with predictions of the same target_from_source.
 
     Args:
@@ -140,9 +126,11 @@ def agreement(
         agreeing += weight * own_weight if distance <= RADIUS else 0.0
         if distance < nearest:
             nearest, difference = distance, apart
-    return Agreement(
+    return Consistency(
         distance=nearest,
-        off_deg=float(np.degrees(se3.rotation_angle(difference))),
-        off_m=float(np.linalg.norm(se3.transform(difference, centroid_m[None])[0] - centroid_m)),
+        max_distance=RADIUS,
+        angle_deg=float(np.degrees(se3.rotation_angle(difference))),
+        offset_m=float(np.linalg.norm(se3.transform(difference, centroid_m[None])[0] - centroid_m)),
         weight=1.0 if len(predictions) * len(modes(posterior)) == 1 else agreeing,
+        min_weight=_LEAST_WEIGHT,
     )

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
-from modeler.closure.consistency import Agreement, agreement, modes
+from modeler.closure.consistency import agreement, modes
 from modeler.closure.extrapolation import composed
 from modeler.closure.map_view import MapView
 from modeler.closure.paths import ShortestPaths
-from modeler.types import Array, PoseGaussian, Posterior
+from modeler.types import Array, Consistency, PoseGaussian, Posterior
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class ConsistencyModel:
         *,
         length: int,
         centroid_m: Array,
-    ) -> Agreement:
+    ) -> Consistency:
         """Return how well a registration agrees with what a chain of edges says of the same motion.
 
         Args:
@@ -65,7 +65,7 @@ class ConsistencyModel:
         posterior: Posterior,
         map_view: MapView,
         reach: ShortestPaths,
-    ) -> Agreement:
+    ) -> Consistency:
         """Return how well a registration of a frame agrees with the way through the graph and along another of it.
 
         Args:

@@ -12,7 +12,7 @@ from modeler.closure.consistency import Thresholds, flaw, modes, stands
 from modeler.closure.consistency_model import ConsistencyModel
 from modeler.closure.extrapolation import extrapolated
 from modeler.closure.map_view import MapView
-from modeler.types import Posterior
+from modeler.types import ConfirmedBy, JoinsPrevious, NearExtrapolation, NotPlaced, Posterior, Reason, Relocalised
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,30 +35,27 @@ class Relocaliser:
     steps: int = 1
     """How many frames lie between the previous view and this frame, this one counted."""
 
-    def base(self, posteriors: Sequence[Posterior]) -> tuple[Posterior | None, str]:
+    def base(self, posteriors: Sequence[Posterior]) -> tuple[Posterior | None, Reason]:
         """Return the posterior that places a frame, and why.
 
         Args:
             posteriors: registrations of the frame, the previous view first.
         """
         if not posteriors:
-            return None, ""
+            return None, NotPlaced()
         odometry = posteriors[0]
-        joins = f"joins the previous view: {odometry.outcome.label}, overlap {odometry.overlap:.2f}"
         if self._follows(odometry) and (self.steps == 1 or self._off_deg(odometry) <= self.max_angle_deg):
-            return odometry, joins
+            return odometry, JoinsPrevious(odometry.outcome, odometry.overlap)
         standing = [posterior for posterior in posteriors if stands(posterior, self.thresholds)]
         for posterior in sorted(standing, key=lambda posterior: -posterior.overlap):
-            instead = f"joins in place of the failed previous view: overlap {posterior.overlap:.2f}"
-            reason = joins if posterior is odometry else instead
             off_deg = self._off_deg(posterior)
             # Near the end of what views can be registered across, one alone may be cut off there.
             turned_deg = float(np.degrees(se3.rotation_angle(posterior.pose.mean)))
             if max(off_deg, turned_deg) <= self.max_angle_deg:
-                return posterior, f"{reason}, {off_deg:.0f}° from the motion going on"
+                return posterior, _reason(posterior, odometry, NearExtrapolation(off_deg))
             if (witness := self._witness(posterior, standing)) is not None:
-                return posterior, f"{reason}, frame {witness.target} agrees"
-        return None, ""
+                return posterior, _reason(posterior, odometry, ConfirmedBy(witness.target))
+        return None, NotPlaced()
 
     def next(self, posteriors: Sequence[Posterior]) -> int | None:
         """Return the earlier view to register a lost frame against next; None where none is left.
@@ -100,7 +97,7 @@ class Relocaliser:
         agreeing = (
             other
             for other in others
-            if self.consistency_model.consistency_through(posterior, other, self.map_view, reach).agrees
+            if self.consistency_model.consistency_through(posterior, other, self.map_view, reach).consistent
         )
         return next(agreeing, None)
 
@@ -111,3 +108,9 @@ class Relocaliser:
         expected = extrapolated(self.map_view.solution, self.map_view.frames, posterior.source)
         placed = self.map_view.solution.trajectory[posterior.target] @ modes(posterior)[0][1].mean
         return float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ placed)))
+
+
+def _reason(posterior: Posterior, odometry: Posterior, support: NearExtrapolation | ConfirmedBy) -> Reason:
+    if posterior is odometry:
+        return JoinsPrevious(posterior.outcome, posterior.overlap, support)
+    return Relocalised(posterior.overlap, support)

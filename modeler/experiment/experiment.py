@@ -27,6 +27,7 @@ from modeler.types import (
     Posterior,
     RayImage,
     Solution,
+    Stated,
 )
 
 _SPARSE_STREAM = 1  # the random stream that thins frame k is [seed, k, this]; pairs draw from [seed, source, target]
@@ -89,7 +90,9 @@ class Experiment:
                     continue
                 if self.learn and answer.usable:
                     lasting = answer.without_samples()
-                    trusted[name].append(Edge(lasting, "odometry", accepted=True, reason="the method stands by it"))
+                    trusted[name].append(
+                        Edge(lasting, "odometry", accepted=True, reason=Stated("the method reports success"))
+                    )
                 yield blank.answered(answer, truth, source.centroid_m)
 
     def _frames(self, recorded: Recorded) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from modeler import se3
-from modeler.types import Array, Edge, EdgeKind, InputError, Mode, ObjectModel, Outcome, PoseGaussian, Posterior
+from modeler.types import Array, Edge, EdgeKind, InputError, Mode, ObjectModel, Outcome, PoseGaussian, Posterior, Stated
 
 Test = Callable[[Any], bool]
 _FARTHEST_M, _WIDEST, _NARROWEST = 1e6, 1e9, 1e-30
@@ -21,7 +21,7 @@ _ROUND = 1e-6
 def edges_of(report: Mapping[str, Any]) -> tuple[Edge, ...]:
     """Return the edges in a report, in order, as they were judged; their posteriors are without samples."""
     return tuple(
-        Edge(_posterior(record), _kind(record), record["accepted"], record.get("reason", ""))
+        Edge(_posterior(record), _kind(record), record["accepted"], Stated(record.get("reason", "")))
         for record in report["edges"]
     )
 

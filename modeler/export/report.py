@@ -18,11 +18,13 @@ from modeler.types import (
     Array,
     Edge,
     Mode,
+    OptimisationOutlier,
     PoseGaussian,
     Posterior,
     RayImage,
     Solution,
     Step,
+    explain,
     joined_without,
     loops_closed,
 )
@@ -31,7 +33,6 @@ _SCHEMA = 1
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
 _LITTLE_OVERLAP = 0.5  # views farther apart are registered wrongly now and then, and surely so
 _UNSURE_DEG = 5.0  # standard deviation of a frame's turn beyond which the model shows a surface several times
-_OUTLIER = "the optimisation left it out: all other edges contradict it"
 _FREE_RAD = np.radians(8.0)  # two such are the usual step between views: the edge does not tell whether there was one
 _FREE_M = 0.01  # surfaces of a hand-sized object then come to lie visibly apart
 _ALIKE = np.cos(np.radians(25.0))  # nearer than this, a direction goes by the name of another
@@ -88,7 +89,8 @@ class FrameRecord:
 def frame_record(step: Step) -> FrameRecord:
     """Return what became of the frame of a step."""
     points = 0 if step.view is None else len(step.view.points_m)
-    return FrameRecord(step.frame.index, float(step.frame.time_s), points, step.outcome)
+    outcome = ACCEPTED if step.left_out is None else explain(step.left_out)
+    return FrameRecord(step.frame.index, float(step.frame.time_s), points, outcome)
 
 
 def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[str, Any]:
@@ -195,7 +197,7 @@ def _taking_part(step: Step) -> list[Edge]:
 
 
 def _reason(edge: Edge, step: Step) -> str:
-    return _OUTLIER if edge in step.solution.outliers else edge.reason
+    return explain(OptimisationOutlier() if edge in step.solution.outliers else edge.reason)
 
 
 def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) -> dict[str, Any]:
@@ -216,7 +218,7 @@ def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) ->
         "span": edge.kind == "span",  # of the odometry, those that only join frames which others placed
         "accepted": solution.takes_part(edge),
         "outcome": posterior.outcome.label,
-        "reason": _OUTLIER if outlier else edge.reason,
+        "reason": explain(OptimisationOutlier() if outlier else edge.reason),
         "target_from_source": posterior.pose.mean,
         "covariance": posterior.pose.covariance,
         "information": posterior.information,

@@ -17,14 +17,15 @@ from modeler.pipeline.state import Seen, State
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter
 from modeler.types import (
-    ACCEPTED,
     AbstractPrior,
     AbstractRegistrar,
     Edge,
+    Failed,
     Frame,
     Outcome,
     Posterior,
     RayImage,
+    Reason,
     Segmentation,
     Step,
 )
@@ -158,15 +159,15 @@ class Modeler:
         steps = state.steps(seen.frame.index, previous)
         edges = self.closer.judge(lasting, state.map_view, steps=steps)
         edges = pairing.explained(edges)
-        outcome = _outcome(seen, edges, first=not state.views)
-        state = state.joined(seen, edges, accepted=outcome == ACCEPTED)
+        left_out = _left_out(seen, edges, first=not state.views)
+        state = state.joined(seen, edges, accepted=left_out is None)
         step = Step(
             frame=seen.frame,
             segmentation=seen.segmentation,
             view=seen.view,
             posteriors=posteriors,
             edges=edges,
-            outcome=outcome,
+            left_out=left_out,
             solution=state.solution,
             model=None,
             edges_so_far=state.graph.edges,
@@ -251,12 +252,11 @@ def _with_last(frames: Iterable[Frame]) -> Iterator[tuple[Frame, bool]]:
         yield frame, True
 
 
-def _outcome(seen: Seen, edges: Sequence[Edge], *, first: bool) -> str:
-    """Return `ACCEPTED`, or in words why a frame is left out."""
+def _left_out(seen: Seen, edges: Sequence[Edge], *, first: bool) -> Reason | None:
+    """Return why a frame is left out; None: it is not."""
     if seen.view is None:
-        label = seen.segmentation.outcome
-        flaw = Outcome.TOO_FEW_POINTS if label is Outcome.CONVERGED else label
-        return f"{flaw.label}: {flaw.advice}"
+        outcome = seen.segmentation.outcome
+        return Failed(Outcome.TOO_FEW_POINTS if outcome is Outcome.CONVERGED else outcome)
     if first or any(edge.accepted for edge in edges):
-        return ACCEPTED
+        return None
     return edges[0].reason

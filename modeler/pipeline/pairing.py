@@ -11,7 +11,7 @@ from modeler.pipeline.limits import believed
 from modeler.pipeline.state import State
 from modeler.priors import PredictedProposal
 from modeler.registration.posterior import failed
-from modeler.types import AbstractPrior, Edge, InputError, Outcome, Posterior, RayImage
+from modeler.types import AbstractPrior, Edge, InputError, Outcome, Posterior, PriorRefused, RayImage
 
 _BEYOND = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # what a motion beyond the prior may look like
 _PATIENCE = 1  # frames searched for in vain, from which on others are glanced at first
@@ -32,8 +32,8 @@ class Pairing:
     """Makes a view ready for that."""
     executor: Executor | None
     """Where pairs are registered side by side; None: one after the other."""
-    refusals: dict[tuple[int, int], str] = field(default_factory=dict)
-    """Why the prior does not apply to a pair, in words, by (source, target): filled as pairs are registered."""
+    refusals: dict[tuple[int, int], PriorRefused] = field(default_factory=dict)
+    """Why the prior does not apply to a pair, by (source, target): filled as pairs are registered."""
     glance: Callable[[RayImage, RayImage, AbstractPrior], Posterior] | None = None
     """As `register`, but gives hopeless pairs up soon; None: there is nothing of the kind."""
     seeking: Callable[[int], None] = lambda frame: None
@@ -145,7 +145,7 @@ class Pairing:
         try:
             return register(self.ready(state, source), view, prior)
         except InputError as error:
-            self.refusals[source.index, target] = str(error)
+            self.refusals[source.index, target] = PriorRefused(str(error))
             return failed(source, view, Outcome.NOT_KNOWN)
 
 

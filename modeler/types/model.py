@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from modeler.types.arrays import Array
 from modeler.types.posteriors import Posterior
+from modeler.types.reasons import Reason
 from modeler.types.solution import Edge, Solution
 from modeler.types.views import Frame, RayImage, Segmentation
-
-ACCEPTED: Final = "accepted"
-"""Outcome of a frame that is part of the model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +54,8 @@ class Step:
     """Registrations tried with this frame as source."""
     edges: tuple[Edge, ...]
     """Their judgement."""
-    outcome: str
-    """`ACCEPTED`, or why the frame was left out."""
+    left_out: Reason | None
+    """Why the frame is no part of the model; None: it is."""
     solution: Solution
     """All poses so far."""
     model: ObjectModel | None
@@ -73,4 +70,4 @@ class Step:
     @property
     def accepted(self) -> bool:
         """Whether the frame is part of the model."""
-        return self.outcome == ACCEPTED
+        return self.left_out is None

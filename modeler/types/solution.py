@@ -10,6 +10,7 @@ from typing import Literal
 from modeler import se3
 from modeler.types.arrays import Array
 from modeler.types.posteriors import PoseGaussian, Posterior
+from modeler.types.reasons import Reason
 
 EdgeKind = Literal["odometry", "closure", "span"]
 """What an edge is for: to place a frame, to close a loop with a view that the object had turned away from, or to span
@@ -26,8 +27,8 @@ class Edge:
     """What the edge is for."""
     accepted: bool
     """Whether the edge takes part in the optimisation."""
-    reason: str
-    """Why, in words."""
+    reason: Reason
+    """Why; `explain` words it."""
 
     @property
     def source(self) -> int:

@@ -21,7 +21,7 @@ from loops.costs import Cost, drawn
 from loops.study import Result, modeler, run
 from modeler.closure import Closer
 from modeler.export import write_atomically
-from modeler.types import Step
+from modeler.types import Step, explain
 
 _WIDTHS = (19, 8, 6, 6, 6, 7, 9, 8, 10, 9, 7, 7, 9, 10, 8, 6)
 _HEADS = (
@@ -121,8 +121,8 @@ class _Progress:
 
     def __call__(self, step: Step, seconds: float, memory_mib: float) -> None:
         self.costs.append(Cost(step.frame.index, seconds, len(step.posteriors), memory_mib))
-        if step.outcome != "accepted":
-            print(f"{self._name}: frame {step.frame.index}: {step.outcome}", file=sys.stderr, flush=True)
+        if step.left_out is not None:
+            print(f"{self._name}: frame {step.frame.index}: {explain(step.left_out)}", file=sys.stderr, flush=True)
         if self._every and len(self.costs) % self._every == 0:
             spent = [cost.seconds for cost in self.costs[-self._every :]]
             figures = f"{np.median(spent):.2f} s a frame (mean {np.mean(spent):.2f}), {memory_mib:.0f} MiB"

@@ -7,7 +7,7 @@ from html import escape
 from typing import Any
 
 from modeler import evaluation, se3
-from modeler.types import Array, Edge
+from modeler.types import Array, Edge, explain
 from viz import certainty
 from viz.report.elements import data_address
 from viz.report.pairs import Thumbnails
@@ -70,5 +70,5 @@ def _pair(result: Result, edge: Edge, record: Mapping[str, Any], pictures: Thumb
     return (
         f"<div class='pair{'' if edge.accepted else ' no'}'><h3>{edge.source} → {edge.target}: {verdict}, "
         f"{posterior.outcome.label}</h3>{shown}<p>{words}.</p>{open_words}"
-        f"<p class='quiet'>{escape(edge.reason)}</p></div>"
+        f"<p class='quiet'>{escape(explain(edge.reason))}</p></div>"
     )

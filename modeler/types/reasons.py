@@ -1,0 +1,215 @@
+"""Why frames and edges take part or are left out: values with figures, and the one place that words them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+from modeler.types.outcomes import Outcome
+
+ACCEPTED: Final = "accepted"
+"""What a report says of a frame that is part of the model."""
+
+
+@dataclass(frozen=True)
+class NearExtrapolation:
+    """The pose lies near where steady motion leads."""
+
+    angle_deg: float
+
+
+@dataclass(frozen=True)
+class ConfirmedBy:
+    """The registration with another view agrees."""
+
+    frame: int
+
+
+@dataclass(frozen=True)
+class JoinsPrevious:
+    """The edge to the previous view places the frame."""
+
+    outcome: Outcome
+    overlap: float
+    support: NearExtrapolation | ConfirmedBy | None = None
+    """What else speaks for it; None: nothing was needed."""
+
+
+@dataclass(frozen=True)
+class Relocalised:
+    """The edge to an earlier view places the frame; the one to the previous view failed."""
+
+    overlap: float
+    support: NearExtrapolation | ConfirmedBy
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The attempt ended without a posterior or a view to go on with."""
+
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class PriorRefused:
+    """The prior does not apply to the pair."""
+
+    message: str
+    """Of the `InputError`: what is missing; what to do."""
+
+
+@dataclass(frozen=True)
+class Degenerate:
+    """The posterior is no Gaussian that a graph can take."""
+
+    finite: bool
+
+
+@dataclass(frozen=True)
+class LowOverlap:
+    """The views share too little surface."""
+
+    overlap: float
+    min_overlap: float
+
+
+@dataclass(frozen=True)
+class LowEvidence:
+    """The images match far worse than those of other edges."""
+
+    log_evidence: float
+    median_nats: float
+
+
+@dataclass(frozen=True)
+class NotPlaced:
+    """No registration of the frame is certain enough to place it."""
+
+
+@dataclass(frozen=True)
+class OpenRotation:
+    """The edge leaves the rotation about an axis open, and the graph knows it no better."""
+
+    sigma_deg: float
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """How far a registration is from what the graph predicts."""
+
+    distance: float
+    """Mahalanobis distance, of the nearest modes where there are several."""
+    max_distance: float
+    angle_deg: float
+    """Angle between the two."""
+    offset_m: float
+    """Distance between the two at the object."""
+    weight: float
+    """Share (0..1) of the posterior's mass in modes that agree."""
+    min_weight: float
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the registration may be true if the prediction is."""
+        return self.distance <= self.max_distance and self.weight >= self.min_weight
+
+
+@dataclass(frozen=True)
+class OptimisationOutlier:
+    """The edge was accepted, and the optimisation left it out later."""
+
+
+@dataclass(frozen=True)
+class Stated:
+    """A reason of which only the words are known, as a report holds them."""
+
+    words: str
+
+
+Reason: TypeAlias = (
+    JoinsPrevious
+    | Relocalised
+    | Failed
+    | PriorRefused
+    | Degenerate
+    | LowOverlap
+    | LowEvidence
+    | NotPlaced
+    | OpenRotation
+    | Consistency
+    | OptimisationOutlier
+    | Stated
+)
+"""Why an edge was accepted or rejected, or a frame left out."""
+
+
+def explain(reason: Reason) -> str:
+    """Return a reason in words: what was found, and what to do about it."""
+    match reason:
+        case Failed(outcome):
+            return f"{outcome.label}: {outcome.advice}"
+        case PriorRefused(message):
+            return message
+        case _:
+            return summary(reason)
+
+
+def advice(reason: Reason) -> str:
+    """Return in words what to do about a reason; "" where there is nothing to do."""
+    match reason:
+        case Failed(outcome):
+            return outcome.advice
+        case PriorRefused(message):
+            return message.partition("; ")[2]
+        case _:
+            return ""
+
+
+def summary(reason: Reason) -> str:
+    """Return in words what was found, without advice."""
+    match reason:
+        case JoinsPrevious(outcome, overlap, support):
+            return f"joins the previous view: {outcome.label}, overlap {overlap:.2f}{_supported(support)}"
+        case Relocalised(overlap, support):
+            return f"joins in place of the failed previous view: overlap {overlap:.2f}{_supported(support)}"
+        case Failed(outcome):
+            return outcome.label
+        case PriorRefused(message):
+            return message.partition("; ")[0]
+        case Degenerate(finite=False):
+            return "the posterior is not finite: the registration broke down"
+        case Degenerate():
+            return "the covariance is not positive definite: the registration is degenerate"
+        case LowOverlap(overlap, min_overlap):
+            return f"the overlap {overlap:.2f} is below {min_overlap:.2f}"
+        case LowEvidence(log_evidence, median_nats):
+            return f"the images contradict it: log evidence {log_evidence:.0f}, median of other edges {median_nats:.0f}"
+        case NotPlaced():
+            return "neither the previous view nor another one places the frame with certainty"
+        case OpenRotation(sigma_deg):
+            return f"it leaves the rotation about an axis open by ±{sigma_deg:.0f}°, and the graph knows it no better"
+        case Consistency():
+            return _agreement(reason)
+        case OptimisationOutlier():
+            return "the optimisation left it out: all other edges contradict it"
+        case Stated(words):
+            return words
+
+
+def _supported(support: NearExtrapolation | ConfirmedBy | None) -> str:
+    match support:
+        case NearExtrapolation(angle_deg):
+            return f", {angle_deg:.0f}° from the motion going on"
+        case ConfirmedBy(frame):
+            return f", frame {frame} agrees"
+        case None:
+            return ""
+
+
+def _agreement(found: Consistency) -> str:
+    words = (
+        f"{'agrees with' if found.consistent else 'contradicts'} the chain: {found.angle_deg:.1f}° and "
+        f"{1000.0 * found.offset_m:.1f} mm from its prediction, distance {found.distance:.1f} of "
+        f"{found.max_distance:.1f} allowed"
+    )
+    return words if found.weight == 1.0 else f"{words}, {100.0 * found.weight:.0f} % of the modes' mass agrees"
