@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from modeler.cli.advice import outcome_advice
 from modeler.cli.console import Console
 from modeler.cli.inputs import reading
-from modeler.types import Failed, Outcome, PriorRefused, Segmentation, Solution, Stated, Step, explain
+from modeler.types import Failed, Outcome, PriorRefused, Segmentation, Solution, Stated, Step
 from sequences import bundled, open_sequence
 
 COMMAND = [sys.executable, "-m", "modeler", "info", str(bundled("tube"))]
@@ -78,10 +79,10 @@ def test_what_to_do_about_frames_left_out_is_told_once(capfd: pytest.CaptureFixt
         for number, outcome in enumerate(outcomes):
             console(replace(lost, frame=replace(frame, index=number), left_out=outcome))
     assert capfd.readouterr().err.splitlines() == [
-        f"modeler: frame 0 is left out: {explain(outcomes[0])}",
+        f"modeler: frame 0 is left out: {few.label}: {outcome_advice(few)}",
         f"modeler: frame 1 is left out: {few.label}",
-        f"modeler: frame 2 is left out: {explain(outcomes[2])}",
-        f"modeler: frame 3 is left out: {explain(outcomes[3])}",
+        f"modeler: frame 2 is left out: {unsure.label}: {outcome_advice(unsure)}",
+        "modeler: frame 3 is left out: frames 3 and 2 show no plane: show it",
         "modeler: frame 4 is left out: frames 4 and 2 show no plane",
     ]
 
@@ -96,7 +97,7 @@ def test_frames_that_are_left_out_in_a_row_are_told_together(capfd: pytest.Captu
             outcome = None if number in (0, 9) else lost.left_out
             console(replace(lost, frame=replace(frame, index=number), left_out=outcome))
     assert capfd.readouterr().err.splitlines() == [
-        f"modeler: frame 1 is left out: {few.label}: {few.advice}",
+        f"modeler: frame 1 is left out: {few.label}: {outcome_advice(few)}",
         f"modeler: frame 2 is left out: {few.label}",
         f"modeler: frame 3 is left out: {few.label}",
         f"modeler: frame 4 is left out: {few.label}",

@@ -9,11 +9,31 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors import TurntablePrior
-from modeler.types import AbstractPrior, Outcome
+from modeler.types import AbstractPrior, Failed, Outcome, Reason, advice
 from sequences import AbstractSequence
 
 _SURE_STEPS: Final = 3  # pairs that tell a step
 _FAR_SDS: Final = 3.0  # of the told step, from which on another one is meant
+_BY_OPTIONS: Final = {
+    Outcome.AT_LIMIT: (
+        "The motion may be larger than the prior allows; raise --max-rotation-deg (general, table), --max-offset-m "
+        "(general) or --max-shift-m (table, turntable)."
+    ),
+    Outcome.TOO_FEW_POINTS: "The object covers too few pixels; check the mask, --roi and --max-depth-m.",
+    Outcome.UNSURE_MASK: (
+        "The object is hard to tell from its surroundings; give --roi, --max-depth-m, or masks that hold nothing else."
+    ),
+}
+
+
+def outcome_advice(outcome: Outcome) -> str:
+    """Return what to do about an outcome, in terms of options."""
+    return _BY_OPTIONS.get(outcome, outcome.advice)
+
+
+def reason_advice(reason: Reason) -> str:
+    """Return what to do about a frame that was left out, in terms of options; "" where there is nothing to do."""
+    return outcome_advice(reason.outcome) if isinstance(reason, Failed) else advice(reason)
 
 
 def comes_back(frames: AbstractSequence, given_deg: float | None, reach_deg: float) -> bool:

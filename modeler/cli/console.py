@@ -133,13 +133,14 @@ class Console:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Leave the bar as it stands, and tell in how many frames something else may have been taken for the object."""
+        from modeler.cli.advice import outcome_advice
         from modeler.types import Outcome
 
         self._bar.stop()
         self._release()
         if self._unsure:
             doubt = Outcome.UNSURE_MASK
-            self._say(f"{len(self._unsure)} of {len(self._placed)} frames: {doubt.label}: {doubt.advice}")
+            self._say(f"{len(self._unsure)} of {len(self._placed)} frames: {doubt.label}: {outcome_advice(doubt)}")
 
     def __call__(self, step: Step) -> None:
         """Tell of a step."""
@@ -191,13 +192,14 @@ class Console:
 
     def _why(self, reason: Reason) -> str:
         """Return why a frame was left out, with what to do about it where that has not been said yet."""
-        from modeler.types import advice, explain, summary
+        from modeler.cli.advice import reason_advice
+        from modeler.types import summary
 
-        what_to_do = advice(reason)
-        if what_to_do in self._advised:
-            return summary(reason)
-        self._advised.update([what_to_do] if what_to_do else [])
-        return explain(reason)
+        what, what_to_do = summary(reason), reason_advice(reason)
+        if not what_to_do or what_to_do in self._advised:
+            return what
+        self._advised.add(what_to_do)
+        return f"{what}: {what_to_do}"
 
     def _say(self, text: str) -> None:
         self._bar.console.print(f"modeler: {text}", markup=False)

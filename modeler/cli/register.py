@@ -33,6 +33,7 @@ class Register:
     def run(self) -> int:
         """Register the pair; status 3 where the result would not become an edge."""
         from modeler.cli import compose
+        from modeler.cli.advice import outcome_advice
         from modeler.export import edge_record
         from modeler.types import Edge, InputError, Solution, Stated
         from sequences import open_sequence
@@ -47,10 +48,10 @@ class Register:
             segmentation, view = modeler.view(sequence.frame(index), scene)
             if view is None:
                 outcome = segmentation.outcome
-                raise InputError(f"{self.sequence}: frame {index} has {outcome.label}. {outcome.advice}")
+                raise InputError(f"{self.sequence}: frame {index} has {outcome.label}. {outcome_advice(outcome)}")
             views.append(view)
         posterior = modeler.register(*views)
-        edge = Edge(posterior, "odometry", posterior.usable, Stated(posterior.outcome.advice))
+        edge = Edge(posterior, "odometry", posterior.usable, Stated(outcome_advice(posterior.outcome)))
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}
         print(json.dumps(record, allow_nan=False))
         _, remark = compose.told(self.prior, sequence)

@@ -18,13 +18,16 @@ class Outcome(enum.Enum):
     NO_OVERLAP = "no overlap", "The views share too little surface; use a smaller step between frames."
     AT_LIMIT = (
         "at the prior's limit",
-        "The motion may be larger than the prior allows; raise --max-rotation-deg (general, table), --max-offset-m "
-        "(general) or --max-shift-m (table, turntable).",
+        "The motion may be larger than the prior allows; raise its limits of rotation, offset or shift.",
     )
-    TOO_FEW_POINTS = "too few points", "The object covers too few pixels; check the mask, --roi and --max-depth-m."
+    TOO_FEW_POINTS = (
+        "too few points",
+        "The object covers too few pixels; check the mask, the region of interest and the largest depth.",
+    )
     UNSURE_MASK = (
         "unsure mask",
-        "The object is hard to tell from its surroundings; give --roi, --max-depth-m, or masks that hold nothing else.",
+        "The object is hard to tell from its surroundings; give a region of interest, a largest depth, or masks that "
+        "hold nothing else.",
     )
     NOT_KNOWN = (
         "prior does not apply",
