@@ -13,13 +13,11 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.fusion import Fuser, own_covariances, surface, tones
-from modeler.fusion.grid import Field, Grid
-from modeler.fusion.views import posed, spread, stack
-from modeler.kernels import closing, fusion, isosurface, thinning
-from modeler.kernels import votes as voting
-from modeler.kernels.pieces import PIECES
-from modeler.kernels.surfels import surfels
+from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances, surface
+from modeler.fusion.distance_field import DistanceField, VoxelGrid
+from modeler.fusion.support import exposure_gains
+from modeler.fusion.views import depth_views, disagreement, posed_views
+from modeler.kernels import marching_cubes, occupancy, point_clouds, tsdf
 from modeler.rays import Sensor
 from modeler.types import (
     Edge,
@@ -83,14 +81,14 @@ def same(one: ObjectModel, other: ObjectModel) -> bool:
 
 def test_thinning_puts_points_of_one_voxel_together(rng):
     points, weights = rng.uniform(0.0, 0.1, (500, 3)), rng.uniform(0.1, 1.0, 500)
-    cells, count = thinning.thin(points, np.zeros(3), 0.02, np.array([5, 5, 4]))
+    cells, count = point_clouds.voxel_numbers(points, np.zeros(3), 0.02, np.array([5, 5, 4]))
     voxels = np.floor(points / 0.02).astype(int)
     outside = voxels[:, 2] >= 4
     assert np.array_equal(cells == -1, outside)
     kept, numbers = voxels[~outside], cells[~outside]
     assert count == len(np.unique(kept, axis=0)) == numbers.max() + 1
     assert len(np.unique(np.column_stack([kept, numbers]), axis=0)) == count
-    sums, totals = thinning.average(cells, count, weights, points)
+    sums, totals = point_clouds.voxel_sums(cells, count, weights, points)
     for cell in range(count):
         mine = cells == cell
         np.testing.assert_allclose(sums[cell], weights[mine] @ points[mine])
@@ -101,12 +99,12 @@ def test_crowd_counts_the_points_in_the_cells_around(rng):
     points = rng.uniform(0.0, 0.1, (200, 3))
     cells = np.floor(points / 0.01).astype(int)
     expected = [(np.abs(cells - cell).max(axis=1) <= 1).sum() for cell in cells]
-    assert np.array_equal(thinning.crowd(points, np.zeros(3), 0.01, np.array([10, 10, 10])), expected)
+    assert np.array_equal(point_clouds.neighbour_counts(points, np.zeros(3), 0.01, np.array([10, 10, 10])), expected)
 
 
 def test_blocks_near_are_those_that_a_cube_around_a_point_touches(rng):
     points, shape, reach_m = rng.uniform(0.0, 1.0, (20, 3)), np.array([9, 10, 11]), 0.03
-    found = fusion.blocks_near(points, np.zeros(3), 0.1, reach_m, shape)
+    found = tsdf.blocks_near(points, np.zeros(3), 0.1, reach_m, shape)
     blocks = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), axis=-1).reshape(-1, 3)
     gap = np.maximum(blocks * 0.1 - points[:, None], points[:, None] - (blocks + 1) * 0.1).max(axis=2)
     assert np.array_equal(found, blocks[(gap <= reach_m).any(axis=0)])
@@ -119,7 +117,7 @@ def test_surfels_of_a_plane_lie_in_it():
     depth_m = (normal @ [0.0, 0.0, 0.8]) / (w * normal[0] + h * normal[1] + normal[2])
     mask = np.ones(depth_m.shape, dtype=bool)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    points, normals = surfels(depth_m.astype(np.float32), np.argwhere(mask), mask, lens, 1e-5, 5.0)
+    points, normals = point_clouds.fitted_planes(depth_m.astype(np.float32), np.argwhere(mask), mask, lens, 1e-5, 5.0)
     np.testing.assert_allclose((points - [0.0, 0.0, 0.8]) @ normal, 0.0, atol=1e-6)
     assert np.degrees(np.arccos((normals @ normal).clip(-1, 1))).max() < 1.5  # it leans to the camera a little
 
@@ -127,26 +125,26 @@ def test_surfels_of_a_plane_lie_in_it():
 def test_a_pixel_that_hangs_in_the_air_has_no_surfel():
     depth_m = np.full((9, 9), 0.8, dtype=np.float32)
     depth_m[4, 4] = 0.75
-    _, normals = surfels(
+    _, normals = point_clouds.fitted_planes(
         depth_m, np.array([[4, 4], [2, 2]]), depth_m > 0, np.array([200.0, 200.0, 4.0, 4.0]), 1e-3, 5.0
     )
     assert np.array_equal(np.any(normals != 0.0, axis=1), [False, True])
 
 
 def naive_side(votes, remaining, tau_m):
-    """Twin of `votes.dominant_vote`."""
+    """Twin of `tsdf.dominant_vote`."""
     score = {k: votes[k][1] * (1.01 - abs(votes[k][0]) / tau_m) for k in remaining}
     best = max(remaining, key=lambda k: score[k])
     if votes[best][0] >= 0:
         return best
-    rivals = [k for k in remaining if votes[k][0] > 0 and votes[k][2] @ votes[best][2] < voting.AGREE]
+    rivals = [k for k in remaining if votes[k][0] > 0 and votes[k][2] @ votes[best][2] < tsdf.SAME_SIDE]
     rivals = [k for k in rivals if score[k] > 0.3 * score[best]]
     return max(rivals, key=lambda k: score[k], default=best)
 
 
 def naive_wall(voxel, vote, other, views):
     """Return whether a vote is for surface that hides a voxel from the view of another vote."""
-    index, _, poses, lenses, points, normals, _ = views
+    index, _, poses, intrinsics, points, normals, _ = views
     along, _, normal, point, f = other
     camera = -poses[vote[4], :, :3].T @ poses[vote[4], :, 3]
     if along >= 0 or normal @ (camera - point) <= 0:
@@ -154,23 +152,23 @@ def naive_wall(voxel, vote, other, views):
     way = camera - voxel
     crossing = voxel + way * (normal @ (point - voxel)) / (normal @ way)
     x, y, z = poses[f, :, :3] @ crossing + poses[f, :, 3]
-    column, row = round(lenses[f, 0] * x / z + lenses[f, 2]), round(lenses[f, 1] * y / z + lenses[f, 3])
+    column, row = round(intrinsics[f, 0] * x / z + intrinsics[f, 2]), round(intrinsics[f, 1] * y / z + intrinsics[f, 3])
     if not (0 <= row < index.shape[1] and 0 <= column < index.shape[2]):
         return False
     n = index[f, row, column]
-    return n >= 0 and normals[n] @ normal > voting.AGREE and abs(normals[n] @ (crossing - points[n])) < -along
+    return n >= 0 and normals[n] @ normal > tsdf.SAME_SIDE and abs(normals[n] @ (crossing - points[n])) < -along
 
 
 def naive_integrate(voxels, tau_m, empty_weight, views):
-    """Twin of `fusion.integrate` for single voxels (n, 3)."""
-    index, free_m, poses, lenses, points, normals, weights = views
+    """Twin of `tsdf.integrate` for single voxels (n, 3)."""
+    index, free_m, poses, intrinsics, points, normals, weights = views
     values, totals = np.zeros(len(voxels)), np.zeros(len(voxels))
     for number, voxel in enumerate(voxels):
         votes, emptiness = [], 0.0
         for f in range(len(index)):
             x, y, z = poses[f, :, :3] @ voxel + poses[f, :, 3]
-            column = round(lenses[f, 0] * x / z + lenses[f, 2])
-            row = round(lenses[f, 1] * y / z + lenses[f, 3])
+            column = round(intrinsics[f, 0] * x / z + intrinsics[f, 2])
+            row = round(intrinsics[f, 1] * y / z + intrinsics[f, 3])
             if not (0 <= row < index.shape[1] and 0 <= column < index.shape[2]):
                 continue
             n = index[f, row, column]
@@ -183,11 +181,11 @@ def naive_integrate(voxels, tau_m, empty_weight, views):
         values[number], totals[number] = (tau_m, emptiness) if emptiness else (0.0, 0.0)
         while remaining:
             best = naive_side(votes, remaining, tau_m)
-            side = [k for k in remaining if votes[k][2] @ votes[best][2] > voting.AGREE]
+            side = [k for k in remaining if votes[k][2] @ votes[best][2] > tsdf.SAME_SIDE]
             values[number], totals[number] = tau_m * emptiness, emptiness + sum(votes[k][1] for k in side)
             values[number] = (values[number] + sum(votes[k][1] * votes[k][0] for k in side)) / totals[number]
             against = [k for k in remaining if k not in side and naive_wall(voxel, votes[best], votes[k], views)]
-            if len(against) < voting.MANY * len(side):
+            if len(against) < tsdf.MAJORITY * len(side):
                 break
             remaining = [k for k in remaining if k not in side]
             values[number], totals[number] = tau_m, emptiness
@@ -223,15 +221,15 @@ def test_integration_is_its_twin(seed, one_mind, turned_rad, monkeypatch):
         rng.uniform(0.01, 1.0, count),
     )
     blocks = rng.permutation(np.stack(np.meshgrid(*[np.arange(2)] * 3), axis=-1).reshape(-1, 3))
-    origin, voxel_m, tau_m = np.full(3, -0.02), 0.04 / (2 * fusion.SIDE), 0.015
-    values, totals = fusion.integrate(blocks, origin, voxel_m, tau_m, 0.3, np.arange(count) // own, *views)
-    inner = np.stack(np.meshgrid(*[np.arange(fusion.SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    voxels = origin + ((blocks[:, None] * fusion.SIDE + inner).reshape(-1, 3) + 0.5) * voxel_m
+    origin, voxel_m, tau_m = np.full(3, -0.02), 0.04 / (2 * tsdf.SIDE), 0.015
+    values, totals = tsdf.integrate(blocks, origin, voxel_m, tau_m, 0.3, np.arange(count) // own, *views)
+    inner = np.stack(np.meshgrid(*[np.arange(tsdf.SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    voxels = origin + ((blocks[:, None] * tsdf.SIDE + inner).reshape(-1, 3) + 0.5) * voxel_m
     expected_values, expected_totals = naive_integrate(voxels, tau_m, 0.3, views)
     assert 0.0 < (expected_totals > 0.0).mean() <= 1.0
     np.testing.assert_allclose(totals.ravel(), expected_totals, rtol=1e-5)
     np.testing.assert_allclose(values.ravel(), expected_values, rtol=1e-4, atol=1e-8)
-    monkeypatch.setattr(voting, "MANY", 1000)  # of the twin alone
+    monkeypatch.setattr(tsdf, "MAJORITY", 1000)  # of the twin alone
     if one_mind:  # some votes were rejected
         assert np.any(naive_integrate(voxels, tau_m, 0.3, views)[1] != expected_totals)
 
@@ -242,11 +240,11 @@ def test_integration_is_its_twin(seed, one_mind, turned_rad, monkeypatch):
 def level_of(values):
     weights = np.zeros(values.shape, dtype=np.float32)
     weights[1:-1, 1:-1, 1:-1] = 1.0
-    return isosurface.extract(values.astype(np.float32), weights, np.argwhere(weights > 0), PIECES)
+    return marching_cubes.extract(values.astype(np.float32), weights, np.argwhere(weights > 0))
 
 
 def test_every_crossed_edge_of_a_cell_belongs_to_one_piece_of_at_least_three():
-    for case, pieces in enumerate(PIECES):
+    for case, pieces in enumerate(marching_cubes.PIECES):
         for edge, piece in enumerate(pieces):
             axis, a, b = edge // 4, edge >> 1 & 1, edge & 1
             start = int(np.insert([a, b], axis, 0) @ [4, 2, 1])
@@ -280,7 +278,7 @@ def test_the_zero_level_stays_open_where_nothing_is_known():
     values = np.broadcast_to(np.arange(16.0) - 7.5, (16, 16, 16)).astype(np.float32)
     weights = np.zeros(values.shape, dtype=np.float32)
     weights[2:9, 3:13, 1:15] = 1.0
-    vertices, triangles = isosurface.extract(values, weights, np.argwhere(weights > 0), PIECES)
+    vertices, triangles = marching_cubes.extract(values, weights, np.argwhere(weights > 0))
     assert np.allclose(vertices[:, 2], 7.5)
     used = vertices[np.unique(triangles)]
     assert np.array_equal(used.min(axis=0), [2.5, 3.5, 7.5])
@@ -292,7 +290,7 @@ def test_gaps_are_filled_but_borders_do_not_grow():
     weights = np.zeros_like(values)
     weights[2:12, 2:12, 2:12] = 1.0
     weights[6, 6, 6] = 0.0
-    cells, means = isosurface.fill(values, weights, np.argwhere(weights > 0), 15)
+    cells, means = marching_cubes.fill(values, weights, np.argwhere(weights > 0), 15)
     assert np.array_equal(cells, [[6, 6, 6]])
     assert means == pytest.approx([0.5])
 
@@ -344,15 +342,15 @@ CORNERS_M = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z 
 
 
 def disagreement_m(views, trajectory):
-    pairs = posed(views, trajectory)
-    found = spread(stack(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1), 0.02)
+    pairs = posed_views(views, trajectory)
+    found = disagreement(depth_views(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1), 0.02)
     return float("nan") if found is None else found[0]
 
 
 def test_views_asked_in_batches_disagree_by_the_same(rng, monkeypatch):
     trajectory, noisy = tabletop.trajectory(POSES), tabletop.views(BRICK, POSES, rng)
     at_once = disagreement_m(noisy, trajectory)
-    monkeypatch.setattr("modeler.fusion.views.AT_ONCE", 100 * len(POSES))
+    monkeypatch.setattr("modeler.fusion.views.BATCH", 100 * len(POSES))
     assert disagreement_m(noisy, trajectory) == at_once
 
 
@@ -411,15 +409,17 @@ def test_what_nobody_saw_is_trimmed_where_it_curls_at_a_border_and_closes_gaps_h
     normals = surface.normals_of(vertices, triangles)
     x, bump = x.ravel(), bump.ravel()
     seen = (x < 20.0) & (bump == 0.0)
-    loose = surface.curled(vertices, normals, seen, ~seen)
+    loose = surface.folded(vertices, normals, seen, ~seen)
     assert loose[(bump > 0.5) & (bump < 4.0)].all()
     assert not loose[seen].any()
-    left = surface.trimmed(np.ones(len(x), dtype=bool), loose, triangles, 20)
+    left = surface.without_loose_border(np.ones(len(x), dtype=bool), loose, triangles, 20)
     assert left.all()  # no border of what is marked: the whole mesh is
-    left = surface.trimmed(x < 30.0, loose, triangles, 20)
+    left = surface.without_loose_border(x < 30.0, loose, triangles, 20)
     assert left[x < 22.0].all()
     assert not left[x > 25.0].any()
-    assert np.array_equal(surface.trimmed(x < 30.0, loose, triangles, 3)[x < 30.0], (left | (x < 27.0))[x < 30.0])
+    assert np.array_equal(
+        surface.without_loose_border(x < 30.0, loose, triangles, 3)[x < 30.0], (left | (x < 27.0))[x < 30.0]
+    )
 
 
 def test_a_few_wrong_pixels_at_a_flat_angle_dig_no_pit():
@@ -511,18 +511,36 @@ def test_a_handful_of_pixels_is_no_reason_to_fail():
     model = FUSER.fuse({0: few}, {0: np.eye(4)})
     assert model.triangles.shape == (len(model.triangles), 3)
     assert np.isfinite(model.vertices_m).all()
-    assert np.isfinite(FUSER.preview({0: few}, {0: np.eye(4)}).model().points_m).all()
+    assert np.isfinite(IncrementalTsdf(FUSER).updated({0: few}, {0: np.eye(4)}).model().points_m).all()
 
 
 def test_input_that_cannot_be_fused_is_refused():
     views, trajectory = tabletop.views(BALL, POSES[:2]), tabletop.trajectory(POSES[:2])
-    for method in (FUSER.fuse, FUSER.preview):
+    for method in (FUSER.fuse, IncrementalTsdf(FUSER).updated):
         with pytest.raises(InputError, match="nothing to fuse"):
             method(views, {})
         with pytest.raises(InputError, match="nothing to fuse"):
             method({}, trajectory)
-    with pytest.raises(InputError, match="voxel size"):
-        Fuser(voxel_m=0.0).fuse(views, trajectory)
+
+
+@pytest.mark.parametrize("voxel_m", [0.0, -1.0, 1e-300, 1e-9, 1e-6, np.inf, np.nan])
+def test_an_absurd_voxel_size_is_refused_before_anything_is_allocated(voxel_m):
+    views, trajectory = tabletop.views(BALL, POSES[:2]), tabletop.trajectory(POSES[:2])
+    fuser = Fuser(voxel_m=voxel_m)
+    for method in (fuser.fuse, IncrementalTsdf(fuser).updated):
+        with pytest.raises(InputError, match=r"voxel size .* is out of range: .* give at least [\d.e-]+ m"):
+            method(views, trajectory)
+
+
+@pytest.mark.parametrize("voxel_m", [5e-5, 1.0])
+def test_extreme_voxel_sizes_stay_within_the_memory_bound(voxel_m):
+    views, trajectory = tabletop.views(BALL, POSES[:2]), tabletop.trajectory(POSES[:2])
+    fuser = Fuser(voxel_m=voxel_m, max_voxels=64**3, preview_limit=64**3)
+    assert np.prod(fuser.volume(views, trajectory).grid.shape) < 1.5 * 64**3
+    fuser.fuse(views, trajectory)
+    preview = IncrementalTsdf(fuser).updated(views, trajectory)
+    assert preview.sums[..., 0].size <= 64**3
+    preview.model()
 
 
 def test_the_voxels_follow_the_pixels_and_stay_within_their_number(ball):
@@ -572,7 +590,7 @@ def test_a_pose_that_is_unsure_counts_less():
     assert same(alike, blind)
 
 
-def test_own_covariances_do_not_know_of_drift(rng):
+def test_conditional_covariances_do_not_know_of_drift(rng):
     covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-6
 
     def edge(target, source, *, accepted=True):
@@ -581,13 +599,13 @@ def test_own_covariances_do_not_know_of_drift(rng):
 
     edges = [edge(2, 5), edge(5, 6), edge(6, 9, accepted=False), edge(2, 6)]
     solution = Solution(trajectory={k: np.eye(4) for k in (2, 5, 6)}, outliers=(edges[3],))
-    own = own_covariances(solution, edges)
+    own = conditional_covariances(solution, edges)
     assert set(own) == {2, 5, 6}
     np.testing.assert_allclose(own[6], covariance)
     np.testing.assert_allclose(own[2], edges[0].posterior.pose.inverse().covariance)
     both = np.linalg.inv(covariance) + np.linalg.inv(edges[1].posterior.pose.inverse().covariance)
     np.testing.assert_allclose(own[5], np.linalg.inv(both))
-    assert own_covariances(Solution(trajectory={0: np.eye(4)}), []) == {}
+    assert conditional_covariances(Solution(trajectory={0: np.eye(4)}), []) == {}
 
 
 def dimmed(view: RayImage, factor: float) -> RayImage:
@@ -611,8 +629,10 @@ def test_sharp_views_have_more_say_in_colours_than_blurred_ones(rng):
         return replace(view, frame=replace(view.frame, colour=np.repeat(levels[..., None], 3, axis=2).astype(np.uint8)))
 
     views = {k: textured(view, 60 if k % 3 else 20) for k, view in tabletop.views(BRICK, POSES).items()}
-    seen = stack(posed(views, tabletop.trajectory(POSES)), CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1)
-    say = tones.gains(seen, seen.points_m, seen.normals, tau_m=0.005, near_m=0.003)[:, 3]
+    seen = depth_views(
+        posed_views(views, tabletop.trajectory(POSES)), CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1
+    )
+    say = exposure_gains(seen, seen.points_m, seen.normals, tau_m=0.005, near_m=0.003)[:, 3]
     sharp = np.arange(len(POSES)) % 3 > 0
     np.testing.assert_allclose(say[~sharp] / say[sharp].mean(), 20.0 / 60.0, rtol=0.15)
 
@@ -621,7 +641,7 @@ def test_a_view_without_colour_leaves_the_colours_to_others(brick):
     views = tabletop.views(BRICK, POSES)
     views[4] = replace(views[4], frame=replace(views[4].frame, colour=None))
     trajectory = tabletop.trajectory(POSES)
-    for model in (FUSER.fuse(views, trajectory), FUSER.preview(views, trajectory).model()):
+    for model in (FUSER.fuse(views, trajectory), IncrementalTsdf(FUSER).updated(views, trajectory).model()):
         assert model.colours is not None
         top = (np.abs(model.points_m[:, :2]) < [0.05, 0.03]).all(axis=1) & (model.points_m[:, 2] > 0.03)
         assert np.abs(model.colours[top].astype(int) - [128, 128, 228]).max() <= 2
@@ -653,10 +673,12 @@ def test_views_find_cells_empty_at_a_surface_or_hidden():
     free_m = np.full((2, 40, 40), 0.8, dtype=np.float32)
     free_m[1] = 0.0
     poses = np.tile(np.eye(4)[:3], (2, 1, 1))
-    lenses = np.tile([20.0, 20.0, 19.5, 19.5], (2, 1))
+    intrinsics = np.tile([20.0, 20.0, 19.5, 19.5], (2, 1))
     planes = np.array([[np.nan] * 4, [0.0, -1.0, 0.0, 0.1]])  # y points down: the table is 0.1 m below
     shape = np.array([10, 10, 10])
-    counts = closing.looked_through(np.array([-0.25, -0.25, 0.5]), 0.05, shape, 0.05, free_m, poses, lenses, planes)
+    counts = occupancy.observation_counts(
+        np.array([-0.25, -0.25, 0.5]), 0.05, shape, 0.05, free_m, poses, intrinsics, planes
+    )
     centres = np.array([-0.25, -0.25, 0.5]) + 0.05 * (np.argwhere(np.ones(shape)) + 0.5)
     below = centres[:, 1] > 0.15
     assert np.array_equal(counts[0].ravel(), (centres[:, 2] < 0.75).astype(int) + below)
@@ -676,7 +698,7 @@ def test_the_smallest_surface_across_an_open_tube_is_flat():
     fixed |= wall | lid
     start[(wall & (radius < 8.0)) | (lid & (z < 24) & (radius < 8.0))] = -1.0
     start[~fixed & (radius < 8.0)] = -1.0  # spills out of the open end, as far as it goes
-    decided = closing.smallest(start, fixed, 600)
+    decided = occupancy.minimal_surface(start, fixed, 600)
     assert np.array_equal(decided[fixed], start[fixed])
     core = radius < 5.0
     assert (decided[core & (z >= 10) & (z < 22)] < -0.5).all()
@@ -727,10 +749,10 @@ def test_no_edge_of_a_zero_level_has_more_than_two_triangles(seed):
     values = gaussian_filter(rng.normal(size=(24, 24, 24)), 0.6).astype(np.float32)
     weights = np.zeros(values.shape, dtype=np.float32)
     weights[1:-1, 1:-1, 1:-1] = 1.0
-    field = Field(Grid(np.zeros(3), 1.0, np.array([6, 6, 6])), values, weights, np.argwhere(weights > 0.0))
-    _, torn = isosurface.extract(values, weights, field.known, PIECES)
+    field = DistanceField(VoxelGrid(np.zeros(3), 1.0, np.array([6, 6, 6])), values, weights, np.argwhere(weights > 0.0))
+    _, torn = marching_cubes.extract(values, weights, field.known)
     assert edge_uses(torn).max() > 1
-    _, triangles = surface.extracted(field)
+    _, triangles = surface.extracted_mesh(field)
     assert edge_uses(triangles).max() == 1
 
 

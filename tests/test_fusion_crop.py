@@ -9,8 +9,7 @@ import pytest
 import tabletop
 
 from modeler import se3
-from modeler.fusion.crop import Crop, crop, free_of, pose_variances
-from modeler.fusion.views import stack
+from modeler.fusion.views import Crop, crop, depth_views, free_of, pose_variances
 from modeler.types import Array, RayImage
 
 WHOLE = slice(0, tabletop.CAMERA.height), slice(0, tabletop.CAMERA.width)
@@ -53,7 +52,7 @@ def test_a_view_counts_as_little_as_noise_grows_with_distance() -> None:
     near = tabletop.turntable(1)[0]
     far = se3.translation(np.array([0.0, 0.0, tabletop.DISTANCE_M])) @ near
     pairs = [(tabletop.view(ball, pose, k), se3.inverse(pose)) for k, pose in enumerate((near, far))]
-    seen = stack(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1)
+    seen = depth_views(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1)
     most = [seen.weights[seen.views == number].max() for number in (0, 1)]
     assert most[1] / most[0] == pytest.approx((0.75 / 1.55) ** 4, rel=0.02)
 
@@ -77,8 +76,8 @@ def test_a_pose_that_may_turn_moves_points_along_their_normals() -> None:
     some = np.arange(0, len(part.points_m), len(part.points_m) // 20)
     carried = part.points_m[some] @ np.swapaxes(moved[:, :3, :3], 1, 2) + moved[:, None, :3, 3]
     along_m = np.sum((carried - part.points_m[some]) * part.normals[some], axis=2)
-    told = pose_variances(part, factor @ factor.T, 0.001)[some]
-    np.testing.assert_allclose(told, np.var(along_m, axis=0) / 0.0005**2, rtol=0.12)
+    variances = pose_variances(part, factor @ factor.T, 0.001)[some]
+    np.testing.assert_allclose(variances, np.var(along_m, axis=0) / 0.0005**2, rtol=0.12)
     assert not pose_variances(part, None, 0.001).any()
 
 
@@ -86,9 +85,9 @@ def test_one_view_of_a_stack_is_looked_up_alone() -> None:
     poses = tabletop.turntable(3)
     views = tabletop.views(tabletop.Sphere(0.05), poses)
     pairs = [(views[k], se3.inverse(pose)) for k, pose in enumerate(poses)]
-    seen = stack(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1)
-    one = seen.alone(1)
-    assert len(one.index) == len(one.free_m) == len(one.poses) == len(one.lenses) == len(one.planes) == 1
+    seen = depth_views(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1)
+    one = seen.only(1)
+    assert len(one.index) == len(one.free_m) == len(one.poses) == len(one.intrinsics) == len(one.planes) == 1
     shown = one.index[one.index >= 0]
     assert (seen.views[shown] == 1).all()
     np.testing.assert_array_equal(one.poses[0], seen.poses[1])

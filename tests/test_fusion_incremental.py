@@ -10,7 +10,7 @@ import tabletop
 
 from modeler import se3
 from modeler.fusion import Fuser, IncrementalTsdf
-from modeler.kernels import preview
+from modeler.kernels import tsdf as kernels
 from modeler.types import Array, InputError, RayImage
 
 BALL = tabletop.Sphere(0.06)
@@ -28,11 +28,11 @@ def trajectory() -> Mapping[int, Array]:
     return tabletop.trajectory(POSES, None)
 
 
-def grown(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], how: Fuser = FUSER) -> IncrementalTsdf:
+def dilated(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], how: Fuser = FUSER) -> IncrementalTsdf:
     """Return a model to which the views came one by one."""
     tsdf = IncrementalTsdf(how)
     for count in range(1, len(views) + 1):
-        tsdf = tsdf.to(dict(list(views.items())[:count]), trajectory)
+        tsdf = tsdf.updated(dict(list(views.items())[:count]), trajectory)
     return tsdf
 
 
@@ -46,7 +46,7 @@ def settled(
 ) -> tuple[IncrementalTsdf, int]:
     """Return the model when it has followed the poses, and in how many steps."""
     for steps in range(100):
-        after = tsdf.to(views, trajectory)
+        after = tsdf.updated(views, trajectory)
         if after is tsdf:
             return tsdf, steps
         tsdf = after
@@ -63,13 +63,13 @@ def test_what_is_added_and_taken_back_leaves_nothing():
     index = np.arange(400, dtype=np.int32).reshape(20, 20) - 40
     points = np.concatenate([rng.uniform(-0.1, 0.1, (360, 2)), rng.uniform(0.4, 0.5, (360, 1))], axis=1)
     normals = np.tile([0.0, 0.0, -1.0], (360, 1))
-    told = (index, np.full((20, 20), 0.6, dtype=np.float32), points, normals, rng.uniform(0.1, 1.0, 360))
+    seen = (index, np.full((20, 20), 0.6, dtype=np.float32), points, normals, rng.uniform(0.1, 1.0, 360))
     sums = np.zeros((12, 12, 24, 6), dtype=np.float32)
     box = sums[2:, :11]
     origin, pose, lens = np.array([-0.04, -0.06, 0.35]), np.eye(4)[:3], np.array([60.0, 60.0, 9.5, 9.5])
     colours = np.concatenate([rng.integers(0, 256, (360, 3)), np.ones((360, 1))], axis=1).astype(np.float64)
     for sign in (1.0, -1.0):
-        preview.integrate_view(box, origin, 0.01, 0.03, 0.3, sign, pose, lens, *told, colours)
+        kernels.integrate_view(box, origin, 0.01, 0.03, 0.3, sign, pose, lens, *seen, colours)
         if sign > 0.0:
             assert np.count_nonzero(sums[..., 0]) > 1000
             assert not sums[:2].any()
@@ -81,10 +81,10 @@ def test_distances_are_those_along_the_normal_within_the_band():
     index = np.zeros((1, 1), dtype=np.int32)
     normal = np.array([[0.0, -0.6, -0.8]])
     sums = np.zeros((1, 1, 40, 6), dtype=np.float32)
-    told = (index, np.full((1, 1), 0.5, dtype=np.float32), np.array([[0.0, 0.0, 0.5]]), normal, np.ones(1))
+    seen = (index, np.full((1, 1), 0.5, dtype=np.float32), np.array([[0.0, 0.0, 0.5]]), normal, np.ones(1))
     origin, pose = np.array([-0.0025, -0.0025, 0.4]), np.eye(4)[:3]
     lens, colours = np.array([1.0, 1.0, 0.0, 0.0]), np.array([[10.0, 20.0, 30.0, 1.0]])
-    preview.integrate_view(sums, origin, 0.005, 0.02, 0.3, 1.0, pose, lens, *told, colours)
+    kernels.integrate_view(sums, origin, 0.005, 0.02, 0.3, 1.0, pose, lens, *seen, colours)
     along = 0.8 * (0.5 - (0.4 + 0.005 * (np.arange(40) + 0.5)))
     inside = np.abs(along) <= 0.02
     expected = np.where(inside, np.minimum(1.0, 1.5 * (1.0 + along / 0.02) + 1e-3), np.where(along > 0.02, 0.3, 0.0))
@@ -101,7 +101,7 @@ def test_distances_are_those_along_the_normal_within_the_band():
 def test_the_preview_is_the_surface_at_every_step(views, trajectory):
     tsdf, triangles = IncrementalTsdf(FUSER), 0
     for count in (1, 3, 8):
-        tsdf = tsdf.to(dict(list(views.items())[:count]), trajectory)
+        tsdf = tsdf.updated(dict(list(views.items())[:count]), trajectory)
         assert len(tsdf.model().triangles) > triangles
         triangles = len(tsdf.model().triangles)
     model = tsdf.model()
@@ -112,10 +112,10 @@ def test_the_preview_is_the_surface_at_every_step(views, trajectory):
 
 
 def test_a_model_that_followed_the_poses_is_one_made_with_them(views, trajectory):
-    before = grown(views, nudged(trajectory, 1))
+    before = dilated(views, nudged(trajectory, 1))
     after, steps = settled(before, views, trajectory)
     assert steps >= 1
-    fresh = grown(views, trajectory)
+    fresh = dilated(views, trajectory)
     low = np.maximum(after.low, fresh.low)
     high = np.minimum(np.add(after.low, after.sums.shape[:3]), np.add(fresh.low, fresh.sums.shape[:3]))
 
@@ -132,55 +132,55 @@ def test_a_model_that_followed_the_poses_is_one_made_with_them(views, trajectory
 
 def test_few_views_move_at_a_time_those_that_moved_most_first(views, trajectory):
     how = replace(FUSER, preview_moves=2)
-    before = grown(views, trajectory, how)
+    before = dilated(views, trajectory, how)
     shifts_m = dict(zip(views, [0.0, 0.001, 0.02, 0.03, 0.01, 0.0, 0.04, 0.05], strict=True))
     moved = {k: se3.translation(np.array([shifts_m[k], 0.0, 0.0])) @ pose for k, pose in trajectory.items()}
     order = []
     tsdf = before
     for _ in range(10):
-        after = tsdf.to(views, moved)
+        after = tsdf.updated(views, moved)
         if after is tsdf:
             break
-        order.append({k for k in views if after.places[k] is not tsdf.places[k]})
+        order.append({k for k in views if after.integrated[k] is not tsdf.integrated[k]})
         tsdf = after
     frames = list(views)
     assert order == [{frames[7], frames[6]}, {frames[3], frames[2]}, {frames[4]}]  # 1 mm is less than half a voxel
 
 
 def test_nothing_new_changes_nothing_and_earlier_models_stay(views, trajectory):
-    tsdf = grown(views, trajectory)
+    tsdf = dilated(views, trajectory)
     sums = tsdf.sums.copy()
-    assert tsdf.to(views, trajectory) is tsdf
-    tsdf.to(views, nudged(trajectory, 2, 0.02))
+    assert tsdf.updated(views, trajectory) is tsdf
+    tsdf.updated(views, nudged(trajectory, 2, 0.02))
     np.testing.assert_array_equal(tsdf.sums, sums)
 
 
 def test_a_view_that_loses_its_pose_is_taken_back(views, trajectory):
     frames = list(views)
     without = {k: pose for k, pose in trajectory.items() if k != frames[-1]}
-    tsdf = grown(views, trajectory).to(views, without)
-    assert set(tsdf.places) == set(frames[:-1])
-    fresh = grown({k: views[k] for k in frames[:-1]}, without)
+    tsdf = dilated(views, trajectory).updated(views, without)
+    assert set(tsdf.integrated) == set(frames[:-1])
+    fresh = dilated({k: views[k] for k in frames[:-1]}, without)
     assert len(tsdf.model().triangles) == pytest.approx(len(fresh.model().triangles), rel=0.01)
 
 
 def test_the_voxels_grow_until_the_box_is_small_enough(views, trajectory):
-    coarse = grown(views, trajectory, replace(FUSER, preview_limit=16_000))
+    coarse = dilated(views, trajectory, replace(FUSER, preview_limit=16_000))
     assert coarse.sums[..., 0].size <= 16_000
     assert coarse.voxel_m > FUSER.preview_voxels * 0.002
-    assert len(coarse.places) == len(views)
+    assert len(coarse.integrated) == len(views)
     assert np.median(off_m(coarse)) < coarse.voxel_m
 
 
 def test_colours_are_those_of_the_views_and_grey_without(views, trajectory):
     plain = {k: replace(view, frame=replace(view.frame, colour=None)) for k, view in views.items()}
-    assert grown(plain, trajectory).model().vertex_colours is None
+    assert dilated(plain, trajectory).model().vertex_colours is None
     frame = next(iter(views))
     view = views[frame]
     red = np.zeros((*view.frame.depth_m.shape, 3), dtype=np.uint8)
     red[..., 0] = 200
-    painted = {**plain, frame: replace(view, frame=replace(view.frame, colour=red))}
-    model = grown(painted, trajectory).model()
+    texture_colours = {**plain, frame: replace(view, frame=replace(view.frame, colour=red))}
+    model = dilated(texture_colours, trajectory).model()
     assert model.vertex_colours is not None
     seen = model.vertex_colours[:, 0] != model.vertex_colours[:, 1]
     assert 0.1 < np.mean(seen) < 0.9
@@ -189,4 +189,4 @@ def test_colours_are_those_of_the_views_and_grey_without(views, trajectory):
 
 def test_without_a_pose_there_is_nothing_to_show(views):
     with pytest.raises(InputError, match="nothing to fuse"):
-        IncrementalTsdf(FUSER).to(views, {})
+        IncrementalTsdf(FUSER).updated(views, {})

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from modeler.fusion import closing, surface
+from modeler.fusion import surface, watertight
 from modeler.types import Array
 
 RADIUS_M, NOISE_M = 0.05, 0.0004
@@ -26,22 +26,24 @@ def test_only_vertices_asked_for_are_smoothed_and_nothing_shrinks(rng: np.random
     vertices_m = rough(rng)
     before_m = vertices_m.copy()
     only = vertices_m[:, 2] > 0.0
-    smooth_m = surface.fair(vertices_m, TRIANGLES, surface.ROUGH, only)
+    smooth_m = surface.taubin_smoothed(vertices_m, TRIANGLES, surface.WEAK_PASSES, only)
     np.testing.assert_array_equal(smooth_m[~only], before_m[~only])
     np.testing.assert_array_equal(vertices_m, before_m)
     assert off_m(smooth_m[only]).std() < 0.5 * off_m(before_m[only]).std()
     assert abs(off_m(smooth_m[only]).mean()) < 1e-3 * RADIUS_M
-    everywhere_m = surface.fair(vertices_m, TRIANGLES, 3)
-    np.testing.assert_allclose(surface.fair(vertices_m, TRIANGLES, 3, np.ones_like(only)), everywhere_m, atol=1e-12)
+    everywhere_m = surface.taubin_smoothed(vertices_m, TRIANGLES, 3)
+    np.testing.assert_allclose(
+        surface.taubin_smoothed(vertices_m, TRIANGLES, 3, np.ones_like(only)), everywhere_m, atol=1e-12
+    )
 
 
 def test_grown_marks_reach_as_many_rings_as_asked() -> None:
     one = np.zeros(len(BALL.vertices), dtype=bool)
     one[0] = True
-    np.testing.assert_array_equal(surface.grown(one, TRIANGLES, 0), one)
-    ring = surface.grown(one, TRIANGLES, 1)
+    np.testing.assert_array_equal(surface.dilated(one, TRIANGLES, 0), one)
+    ring = surface.dilated(one, TRIANGLES, 1)
     assert set(np.flatnonzero(ring)) == {0, *BALL.vertex_neighbors[0]}
-    np.testing.assert_array_equal(surface.grown(one, TRIANGLES, 2), surface.grown(ring, TRIANGLES, 1))
+    np.testing.assert_array_equal(surface.dilated(one, TRIANGLES, 2), surface.dilated(ring, TRIANGLES, 1))
 
 
 @pytest.mark.parametrize("weak_above_m", [np.inf, 0.03])
@@ -54,7 +56,7 @@ def test_crumbs_along_the_seam_and_where_views_know_little_are_smoothed(
     vertices_m[crumbs] *= 1.0 + 0.5 * EDGE_M / RADIUS_M
     seen_m = vertices_m[vertices_m[:, 2] > 0.0]
     weak = seen_m[:, 2] > weak_above_m
-    found_m, triangles, shown = closing.tidied(vertices_m, TRIANGLES, seen_m, weak, voxel_m=0.5 * EDGE_M, passes=0)
+    found_m, triangles, shown = watertight.cleaned(vertices_m, TRIANGLES, seen_m, weak, voxel_m=0.5 * EDGE_M, passes=0)
     np.testing.assert_array_equal(np.sort(triangles), np.sort(TRIANGLES))
     np.testing.assert_array_equal(shown, vertices_m[:, 2] > 0.0)
     equator = np.abs(vertices_m[:, 2]) < EDGE_M

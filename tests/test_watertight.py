@@ -8,8 +8,7 @@ import tabletop
 import trimesh
 
 from modeler import se3
-from modeler.fusion import Fuser, closing
-from modeler.fusion.volume import FusionVolume
+from modeler.fusion import Fuser, FusionVolume, watertight
 from modeler.types import Array, Plane
 
 VOXEL_M = 0.0025
@@ -30,8 +29,8 @@ def volume_of(planes: list[Plane], object_from_model: Array | None = None) -> Fu
     return FUSER.volume(views, tabletop.trajectory(POSES, object_from_model))
 
 
-def tables(volume: FusionVolume) -> Array:
-    return closing.tables(volume.views, volume.box.corners_m, volume.tau_m)
+def support_planes_of(volume: FusionVolume) -> Array:
+    return watertight.support_planes(volume.views, volume.grid.corners_m, volume.tau_m)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -53,10 +52,10 @@ def test_a_watertight_model_stands_on_its_table(seed: int) -> None:
 def test_planes_that_are_alike_are_one_table_and_one_view_makes_none() -> None:
     rng = np.random.default_rng(0)
     planes = [plane(pose, -BRICK.half_m[2] + rng.normal(0.0, 3e-4)) for pose in POSES]
-    (table,) = tables(volume_of(planes))
+    (table,) = support_planes_of(volume_of(planes))
     np.testing.assert_allclose(table, [0.0, 0.0, 1.0, BRICK.half_m[2]], atol=3e-4)
     wrong = replace(planes[5], offset_m=planes[5].offset_m - 0.03)
-    (same,) = tables(volume_of([*planes[:5], wrong, *planes[6:]]))
+    (same,) = support_planes_of(volume_of([*planes[:5], wrong, *planes[6:]]))
     np.testing.assert_allclose(same, table, atol=3e-4)
 
 
@@ -64,12 +63,12 @@ def test_an_object_that_lay_two_ways_stood_on_two_tables() -> None:
     on_end = [
         Plane(pose[:3, 0], float(-pose[:3, 0] @ (pose[:3, 3] - 0.07 * pose[:3, 0])), 0.005, 1e-3) for pose in POSES
     ]
-    found = tables(volume_of([plane(pose) if k < 9 else on_end[k] for k, pose in enumerate(POSES)]))
+    found = support_planes_of(volume_of([plane(pose) if k < 9 else on_end[k] for k, pose in enumerate(POSES)]))
     np.testing.assert_allclose(found, [[0.0, 0.0, 1.0, 0.04], [1.0, 0.0, 0.0, 0.07]], atol=1e-9)
 
 
 def test_what_reaches_below_a_plane_does_not_stand_on_it() -> None:
     volume = volume_of([plane(pose, -0.02) for pose in POSES])
-    assert len(tables(volume)) == 0
+    assert len(support_planes_of(volume)) == 0
     low_m = volume.model(watertight=True).vertices_m[:, 2].min()
     assert low_m < -0.035

@@ -73,7 +73,7 @@ class Export:
         if self.texture and volume is not None:
             if not volume.views.coloured.any():
                 raise InputError(f"{self.run_folder}: its frames have no colour; leave out --texture")
-            model, texture = files.textured(model, volume.painted, volume.texel_m)
+            model, texture = files.textured(model, volume.texture_colours, volume.texel_m)
         if self.bop:
             files.write_bop(model, self.out)
         else:

@@ -14,7 +14,7 @@ from modeler.cli import compose
 from modeler.cli.console import bar, say
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.export import RunFolder, edges_of, poses_of
-from modeler.fusion import Fuser, FusionVolume, own_covariances
+from modeler.fusion import Fuser, FusionVolume, conditional_covariances
 from modeler.graph import PoseGraph, solve
 from modeler.rays import Sensor
 from modeler.types import ACCEPTED, Array, Edge, Frame, InputError, RayImage, Solution
@@ -209,7 +209,7 @@ class Reopened:
 
     def volume(self, fuser: Fuser) -> FusionVolume:
         """Return the views laid together as `modeler build` lays them."""
-        return fuser.volume(self.views, self.solution.trajectory, own_covariances(self.solution, self.edges))
+        return fuser.volume(self.views, self.solution.trajectory, conditional_covariances(self.solution, self.edges))
 
 
 def reopened(run: Path, moved: Sequence[Path] = ()) -> Reopened:

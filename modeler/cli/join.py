@@ -259,12 +259,12 @@ def _written(
     import numpy as np
 
     from modeler.export.report import FrameRecord
-    from modeler.fusion import Fuser, own_covariances
+    from modeler.fusion import Fuser, conditional_covariances
     from modeler.types import Solution
     from viz.stream import open_stream
 
     views = dict(parts[0].views) | dict(parts[1].views)
-    model = Fuser().fuse(views, solution.trajectory, own_covariances(solution, graph.edges))
+    model = Fuser().fuse(views, solution.trajectory, conditional_covariances(solution, graph.edges))
     for record in (record for part in parts for record in part.report["frames"]):
         folder.frames[record["id"]] = FrameRecord(**{field.name: record[field.name] for field in fields(FrameRecord)})
     joining = tuple(edge for edge in graph.edges if edge.source in parts[1].views and edge.target in parts[0].views)

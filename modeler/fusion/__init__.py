@@ -1,9 +1,8 @@
-"""Views and their poses to one model of the object: merged cloud and mesh."""
+"""Fusion of posed depth views into one model of the object: point cloud and mesh."""
 
-from modeler.fusion.fuser import Fuser
+from modeler.fusion.alignment import Match, Matcher
+from modeler.fusion.fuser import Fuser, FusionVolume
 from modeler.fusion.incremental import IncrementalTsdf
-from modeler.fusion.matching import Match, Matcher
-from modeler.fusion.poses import own_covariances
-from modeler.fusion.volume import FusionVolume
+from modeler.fusion.views import conditional_covariances
 
-__all__ = ["Fuser", "FusionVolume", "IncrementalTsdf", "Match", "Matcher", "own_covariances"]
+__all__ = ["Fuser", "FusionVolume", "IncrementalTsdf", "Match", "Matcher", "conditional_covariances"]

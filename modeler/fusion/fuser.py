@@ -1,74 +1,67 @@
-"""Views and their poses to one model."""
+"""Fusion of posed depth views into a point cloud and a mesh."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from modeler import se3
-from modeler.fusion import grid
-from modeler.fusion.crop import SMOOTHED
-from modeler.fusion.incremental import IncrementalTsdf
-from modeler.fusion.views import posed, spread, stack
-from modeler.fusion.volume import FusionVolume
-from modeler.types import Array, InputError, ObjectModel, RayImage
+from modeler.fusion import surface, watertight
+from modeler.fusion.distance_field import DistanceField, VoxelGrid, filled, grid_around, measured
+from modeler.fusion.support import ViewSupport, exposure_gains, view_support
+from modeler.fusion.views import SMOOTHED, DepthViews, depth_views, disagreement, posed_views
+from modeler.kernels import point_clouds
+from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage
+
+# Exponents of the view weights for colours: an average of views for vertices, nearly one view for textures, where an
+# average blurs. Chosen by hand.
+SOFT, SHARP = 4.0, 16.0
+FOLD_RINGS = 8  # rings of triangles along borders that may fold over; chosen by hand
+MIN_NEIGHBOURS = 6  # points of the cloud with fewer in 27 cells of two voxels are outliers; a plane has some 36
+FINEST_PX = 0.01  # smallest voxel, in pixel footprints: a hundred voxels per pixel resolve nothing
 
 
 @dataclass(frozen=True)
 class Fuser:
-    """Merge views into a cloud and a mesh.
+    """Fuse views into a cloud and a mesh.
 
-    The mesh is the zero level of a truncated signed distance (Curless and Levoy 1996, "A volumetric method for building
-    complex models from range images") on voxels near the surface.
+    The mesh is the zero level set of a truncated signed distance function (TSDF; Curless and Levoy 1996, "A volumetric
+    method for building complex models from range images") on voxels near the surface. docs/method.md, section Fusion,
+    has the equations.
     """
 
     voxel_m: float | None = None
-    """Side of a voxel in m; None: what a pixel covers, or half the sensor's noise where that is more."""
-    truncation_m: float | None = None
-    """Half width of the band around the surface in m; None: three voxels and twice what the views disagree by."""
+    """Side of a voxel in m; None: the footprint of a pixel, or half the sensor's noise if that is larger."""
     max_voxels: int = 192**3
-    """The voxels grow until the object's box holds no more than so many."""
+    """Memory bound: voxels are enlarged until the object's box holds at most this many."""
     preview_voxels: float = 2.0
-    """Side of a voxel of a preview, in voxels of the model."""
+    """Side of a voxel of the preview, in voxels of the model."""
     preview_limit: int = 128**3
-    """The voxels of a preview grow until its box holds no more than so many."""
+    """Memory bound of the preview, as `max_voxels`."""
     preview_moves: int = 8
-    """At most so many views whose poses have moved are carried along from one preview to the next."""
+    """The preview integrates at most this many moved views again per update."""
     min_cosine: float = 0.15
-    """Surface seen at a more grazing angle than this cosine (normal to ray) is not used."""
+    """Surface points seen at a smaller cosine between normal and ray (81°) are not used."""
     edge_weight: float = 0.1
-    """Weight of pixels next to a silhouette or a step in depth, against 1: they mix what is before and behind."""
+    """Weight of pixels next to a silhouette or depth step, relative to 1: they mix foreground and background."""
     margin_px: int = 2
-    """A pixel carves only as deep as all its neighbours within so many px, so that silhouettes are not eaten away."""
+    """A pixel carves only as deep as all its neighbours within this distance, which preserves silhouettes."""
     empty_weight: float = 0.3
-    """Weight of a view that sees through a place, against 1 for a view that sees surface there head-on."""
+    """Weight of a view that sees a voxel empty, relative to 1 for a view that sees surface there head-on."""
     min_support: float = 0.03
-    """Mesh that is seen less is removed. A view counts 1 head-on, less at flat angles, `edge_weight` at silhouettes."""
+    """Smallest sum of view weights of a mesh vertex."""
     closing: int = 3
-    """Gaps narrower than about twice so many voxels are closed; what nobody saw beyond stays open."""
+    """Gaps narrower than about twice this many voxels are closed; wider unseen regions stay open."""
     opening: int = 2
-    """Spikes and strips along open borders narrower than about twice so many voxels are cut off."""
+    """Spikes and strips along open borders narrower than about twice this many voxels are removed."""
     fairing: int = 10
-    """Passes of smoothing the mesh without shrinking it."""
+    """Passes of Taubin smoothing."""
     min_piece: float = 0.01
-    """Loose pieces of the mesh smaller than this share of the largest piece's area are removed."""
-
-    def preview(
-        self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array], before: IncrementalTsdf | None = None
-    ) -> IncrementalTsdf:
-        """Return a coarse model that costs little more than what has changed since the one before.
-
-        Args:
-            views: by frame number; those without a pose are left out.
-            trajectory: object_from_camera (4, 4) by frame number.
-            before: what this returned for fewer views or older poses; None: begin afresh.
-
-        Raises:
-            InputError: where no view with surface points has a pose.
-        """
-        return (before or IncrementalTsdf(self)).to(views, trajectory)
+    """Connected components of the mesh smaller than this share of the largest one's area are removed."""
 
     def fuse(
         self,
@@ -76,19 +69,18 @@ class Fuser:
         trajectory: Mapping[int, Array],
         covariances: Mapping[int, Array] | None = None,
     ) -> ObjectModel:
-        """Return cloud and mesh, made with care.
+        """Return the cloud and the open mesh.
 
-        Space that a view saw empty is carved, what nobody saw stays open, and nothing but pixels of the object becomes
-        surface.
+        Space that a view saw empty is carved, unseen surface stays open, and only pixels of the object become surface.
 
         Args:
-            views: by frame number; those without a pose are left out.
+            views: by frame number; views without a pose are left out.
             trajectory: object_from_camera (4, 4) by frame number.
-            covariances: (6, 6) of the poses by frame number; the surer a pose, the more its view counts. A pose without
-                one counts as exact.
+            covariances: (6, 6) of the poses by frame number, which reduce the weights of uncertain views. Poses
+                without one count as exact.
 
         Raises:
-            InputError: where no view with surface points has a pose.
+            InputError: if no view with surface points has a pose, or the voxel size is out of range.
         """
         return self.volume(views, trajectory, covariances).model()
 
@@ -98,39 +90,206 @@ class Fuser:
         trajectory: Mapping[int, Array],
         covariances: Mapping[int, Array] | None = None,
     ) -> FusionVolume:
-        """Return the views laid together in one volume, from which models are made; arguments as of `fuse`."""
-        pairs = posed(views, trajectory)
+        """Return the views and voxels from which models are made; arguments as for `fuse`."""
+        pairs = posed_views(views, trajectory)
         noise_m = float(np.median([view.sigma_r_m for view, _ in pairs]))
-        voxel_m = self.side_m(pairs)
-        box = grid.around(
+        voxel_m = self.voxel_side_m(pairs)
+        grid = grid_around(
             np.concatenate([se3.transform(pose, view.points_m) for view, pose in pairs]),
             voxel_m=voxel_m,
-            border_m=self.truncation_m or 3.0 * voxel_m + 2.0 * noise_m,
+            border_m=3.0 * voxel_m + 2.0 * noise_m,
             max_voxels=self.max_voxels,
         )
-        seen = stack(
+        seen = depth_views(
             pairs,
-            box.corners_m,
+            grid.corners_m,
             margin_px=self.margin_px,
             min_cosine=self.min_cosine,
             edge_weight=self.edge_weight,
             covariances=covariances,
         )
-        # Where poses are off, the band must be wide enough for the views to meet in it.
-        limit_m = 0.05 * float(np.linalg.norm(box.shape)) * box.voxel_m
-        spread_m, sigma_m = spread(seen, limit_m) or (noise_m, SMOOTHED * noise_m)
-        tau_m = self.truncation_m or 3.0 * box.voxel_m + 2.0 * spread_m
-        return FusionVolume(self, seen.carving(tau_m), box, tau_m, box.voxel_m + 2.0 * spread_m, sigma_m)
+        limit_m = 0.05 * float(np.linalg.norm(grid.shape)) * grid.voxel_m
+        spread_m, sigma_m = disagreement(seen, limit_m) or (noise_m, SMOOTHED * noise_m)
+        tau_m = 3.0 * grid.voxel_m + 2.0 * spread_m  # (F4)
+        return FusionVolume(self, seen.carving(tau_m), grid, tau_m, grid.voxel_m + 2.0 * spread_m, sigma_m)
 
-    def side_m(self, pairs: list[tuple[RayImage, Array]]) -> float:
-        """Return the side of a voxel, before the box is known.
+    def voxel_side_m(self, pairs: list[tuple[RayImage, Array]]) -> float:
+        """Return the side of a voxel before the memory bound is applied.
 
         Raises:
-            InputError: where the one that was given is none.
+            InputError: if `voxel_m` is not a length that the views resolve.
         """
-        if self.voxel_m is not None:
-            if not self.voxel_m > 0.0:
-                raise InputError(f"voxel size {self.voxel_m} m is not positive; give a length in m, or none")
-            return self.voxel_m
         footprint_m = np.concatenate([view.points_m[:, 2] / view.frame.camera.fx for view, _ in pairs])
-        return max(float(np.median(footprint_m)), 0.5 * float(np.median([view.sigma_r_m for view, _ in pairs])))
+        pixel_m = float(np.median(footprint_m))
+        if self.voxel_m is None:
+            return max(pixel_m, 0.5 * float(np.median([view.sigma_r_m for view, _ in pairs])))
+        if not FINEST_PX * pixel_m <= self.voxel_m < np.inf:
+            raise InputError(
+                f"voxel size {self.voxel_m:g} m is out of range: a pixel covers {pixel_m:.2g} m of this object; "
+                f"give at least {FINEST_PX * pixel_m:.1g} m, or leave it out"
+            )
+        return self.voxel_m
+
+
+@dataclass(frozen=True, eq=False)
+class FusionVolume:
+    """Posed views and the voxels around the object."""
+
+    fuser: Fuser
+    """Parameters."""
+    views: DepthViews
+    """The views."""
+    grid: VoxelGrid
+    """The voxels."""
+    tau_m: float
+    """Half width of the truncation band."""
+    near_m: float
+    """Largest distance along the normal between observations of the same surface."""
+    sigma_m: float
+    """Standard deviation of a surface point seen head-on by one view."""
+
+    def model(self, *, watertight: bool = False) -> ObjectModel:
+        """Return the cloud and the mesh.
+
+        Args:
+            watertight: close the mesh with surface that no view saw; the standard deviation of its vertices is inf.
+        """
+        vertices, triangles, seen = self._mesh(watertight=watertight)
+        normals = surface.normals_of(vertices, triangles)
+        at_vertices = self.support(vertices, normals)
+        points, point_normals = downsampled(
+            self.views.points_m,
+            self.views.normals,
+            self.views.weights,
+            voxel_m=self.grid.voxel_m,
+            max_voxels=8 * self.fuser.max_voxels,
+        )
+        at_points = self.support(points, point_normals)
+        kept = self._supported(at_points) & ~_outliers(points, 2.0 * self.grid.voxel_m)
+        coloured = bool(self.views.coloured.any())
+        known = at_vertices.coloured & seen
+        return ObjectModel(
+            points_m=points[kept],
+            normals=point_normals[kept],
+            colours=at_points.colours[kept] if coloured else None,
+            vertices_m=vertices,
+            triangles=triangles,
+            vertex_normals=normals,
+            vertex_colours=surface.filled_colours(at_vertices.colours, known, vertices) if coloured else None,
+            vertex_views=np.where(seen, at_vertices.views, 0),
+            vertex_sigmas_m=np.where(seen, at_vertices.sigmas_m, np.inf),
+        )
+
+    def support(self, points_m: Array, normals: Array) -> ViewSupport:
+        """Return what the views observe at oriented points (n, 3) of the object frame."""
+        return self._support(points_m, normals, self._gains)
+
+    def texture_colours(self, points_m: Array, normals: Array) -> npt.NDArray[np.uint8]:
+        """Return the RGB (n, 3) of surface points (n, 3) from the most frontal and sharpest views."""
+        found = self._support(points_m, normals, self._gains, focus=SHARP)
+        return surface.filled_colours(found.colours, found.coloured, points_m)
+
+    @property
+    def texel_m(self) -> float:
+        """Length on the surface that half a pixel of the views covers."""
+        turns, shifts = self.views.poses[:, :, :3], self.views.poses[:, :, 3]
+        centres_m = -np.einsum("fji,fj->fi", turns, shifts)[self.views.views]
+        depth_m = float(np.median(np.linalg.norm(self.views.points_m - centres_m, axis=1)))
+        return 0.5 * depth_m / float(np.median(self.views.intrinsics[:, 0]))
+
+    @cached_property
+    def _gains(self) -> Array:
+        """Exposure gains and colour weights of the views, (f, 4)."""
+        return exposure_gains(self.views, self.views.points_m, self.views.normals, tau_m=self.tau_m, near_m=self.near_m)
+
+    def _support(self, points_m: Array, normals: Array, gains: Array, *, focus: float = SOFT) -> ViewSupport:
+        return view_support(
+            self.views,
+            points_m,
+            normals,
+            tau_m=self.tau_m,
+            near_m=self.near_m,
+            sigma_m=self.sigma_m,
+            gains=gains,
+            focus=focus,
+        )
+
+    def _supported(self, found: ViewSupport) -> BoolArray:
+        """Return which points (n,) have more support than views that see them empty."""
+        return found.weight > self.fuser.empty_weight * found.empty_views
+
+    def _mesh(self, *, watertight: bool) -> tuple[Array, surface.Triangles, BoolArray]:
+        """Return vertices (v, 3) and triangles (t, 3) of the surface, and which vertices the views support."""
+        field = measured(self.grid, self.views, tau_m=self.tau_m, empty_weight=self.fuser.empty_weight)
+        for _ in range(self.fuser.closing):
+            field = filled(field)
+        vertices, triangles = surface.extracted_mesh(field)
+        kept, weak = self._kept(vertices, triangles)
+        shown = triangles[np.all(kept[triangles], axis=1)]
+        shown = shown[surface.large_pieces(vertices, shown, self.fuser.min_piece)]
+        used, compact = surface.used_vertices(shown, len(vertices))
+        if watertight:
+            return self._closed_mesh(field, vertices, used, weak)
+        smooth = surface.taubin_smoothed(vertices[used], compact, self.fuser.fairing)
+        smooth = surface.taubin_smoothed(smooth, compact, surface.WEAK_PASSES, weak[used])
+        return smooth, compact, np.ones(len(used), dtype=bool)
+
+    def _kept(self, vertices: Array, triangles: surface.Triangles) -> tuple[BoolArray, BoolArray]:
+        """Return which vertices (v,) of the zero level set are surface, and which (v,) have weak support.
+
+        Surface is supported, not seen empty by several views, and does not fold over at a border.
+        """
+        normals = surface.normals_of(vertices, triangles)
+        found = self._support(vertices, normals, np.zeros((len(self.views.index), 4)))
+        # Closing gaps in the support must not add what several views see empty.
+        empty = found.empty_views * self.fuser.empty_weight > found.weight + self.fuser.empty_weight
+        seen = (found.weight > self.fuser.min_support) & self._supported(found)
+        marked = surface.gaps_closed(seen, triangles, self.fuser.closing) & ~empty
+        # At silhouettes the zero level set folds over: views extrapolate the object one band behind its surface.
+        loose = surface.folded(vertices, normals, seen, marked & ~seen)
+        marked = surface.without_loose_border(marked, loose, triangles, FOLD_RINGS)
+        usual = float(np.median(found.weight[marked])) if marked.any() else 0.0
+        return surface.spikes_removed(marked, triangles, self.fuser.opening), found.weight < surface.WEAK * usual
+
+    def _closed_mesh(
+        self, field: DistanceField, vertices: Array, used: npt.NDArray[np.int64], weak: BoolArray
+    ) -> tuple[Array, surface.Triangles, BoolArray]:
+        """Return the watertight mesh: vertices, triangles, and which vertices the views support."""
+        unused = np.ones(len(vertices), dtype=bool)
+        unused[used] = False
+        field = watertight.without_rejected(field, vertices[unused], vertices[used], self.tau_m)
+        return watertight.cleaned(
+            *surface.extracted_mesh(watertight.closed_field(field, self.views, self.tau_m)),
+            vertices[used],
+            weak[used],
+            voxel_m=self.grid.voxel_m,
+            passes=self.fuser.fairing,
+        )
+
+
+def downsampled(
+    points_m: Array, normals: Array, weights: Array, *, voxel_m: float, max_voxels: int
+) -> tuple[Array, Array]:
+    """Average oriented points (n, 3) over voxels.
+
+    Returns:
+        Points (m, 3) and unit normals (m, 3), in the order in which the points enter the voxels.
+    """
+    low, high = points_m.min(axis=0), points_m.max(axis=0)
+    while np.prod(np.ceil((high - low) / voxel_m) + 1.0) > max_voxels:
+        voxel_m *= 1.25
+    shape = (np.ceil((high - low) / voxel_m) + 1.0).astype(np.int64)
+    cells, count = point_clouds.voxel_numbers(points_m, low, voxel_m, shape)
+    sums, totals = point_clouds.voxel_sums(cells, count, weights, np.concatenate([points_m, normals], axis=1))
+    means = sums / totals[:, None]
+    lengths = np.linalg.norm(means[:, 3:], axis=1)
+    # Opposite sides of a sheet thinner than a voxel cancel: such a point has no normal and is left out.
+    kept = lengths > 0.1
+    return means[kept, :3], means[kept, 3:] / lengths[kept, None]
+
+
+def _outliers(points_m: Array, cell_m: float) -> BoolArray:
+    """Return which points (n,) have fewer than `MIN_NEIGHBOURS` points, themselves included, in 27 cells around."""
+    low, high = points_m.min(axis=0), points_m.max(axis=0)
+    shape = (np.ceil((high - low) / cell_m) + 1.0).astype(np.int64)
+    return point_clouds.neighbour_counts(points_m, low, cell_m, shape) < MIN_NEIGHBOURS

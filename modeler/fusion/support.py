@@ -1,4 +1,4 @@
-"""What the views say of points of a surface: who saw them, how sure they are, and in which colour."""
+"""What the views observe at points of a surface: support, standard deviation and colour."""
 
 from __future__ import annotations
 
@@ -6,31 +6,38 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import laplace, minimum_filter
 
-from modeler.fusion.crop import GREY
-from modeler.fusion.views import DepthViews
-from modeler.kernels import fusion
+from modeler.fusion.views import GREY, DepthViews
+from modeler.kernels import tsdf
 from modeler.types import Array
 
-# The noise at a point is that of all points as if so many views had shown it, until its own tell more.
-PRIOR_VIEWS = 3.0
-BATCH = 1 << 18  # points looked up at a time
+# Strength of the prior on the noise of a single point: the noise of all points counts as much as this many views.
+PRIOR_VIEWS = 3.0  # chosen by hand
+BATCH = 1 << 18  # points per kernel call, which bounds memory
+
+DARK, BRIGHT = 12.0, 243.0  # levels (of 255) beyond which a pixel may be clipped: 5 % at either end
+EXPOSURE_LOOKUPS = 100_000  # points times views at which exposures are compared, which bounds time
+ROUNDS = 8  # of iteratively reweighted least squares
+GAIN_SIGMA = 0.05  # prior sd of log gains; chosen by hand
+COLOUR_SIGMA = 0.1  # scale of the Cauchy weights on log colours, against highlights; chosen by hand
+LARGEST_GAIN = 2.5  # largest factor between exposures; chosen by hand
 
 
 @dataclass(frozen=True, eq=False)
 class ViewSupport:
-    """What the views say of oriented points, each (n,) or (n, 3)."""
+    """What the views observe at oriented points, each (n,) or (n, 3)."""
 
-    support: Array
+    weight: Array
     """Sum of the weights of the views that see surface there."""
-    emptiness: Array
-    """Number of views that see the place empty."""
+    empty_views: Array
+    """Number of views that see the point in empty space."""
     views: npt.NDArray[np.int64]
     """Number of views that see surface there."""
     sigmas_m: Array
-    """Standard deviation along the normal of the surface fused from those views; inf where there is none."""
+    """Standard deviation of the fused surface along the normal; inf where no view sees surface."""
     colours: npt.NDArray[np.uint8]
-    """RGB, grey where no view has a colour to give."""
+    """RGB, grey where no view has a colour."""
     coloured: npt.NDArray[np.bool_]
     """Whether a view has."""
 
@@ -46,20 +53,20 @@ def view_support(
     gains: Array,
     focus: float,
 ) -> ViewSupport:
-    """Ask the views about points.
+    """Return what the views observe at oriented points (docs/method.md, F7 to F9).
 
     Args:
         views: the views.
         points_m: (n, 3) in the object frame.
         normals: (n, 3) unit.
-        tau_m: half width of the band around the surface.
-        near_m: surface further away along the normal is another one.
-        sigma_m: standard deviation of what one view of weight 1 says.
-        gains: (f, 4) factors on the views' red, green and blue, and their say in colours.
-        focus: power of the weights with which views speak of colour: the higher, the more the most frontal one alone.
+        tau_m: half width of the truncation band.
+        near_m: largest distance along the normal to the same surface.
+        sigma_m: standard deviation of one view of weight 1.
+        gains: (f, 4) gains of red, green and blue, and the weight of each view's colours.
+        focus: exponent of the view weights for colours; the larger, the more the most frontal view dominates.
     """
-    parts = [
-        fusion.survey(
+    batches = [
+        tsdf.observe(
             np.ascontiguousarray(points_m[start : start + BATCH]),
             np.ascontiguousarray(normals[start : start + BATCH]),
             near_m,
@@ -71,19 +78,87 @@ def view_support(
         )
         for start in range(0, max(len(points_m), 1), BATCH)
     ]
-    sums, colours = (np.concatenate(part) for part in zip(*parts, strict=True))
-    support, emptiness, count, first, second = sums.T
+    sums, colours = (np.concatenate(part) for part in zip(*batches, strict=True))
+    weight, empty_views, count, first, second = sums.T
     found = count > 0.0
-    safe = np.where(found, support, 1.0)
-    # How well the views agree here, against how well they agree everywhere: a χ² with one degree for the mean.
-    misfit = np.maximum(second - first**2 / safe, 0.0) / sigma_m**2
-    scale = (PRIOR_VIEWS + misfit) / (PRIOR_VIEWS + np.maximum(count - 1.0, 0.0))
-    known = colours[:, 3] > 0.0
+    safe = np.where(found, weight, 1.0)
+    misfit = np.maximum(second - first**2 / safe, 0.0) / sigma_m**2  # χ² of the views about their mean
+    scale = (PRIOR_VIEWS + misfit) / (PRIOR_VIEWS + np.maximum(count - 1.0, 0.0))  # (F8)
+    coloured = colours[:, 3] > 0.0
     return ViewSupport(
-        support=support,
-        emptiness=emptiness,
+        weight=weight,
+        empty_views=empty_views,
         views=count.astype(np.int64),
-        sigmas_m=np.where(found, sigma_m * np.sqrt(scale / safe), np.inf),
-        colours=np.rint(np.where(known[:, None], colours[:, :3], GREY)).astype(np.uint8),
-        coloured=known,
+        sigmas_m=np.where(found, sigma_m * np.sqrt(scale / safe), np.inf),  # (F8)
+        colours=np.rint(np.where(coloured[:, None], colours[:, :3], GREY)).astype(np.uint8),
+        coloured=coloured,
     )
+
+
+def exposure_gains(views: DepthViews, points_m: Array, normals: Array, *, tau_m: float, near_m: float) -> Array:
+    """Return (f, 4): gains of red, green and blue that equalise exposure, and colour weights, 0 without colour.
+
+    Each point has one colour and each view a gain; both are fitted to the logarithms of the observed colours of
+    common points (docs/method.md, F10). Sharper views have more weight.
+
+    Args:
+        views: the views.
+        points_m: (n, 3) on the surface, in the object frame.
+        normals: (n, 3) unit.
+        tau_m: half width of the truncation band.
+        near_m: largest distance along the normal to the same surface.
+    """
+    result = np.concatenate([np.ones((len(views.coloured), 3)), _sharpness(views)[:, None]], axis=1)
+    with_colour = np.flatnonzero(views.coloured)
+    if len(with_colour) < 2 or not len(points_m):
+        return result
+    chosen = np.arange(0, len(points_m), max(1, len(points_m) * len(with_colour) // EXPOSURE_LOOKUPS))
+    points_m, normals = np.ascontiguousarray(points_m[chosen]), np.ascontiguousarray(normals[chosen])
+    levels = np.zeros((len(with_colour), len(chosen), 3))
+    weights = np.zeros((len(with_colour), len(chosen)))
+    unit_gain = np.ones((1, 4))
+    for row, view in enumerate(with_colour):
+        one = views.only(int(view))
+        _, colours = tsdf.observe(points_m, normals, near_m, tau_m, *one.lookup, one.colour, unit_gain, 1.0)
+        levels[row], weights[row] = colours[:, :3], colours[:, 3]
+    weights[np.any((levels < DARK) | (levels > BRIGHT), axis=2)] = 0.0
+    weights[:, np.count_nonzero(weights, axis=0) < 2] = 0.0
+    if not weights.any():
+        return result
+    logs = np.log(np.maximum(levels, 1.0))
+    for channel in range(3):
+        result[with_colour, channel] = np.exp(_log_gains(logs[:, :, channel], weights))
+    return result
+
+
+def _log_gains(logs: Array, observed: Array) -> Array:
+    """Return log gains (f,), zero on average, that make logs (f, n) with weights `observed` (f, n) agree, robustly."""
+    gain, weights = np.zeros(len(logs)), observed
+    for _ in range(ROUNDS):
+        totals = np.maximum(weights.sum(axis=0), 1e-12)
+        shares = weights / totals
+        means = np.sum(shares * logs, axis=0)
+        # Normal equations of (F10), the points' colours already eliminated.
+        normal = np.diag(weights.sum(axis=1)) - weights @ shares.T
+        ridge = 1e-3 * normal.trace() / len(logs) + (COLOUR_SIGMA / GAIN_SIGMA) ** 2
+        gain = np.linalg.solve(normal + ridge * np.eye(len(logs)), np.sum(weights * (means - logs), axis=1))
+        gain = np.clip(gain - gain.mean(), -np.log(LARGEST_GAIN), np.log(LARGEST_GAIN))
+        off = logs + gain[:, None] - np.sum(shares * (logs + gain[:, None]), axis=0)
+        weights = observed / (1.0 + (off / COLOUR_SIGMA) ** 2)
+    return gain
+
+
+def _sharpness(views: DepthViews) -> Array:
+    """Return colour weights (f,): fine detail on the object relative to the other views; 0 without colour."""
+    sharpness = np.zeros(len(views.coloured))
+    for view in np.flatnonzero(views.coloured):
+        brightness = views.colour[view].astype(np.float64).mean(axis=2)
+        inside = np.asarray(minimum_filter(views.index[view] >= 0, size=3), dtype=bool)
+        if inside.any():
+            detail = np.median(np.abs(laplace(brightness)[inside]))
+            sharpness[view] = detail / max(float(brightness[inside].mean()), 1.0)
+    known = sharpness > 0.0
+    if known.any():
+        sharpness[known] = np.clip(sharpness[known] / np.median(sharpness[known]), 0.3, 3.0)
+    sharpness[views.coloured & ~known] = 1.0
+    return sharpness

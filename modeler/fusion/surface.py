@@ -1,4 +1,4 @@
-"""From a signed distance to a mesh: extraction, what the views support, and tidying."""
+"""From a signed distance to a mesh: extraction, selection of vertices, and smoothing."""
 
 from __future__ import annotations
 
@@ -8,43 +8,43 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from modeler.fusion.grid import Field
-from modeler.kernels import isosurface
-from modeler.kernels.pieces import PIECES
+from modeler.fusion.distance_field import DistanceField
+from modeler.kernels import marching_cubes
 from modeler.types import Array, BoolArray
 
 Triangles = npt.NDArray[np.int64]
 
-PINCHES = 50  # rounds after which sheets that touch are left touching
-NEAREST = 6  # vertices that lend their colour to one that has none
-AROUND = 12  # vertices that tell how the surface lies beside them
-TURNED_RAD = 0.7  # a surface that turns away by more within a few voxels curls
-WEAK = 0.2  # of the median support: a vertex with less is known badly
-ROUGH = 40  # passes of smoothing there
-HAIR = 1e-2  # how far inside a voxel is put, in voxels
+# Chosen by hand where nothing else is said.
+PINCH_ROUNDS = 50  # at most; a few rounds resolve all pinches of every field tried in the tests
+COLOUR_NEIGHBOURS = 6  # vertices whose colours are interpolated where none was observed
+NORMAL_NEIGHBOURS = 12  # supported vertices whose normals are compared with an unsupported one's
+FOLD_RAD = 0.7  # a surface that turns by more within a few voxels folds over
+WEAK = 0.2  # vertices with less than this share of the median support are weak
+WEAK_PASSES = 40  # of smoothing weak vertices
+PINCH_DEPTH = 1e-2  # how far inside a voxel is put to resolve a pinch, in voxels
 
 
-def parted(field: Field) -> Field:
-    """Return the field with the gap closed between sheets of the zero level that touch along an edge."""
+def without_pinches(field: DistanceField) -> DistanceField:
+    """Return the field with sheets of the zero level set joined that touch along an edge."""
     values, known = field.values_m, field.known
-    for _ in range(PINCHES):
-        voxels = isosurface.pinched(values, field.weights, known, PIECES)
+    for _ in range(PINCH_ROUNDS):
+        voxels = marching_cubes.pinched_voxels(values, field.weights, known)
         if not len(voxels):
             break
         if values is field.values_m:
             values = values.copy()
-        values[tuple(voxels.T)] = -HAIR * field.grid.voxel_m
-        # What is crossed now was crossed before, or lies around a voxel that was put inside.
+        values[tuple(voxels.T)] = -PINCH_DEPTH * field.grid.voxel_m
+        # Cells crossed by the surface now were crossed before, or lie around a changed voxel.
         around = (voxels[:, None] - np.argwhere(np.ones((2, 2, 2)))).reshape(-1, 3)
         keys = (np.ravel_multi_index(tuple(cells.T), values.shape) for cells in (known, around))
         known = np.stack(np.unravel_index(np.union1d(*keys), values.shape), axis=1)
-    return field if values is field.values_m else Field(field.grid, values, field.weights, known)
+    return field if values is field.values_m else DistanceField(field.grid, values, field.weights, known)
 
 
-def extracted(field: Field) -> tuple[Array, Triangles]:
-    """Return vertices (v, 3) in m and triangles (t, 3) of the zero level; no edge has more than two triangles."""
-    field = parted(field)
-    vertices, triangles = isosurface.extract(field.values_m, field.weights, field.known, PIECES)
+def extracted_mesh(field: DistanceField) -> tuple[Array, Triangles]:
+    """Return vertices (v, 3) in m and triangles (t, 3) of the zero level set; no edge has more than two triangles."""
+    field = without_pinches(field)
+    vertices, triangles = marching_cubes.extract(field.values_m, field.weights, field.known)
     return field.grid.origin_m + (vertices + 0.5) * field.grid.voxel_m, triangles
 
 
@@ -70,7 +70,7 @@ def areas_of(vertices_m: Array, triangles: Triangles) -> Array:
 
 
 def large_pieces(vertices_m: Array, triangles: Triangles, min_share: float) -> BoolArray:
-    """Return which triangles (t,) belong to connected pieces with at least `min_share` of the largest piece's area."""
+    """Return which triangles (t,) belong to connected components of at least `min_share` of the largest one's area."""
     if not len(triangles):
         return np.zeros(0, dtype=bool)
     piece = _piece(triangles, len(vertices_m))
@@ -79,7 +79,7 @@ def large_pieces(vertices_m: Array, triangles: Triangles, min_share: float) -> B
 
 
 def solid_pieces(vertices_m: Array, triangles: Triangles) -> BoolArray:
-    """Return which triangles (t,) of closed pieces bound the largest volume; bubbles inside and crumbs do not."""
+    """Return which triangles (t,) belong to the closed component of the largest volume."""
     if not len(triangles):
         return np.zeros(0, dtype=bool)
     piece = _piece(triangles, len(vertices_m))
@@ -88,34 +88,34 @@ def solid_pieces(vertices_m: Array, triangles: Triangles) -> BoolArray:
 
 
 def _piece(triangles: Triangles, count: int) -> npt.NDArray[np.int64]:
-    """Return the number of the connected piece of each triangle (t,)."""
+    """Return the number of the connected component of each triangle (t,)."""
     ones = np.ones(2 * len(triangles), dtype=bool)
     pairs = np.concatenate([triangles[:, :2], triangles[:, 1:]])
     links = coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     return connected_components(links, directed=False)[1][triangles[:, 0]]
 
 
-def rim(triangles: Triangles) -> npt.NDArray[np.int64]:
-    """Return the edges (e, 2) along open borders: those of one triangle only."""
+def boundary_edges(triangles: Triangles) -> npt.NDArray[np.int64]:
+    """Return the boundary edges (e, 2): those of one triangle only."""
     edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     keys = edges[:, 0] * (edges.max(initial=0) + 1) + edges[:, 1]
     _, first, uses = np.unique(keys, return_index=True, return_counts=True)
     return edges[first[uses == 1]]
 
 
-def grown(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
-    """Return which vertices (v,) are marked, or within `rings` edges of one that is."""
+def dilated(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
+    """Return which vertices (v,) are marked or within `rings` edges of a marked one (dilation)."""
     found = marked.copy()
     for _ in range(rings):
         found[triangles[np.any(found[triangles], axis=1)]] = True
     return found
 
 
-def closed(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
-    """Return which vertices (v,) are marked, or lie in gaps between marked ones up to twice `rings` wide."""
-    # What has grown towards an open border is taken back: the border counts as unmarked.
-    outside = ~grown(marked, triangles, rings)
-    outside[rim(triangles)] = True
+def gaps_closed(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
+    """Return which vertices (v,) are marked or in gaps up to twice `rings` wide (morphological closing)."""
+    # The border of the mesh counts as unmarked, so that closing does not extend to it.
+    outside = ~dilated(marked, triangles, rings)
+    outside[boundary_edges(triangles)] = True
     outside &= ~marked
     for _ in range(rings):
         outside[triangles[np.any(outside[triangles], axis=1)]] = True
@@ -123,20 +123,20 @@ def closed(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
     return ~outside
 
 
-def curled(vertices_m: Array, normals: Array, seen: BoolArray, added: BoolArray) -> BoolArray:
-    """Return which of the vertices (v,) that were added beside those seen do not go on as the surface does there."""
-    asked, found = np.flatnonzero(added), np.zeros(len(added), dtype=bool)
-    if np.count_nonzero(seen) < AROUND:
+def folded(vertices_m: Array, normals: Array, seen: BoolArray, added: BoolArray) -> BoolArray:
+    """Return which of the added vertices (v,) have a normal far from those of the nearest vertices seen."""
+    chosen, found = np.flatnonzero(added), np.zeros(len(added), dtype=bool)
+    if np.count_nonzero(seen) < NORMAL_NEIGHBOURS:
         return found
-    near = KDTree(vertices_m[seen]).query(vertices_m[asked], k=AROUND)[1]
+    near = KDTree(vertices_m[seen]).query(vertices_m[chosen], k=NORMAL_NEIGHBOURS)[1]
     mean = normals[seen][near].mean(axis=1)
-    cosine = np.sum(mean * normals[asked], axis=1)
-    found[asked] = cosine < np.cos(TURNED_RAD) * np.linalg.norm(mean, axis=1)
+    cosine = np.sum(mean * normals[chosen], axis=1)
+    found[chosen] = cosine < np.cos(FOLD_RAD) * np.linalg.norm(mean, axis=1)
     return found
 
 
-def trimmed(marked: BoolArray, loose: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
-    """Return the marked vertices (v,) without the loose ones along the border, up to `rings` deep."""
+def without_loose_border(marked: BoolArray, loose: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
+    """Return the marked vertices (v,) without loose ones along the border, up to `rings` deep."""
     outside = ~marked
     triangles = triangles[np.any(loose[triangles], axis=1)]
     for _ in range(rings):
@@ -145,43 +145,43 @@ def trimmed(marked: BoolArray, loose: BoolArray, triangles: Triangles, rings: in
     return ~outside
 
 
-def opened(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
-    """Return the marked vertices (v,) without spikes and strips along the border narrower than about twice `rings`."""
+def spikes_removed(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
+    """Return the marked vertices (v,) without parts narrower than about twice `rings` (morphological opening)."""
     outside = ~marked
-    outside[rim(triangles[np.all(marked[triangles], axis=1)])] = True
-    core = ~grown(outside, triangles, rings - 1)
+    outside[boundary_edges(triangles[np.all(marked[triangles], axis=1)])] = True
+    core = ~dilated(outside, triangles, rings - 1)
     for _ in range(rings):
         core[triangles[np.any(core[triangles], axis=1)]] = True
         core &= marked
     return core
 
 
-def fair(vertices_m: Array, triangles: Triangles, passes: int, only: BoolArray | None = None) -> Array:
-    """Return vertices (v, 3) with ripples of a few edges' length taken out, without shrinking the mesh.
+def taubin_smoothed(vertices_m: Array, triangles: Triangles, passes: int, only: BoolArray | None = None) -> Array:
+    """Return vertices (v, 3) smoothed by a low-pass filter that does not shrink the mesh.
 
     Each pass is a step towards the neighbours' mean and a slightly longer one back (Taubin 1995, "A signal processing
-    approach to fair surface design"). Vertices on open borders follow their neighbours on the border alone.
+    approach to fair surface design"). Vertices on the boundary follow their neighbours on it alone.
 
     Args:
         vertices_m: (v, 3).
         triangles: (t, 3).
-        passes: how many.
+        passes: number of passes.
         only: which vertices (v,) move; None: all.
     """
-    border = rim(triangles)
+    border = boundary_edges(triangles)
     on_border = np.zeros(len(vertices_m), dtype=bool)
     on_border[border] = True
     pairs = _neighbours(triangles)
     pairs = np.concatenate([pairs[~on_border[pairs[:, 0]]], border, border[:, ::-1]])
     moving = np.arange(len(vertices_m)) if only is None else np.flatnonzero(only)
     mean, vertices_m = _means(pairs, len(vertices_m))[moving], vertices_m.copy()
-    for step in [0.5, -0.53] * passes:
+    for step in [0.5, -0.53] * passes:  # pass band at 1 / 0.5 - 1 / 0.53 = 0.11, as Taubin proposes
         vertices_m[moving] += step * (mean @ vertices_m - vertices_m[moving])
     return vertices_m
 
 
-def spanned(vertices_m: Array, triangles: Triangles, free: BoolArray, passes: int) -> Array:
-    """Return vertices (v, 3) of which the free ones have moved towards the mean of their neighbours."""
+def laplacian_smoothed(vertices_m: Array, triangles: Triangles, free: BoolArray, passes: int) -> Array:
+    """Return vertices (v, 3) of which the free ones are repeatedly replaced by the mean of their neighbours."""
     moving = np.flatnonzero(free)
     mean, vertices_m = _means(_neighbours(triangles), len(vertices_m))[moving], vertices_m.copy()
     for _ in range(passes):
@@ -196,17 +196,17 @@ def _neighbours(triangles: Triangles) -> Triangles:
 
 
 def _means(pairs: Triangles, count: int) -> csr_array:
-    """Return what makes of vertices (v, 3) the means of their neighbours, (v, v)."""
+    """Return the matrix (v, v) that maps vertices to the means of their neighbours."""
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
     links.data[:] = 1.0
     return csr_array(diags_array(1.0 / np.maximum(links.sum(axis=1), 1.0)) @ links)
 
 
-def spread_colours(colours: npt.NDArray[np.uint8], known: BoolArray, vertices_m: Array) -> npt.NDArray[np.uint8]:
-    """Return RGB (v, 3) where vertices of unknown colour take that of the few nearest known ones."""
-    if known.all() or np.count_nonzero(known) < NEAREST:
+def filled_colours(colours: npt.NDArray[np.uint8], known: BoolArray, vertices_m: Array) -> npt.NDArray[np.uint8]:
+    """Return RGB (v, 3) with unknown colours interpolated from the nearest known ones by inverse distance."""
+    if known.all() or np.count_nonzero(known) < COLOUR_NEIGHBOURS:
         return colours
-    near_m, near = KDTree(vertices_m[known]).query(vertices_m[~known], k=NEAREST)
+    near_m, near = KDTree(vertices_m[known]).query(vertices_m[~known], k=COLOUR_NEIGHBOURS)
     weights = 1.0 / (near_m + 1e-6)
     spread = colours.copy()
     spread[~known] = np.rint(
@@ -215,8 +215,8 @@ def spread_colours(colours: npt.NDArray[np.uint8], known: BoolArray, vertices_m:
     return spread
 
 
-def compacted(triangles: Triangles, count: int) -> tuple[npt.NDArray[np.int64], Triangles]:
-    """Return which of `count` vertices the triangles use, in ascending order, and the triangles in numbers of those."""
+def used_vertices(triangles: Triangles, count: int) -> tuple[npt.NDArray[np.int64], Triangles]:
+    """Return which of `count` vertices the triangles use, in ascending order, and the triangles renumbered."""
     used = np.zeros(count, dtype=bool)
     used[triangles.ravel()] = True
     return np.flatnonzero(used), (np.cumsum(used) - 1)[triangles]

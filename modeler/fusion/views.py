@@ -1,85 +1,198 @@
-"""The views cut to the object and laid side by side, as the kernels look them up."""
+"""Depth views cropped to the object, in the form in which the kernels look them up."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from modeler import se3
-from modeler.fusion.crop import Crop, crop, pose_variances, window
-from modeler.kernels import fusion
-from modeler.types import Array, BoolArray, InputError, RayImage
+from modeler.kernels import tsdf
+from modeler.kernels.point_clouds import fitted_planes
+from modeler.types import Array, BoolArray, Edge, InputError, RayImage, Solution
 
-WITNESSES = 20000  # points asked for how well the views agree
-LOOKS = 10_000_000  # witnesses times views, at most
-AT_ONCE = 1_000_000  # of these, for the memory it takes
+GREY = 128  # colour of points that no view with colour sees
+SMOOTHED = 0.5  # noise of a surface point, smoothed over its neighbours, relative to that of its pixel
+STEEPEST_RAD = 1.40  # steeper steps between neighbouring pixels (80°) are depth edges; chosen by hand
+SAMPLES = 20000  # points at which views are compared
+LOOKUPS = 10_000_000  # samples times views, at most, which bounds time
+BATCH = 1_000_000  # lookups per kernel call, which bounds memory
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """One view cropped to a window: its images, and the surface points seen in it, in camera coordinates."""
+
+    index: npt.NDArray[np.int32]
+    """(h, w) number of the surface point at a pixel, -1 = none."""
+    free_m: npt.NDArray[np.float32]
+    """(h, w), as in `DepthViews`."""
+    background_m: npt.NDArray[np.float32]
+    """(h, w), as in `DepthViews`."""
+    colour: npt.NDArray[np.uint8] | None
+    """(h, w, 3) RGB."""
+    intrinsics: Array
+    """(4,) fx, fy, cx, cy of the window's pixels."""
+    points_m: Array
+    """(n, 3)."""
+    normals: Array
+    """(n, 3) unit normals."""
+    weights: Array
+    """(n,) 1 = seen head-on, away from edges."""
+
+
+def window(view: RayImage, camera_from_object: Array, corners_m: Array) -> tuple[slice, slice]:
+    """Return the rows and columns in which a box, given by its corners (8, 3), is seen."""
+    camera = view.frame.camera
+    x, y, z = se3.transform(camera_from_object, corners_m).T
+    if np.any(z <= 0.0):  # the box reaches behind the camera
+        return slice(0, camera.height), slice(0, camera.width)
+    columns, rows = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    top, bottom = (int(n) for n in np.clip([np.floor(rows.min()), np.ceil(rows.max()) + 1.0], 0, camera.height))
+    left, right = (int(n) for n in np.clip([np.floor(columns.min()), np.ceil(columns.max()) + 1.0], 0, camera.width))
+    return slice(top, bottom), slice(left, right)
+
+
+def crop(view: RayImage, where: tuple[slice, slice], *, margin_px: int, min_cosine: float, edge_weight: float) -> Crop:
+    """Crop a view to a window.
+
+    Pixels of the object without a surface point (silhouettes, thin parts, grazing angles) get one from a plane fitted
+    to the measured depth around them.
+    """
+    frame, camera = view.frame, view.frame.camera
+    corner = np.array([where[0].start, where[1].start])
+    depth_m = frame.depth_m[where]
+    colour = None if frame.colour is None else frame.colour[where]
+    measured = np.isfinite(depth_m) & (depth_m > 0.0)
+    mask = measured if frame.mask is None else measured & frame.mask[where]
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx - corner[1], camera.cy - corner[0]])
+
+    pixels = view.pixels - corner
+    inside = np.all((pixels >= 0) & (pixels < depth_m.shape), axis=1)
+    rest = mask.copy()
+    rest[tuple(pixels[inside].T)] = False
+    others = np.argwhere(rest)
+    points_m, normals = fitted_planes(depth_m, others, mask, intrinsics, view.sigma_r_m, np.tan(STEEPEST_RAD))
+    found = np.any(normals != 0.0, axis=1)
+    pixels = np.concatenate([pixels[inside], others[found]])
+    points_m = np.concatenate([view.points_m[inside], points_m[found]])
+    normals = np.concatenate([view.normals[inside], normals[found]])
+
+    # An edge pixel has a neighbour outside the object, or one too far away for a surface in between.
+    far = maximum_filter(np.where(mask, depth_m, -np.inf), size=3)
+    near = minimum_filter(np.where(mask, depth_m, np.inf), size=3)
+    with np.errstate(invalid="ignore"):
+        step = far - near > 2.0 * depth_m / camera.fx * np.tan(STEEPEST_RAD) + 4.0 * view.sigma_r_m
+    edges = step | np.logical_not(minimum_filter(mask, size=3))
+    cosine = -np.sum(points_m * normals, axis=1) / np.linalg.norm(points_m, axis=1)
+    weights = cosine * np.where(edges[tuple(pixels.T)], edge_weight, 1.0)  # (F1)
+    kept = cosine >= min_cosine
+    pixels = pixels[kept]
+    index = np.full(depth_m.shape, -1, dtype=np.int32)
+    index[tuple(pixels.T)] = np.arange(len(pixels))
+    around = np.asarray(maximum_filter(mask, size=2 * margin_px + 1, mode="nearest"), dtype=bool)
+    return Crop(
+        index=index,
+        free_m=free_of(depth_m, margin_px),
+        background_m=np.where(measured & ~around, depth_m, 0.0).astype(np.float32),
+        colour=colour,
+        intrinsics=intrinsics,
+        points_m=points_m[kept],
+        normals=normals[kept],
+        weights=weights[kept],
+    )
+
+
+def free_of(depth_m: npt.NDArray[np.float32], margin_px: int) -> npt.NDArray[np.float32]:
+    """Return the depth (h, w) up to which a pixel sees empty space: the least of all pixels around it; 0 = unknown.
+
+    Args:
+        depth_m: (h, w); not positive or NaN = no measurement, which carves nothing.
+        margin_px: largest distance to the pixels around.
+    """
+    measured = np.isfinite(depth_m) & (depth_m > 0.0)
+    reach_m = minimum_filter(np.where(measured, depth_m, np.inf), size=2 * margin_px + 1, mode="nearest")
+    return np.where(measured, reach_m, 0.0).astype(np.float32)
+
+
+def pose_variances(part: Crop, covariance: Array | None, sigma_r_m: float) -> Array:
+    """Return the variances (n,) along the normals due to the pose's error, in units of a surface point's own variance.
+
+    Args:
+        part: a view.
+        covariance: (6, 6) of its object_from_camera; None: exact.
+        sigma_r_m: sd of a pixel along its ray.
+    """
+    if covariance is None:
+        return np.zeros(len(part.points_m))
+    # A perturbation ξ = (ω, v) moves a point p along its normal n by ω · (p × n) + v · n (F2).
+    rows = np.concatenate([np.cross(part.points_m, part.normals), part.normals], axis=1)
+    return np.einsum("ni,ij,nj->n", rows, covariance, rows) / (SMOOTHED * sigma_r_m) ** 2
 
 
 @dataclass(frozen=True, eq=False)
 class DepthViews:
-    """Views side by side; see `modeler.kernels.fusion` for how they are looked up. Points are in the object frame."""
+    """Stacked images of all views and their surface points, as `modeler.kernels.tsdf` looks them up."""
 
     index: npt.NDArray[np.int32]
     """(f, h, w) number of the surface point at a pixel, -1 = none."""
     free_m: npt.NDArray[np.float32]
-    """(f, h, w) depth up to which the space along a pixel was seen empty, 0 = nothing known."""
-    beside_m: npt.NDArray[np.float32]
-    """(f, h, w) depth measured at pixels around which nothing of the object is seen, 0 = object near by, or nothing."""
+    """(f, h, w) depth up to which a pixel sees empty space, 0 = unknown."""
+    background_m: npt.NDArray[np.float32]
+    """(f, h, w) depth of background pixels with no object pixel nearby, 0 elsewhere."""
     colour: npt.NDArray[np.uint8]
     """(f, h, w, 3) RGB."""
     coloured: BoolArray
-    """(f,) which views have colour."""
+    """(f,) whether the view has colour."""
     poses: Array
     """(f, 3, 4) camera_from_object."""
-    lenses: Array
-    """(f, 4) fx, fy, cx, cy of the pixels as stacked."""
+    intrinsics: Array
+    """(f, 4) fx, fy, cx, cy of the cropped images."""
     planes: Array
-    """(f, 4) normal and offset in m of the plane on which the object stands, in the object frame; NaN = none seen."""
+    """(f, 4) normal and offset in m of the support plane in the object frame; NaN = none seen."""
     points_m: Array
-    """(n, 3) surface points."""
+    """(n, 3) surface points in the object frame."""
     normals: Array
     """(n, 3) unit normals."""
     weights: Array
-    """(n,) 1 = seen head-on from the median distance, away from edges."""
-    colours: npt.NDArray[np.uint8]
-    """(n, 3) RGB of the points."""
+    """(n,) 1 = seen head-on from the median distance, away from edges (docs/method.md, F1 to F3)."""
     views: npt.NDArray[np.int64]
-    """(n,) which view each point is of."""
+    """(n,) the view of each point."""
 
     @property
     def lookup(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32], Array, Array, Array, Array, Array]:
-        """Arguments that every kernel shares."""
-        return self.index, self.free_m, self.poses, self.lenses, self.points_m, self.normals, self.weights
+        """Arguments common to the kernels."""
+        return self.index, self.free_m, self.poses, self.intrinsics, self.points_m, self.normals, self.weights
 
-    def alone(self, view: int) -> DepthViews:
-        """Return the stack with the images of one view only; the surface points of all stay, by their numbers."""
+    def only(self, view: int) -> DepthViews:
+        """Return the images of one view only; the surface points of all views stay, under their numbers."""
         here = slice(view, view + 1)
         return replace(
             self,
             index=self.index[here],
             free_m=self.free_m[here],
-            beside_m=self.beside_m[here],
+            background_m=self.background_m[here],
             colour=self.colour[here],
             coloured=self.coloured[here],
             poses=self.poses[here],
-            lenses=self.lenses[here],
+            intrinsics=self.intrinsics[here],
             planes=self.planes[here],
         )
 
     def carving(self, tau_m: float) -> DepthViews:
-        """Return the views with empty space that ends behind what is measured beside the object, by a band ±`tau_m`.
+        """Return the views with empty space extended behind the background, by the band ±`tau_m`.
 
-        Empty space ends a band short of the object's surface, whose place is not known better. Something else that is
-        seen tells more: right there is nothing of the object.
+        Carving stops one band in front of a measured surface because its position is uncertain by as much. Where the
+        background is measured, the object is known not to be there, so this margin is added back.
         """
-        beside_m = np.where(self.beside_m > 0.0, self.beside_m + np.float32(1.5 * tau_m), np.float32(0.0))
-        return replace(self, free_m=np.maximum(self.free_m, beside_m))
+        background_m = np.where(self.background_m > 0.0, self.background_m + np.float32(1.5 * tau_m), np.float32(0.0))
+        return replace(self, free_m=np.maximum(self.free_m, background_m))
 
 
-def posed(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> list[tuple[RayImage, Array]]:
+def posed_views(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> list[tuple[RayImage, Array]]:
     """Return the views that have a pose with object_from_camera, by ascending frame number.
 
     Raises:
@@ -91,7 +204,7 @@ def posed(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> lis
     return pairs
 
 
-def stack(
+def depth_views(
     pairs: list[tuple[RayImage, Array]],
     corners_m: Array,
     *,
@@ -100,54 +213,63 @@ def stack(
     edge_weight: float,
     covariances: Mapping[int, Array] | None = None,
 ) -> DepthViews:
-    """Lay views side by side.
+    """Crop views to a box and stack them.
 
     Args:
         pairs: views with object_from_camera.
-        corners_m: (8, 3) corners of the box of interest in the object frame.
-        margin_px: a pixel calls space empty only as far as all pixels within this distance do.
-        min_cosine: points seen at a flatter angle than this cosine are left out.
-        edge_weight: factor on the weight of pixels next to a silhouette or a step in depth.
+        corners_m: (8, 3) corners of the box in the object frame.
+        margin_px: a pixel carves only as far as all pixels within this distance.
+        min_cosine: points seen at a smaller cosine between normal and ray are left out.
+        edge_weight: factor on the weight of pixels next to a silhouette or depth step.
         covariances: (6, 6) of object_from_camera by frame number; poses without one count as exact.
 
     Raises:
-        InputError: where no view sees anything of the object in the box.
+        InputError: if no view sees the object in the box.
     """
     windows = [window(view, se3.inverse(pose), corners_m) for view, pose in pairs]
     size = (len(pairs), *(max(where[axis].stop - where[axis].start for where in windows) for axis in range(2)))
     index = np.full(size, -1, dtype=np.int32)
-    free_m, beside_m = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.float32)
+    free_m, background_m = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.float32)
     colour = np.zeros((*size, 3), dtype=np.uint8)
-    lenses, told, counts = [], [], []
+    intrinsics, surfaces, counts = [], [], []
     for number, ((view, pose), where) in enumerate(zip(pairs, windows, strict=True)):
         part = crop(view, where, margin_px=margin_px, min_cosine=min_cosine, edge_weight=edge_weight)
         here = number, *map(slice, part.index.shape)
         index[here] = np.where(part.index >= 0, part.index + sum(counts), -1)
-        free_m[here], beside_m[here] = part.free_m, part.beside_m
+        free_m[here], background_m[here] = part.free_m, part.background_m
         if part.colour is not None:
             colour[here] = part.colour
-        lenses.append(part.lens)
-        told.append(_told(part, pose, None if covariances is None else covariances.get(view.index), view.sigma_r_m))
+        intrinsics.append(part.intrinsics)
+        covariance = None if covariances is None else covariances.get(view.index)
+        surfaces.append(
+            (
+                se3.transform(pose, part.points_m),
+                part.normals @ pose[:3, :3].T,
+                part.points_m[:, 2].copy(),  # a view would keep the whole crop in memory
+                part.weights,
+                pose_variances(part, covariance, view.sigma_r_m),
+            )
+        )
         counts.append(len(part.points_m))
     if sum(counts) == 0:
-        raise InputError("nothing to fuse: the object is seen at flat angles only; check the masks and the trajectory")
-    points_m, normals, depth_m, weights, noise, colours = (np.concatenate(some) for some in zip(*told, strict=True))
-    # The noise of a triangulating camera grows with z².
-    weights = weights * (np.median(depth_m) / depth_m) ** 4
-    trust = 1.0 / (1.0 + weights * noise)
+        raise InputError(
+            "nothing to fuse: the object is seen at grazing angles only; check the masks and the trajectory"
+        )
+    points_m, normals, depth_m, weights, pose_noise = (np.concatenate(some) for some in zip(*surfaces, strict=True))
+    weights = weights * (np.median(depth_m) / depth_m) ** 4  # (F1): the sd of a triangulating camera grows with z²
+    trust = 1.0 / (1.0 + weights * pose_noise)  # (F3)
     return DepthViews(
         index=index,
         free_m=free_m,
-        beside_m=beside_m,
+        background_m=background_m,
         colour=colour,
         coloured=np.array([view.frame.colour is not None for view, _ in pairs]),
         poses=np.stack([se3.inverse(pose)[:3] for _, pose in pairs]),
-        lenses=np.stack(lenses),
+        intrinsics=np.stack(intrinsics),
         planes=np.stack([_plane(view, pose) for view, pose in pairs]),
         points_m=points_m,
         normals=normals,
         weights=weights * trust / np.median(trust),
-        colours=colours,
         views=np.repeat(np.arange(len(pairs)), counts),
     )
 
@@ -160,41 +282,49 @@ def _plane(view: RayImage, object_from_camera: Array) -> Array:
     return np.append(normal, view.plane.offset_m - normal @ object_from_camera[:3, 3])
 
 
-def _told(
-    part: Crop, object_from_camera: Array, covariance: Array | None, sigma_r_m: float
-) -> tuple[Array, Array, Array, Array, Array, npt.NDArray[np.uint8]]:
-    """Return points and normals (n, 3) in the object frame, their depths, weights and pose variances (n,), and RGB."""
-    return (
-        se3.transform(object_from_camera, part.points_m),
-        part.normals @ object_from_camera[:3, :3].T,
-        part.points_m[:, 2].copy(),  # so that the rest of the cut need not be kept
-        part.weights,
-        pose_variances(part, covariance, sigma_r_m),
-        part.colours,
-    )
+def disagreement(views: DepthViews, limit_m: float) -> tuple[float, float] | None:
+    """Return robust standard deviations of the distance between the surfaces of different views, in m (F4).
 
-
-def spread(views: DepthViews, limit_m: float) -> tuple[float, float] | None:
-    """Return by how much views disagree about where the surface is, in m: robust standard deviations.
-
-    They hold the noise of both views and the error of their poses. None where no two views see the same surface.
+    They contain the noise of both views and the error of their poses. None if no two views see the same surface.
 
     Args:
         views: the views.
-        limit_m: disagreements beyond this are two surfaces.
+        limit_m: larger distances are between different surfaces.
 
     Returns:
         The standard deviation between two views, and that of one view of weight 1.
     """
-    witnesses = min(WITNESSES, -(-LOOKS // len(views.index)))
-    chosen = np.arange(0, len(views.points_m), max(1, len(views.points_m) // witnesses))
-    lookup = views.index, views.poses, views.lenses, views.points_m, views.normals
-    told = []
-    for some in np.array_split(chosen, -(-len(chosen) * len(views.index) // AT_ONCE)):
-        distance_m, rivals = fusion.disagreements(some, views.views[some], limit_m, *lookup)
-        found = rivals >= 0
-        mine, theirs = views.weights[some[np.nonzero(found)[0]]], views.weights[rivals[found]]
+    samples = min(SAMPLES, -(-LOOKUPS // len(views.index)))
+    chosen = np.arange(0, len(views.points_m), max(1, len(views.points_m) // samples))
+    lookup = views.index, views.poses, views.intrinsics, views.points_m, views.normals
+    found_m = []
+    for some in np.array_split(chosen, -(-len(chosen) * len(views.index) // BATCH)):
+        distance_m, others = tsdf.disagreements(some, views.views[some], limit_m, *lookup)
+        found = others >= 0
+        mine, theirs = views.weights[some[np.nonzero(found)[0]]], views.weights[others[found]]
         off_m = np.abs(distance_m[found])
-        told.append((off_m, off_m / np.sqrt(1.0 / mine + 1.0 / theirs)))
-    off_m, share_m = (np.concatenate(some) for some in zip(*told, strict=True))
+        found_m.append((off_m, off_m / np.sqrt(1.0 / mine + 1.0 / theirs)))
+    off_m, share_m = (np.concatenate(some) for some in zip(*found_m, strict=True))
     return (1.4826 * float(np.median(off_m)), 1.4826 * float(np.median(share_m))) if len(off_m) else None
+
+
+def conditional_covariances(solution: Solution, edges: Iterable[Edge]) -> Mapping[int, Array]:
+    """Return the covariance (6, 6) of each pose conditional on its neighbours in the pose graph, by frame number.
+
+    Neighbours see the same surface. Errors that they share, such as drift since the first frame, do not decide which
+    of them is right; the error of each relative to the others does.
+
+    Args:
+        solution: the poses.
+        edges: all edges; those that take part in the solution count.
+    """
+    information: dict[int, Array] = {}
+    for edge in edges:
+        if not solution.takes_part(edge):
+            continue
+        pose = solution.pose_of(edge)
+        ends = ((edge.source, pose.covariance), (edge.target, pose.inverse().covariance))
+        for frame, covariance in ends:
+            if frame in solution.trajectory:
+                information[frame] = information.get(frame, np.zeros((6, 6))) + np.linalg.inv(covariance)
+    return {frame: np.linalg.inv(matrix).astype(np.float64) for frame, matrix in information.items()}

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from modeler.closure import Closer
-from modeler.fusion import Fuser, own_covariances
+from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances
 from modeler.graph import CommonAxis, shared_noise
 from modeler.pipeline.pairing import Pairing
 from modeler.pipeline.state import Seen, State
@@ -236,9 +236,9 @@ class Modeler:
     def _fused(self, state: State, *, last: bool) -> State:
         """Return the state with its model: that of before brought up to date, or in the end one made with care."""
         if last:
-            sure = own_covariances(state.solution, state.graph.edges)
+            sure = conditional_covariances(state.solution, state.graph.edges)
             return replace(state, model=self.fuser.fuse(state.views, state.solution.trajectory, sure))
-        growing = self.fuser.preview(state.views, state.solution.trajectory, state.growing)
+        growing = (state.growing or IncrementalTsdf(self.fuser)).updated(state.views, state.solution.trajectory)
         return replace(state, growing=growing, model=growing.model())
 
 

@@ -84,7 +84,7 @@ def _rows(name: str, folder: Path) -> list[dict[str, object]]:
     for poses, trajectory in (("true", {frame: se3.inverse(truth[frame]) for frame in run.views}), ("own", own)):
         volume = Fuser().volume(run.views, trajectory)
         for method in METHODS:
-            made, seconds, megabytes = _made(method, run.views, trajectory, volume.box.voxel_m, volume.tau_m)
+            made, seconds, megabytes = _made(method, run.views, trajectory, volume.grid.voxel_m, volume.tau_m)
             errors = surface_errors(*made, surface, np.random.default_rng([0, 1])).over(seen)
             rows.append(
                 {

@@ -1,4 +1,4 @@
-"""The box of voxels around the object, and the signed distance in it."""
+"""The truncated signed distance function (TSDF) on a voxel grid around the object."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.fusion.views import DepthViews
-from modeler.kernels import fusion, isosurface
+from modeler.kernels import marching_cubes, tsdf
 from modeler.types import Array
 
-MOST_NEIGHBOURS = 15  # of the 26 of a voxel
-FAINT = 1e-3  # weight of a voxel that only its neighbours know
+LEAST_NEIGHBOURS = 15  # of the 26 around a voxel that fill it: more than half, so that open borders do not grow
+FAINT = 1e-3  # weight of a voxel that is filled: known, but next to nothing against an observation
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class VoxelGrid:
     """Cubic voxels over a box of the object frame, whole blocks along each axis."""
 
     origin_m: Array
@@ -24,12 +24,12 @@ class Grid:
     voxel_m: float
     """Side of a voxel."""
     blocks: npt.NDArray[np.int64]
-    """(3,) blocks of `fusion.SIDE` voxels along each axis."""
+    """(3,) blocks of `tsdf.SIDE` voxels along each axis."""
 
     @property
     def shape(self) -> npt.NDArray[np.int64]:
         """(3,) voxels along each axis."""
-        return self.blocks * fusion.SIDE
+        return self.blocks * tsdf.SIDE
 
     @property
     def corners_m(self) -> Array:
@@ -38,27 +38,27 @@ class Grid:
         return self.origin_m + size_m * np.array([[c >> 2 & 1, c >> 1 & 1, c & 1] for c in range(8)])
 
 
-def around(points_m: Array, *, voxel_m: float, border_m: float, max_voxels: int) -> Grid:
-    """Return the grid around points (n, 3) and a border, with larger voxels where it would have too many.
+def grid_around(points_m: Array, *, voxel_m: float, border_m: float, max_voxels: int) -> VoxelGrid:
+    """Return the grid around points (n, 3) and a border; its voxels are enlarged until it holds at most `max_voxels`.
 
-    Points far outside the bulk do not stretch the box: it ends half its size beyond the central 98 %.
+    Outliers do not enlarge the box: it ends half its size beyond the central 98 % of the points.
     """
     low, high = np.quantile(points_m, [0.01, 0.99], axis=0)
     slack = 0.5 * (high - low) + border_m
     low = np.maximum(low - slack, points_m.min(axis=0)) - border_m
     high = np.minimum(high + slack, points_m.max(axis=0)) + border_m
     voxel_m = max(voxel_m, float(np.prod(high - low) / max_voxels) ** (1.0 / 3.0))
-    # One unknown voxel on each side lets the kernels look at neighbours without asking where the grid ends.
-    blocks = np.ceil((high - low) / voxel_m + 2.0).astype(np.int64) // fusion.SIDE + 1
-    origin = 0.5 * (low + high) - 0.5 * blocks * fusion.SIDE * voxel_m
-    return Grid(origin, voxel_m, blocks)
+    # One unknown voxel on each side, so that kernels may look at neighbours without bounds checks.
+    blocks = np.ceil((high - low) / voxel_m + 2.0).astype(np.int64) // tsdf.SIDE + 1
+    origin = 0.5 * (low + high) - 0.5 * blocks * tsdf.SIDE * voxel_m
+    return VoxelGrid(origin, voxel_m, blocks)
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
-    """Signed distance to the surface on the voxels of a grid near the surface."""
+class DistanceField:
+    """Signed distance on the voxels of a grid near the surface."""
 
-    grid: Grid
+    grid: VoxelGrid
     """The voxels."""
     values_m: npt.NDArray[np.float32]
     """(x, y, z) distance at voxel centres, positive outside."""
@@ -68,32 +68,32 @@ class Field:
     """(n, 3) voxels with a weight, in ascending order."""
 
 
-def measure(grid: Grid, views: DepthViews, *, tau_m: float, empty_weight: float) -> Field:
-    """Return the signed distance that the views measure, within ±`tau_m` around the surface."""
-    block_m = fusion.SIDE * grid.voxel_m
-    blocks = fusion.blocks_near(views.points_m, grid.origin_m, block_m, tau_m, grid.blocks)
-    distance, weight = fusion.integrate(
+def measured(grid: VoxelGrid, views: DepthViews, *, tau_m: float, empty_weight: float) -> DistanceField:
+    """Return the signed distance measured by the views, within ±`tau_m` of the surface (docs/method.md, F5)."""
+    block_m = tsdf.SIDE * grid.voxel_m
+    blocks = tsdf.blocks_near(views.points_m, grid.origin_m, block_m, tau_m, grid.blocks)
+    distance, weight = tsdf.integrate(
         blocks, grid.origin_m, grid.voxel_m, tau_m, empty_weight, views.views, *views.lookup
     )
     x, y, z = (int(n) for n in grid.blocks)
-    values, weights = (np.zeros((x, y, z, fusion.SIDE, fusion.SIDE, fusion.SIDE), dtype=np.float32) for _ in range(2))
+    values, weights = (np.zeros((x, y, z, tsdf.SIDE, tsdf.SIDE, tsdf.SIDE), dtype=np.float32) for _ in range(2))
     values[tuple(blocks.T)], weights[tuple(blocks.T)] = distance, weight
     values = values.transpose(0, 3, 1, 4, 2, 5).reshape(grid.shape)
     weights = weights.transpose(0, 3, 1, 4, 2, 5).reshape(grid.shape)
     for axis in range(3):
         np.moveaxis(weights, axis, 0)[[0, -1]] = 0.0
-    return Field(grid, values, weights, np.argwhere(weights > 0.0))
+    return DistanceField(grid, values, weights, np.argwhere(weights > 0.0))
 
 
-def filled(field: Field) -> Field:
-    """Return the field with gaps of a few voxels closed: unknown voxels that most of their neighbours know."""
-    cells, means = isosurface.fill(field.values_m, field.weights, field.known, MOST_NEIGHBOURS)
+def filled(field: DistanceField) -> DistanceField:
+    """Return the field with unknown voxels filled whose neighbours are mostly known: the mean of these."""
+    cells, means = marching_cubes.fill(field.values_m, field.weights, field.known, LEAST_NEIGHBOURS)
     if not len(cells):
         return field
     values, weights = field.values_m.copy(), field.weights.copy()
     values[tuple(cells.T)] = means
     weights[tuple(cells.T)] = FAINT
-    return Field(field.grid, values, weights, np.argwhere(weights > 0.0))
+    return DistanceField(field.grid, values, weights, np.argwhere(weights > 0.0))
 
 
 def crossed(values_m: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:

@@ -1,27 +1,27 @@
-"""Kernels that decide what nobody saw: what views look through, and the smallest surface that closes the rest."""
+"""Kernels that classify unseen space: what views observe of cells, and the surface of least area that closes gaps."""
 
 import math
 
 import numpy as np
 from numba import njit, prange
 
-from modeler.kernels.votes import project
+from modeler.kernels.tsdf import project
 
 
 @njit(cache=True, parallel=True)
-def looked_through(origin, cell_m, shape, margin_m, free_m, poses, lenses, planes):
-    """Return how many views find cells of a grid empty, at a surface and hidden behind one, (3, x, y, z) uint16.
+def observation_counts(origin, cell_m, shape, margin_m, free_m, poses, intrinsics, planes):
+    """Return how many views see cells of a grid empty, at a surface, and hidden behind one, (3, x, y, z) uint16.
 
-    A cell is empty where a view looks through it, or it lies below the plane on which the object stands.
+    A cell below the view's support plane counts as empty.
 
     Args:
         origin: (3,) lowest corner of the grid in m.
-        cell_m: side of a cell; its centre is looked at.
+        cell_m: side of a cell; its centre is tested.
         shape: (3,) cells along each axis.
-        margin_m: how far from the end of the empty space, and below the plane, a cell must lie.
-        free_m: (f, h, w) float32 depth up to which the space along a pixel is empty.
+        margin_m: least distance of empty cells from the end of the empty space, or below the plane.
+        free_m: (f, h, w) float32 depth up to which a pixel sees empty space, 0 = unknown.
         poses: (f, 3, 4) camera_from_object.
-        lenses: (f, 4) fx, fy, cx, cy.
+        intrinsics: (f, 4) fx, fy, cx, cy.
         planes: (f, 4) normal and offset in the object frame, NaN where no plane is seen.
     """
     frames, height, width = free_m.shape
@@ -36,7 +36,7 @@ def looked_through(origin, cell_m, shape, margin_m, free_m, poses, lenses, plane
                     if planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z + planes[f, 3] < -margin_m:
                         counts[0, i, j, k] += 1
                         continue
-                    u, v, depth = project(poses[f], lenses[f], x, y, z)
+                    u, v, depth = project(poses[f], intrinsics[f], x, y, z)
                     if depth > 0.0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
                         free = free_m[f, int(v + 0.5), int(u + 0.5)]
                         if free > 0.0:
@@ -45,16 +45,17 @@ def looked_through(origin, cell_m, shape, margin_m, free_m, poses, lenses, plane
 
 
 @njit(cache=True, parallel=True)
-def smallest(start, fixed, rounds):
-    """Return a field (x, y, z) whose zero level has little area, and which keeps its fixed values.
+def minimal_surface(start, fixed, rounds):
+    """Return the field (x, y, z) of least total variation with the given fixed values (F11).
 
-    Minimises the total variation of u in [-1, 1] (Chambolle and Pock 2011, "A first-order primal-dual algorithm",
-    algorithm 1 with θ = 1). The total variation of a field that jumps between -1 and 1 is twice the area of the jump.
+    Its zero level set has the least area: the total variation of a field that jumps between -1 and 1 is twice the area
+    of the jump. Solved by the primal-dual algorithm of Chambolle and Pock 2011 ("A first-order primal-dual algorithm
+    for convex problems with applications to imaging", algorithm 1 with θ = 1).
 
     Args:
         start: (x, y, z) float32 in [-1, 1].
         fixed: (x, y, z) bool; the outermost cells must be fixed.
-        rounds: of descent.
+        rounds: iterations.
     """
     nx, ny, nz = start.shape
     u, ahead = start.copy(), start.copy()

@@ -1,13 +1,66 @@
-"""Dual marching cubes: the zero level of a signed distance that is known in parts of a grid.
+"""Dual marching cubes: the zero level set of a signed distance that is known in parts of a grid.
 
-A vertex lies in every cell for each piece of surface that crosses it, a quad around every grid edge that changes sign
+Every cell has a vertex for each piece of surface that crosses it, and every grid edge that changes sign has a quad
 (Nielson 2004, "Dual marching cubes"). Quads need all four cells around their edge known, so the surface stays open
-where nobody looked. Which piece crosses which edge is told by a table, `pieces.PIECES`, as are the numbers of corners
-and edges.
+where no view looked.
+
+Corners of a cell are numbered 4 dx + 2 dy + dz; its edges 4 axis + 2 a + b, with a and b the offsets along the two
+other axes in ascending order.
 """
 
 import numpy as np
 from numba import njit
+
+
+def _edge(first: int, second: int) -> int:
+    """Return the number of the edge between two neighbouring corners."""
+    axis = {4: 0, 2: 1, 1: 2}[first ^ second]
+    offsets = [(first >> 2) & 1, (first >> 1) & 1, first & 1]
+    del offsets[axis]
+    return 4 * axis + 2 * offsets[0] + offsets[1]
+
+
+def _pieces() -> np.ndarray:
+    """Return (256, 12) int8: which piece of surface crosses each edge of a cell, by its corners' signs; -1 = none.
+
+    Bit c of the case is set where corner c is inside. Two pieces meet in a face whose diagonals differ; there the
+    inside corners are joined, which keeps thin parts whole, and the choice rests on the face alone: neighbours agree.
+    """
+    faces = []
+    for axis in range(3):
+        one, two = 4 >> ((axis + 1) % 3), 4 >> ((axis + 2) % 3)
+        for level in (0, 4 >> axis):
+            faces.append([level, level | one, level | one | two, level | two])
+    table = np.full((256, 12), -1, dtype=np.int8)
+    for case in range(256):
+        links: dict[int, list[int]] = {}
+        for face in faces:
+            inside = [bool(case >> corner & 1) for corner in face]
+            edges = [_edge(face[k], face[(k + 1) % 4]) for k in range(4)]
+            crossed = [edges[k] for k in range(4) if inside[k] != inside[(k + 1) % 4]]
+            if len(crossed) == 4:
+                # Join the inside: cut off the outside corners, each with the two edges that meet there.
+                pairs = [(edges[k - 1], edges[k]) for k in range(4) if not inside[k]]
+            else:
+                pairs = [(crossed[0], crossed[1])] if crossed else []
+            for a, b in pairs:
+                links.setdefault(a, []).append(b)
+                links.setdefault(b, []).append(a)
+        piece = 0
+        for start in sorted(links):
+            if table[case, start] >= 0:
+                continue
+            waiting = [start]
+            while waiting:
+                edge = waiting.pop()
+                if table[case, edge] < 0:
+                    table[case, edge] = piece
+                    waiting.extend(links[edge])
+            piece += 1
+    return table
+
+
+PIECES = _pieces()
 
 
 @njit(cache=True)
@@ -18,7 +71,7 @@ def fill(values, totals, cells, least):
         values: (x, y, z) float32.
         totals: (x, y, z) float32, 0 = unknown; the outermost voxels are unknown.
         cells: (n, 3) known voxels, in ascending order.
-        least: neighbours asked for; more than half of them keeps open borders where they are.
+        least: least number of known neighbours; with more than half of them, open borders do not grow.
     """
     counts = np.zeros(values.shape, dtype=np.uint8)
     sums = np.zeros(values.shape, dtype=np.float32)
@@ -44,8 +97,8 @@ def fill(values, totals, cells, least):
 
 
 @njit(cache=True)
-def extract(values, totals, cells, pieces):
-    """Return the zero level: vertices (v, 3) in voxels from the centre of voxel 0, and triangles (t, 3).
+def extract(values, totals, cells):
+    """Return the zero level set: vertices (v, 3) in voxels from the centre of voxel 0, and triangles (t, 3).
 
     Triangles are counter-clockwise seen from where the distance is positive. Order follows `cells`.
 
@@ -53,15 +106,14 @@ def extract(values, totals, cells, pieces):
         values: (x, y, z) float32, negative inside.
         totals: (x, y, z) float32, 0 = unknown; the outermost voxels are unknown.
         cells: (n, 3) known voxels, in ascending order.
-        pieces: `pieces.PIECES`.
     """
-    first, cases, count = _numbered(values, totals, cells, pieces)
-    vertices, quads = _vertices(values, cells, pieces, first, cases, count)
-    return vertices, _triangles(values, cells, pieces, first, cases, vertices, quads)
+    first, cases, count = _numbered(values, totals, cells)
+    vertices, quads = _vertices(values, cells, first, cases, count)
+    return vertices, _triangles(values, cells, first, cases, vertices, quads)
 
 
 @njit(cache=True)
-def _numbered(values, totals, cells, pieces):
+def _numbered(values, totals, cells):
     """Return the number of each cell's first vertex, -1 = none, its case, and how many vertices there are.
 
     A vertex stands for each piece in each cell whose eight corners are known.
@@ -75,12 +127,12 @@ def _numbered(values, totals, cells, pieces):
         if 0 < case < 255:
             cases[i, j, k] = case
             first[i, j, k] = count
-            count += np.max(pieces[case]) + 1
+            count += np.max(PIECES[case]) + 1
     return first, cases, count
 
 
 @njit(cache=True)
-def _vertices(values, cells, pieces, first, cases, count):
+def _vertices(values, cells, first, cases, count):
     """Return the mean (v, 3) of where each piece crosses edges, and the number of edges that quads may lie around."""
     vertices = np.zeros((count, 3))
     crossings = np.zeros(count)
@@ -90,7 +142,7 @@ def _vertices(values, cells, pieces, first, cases, count):
         if first[i, j, k] < 0:
             continue
         for edge in range(12):
-            piece = pieces[cases[i, j, k], edge]
+            piece = PIECES[cases[i, j, k], edge]
             if piece < 0:
                 continue
             axis, a, b = edge // 4, (edge >> 1) & 1, edge & 1
@@ -110,10 +162,10 @@ def _vertices(values, cells, pieces, first, cases, count):
 
 
 @njit(cache=True)
-def _triangles(values, cells, pieces, first, cases, vertices, quads):
+def _triangles(values, cells, first, cases, vertices, quads):
     """Return the triangles (t, 3) of a quad around every crossed edge whose four cells are known.
 
-    An edge is seen by the cell that has it as its last one along its axis.
+    Each edge is handled by the cell in which it is the last one along its axis.
     """
     triangles = np.empty((2 * quads, 3), dtype=np.int64)
     corner = np.empty(4, dtype=np.int64)
@@ -123,7 +175,7 @@ def _triangles(values, cells, pieces, first, cases, vertices, quads):
         if first[i, j, k] < 0:
             continue
         for axis in range(3):
-            if pieces[cases[i, j, k], 4 * axis + 3] < 0:
+            if PIECES[cases[i, j, k], 4 * axis + 3] < 0:
                 continue
             known = True
             for turn in range(4):  # the cells around the edge, counter-clockwise in the plane of the two other axes
@@ -133,7 +185,7 @@ def _triangles(values, cells, pieces, first, cases, vertices, quads):
                     known = False
                     break
                 edge = 4 * axis + 2 * (1 - one) + (1 - two)
-                corner[turn] = first[p, q, r] + pieces[cases[p, q, r], edge]
+                corner[turn] = first[p, q, r] + PIECES[cases[p, q, r], edge]
             if not known:
                 continue
             x, y, z = _beside(i, j, k, axis, 1, 1)  # where the edge starts
@@ -155,7 +207,7 @@ def _triangles(values, cells, pieces, first, cases, vertices, quads):
 
 @njit(cache=True)
 def _beside(i, j, k, axis, one, two):
-    """Return the voxel that lies some steps beside another, along the two axes beside `axis` in ascending order."""
+    """Return the voxel some steps away from another along the two axes other than `axis`, in ascending order."""
     if axis == 0:
         return i, j + one, k + two
     if axis == 1:
@@ -164,18 +216,17 @@ def _beside(i, j, k, axis, one, two):
 
 
 @njit(cache=True)
-def pinched(values, totals, cells, pieces):
-    """Return the voxels (m, 3) to be put inside so that no edge of the zero level has more than two triangles.
+def pinched_voxels(values, totals, cells):
+    """Return the voxels (m, 3) to put inside so that no edge of the zero level set has more than two triangles.
 
     Where the corners of a face between two cells differ along its diagonals, two sheets meet in it. If each cell
     joins them in one piece, both sheets share the edge between the two vertices; with one more corner inside, they do
-    not meet. Putting voxels inside may pinch elsewhere: to be repeated until nothing is returned.
+    not meet. The change may cause other pinches: repeat until nothing is returned.
 
     Args:
         values: (x, y, z) float32, negative inside.
         totals: (x, y, z) float32, 0 = unknown.
         cells: (n, 3) voxels that are the lowest corner of a cell to look at.
-        pieces: `pieces.PIECES`.
     """
     found = np.empty((3 * len(cells), 3), dtype=np.int64)
     count = 0
@@ -195,9 +246,9 @@ def pinched(values, totals, cells, pieces):
             c, d = bool(case & (1 << (step | one | two))), bool(case & (1 << (step | two)))
             if a != c or b != d or a == b:
                 continue
-            if not (_joined(pieces[case], axis, 1) and _joined(pieces[beyond], axis, 0)):
+            if not (_joined(PIECES[case], axis, 1) and _joined(PIECES[beyond], axis, 0)):
                 continue
-            # Of the two corners outside, the one that is less so.
+            # Of the two corners outside, the one nearer to the surface.
             best, least = -1, np.inf
             for corner in range(4):
                 number = step | (one if corner == 1 or corner == 2 else 0) | (two if corner >= 2 else 0)

@@ -1,0 +1,450 @@
+"""Kernels of fusion: the truncated signed distance function (TSDF) on voxels, and observations of single points.
+
+Views are stacked: `index` (f, h, w) holds the number of the surface point seen at a pixel, -1 where there is none;
+`free_m` (f, h, w) the depth up to which a pixel sees empty space, 0 where that is unknown. `poses` (f, 3, 4) are
+camera_from_object, and `intrinsics` (f, 4) are fx, fy, cx, cy of the stacked images. Points and normals are given in
+the object frame.
+
+A view that sees a surface within the truncation band along a voxel's pixel votes with the voxel's distance above that
+surface along its normal, a weight, and the number of the surface point. Equation numbers are those of docs/method.md.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+SIDE = 4  # voxels along the side of a block
+SAME_SIDE = 0.3  # least cosine between normals on the same side of the object; chosen by hand
+MAJORITY = 3  # a side is rejected if this many times as many votes contradict it; chosen by hand
+
+
+@njit(cache=True)
+def blocks_near(points, origin, block_m, reach_m, shape):
+    """Return the coordinates (b, 3) of the blocks of a grid that come within reach of a point, in ascending order.
+
+    Args:
+        points: (n, 3) in m.
+        origin: (3,) lowest corner of the grid in m.
+        block_m: side of a block.
+        reach_m: half the side of the cube around each point that must be covered.
+        shape: (3,) blocks along each axis.
+    """
+    touched = np.zeros((shape[0], shape[1], shape[2]), dtype=np.bool_)
+    low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
+    for i in range(len(points)):
+        for k in range(3):
+            low[k] = max(0, math.floor((points[i, k] - reach_m - origin[k]) / block_m))
+            high[k] = min(shape[k] - 1, math.floor((points[i, k] + reach_m - origin[k]) / block_m))
+        for x in range(low[0], high[0] + 1):
+            for y in range(low[1], high[1] + 1):
+                for z in range(low[2], high[2] + 1):
+                    touched[x, y, z] = True
+    blocks = np.empty((int(np.sum(touched)), 3), dtype=np.int64)
+    count = 0
+    for x in range(shape[0]):
+        for y in range(shape[1]):
+            for z in range(shape[2]):
+                if touched[x, y, z]:
+                    blocks[count, 0], blocks[count, 1], blocks[count, 2] = x, y, z
+                    count += 1
+    return blocks
+
+
+@njit(cache=True)
+def between(image, column, row, channel):
+    """Return the value of an image (h, w, c) between four pixel centres by bilinear interpolation."""
+    left, top = math.floor(column), math.floor(row)
+    right, bottom = column - left, row - top
+    upper = (1.0 - right) * image[top, left, channel] + right * image[top, left + 1, channel]
+    lower = (1.0 - right) * image[top + 1, left, channel] + right * image[top + 1, left + 1, channel]
+    return (1.0 - bottom) * upper + bottom * lower
+
+
+@njit(cache=True, parallel=True)
+def integrate(
+    blocks, origin, voxel_m, tau_m, empty_weight, views, index, free_m, poses, intrinsics, points, normals, weights
+):
+    """Return signed distance and weight of the voxels of some blocks, each (b, SIDE, SIDE, SIDE) float32 (F5).
+
+    Distances are positive outside and truncated to ±`tau_m`; weight 0 = unobserved. Values are at voxel centres:
+    origin + (index + ½) voxel_m.
+
+    Args:
+        blocks: (b, 3) block coordinates.
+        origin: (3,) lowest corner of the grid in m.
+        voxel_m: side of a voxel.
+        tau_m: half width of the truncation band.
+        empty_weight: weight of a view that sees the voxel empty, relative to 1 for a surface seen head-on.
+        views: (n,) the view of each surface point.
+        index: (f, h, w) int32.
+        free_m: (f, h, w) float32.
+        poses: (f, 3, 4) camera_from_object.
+        intrinsics: (f, 4).
+        points: (n, 3).
+        normals: (n, 3).
+        weights: (n,).
+    """
+    values = np.zeros((len(blocks), SIDE**3), dtype=np.float32)
+    totals = np.zeros((len(blocks), SIDE**3), dtype=np.float32)
+    for b in prange(len(blocks)):
+        positions = np.empty((SIDE**3, 3))
+        for voxel in range(SIDE**3):
+            positions[voxel, 0] = origin[0] + (blocks[b, 0] * SIDE + voxel // (SIDE * SIDE) + 0.5) * voxel_m
+            positions[voxel, 1] = origin[1] + (blocks[b, 1] * SIDE + voxel // SIDE % SIDE + 0.5) * voxel_m
+            positions[voxel, 2] = origin[2] + (blocks[b, 2] * SIDE + voxel % SIDE + 0.5) * voxel_m
+        seen, distance, weight, number, empty = collect_votes(
+            positions, tau_m, index, free_m, poses, intrinsics, points, normals, weights
+        )
+        for voxel in range(SIDE**3):
+            if seen[voxel] > 0 or empty[voxel] > 0:
+                values[b, voxel], totals[b, voxel] = fuse_votes(
+                    positions[voxel],
+                    seen[voxel],
+                    distance[voxel],
+                    weight[voxel],
+                    number[voxel],
+                    empty_weight * empty[voxel],
+                    tau_m,
+                    views,
+                    index,
+                    poses,
+                    intrinsics,
+                    points,
+                    normals,
+                )
+    shape = (len(blocks), SIDE, SIDE, SIDE)
+    return values.reshape(shape), totals.reshape(shape)
+
+
+@njit(cache=True)
+def collect_votes(positions, tau_m, index, free_m, poses, intrinsics, points, normals, weights):
+    """Return the votes on positions (m, 3), as `fuse_votes` takes them, and how many views see each empty.
+
+    These are the number of votes (m,); the distance, weight and surface point of each, all (m, f); and (m,).
+    Arguments as for `integrate`.
+    """
+    frames, height, width = index.shape
+    distance, weight = np.empty((len(positions), frames)), np.empty((len(positions), frames))
+    number = np.empty((len(positions), frames), dtype=np.int64)
+    seen, empty = np.zeros(len(positions), dtype=np.int64), np.zeros(len(positions), dtype=np.int64)
+    for f in range(frames):
+        pose, camera = poses[f], intrinsics[f]
+        for voxel in range(len(positions)):
+            x, y, z = positions[voxel, 0], positions[voxel, 1], positions[voxel, 2]
+            u, v, depth = project(pose, camera, x, y, z)
+            if not (depth > 0.0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+                continue
+            row, column = int(v + 0.5), int(u + 0.5)
+            n = index[f, row, column]
+            along = 2.0 * tau_m
+            if n >= 0:
+                along = (
+                    normals[n, 0] * (x - points[n, 0])
+                    + normals[n, 1] * (y - points[n, 1])
+                    + normals[n, 2] * (z - points[n, 2])
+                )
+            if abs(along) <= tau_m:
+                k = seen[voxel]
+                distance[voxel, k], number[voxel, k] = along, n
+                # (F5): the extrapolation behind a surface fades out with depth.
+                weight[voxel, k] = weights[n] * min(1.0, 1.5 * (1.0 + along / tau_m) + 1e-3)
+                seen[voxel] = k + 1
+            elif along > 0.0 and depth < free_m[f, row, column] - tau_m:
+                empty[voxel] += 1
+    return seen, distance, weight, number, empty
+
+
+@njit(cache=True, parallel=True)
+def observe(
+    queries,
+    directions,
+    tolerance_m,
+    tau_m,
+    index,
+    free_m,
+    poses,
+    intrinsics,
+    points,
+    normals,
+    weights,
+    colour,
+    gains,
+    focus,
+):
+    """Return what the views observe at oriented points (F7 to F9).
+
+    A view supports a point if it sees a surface within `tolerance_m` along the same pixel that faces the same way.
+    Colours are averaged over the supporting views.
+
+    Args:
+        queries: (n, 3) in the object frame.
+        directions: (n, 3) unit normals.
+        tolerance_m: largest distance along the normal.
+        tau_m: least distance of empty points from the end of the empty space.
+        index: (f, h, w) int32.
+        free_m: (f, h, w) float32.
+        poses: (f, 3, 4) camera_from_object.
+        intrinsics: (f, 4).
+        points: (p, 3).
+        normals: (p, 3).
+        weights: (p,).
+        colour: (f, h, w, 3) uint8.
+        gains: (f, 4) gains of red, green and blue, and the weight of a view's colours, 0 = none.
+        focus: exponent of the view weights for colours.
+
+    Returns:
+        (n, 5): sum of the supporting views' weights w, number of views that see the point empty, number of supporting
+        views, Σ w d and Σ w d² with d the distance of the point above the surface; and (n, 4) RGB with its weight.
+    """
+    frames, height, width = index.shape
+    observed, colours = np.zeros((len(queries), 5)), np.zeros((len(queries), 4))
+    for q in prange(len(queries)):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        for f in range(frames):
+            u, v, depth = project(poses[f], intrinsics[f], x, y, z)
+            column, row = math.floor(u + 0.5), math.floor(v + 0.5)
+            if depth <= 0.0 or not (0 <= column < width and 0 <= row < height):
+                continue
+            n = index[f, row, column]
+            if depth < free_m[f, row, column] - tau_m:
+                observed[q, 1] += 1.0
+            if n < 0:
+                continue
+            along = above(x, y, z, points, normals, n)
+            if abs(along) > tolerance_m or facing(normals, n, directions, q) < SAME_SIDE:
+                continue
+            observed[q, 0] += weights[n]
+            observed[q, 2] += 1.0
+            observed[q, 3] += weights[n] * along
+            observed[q, 4] += weights[n] * along * along
+            left, top = math.floor(u), math.floor(v)
+            if gains[f, 3] == 0.0 or left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
+                continue
+            share = gains[f, 3] * weights[n] ** focus
+            colours[q, 3] += share
+            for c in range(3):
+                colours[q, c] += share * gains[f, c] * between(colour[f], u, v, c)
+        if colours[q, 3] > 0.0:
+            for c in range(3):
+                colours[q, c] = min(255.0, colours[q, c] / colours[q, 3])
+    return observed, colours
+
+
+@njit(cache=True)
+def disagreements(chosen, views, limit_m, index, poses, intrinsics, points, normals):
+    """Return the distances (m, f) of surface points above the surface seen by each view, and its points there (m, f).
+
+    Distances are along the normal; NaN and -1 where a view sees no surface.
+
+    Args:
+        chosen: (m,) numbers of points.
+        views: (m,) the view of each.
+        limit_m: largest distance along the normal to the same surface.
+        index: (f, h, w) int32.
+        poses: (f, 3, 4) camera_from_object.
+        intrinsics: (f, 4).
+        points: (n, 3).
+        normals: (n, 3).
+    """
+    frames, height, width = index.shape
+    result = np.full((len(chosen), frames), np.nan)
+    rivals = np.full((len(chosen), frames), -1, dtype=np.int64)
+    for q in range(len(chosen)):
+        i = chosen[q]
+        for f in range(frames):
+            u, v, depth = project(poses[f], intrinsics[f], points[i, 0], points[i, 1], points[i, 2])
+            if f == views[q] or not (depth > 0.0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+                continue
+            n = index[f, int(v + 0.5), int(u + 0.5)]
+            if n < 0:
+                continue
+            along = above(points[i, 0], points[i, 1], points[i, 2], points, normals, n)
+            if abs(along) <= limit_m and facing(normals, n, normals, i) > SAME_SIDE:
+                result[q, f], rivals[q, f] = along, n
+    return result, rivals
+
+
+@njit(cache=True)
+def project(pose, camera, x, y, z):
+    """Return column, row (px) and depth (m) of a point of the object frame; depth <= 0 behind the camera."""
+    depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+    if depth <= 0.0:
+        return -1.0, -1.0, depth
+    u = camera[0] * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + camera[2]
+    v = camera[1] * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + camera[3]
+    return u, v, depth
+
+
+# `collect_votes`, `fuse_votes` and `dominant_vote` write the next two functions out: calls would cost a fifth of their
+# time.
+@njit(cache=True)
+def above(x, y, z, points, normals, n):
+    """Return the distance of a position above the surface at point `n`, along its normal."""
+    return normals[n, 0] * (x - points[n, 0]) + normals[n, 1] * (y - points[n, 1]) + normals[n, 2] * (z - points[n, 2])
+
+
+@njit(cache=True)
+def facing(first, i, second, k):
+    """Return the cosine between unit vectors `first[i]` and `second[k]`."""
+    return first[i, 0] * second[k, 0] + first[i, 1] * second[k, 1] + first[i, 2] * second[k, 2]
+
+
+@njit(cache=True)
+def fuse_votes(
+    position, seen, distance, weight, number, emptiness, tau_m, views, index, poses, intrinsics, points, normals
+):
+    """Return the signed distance and weight of a position from its votes (F6). Weights of rejected votes become 0.
+
+    Only votes on the same side of the object as the dominant vote are averaged. A side is rejected if most votes see
+    surface between it and its view: a few pixels at a grazing angle with errors along their rays far beyond the noise
+    seem to look out from within the object.
+
+    Args:
+        position: (3,) in the object frame.
+        seen: number of votes.
+        distance: (f,) above the surface of each vote.
+        weight: (f,) of each.
+        number: (f,) surface point of each.
+        emptiness: sum of the weights of the views that see the position empty.
+        tau_m: half width of the truncation band.
+        views: (n,) the view of each surface point.
+        index: (f, h, w) int32.
+        poses: (f, 3, 4) camera_from_object.
+        intrinsics: (f, 4).
+        points: (n, 3).
+        normals: (n, 3).
+    """
+    remaining = seen
+    while True:
+        best = dominant_vote(seen, distance, weight, number, normals, tau_m)
+        if best < 0:
+            return tau_m, emptiness
+        side = number[best]
+        total, value, agreeing = emptiness, emptiness * tau_m, 0
+        for k in range(seen):
+            n = number[k]
+            cosine = (
+                normals[side, 0] * normals[n, 0] + normals[side, 1] * normals[n, 1] + normals[side, 2] * normals[n, 2]
+            )
+            if cosine > SAME_SIDE and weight[k] > 0.0:
+                total += weight[k]
+                value += weight[k] * distance[k]
+                agreeing += 1
+        if remaining < (1 + MAJORITY) * agreeing:
+            return value / total, total
+        against = occluding_votes(
+            best, position, seen, distance, weight, number, views, index, poses, intrinsics, points, normals
+        )
+        if against < MAJORITY * agreeing:
+            return value / total, total
+        for k in range(seen):
+            if weight[k] > 0.0 and facing(normals, side, normals, number[k]) > SAME_SIDE:
+                weight[k] = 0.0
+                remaining -= 1
+
+
+@njit(cache=True)
+def dominant_vote(seen, distance, weight, number, normals, tau_m):
+    """Return the vote that decides on which side of the object a position is, -1 = none; arguments as for `fuse_votes`.
+
+    A view that sees a position in front of a surface observes that it is empty; one that sees it behind a surface
+    extrapolates that it is full. The nearest surface decides, unless an opposing view sees the position in front of
+    its surface: this preserves walls thinner than the band.
+    """
+    best, best_score = -1, 0.0
+    for k in range(seen):
+        score = weight[k] * (1.01 - abs(distance[k]) / tau_m)
+        if score > best_score:
+            best, best_score = k, score
+    if best < 0 or distance[best] >= 0.0:
+        return best
+    side, other, other_score = number[best], best, 0.3 * best_score
+    for k in range(seen):
+        n = number[k]
+        cosine = normals[side, 0] * normals[n, 0] + normals[side, 1] * normals[n, 1] + normals[side, 2] * normals[n, 2]
+        score = weight[k] * (1.01 - abs(distance[k]) / tau_m)
+        if distance[k] > 0.0 and cosine < SAME_SIDE and score > other_score:
+            other, other_score = k, score
+    return other
+
+
+@njit(cache=True)
+def occluding_votes(best, position, seen, distance, weight, number, views, index, poses, intrinsics, points, normals):
+    """Return how many votes for other sides see surface between a position and the camera of the best vote.
+
+    Arguments as for `fuse_votes`.
+    """
+    side = number[best]
+    pose = poses[views[side]]
+    x = -(pose[0, 0] * pose[0, 3] + pose[1, 0] * pose[1, 3] + pose[2, 0] * pose[2, 3])  # the camera's position
+    y = -(pose[0, 1] * pose[0, 3] + pose[1, 1] * pose[1, 3] + pose[2, 1] * pose[2, 3])
+    z = -(pose[0, 2] * pose[0, 3] + pose[1, 2] * pose[1, 3] + pose[2, 2] * pose[2, 3])
+    count = 0
+    for k in range(seen):
+        n = number[k]
+        if not (weight[k] > 0.0 and distance[k] < 0.0) or facing(normals, side, normals, n) > SAME_SIDE:
+            continue
+        height_m = above(x, y, z, points, normals, n)
+        if height_m <= 0.0:
+            continue
+        share = distance[k] / (distance[k] - height_m)  # of the way to the camera, up to the surface
+        a, b, c = (
+            position[0] + share * (x - position[0]),
+            position[1] + share * (y - position[1]),
+            position[2] + share * (z - position[2]),
+        )
+        u, v, depth = project(poses[views[n]], intrinsics[views[n]], a, b, c)
+        if depth <= 0.0 or not (-0.5 <= u < index.shape[2] - 0.5 and -0.5 <= v < index.shape[1] - 0.5):
+            continue
+        m = index[views[n], int(v + 0.5), int(u + 0.5)]
+        if m >= 0 and facing(normals, m, normals, n) > SAME_SIDE:
+            count += abs(above(a, b, c, points, normals, m)) < -distance[k]
+    return count
+
+
+@njit(cache=True, parallel=True)
+def integrate_view(
+    sums, origin, voxel_m, tau_m, empty_weight, sign, pose, camera, index, free_m, points, normals, weights, colours
+):
+    """Add one view to the sums of a box of voxels in place (F5 with plain sums, without F6).
+
+    Args:
+        sums: (x, y, z, 6) float32: Σ w, Σ w d, Σ c, Σ c red, Σ c green, Σ c blue.
+        origin: (3,) lowest corner of the box in m, object frame.
+        voxel_m: side of a voxel.
+        tau_m: half width of the truncation band.
+        empty_weight: relative to 1 for a surface seen head-on.
+        sign: 1 adds, -1 removes what was added with the same arguments.
+        pose: (3, 4) camera_from_object.
+        camera: (4,) fx, fy, cx, cy of the images.
+        index: (h, w) int32 number of the surface point at a pixel, -1 = none.
+        free_m: (h, w) float32 depth up to which a pixel sees empty space, 0 = unknown.
+        points: (n, 3) in the object frame.
+        normals: (n, 3).
+        weights: (n,).
+        colours: (n, 4) RGB and 1, or 0 without colour.
+    """
+    for i in prange(sums.shape[0]):
+        x = origin[0] + (i + 0.5) * voxel_m
+        for j in range(sums.shape[1]):
+            y = origin[1] + (j + 0.5) * voxel_m
+            for k in range(sums.shape[2]):
+                z = origin[2] + (k + 0.5) * voxel_m
+                u, v, depth = project(pose, camera, x, y, z)
+                if not (depth > 0.0 and -0.5 <= u < index.shape[1] - 0.5 and -0.5 <= v < index.shape[0] - 0.5):
+                    continue
+                row, column = int(v + 0.5), int(u + 0.5)
+                n = index[row, column]
+                along = above(x, y, z, points, normals, n) if n >= 0 else 2.0 * tau_m
+                if abs(along) <= tau_m:
+                    weight = sign * weights[n] * min(1.0, 1.5 * (1.0 + along / tau_m) + 1e-3)
+                    share = weight * colours[n, 3]
+                    sums[i, j, k, 0] += weight
+                    sums[i, j, k, 1] += weight * along
+                    sums[i, j, k, 2] += share
+                    for c in range(3):
+                        sums[i, j, k, 3 + c] += share * colours[n, c]
+                elif along > 0.0 and depth < free_m[row, column] - tau_m:
+                    sums[i, j, k, 0] += sign * empty_weight
+                    sums[i, j, k, 1] += sign * empty_weight * tau_m
