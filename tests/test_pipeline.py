@@ -15,8 +15,8 @@ from modeler import se3
 from modeler.closure import Closer
 from modeler.fusion import Fuser
 from modeler.graph import CommonAxis, PoseGraph, shared_noise, solve
-from modeler.pipeline import Modeler
-from modeler.pipeline.state import Seen, State
+from modeler.pipeline import Modeler, Prepared
+from modeler.pipeline.state import State
 from modeler.priors.bumps import KernelMixture
 from modeler.priors.proposal import DefensiveMixture
 from modeler.rays import Sensor
@@ -29,12 +29,14 @@ from modeler.types import (
     Edge,
     Failed,
     Frame,
+    Fusing,
     InputError,
     Outcome,
     PoseGaussian,
     Posterior,
     PriorRefused,
     RayImage,
+    Refining,
     Segmentation,
     SharedAxis,
     Solution,
@@ -127,7 +129,7 @@ def modeler(**changes: object) -> Modeler:
 
 
 def run(frames: list[Frame] = FRAMES, **changes: object) -> list[Step]:
-    return list(modeler(**changes).run(frames, Scene()))
+    return [event for event in modeler(**changes).run(frames, Scene()) if isinstance(event, Step)]
 
 
 def blank(index: int) -> Frame:
@@ -146,23 +148,24 @@ def test_true_edges_give_the_true_trajectory_in_the_camera_frame_of_the_first_vi
     assert trajectory_error(last) < 1e-6
 
 
-def test_each_frame_gives_one_step_with_a_preview_and_the_last_one_the_model() -> None:
+def test_each_frame_gives_one_step_with_a_preview_and_the_end_one_more_with_the_model() -> None:
     steps = run()
-    assert [step.frame.index for step in steps] == list(range(9))
-    assert [step.last for step in steps] == [False] * 8 + [True]
+    assert [step.frame.index for step in steps] == [*range(9), 8]
+    assert [step.last for step in steps] == [False] * 9 + [True]
     models = [step.model for step in steps if step.model is not None]
     assert all(len(model.triangles) > 0 for model in models)
-    assert [model.vertex_views is not None for model in models] == [False] * 8 + [True]  # made with care
+    assert [model.vertex_views is not None for model in models] == [False] * 9 + [True]  # made with care
     assert all(len(model.points_m) > 0 for model in models)
 
 
 def test_a_full_turn_is_closed_on_the_first_view() -> None:
-    last = run()[-1]
-    assert [(edge.target, edge.kind, edge.accepted) for edge in last.edges[:2]] == [
+    *_, closing, last = run()
+    assert [(edge.target, edge.kind, edge.accepted) for edge in closing.edges] == [
         (7, "odometry", True),
         (0, "closure", True),
     ]
-    assert last.edges_so_far[-len(last.edges) :] == last.edges
+    assert closing.edges_so_far[-2:] == closing.edges
+    assert last.edges_so_far == (*closing.edges_so_far, *last.edges)
 
 
 def test_frames_are_read_one_ahead_and_no_more() -> None:
@@ -183,7 +186,7 @@ def test_frames_are_read_one_ahead_and_no_more() -> None:
 def test_a_frame_without_object_is_left_out_and_the_next_joins_the_view_before() -> None:
     registrar = Oracle()
     steps = run([FRAMES[0], FRAMES[1], blank(2), FRAMES[3]], registrar=registrar)
-    assert [step.accepted for step in steps] == [True, True, False, True]
+    assert [step.accepted for step in steps] == [True, True, False, True, True]
     assert steps[2].left_out == Failed(Outcome.TOO_FEW_POINTS)
     assert steps[2].view is None
     assert registrar.asked == [(1, 0), (3, 1)]
@@ -201,7 +204,7 @@ def test_a_frame_that_cannot_be_registered_is_left_out_with_advice() -> None:
 
 def test_a_frame_to_which_the_prior_does_not_apply_is_left_out() -> None:
     steps = run(FRAMES[:4], prior=AnyPrior(refused=frozenset({(2, 0), (2, 1), (2, 3)})))
-    assert [step.left_out for step in steps] == [None, None, PriorRefused("frames 2 and 1: no plane"), None]
+    assert [step.left_out for step in steps] == [None, None, PriorRefused("frames 2 and 1: no plane"), None, None]
     assert [explain(edge.reason) for edge in steps[2].edges] == ["frames 2 and 1: no plane", "frames 2 and 0: no plane"]
     assert {edge.posterior.outcome for edge in steps[2].edges} == {Outcome.NOT_KNOWN}
 
@@ -209,7 +212,7 @@ def test_a_frame_to_which_the_prior_does_not_apply_is_left_out() -> None:
 def test_a_closure_to_which_the_prior_does_not_apply_leaves_its_frame_in() -> None:
     last = run(prior=AnyPrior(refused=frozenset({(8, 0)})))[-1]
     assert last.accepted
-    refused = next(edge for edge in last.edges if edge.target == 0)
+    refused = next(edge for edge in last.edges_so_far if (edge.source, edge.target) == (8, 0))
     assert not refused.accepted
     assert explain(refused.reason) == "frames 8 and 0: no plane"
     assert 8 in last.solution.trajectory
@@ -225,8 +228,9 @@ def test_a_previous_view_to_which_the_prior_does_not_apply_gives_way_to_others()
 def test_at_the_end_views_two_steps_apart_are_registered_too_and_judged() -> None:
     registrar, closer = Oracle(noise=1.0), Closer(max_span_deg=85.0, min_span_gain_nats=0.0, min_overlap=0.2)
     *steps, last = run(registrar=registrar, closer=closer)
-    assert all(edge.source - edge.target == 1 for step in steps for edge in step.edges)
+    assert all(edge.source - edge.target in (1, 8) for step in steps for edge in step.edges)
     spans = [edge for edge in last.edges if (edge.source - edge.target) % 9 in (2, 7)]
+    assert list(last.edges) == spans
     assert sorted(edge.source for edge in spans) == list(range(2, 9))
     assert all(
         edge.accepted and edge.kind == ("span" if edge.source - edge.target == 2 else "closure") for edge in spans
@@ -235,28 +239,30 @@ def test_at_the_end_views_two_steps_apart_are_registered_too_and_judged() -> Non
     none = run(registrar=Oracle(noise=1.0), closer=replace(closer, max_spans=0))[-1]
     assert len(none.edges_so_far) == len(last.edges_so_far) - len(spans)
     assert np.mean(_rotation_errors(last.solution)) < np.mean(_rotation_errors(none.solution))
-    hurried = list(modeler(registrar=Oracle(noise=1.0), closer=closer).run(FRAMES, Scene(), hurry=lambda: True))[-1]
-    assert len(hurried.edges_so_far) == len(none.edges_so_far)
     shared = run(registrar=Oracle(noise=1.0), closer=closer, prior=AnyPrior(axis=SharedAxis(1e-4, 1e-5)))[-1]
     assert len(shared.edges_so_far) == len(none.edges_so_far)  # their noise is not told apart from slip
 
 
 def test_the_end_tells_how_far_it_is_and_can_be_cut_short() -> None:
-    told: list[tuple[str, int, int]] = []
     closer = Closer(max_span_deg=85.0, min_span_gain_nats=0.0, min_overlap=0.2)
     building = modeler(registrar=Oracle(noise=1.0), closer=closer)
-    steps = list(building.run(FRAMES, Scene(), ending=lambda *stage: told.append(stage)))
-    pairs = [(done, total) for stage, done, total in told if stage == "registering more pairs"]
-    assert pairs == [(done, pairs[0][1]) for done in range(len(pairs))]
+    events = list(building.run(FRAMES, Scene()))
+    told = [event for event in events if not isinstance(event, Step)]
+    total = len(told) - 3
+    assert told == [Refining(0, None), *(Refining(done, total) for done in range(total + 1)), Fusing()]
+    last = events[-1]
+    assert isinstance(last, Step)
     none = run(registrar=Oracle(noise=1.0), closer=replace(closer, max_spans=0))[-1]
-    assert pairs[-1][0] == pairs[-1][1] == len(steps[-1].edges_so_far) - len(none.edges_so_far)
-    assert [stage for stage, _, _ in told[:1] + told[-1:]] == ["choosing more pairs", "making the model"]
-    told.clear()
-    hurry = iter([False, *[True] * 9])
-    cut = list(building.run(FRAMES, Scene(), hurry=lambda: next(hurry), ending=lambda *stage: told.append(stage)))
-    assert len(cut[-1].edges_so_far) == len(steps[-1].edges_so_far) - pairs[-1][1] + 1
-    assert told[-1][0] == "making the model"
-    assert cut[-1].model is not None
+    assert total == len(last.edges) == len(last.edges_so_far) - len(none.edges_so_far)
+    for stop, edges in ((Refining(1, total), 1), (Refining(0, None), 0)):
+        cut = building.start(Scene())
+        list(cut.track(FRAMES))
+        next(event for event in cut.refine() if event == stop)
+        *_, hurried = cut.finish()
+        assert isinstance(hurried, Step)
+        assert len(hurried.edges) == edges
+        assert len(hurried.edges_so_far) == len(none.edges_so_far) + edges
+        assert hurried.model is not None
 
 
 def test_covariances_account_for_the_noise_of_a_frame_in_all_its_edges() -> None:
@@ -315,7 +321,7 @@ def _rotation_errors(solution: Solution) -> list[float]:
 
 def test_without_any_object_there_is_no_model() -> None:
     steps = run([blank(0), blank(1)])
-    assert [step.model for step in steps] == [None, None]
+    assert [step.model for step in steps] == [None, None, None]
     assert steps[-1].last
     assert run([]) == []
 
@@ -323,8 +329,7 @@ def test_without_any_object_there_is_no_model() -> None:
 def test_a_pair_depends_on_the_seed_and_its_views_alone() -> None:
     whole = run(registrar=Oracle(noise=1.0), seed=7)[4].posteriors[0]
     maker = modeler(registrar=Oracle(noise=1.0), seed=7)
-    _, source = maker.view(FRAMES[4], Scene())
-    _, target = maker.view(FRAMES[3], Scene())
+    source, target = (maker.prepare(FRAMES[k], Scene()).view for k in (4, 3))
     assert source is not None
     assert target is not None
     assert np.array_equal(maker.register(source, target).pose.mean, whole.pose.mean)
@@ -336,7 +341,7 @@ def test_same_seed_same_bits_side_by_side_or_one_after_the_other() -> None:
     one = run(registrar=Oracle(noise=1.0))[-1]
     with ThreadPoolExecutor(2) as executor:
         other = run(registrar=Oracle(noise=1.0), executor=executor)[-1]
-    assert len(one.posteriors) > 1
+    assert len(one.edges_so_far) > 8
     for k, pose in one.solution.trajectory.items():
         assert np.array_equal(pose, other.solution.trajectory[k])
     assert one.model is not None
@@ -390,8 +395,8 @@ def test_lost_frames_join_after_all_where_later_views_place_them() -> None:
     lost = [frame for frame, joined in outcomes if not joined]
     assert lost == [3, 4, 5, 6]
     assert outcomes[:8] == [(k, k not in lost) for k in range(8)]
-    assert outcomes[8:] == [(6, True), (5, True), (4, True), (3, True), (8, True)]
-    assert [step.last for step in steps] == [False] * 12 + [True]
+    assert outcomes[8:] == [(8, True), (6, True), (5, True), (4, True), (3, True), (8, True)]
+    assert [step.last for step in steps] == [False] * 13 + [True]
     assert set(steps[-1].views) == set(steps[-1].solution.trajectory) == set(range(9))
     assert steps[-1].model is not None
     assert len({(e.source, e.target) for e in steps[-1].edges_so_far}) == len(steps[-1].edges_so_far)
@@ -409,7 +414,7 @@ def test_a_lost_frame_far_back_joins_across_another_that_is_lost_for_good() -> N
 def test_frames_tried_once_more_in_vain_are_told_of_too() -> None:
     hopeless = frozenset((source, target) for source in (2, 3, 5) for target in range(9))
     steps = run(FRAMES, registrar=Oracle(apart=hopeless, reach=9.0))
-    assert [step.frame.index for step in steps] == list(range(9))
+    assert [step.frame.index for step in steps] == [*range(9), 8]
     told = {(edge.source, edge.target): edge.accepted for edge in steps[-1].edges_so_far}
     assert [told[pair] for pair in ((2, 4), (3, 4), (5, 6))] == [False] * 3
     assert len(told) == len(steps[-1].edges_so_far)
@@ -506,9 +511,8 @@ def test_a_scene_is_told_by_few_frames_spread_over_the_sequence(frames: int, tol
 
 
 def test_only_frames_that_a_view_followed_soon_are_tried_again_newest_first() -> None:
-    seen = {
-        k: Seen(FRAMES[k], Segmentation(np.ones((2, 2), dtype=bool), None, Outcome.CONVERGED), None) for k in (1, 4, 5)
-    }
+    all_object = Segmentation(np.ones((2, 2), dtype=bool), None, Outcome.CONVERGED)
+    lost = {k: Prepared(FRAMES[k], all_object, None) for k in (1, 4, 5)}
     views = {k: tabletop.view(BOX, POSES[k], k) for k in (0, 7)}
-    state = State(views=views, lost=seen, places={k: k for k in range(9)})
-    assert [(lost.frame.index, view) for lost, view in state.overdue()] == [(5, 7), (4, 7)]
+    state = State(views=views, lost=lost, places={k: k for k in range(9)})
+    assert list(state.overdue()) == [(5, 7), (4, 7)]

@@ -8,7 +8,7 @@ from test_pipeline import FRAMES, Oracle, modeler, run, trajectory_error
 from modeler.pipeline import glancing
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.segmentation import Scene
-from modeler.types import Reason, Step
+from modeler.types import Reason, Searching, Step
 
 HIDDEN = frozenset({2, 3, 4, 5})
 
@@ -56,14 +56,10 @@ def test_lost_frames_are_found_from_far_round_by_way_of_glances() -> None:
     assert trajectory_error(last) < 1e-6
 
 
-def test_frames_that_are_tried_again_are_told_of_and_no_others() -> None:
-    told: list[int] = []
+def test_a_search_is_announced_for_lost_frames_and_no_others() -> None:
     maker = modeler(registrar=Oracle(blind=HIDDEN), glance=Oracle(blind=HIDDEN))
-    list(maker.run(FRAMES, Scene(), seeking=told.append))
-    assert set(told) == HIDDEN
-    told.clear()
-    list(modeler().run(FRAMES, Scene(), seeking=told.append))
-    assert told == []
+    assert {event.frame for event in maker.run(FRAMES, Scene()) if isinstance(event, Searching)} == HIDDEN
+    assert not any(isinstance(event, Searching) for event in modeler().run(FRAMES, Scene()))
 
 
 def test_a_glance_is_a_smaller_search_of_the_same_likelihood() -> None:

@@ -132,10 +132,11 @@ def on_a_terminal(command: list[str]) -> str:
 
 ENDING = """
 from modeler.cli.console import Console
+from modeler.types import Fusing, Refining
 with Console(3, None) as console:
-    console.ending("making the model", 0, 1)
+    console(Fusing())
     for done in range(8):
-        console.ending("registering more pairs", done, 7)
+        console(Refining(done, 7))
 """
 
 

@@ -11,14 +11,19 @@ import sys
 import pytest
 
 from modeler.cli.console import Console
+from modeler.types import Searching
 
-_SEEKING = "from modeler.cli.console import Console\nwith Console(25, None) as console: console.seeking(12)"
+_SEARCHING = """
+from modeler.cli.console import Console
+from modeler.types import Searching
+with Console(25, None) as console: console(Searching(12))
+"""
 
 
 def test_somebody_who_watches_sees_which_frame_is_tried_again() -> None:
     ours, theirs = pty.openpty()
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120"}
-    with subprocess.Popen([sys.executable, "-c", _SEEKING], stderr=theirs, env=environment) as process:
+    with subprocess.Popen([sys.executable, "-c", _SEARCHING], stderr=theirs, env=environment) as process:
         os.close(theirs)
         said = b""
         while select.select([ours], [], [], 60.0)[0]:
@@ -36,6 +41,6 @@ def test_somebody_who_watches_sees_which_frame_is_tried_again() -> None:
 
 def test_nobody_is_told_where_there_is_no_bar(capfd: pytest.CaptureFixture[str]) -> None:
     with Console(25, None) as console:
-        console.seeking(12)
+        console(Searching(12))
     said = capfd.readouterr()
     assert (said.out, said.err) == ("", "")

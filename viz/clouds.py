@@ -45,8 +45,9 @@ def pair_drawing(step: Step) -> Drawing:
 
 
 def shown_posterior(step: Step) -> Posterior | None:
-    """Return the step's first registration to a view that is at hand: the odometry pair."""
-    return next((posterior for posterior in step.posteriors if posterior.target in step.views), None)
+    """Return the first registration of the step's frame to a view that is at hand: the odometry pair."""
+    own = (posterior for posterior in step.posteriors if posterior.source == step.frame.index)
+    return next((posterior for posterior in own if posterior.target in step.views), None)
 
 
 def below_m(view: RayImage) -> Array:

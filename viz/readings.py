@@ -64,7 +64,7 @@ def drawing(step: Step) -> Drawing:
 def words(step: Step) -> Drawing:
     """Yield what happened to the frame in words, and a line for the log for each pair."""
     level = rr.TextLogLevel.INFO if step.accepted else rr.TextLogLevel.WARN
-    if not step.edges:
+    if not step.edges and not step.last:
         yield entities.LOG, rr.TextLog(f"frame {step.frame.index}: {_outcome(step)}", level=level)
     for edge in step.edges:
         level = rr.TextLogLevel.INFO if edge.accepted else rr.TextLogLevel.WARN
@@ -88,7 +88,8 @@ def pair_words(edge: Edge, step: Step) -> str:
 
 def now_words(step: Step) -> str:
     """Say in Markdown what the frame brought, pair by pair, and where the model stands."""
-    lines = [f"### Frame {step.frame.index}: {'accepted' if step.accepted else 'left out'}"]
+    frame = f"Frame {step.frame.index}: {'accepted' if step.accepted else 'left out'}"
+    lines = [f"### {frame}{', the last' if step.last else ''}"]
     for edge in step.edges:
         lines.append(f"- **{pair_words(edge, step)}.** {edge.posterior.outcome.advice}")
         if np.isfinite(edge.posterior.pose.covariance).all():
@@ -96,7 +97,7 @@ def now_words(step: Step) -> str:
         left = step.solution.mode_weights.get((edge.source, edge.target))
         if left is not None and len(left) > 1:
             lines.append(f"  - all edges together leave to its modes {', '.join(f'{100 * w:.0f}%' for w in left)}")
-    if not step.edges:
+    if not step.edges and not step.last:
         lines.append("- The first view of the object." if step.accepted else f"- {_outcome(step)}")
     kinds = [edge.kind for edge in step.edges_so_far if poses.takes_part(edge, step)]
     for edge in step.solution.outliers:

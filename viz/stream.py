@@ -55,12 +55,10 @@ class RerunStream:
         self.recording.set_time(entities.ELAPSED, duration=time.monotonic() - self.started_s)
         if step.view is not None and set(step.views) == {step.frame.index}:
             self.recording.send_blueprint(blueprint.layout(step.view))
+        of_pair = (images.drawing, clouds.pair_drawing, spread.drawing, ghosts.drawing, visibility.drawing)
+        repeated = step.last and clouds.shown_posterior(step) is None  # the last frame's pair stays in view
         for path, archetype in itertools.chain(
-            images.drawing(step),
-            clouds.pair_drawing(step),
-            spread.drawing(step),
-            ghosts.drawing(step),
-            visibility.drawing(step),
+            *(() if repeated else (drawing(step) for drawing in of_pair)),
             clouds.model_drawing(step),
             merged.drawing(step),
             poses.newest_drawing(step),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,9 +15,9 @@ from modeler.cli.options import FrameOptions, MethodOptions, ObjectOptions, Prio
 
 if TYPE_CHECKING:
     from modeler.export import RunFolder, RunMeta
-    from modeler.pipeline import Modeler
+    from modeler.pipeline import Modeler, Run
     from modeler.segmentation import Scene
-    from modeler.types import AbstractPrior
+    from modeler.types import AbstractPrior, Event, Frame
     from sequences import AbstractSequence
 
 
@@ -161,6 +161,7 @@ def _run(
         KeyboardInterrupt: where somebody asked for an end before the first frame.
     """
     from modeler.cli.inputs import while_it_lasts
+    from modeler.types import Step
     from viz.stream import open_stream
 
     frames, scene = seen
@@ -178,25 +179,30 @@ def _run(
         with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
             wanted = frames.until(lambda: interrupt.asked)
             coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
-            steps = modeler.run(
-                coming,
-                scene,
-                hurry=lambda: interrupt.asked,
-                ending=console.ending,
-                seeking=console.seeking,
-            )
-            for step in steps:
-                seconds["registration"] += sum(posterior.seconds for posterior in step.posteriors)
-                seconds["total"] = time.perf_counter() - began_s
-                meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
-                report = folder.write(step, meta)
-                stream(step)
-                console(step)
+            for event in _events(modeler.start(scene), coming, interrupt):
+                console(event)
+                if isinstance(event, Step):
+                    seconds["registration"] += sum(posterior.seconds for posterior in event.posteriors)
+                    seconds["total"] = time.perf_counter() - began_s
+                    meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
+                    report = folder.write(event, meta)
+                    stream(event)
     finally:
         stream.close()
     if not report:
         raise KeyboardInterrupt
     return report
+
+
+def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt) -> Iterator[Event]:
+    """Yield what happens in a run; Ctrl-C ends the refinement."""
+    yield from run.track(frames)
+    yield from run.revisit()
+    for event in run.refine():
+        yield event
+        if interrupt.asked:
+            break
+    yield from run.finish()
 
 
 def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:

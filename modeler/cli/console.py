@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from modeler.types import Reason, Step
+    from modeler.types import Event, Reason, Step
 
 T = TypeVar("T")
 
@@ -142,34 +142,46 @@ class Console:
             doubt = Outcome.UNSURE_MASK
             self._say(f"{len(self._unsure)} of {len(self._placed)} frames: {doubt.label}: {outcome_advice(doubt)}")
 
-    def __call__(self, step: Step) -> None:
-        """Tell of a step."""
+    def __call__(self, event: Event) -> None:
+        """Show what happens in a run."""
+        from modeler.types import Fusing, Refining, Searching, Step
+
+        match event:
+            case Step():
+                self._show_step(event)
+            case Searching(frame):
+                self._bar.update(self._task, description=f"trying frame {frame} again")
+            case Refining(done, int(total)):
+                self._show_stage("registering more pairs", done, total)
+            case Refining():
+                self._show_stage("choosing more pairs", 0, 1)
+            case Fusing():
+                self._show_stage("making the model", 0, 1)
+
+    def _show_step(self, step: Step) -> None:
+        """Show what became of a frame; a lost frame that is placed later has a second step, and so has the last."""
         from modeler.types import Outcome, loops_closed
 
         loops = loops_closed([edge for edge in step.edges_so_far if edge.accepted])
         frame, accepted = step.frame.index, step.accepted
-        again, self._placed[frame] = frame in self._placed, accepted
+        before, self._placed[frame] = self._placed.get(frame), accepted
         if accepted and step.segmentation.outcome is Outcome.UNSURE_MASK:
             self._unsure.add(frame)
         description = f"{len(step.views)} joined, {loops} {'loop' if loops == 1 else 'loops'} closed"
         self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=description)
-        if step.left_out is not None and not again:
+        if step.left_out is not None and before is None:
             self._tell(frame, f"left out: {self._why(step.left_out)}")
-        elif accepted and again:
+        elif accepted and before is False:
             self._tell(frame, "placed after all")
         elif accepted:
             self._release()
 
-    def ending(self, stage: str, done: int, total: int) -> None:
-        """Tell of what is done after the last frame: `done` of `total`."""
+    def _show_stage(self, stage: str, done: int, total: int) -> None:
+        """Show how much is done of what follows the last frame."""
         if stage != self._stage:
             self._stage = stage
             self._bar.update(self._task, total=None, description=stage)  # forgets how fast the stage before went
         self._bar.update(self._task, completed=done, total=total, description=stage)
-
-    def seeking(self, frame: int) -> None:
-        """Tell that a frame did not join the previous view and is being tried against others."""
-        self._bar.update(self._task, description=f"trying frame {frame} again")
 
     def _tell(self, frame: int, what: str) -> None:
         """Tell what became of a frame; of those that follow each other for one reason, only the first few by one."""

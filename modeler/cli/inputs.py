@@ -128,7 +128,7 @@ class Part:
         scene, views = compose.scene(modeler, self.sequence), {}
         points = {record["id"]: record["points"] for record in self.report["frames"]}
         for frame in frames:
-            _, view = modeler.view(self.sequence.frame(frame), scene)
+            view = modeler.prepare(self.sequence.frame(frame), scene).view
             if view is None or abs(len(view.points_m) - points[frame]) > _ALIKE * points[frame]:
                 raise InputError(
                     f"{self.sequence.name}: frame {frame} shows something else than the one that {self.run} was made "

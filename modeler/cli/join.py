@@ -160,6 +160,7 @@ def _edges(first: Reopened, second: Reopened, match: Match, options: Join) -> tu
 
     from modeler import se3
     from modeler.priors.bumps import KernelMixture
+    from modeler.pipeline import register
     from modeler.registration import VisibilityRegistrar
 
     edges = []
@@ -175,9 +176,7 @@ def _edges(first: Reopened, second: Reopened, match: Match, options: Join) -> tu
             sigma_m=_SIGMA_M,
             evidence=False,
         )
-        rng = np.random.default_rng([options.seed, source, target])
-        posterior = VisibilityRegistrar().register(*views, density, rng=rng)
-        edges.append(_judged(posterior, guess))
+        edges.append(_judged(register(VisibilityRegistrar(), *views, density, seed=options.seed), guess))
     return tuple(edges)
 
 

@@ -45,11 +45,11 @@ class Register:
         scene = compose.scene(modeler, sequence)
         views = []
         for index in (self.source, self.target):
-            segmentation, view = modeler.view(sequence.frame(index), scene)
-            if view is None:
-                outcome = segmentation.outcome
-                raise InputError(f"{self.sequence}: frame {index} has {outcome.label}. {outcome_advice(outcome)}")
-            views.append(view)
+            prepared = modeler.prepare(sequence.frame(index), scene)
+            if prepared.view is None:
+                flaw = prepared.flaw
+                raise InputError(f"{self.sequence}: frame {index} has {flaw.label}. {outcome_advice(flaw)}")
+            views.append(prepared.view)
         posterior = modeler.register(*views)
         edge = Edge(posterior, "odometry", posterior.usable, Stated(outcome_advice(posterior.outcome)))
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}

@@ -1,5 +1,8 @@
-"""The loop: frames in, steps out."""
+"""The loop: frames in, events out."""
 
-from modeler.pipeline.glances import glancing as glancing
 from modeler.pipeline.modeler import Modeler as Modeler
-from modeler.types import ACCEPTED as ACCEPTED
+from modeler.pipeline.modeler import Run as Run
+from modeler.pipeline.pairs import Prepared as Prepared
+from modeler.pipeline.pairs import prepare as prepare
+from modeler.pipeline.pairs import register as register
+from modeler.pipeline.tracking import glancing as glancing

@@ -1,36 +1,41 @@
-"""The loop: frames in, steps out. Estimation does not know that it is watched."""
+"""The loop: frames in, events out. Estimation does not know that it is watched."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import final
 
 import numpy as np
 
 from modeler.closure import Closer
 from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances
 from modeler.graph import CommonAxis, shared_noise
-from modeler.pipeline.pairing import Pairing
-from modeler.pipeline.state import Seen, State
+from modeler.pipeline.pairs import Prepared, prepare, register
+from modeler.pipeline.state import State
+from modeler.pipeline.tracking import Tracker
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter
 from modeler.types import (
     AbstractPrior,
     AbstractRegistrar,
     Edge,
+    Event,
     Failed,
     Frame,
-    Outcome,
+    Fusing,
     Posterior,
     RayImage,
     Reason,
-    Segmentation,
+    Refining,
+    Searching,
     Step,
 )
 
 
+@final
 @dataclass(frozen=True)
 class Modeler:
     """Builds the model of an object while it is being turned before the camera.
@@ -52,66 +57,41 @@ class Modeler:
     fuser: Fuser
     """Makes the model."""
     common_noise: float = 0.1
-    """Covariance of what all views of a run err by alike, as a share of an edge's. No loop tells it: over many rendered
-    runs, whose truth is known, the covariances of poses come out no smaller than they may be with this."""
+    """Covariance of the error that all views of a run share, as a share of an edge's. No loop observes it: over many
+    rendered runs, whose truth is known, the covariances of poses come out no smaller than they may be with this."""
     glance: AbstractRegistrar | None = None
-    """Looks briefly at pairs of frames that are likely hidden, so that a search follows only where surface matches (see
-    `glancing`); None: every frame that is lost is searched for."""
+    """A cheap registration of frames in which the object is probably hidden: a search follows only where they
+    match (see `glancing`). None: every lost frame is searched for."""
     seed: int = 0
     """Each pair draws from a generator of its own, made from this and the two frame numbers."""
     executor: Executor | None = None
     """Where the pairs of one frame are registered side by side; None: one after the other. Results are the same."""
 
-    def run(
-        self,
-        frames: Iterable[Frame],
-        scene: Scene,
-        *,
-        hurry: Callable[[], bool] = lambda: False,
-        ending: Callable[[str, int, int], None] = lambda stage, done, total: None,
-        seeking: Callable[[int], None] = lambda frame: None,
-    ) -> Iterator[Step]:
-        """Yield what each frame brings. A frame that cannot be used is reported and left out.
+    def run(self, frames: Iterable[Frame], scene: Scene) -> Iterator[Event]:
+        """Build a model and yield what happens: for each frame a `Step`, the last of which has the final model.
 
-        Before the last step, frames left out are tried once more, against views that followed them: one that then joins
-        has a second step.
+        To skip or cut short the refinement, go through the phases of `start(scene)` instead.
 
         Args:
-            frames: in order of time; read one ahead, so that the last step is known as such.
+            frames: in order of time; read one ahead, because the last frame is always compared with the first.
             scene: what the segmenter learnt from the sequence.
-            hurry: asked after the last frame; once it says so, no more edges are tried beyond those that placed the
-                frames.
-            ending: told after the last frame what is being done, and how much of how much is done.
-            seeking: told the number of a frame that the previous view does not place, while others are tried.
-        """
-        state = State()
-        for frame, last in _with_last(frames):
-            seen = Seen(frame, *self.view(frame, scene))
-            state = state.read(frame.index)
-            state, step = self._joined(state, seen, state.latest, last=last, seeking=seeking)
-            if last:
-                for later, found in self._caught_up(state, seeking):
-                    state = replace(later, growing=state.growing, model=state.model)
-                    if found.accepted:
-                        state = self._fused(state, last=False)
-                        yield replace(found, model=state.model)
-                state, spans = (state, ()) if hurry() else self._spanned(state, hurry, ending)
-                state = self._solved(state)
-                ending("making the model", 0, 1)
-                step = replace(step, posteriors=(*step.posteriors, *(edge.posterior for edge in spans)))
-                step = replace(step, edges=(*step.edges, *spans))
-                step = replace(step, solution=state.solution, edges_so_far=state.graph.edges, views=state.views)
-            if state.views and (last or step.accepted):
-                state = self._fused(state, last=last)
-            yield replace(step, model=state.model, last=last)
 
-    def view(self, frame: Frame, scene: Scene) -> tuple[Segmentation, RayImage | None]:
-        """Return the object in a frame, and the frame made ready; None where the object was not found."""
-        segmentation = self.segmenter.segment(frame, scene)
-        if segmentation.outcome not in (Outcome.CONVERGED, Outcome.UNSURE_MASK):
-            return segmentation, None
-        view = self.sensor.ray_image(replace(frame, mask=segmentation.mask), segmentation.plane)
-        return segmentation, view if len(view.points_m) else None
+        Raises:
+            InputError: where two frames have the same number.
+        """
+        run = self.start(scene)
+        yield from run.track(frames)
+        yield from run.revisit()
+        yield from run.refine()
+        yield from run.finish()
+
+    def start(self, scene: Scene) -> Run:
+        """Return a run before its first frame."""
+        return Run(self, scene)
+
+    def prepare(self, frame: Frame, scene: Scene) -> Prepared:
+        """Segment a frame and prepare it for registration."""
+        return prepare(frame, scene, self.segmenter, self.sensor)
 
     def register(self, source: RayImage, target: RayImage, prior: AbstractPrior | None = None) -> Posterior:
         """Return the posterior of target_from_source. The result depends on views, prior and seed alone.
@@ -119,127 +99,156 @@ class Modeler:
         Args:
             source: one view.
             target: another.
-            prior: what is known of the motion; None: what is known of any.
+            prior: what is known of the motion; None: the modeler's own.
 
         Raises:
             InputError: where the views lack what the prior needs.
         """
-        return self._asking(self.registrar, source, target, self.prior if prior is None else prior)
+        return self._register(self.registrar, source, target, self.prior if prior is None else prior)
 
-    def _asking(
+    def tracker(self, state: State) -> Tracker:
+        """Return what registers the views of a run with these components."""
+        glance = None if self.glance is None else partial(self._register, self.glance)
+        return Tracker(state, self.prior, self.closer, self.sensor, self.register, glance, self.executor)
+
+    def _register(
         self, registrar: AbstractRegistrar, source: RayImage, target: RayImage, prior: AbstractPrior
     ) -> Posterior:
-        rng = np.random.default_rng([self.seed, source.index, target.index])
-        return registrar.register(source, target, prior.between(source, target), rng=rng)
+        return register(registrar, source, target, prior.between(source, target), seed=self.seed)
 
-    def _joined(
-        self,
-        state: State,
-        seen: Seen,
-        previous: int | None,
-        *,
-        seeking: Callable[[int], None],
-        last: bool = False,
-        again: bool = False,
-    ) -> tuple[State, Step]:
-        """Return the state with one more frame, if it can be placed, and its step.
+
+@final
+@dataclass(eq=False)
+class Run:
+    """One run of the loop and the only owner of its state: four phases in order, each a stream of events.
+
+    A consumer in a hurry omits `revisit` or `refine`, or stops consuming one of them: `finish` takes what is there.
+    """
+
+    modeler: Modeler
+    """The components."""
+    scene: Scene
+    """What the segmenter learnt from the sequence."""
+    state: State = field(default_factory=State)
+    """What is known so far."""
+
+    def track(self, frames: Iterable[Frame]) -> Iterator[Step | Searching]:
+        """Place each frame among the views before it. A frame that cannot be placed is reported and left out.
+
+        Raises:
+            InputError: where two frames have the same number.
+        """
+        for frame, last in _with_last(frames):
+            prepared = self.modeler.prepare(frame, self.scene)
+            self.state = self.state.read(prepared)
+            yield from self._place(prepared, self.state.latest, last=last)
+
+    def revisit(self) -> Iterator[Step | Searching]:
+        """Register lost frames again, newest first, with the views that followed them; yield steps of those placed."""
+        tried: set[tuple[int, int]] = set()
+        while waiting := [pair for pair in self.state.overdue() if pair not in tried]:
+            tried.add(waiting[0])
+            frame, neighbour = waiting[0]
+            yield Searching(frame)
+            lost = self.state.lost[frame]
+            assert lost.view is not None
+            view = self.modeler.tracker(self.state).ready(lost.view)
+            yield from self._place(replace(lost, view=view), neighbour, again=True)
+
+    def refine(self) -> Iterator[Refining]:
+        """Register further pairs of views, whose edges make the poses more precise.
+
+        None where all steps share an axis: the noise that the edges of a frame share is not modelled together with it.
+        """
+        if self.modeler.prior.shared_axis(list(self.state.views.values())) is not None:
+            return
+        yield Refining(0, None)
+        tracker, known = self.modeler.tracker(self.state), self.state.map_view
+        pairs = self.modeler.closer.span_pairs(known)
+        yield Refining(0, len(pairs))
+        for posterior in tracker.spans(pairs):
+            edge = self.modeler.closer.judge_span(posterior.without_samples(), known)
+            self.state = self.state.refined(tracker.explained([edge]))
+            yield Refining(len(self.state.spans), len(pairs))
+
+    def finish(self) -> Iterator[Step | Fusing]:
+        """Solve the graph with the noise that its edges share, make the final model and yield the last step."""
+        newest = self.state.newest
+        if newest is None:
+            return
+        self._solve()
+        if self.state.views:
+            yield Fusing()
+            sure = conditional_covariances(self.state.solution, self.state.graph.edges)
+            model = self.modeler.fuser.fuse(self.state.views, self.state.solution.trajectory, sure)
+            self.state = replace(self.state, model=model)
+        spans = self.state.spans
+        yield self._step(newest, [edge.posterior for edge in spans], spans, last=True)
+
+    def _place(
+        self, prepared: Prepared, previous: int | None, *, last: bool = False, again: bool = False
+    ) -> Iterator[Step | Searching]:
+        """Register a frame, add it to the graph and to the model, and yield its step.
 
         Args:
-            state: what is known so far.
-            seen: the frame.
-            previous: the view that it should hang on; None where there is none.
-            seeking: told its number where that view does not place it.
-            last: whether it is the last.
-            again: whether it was tried before.
+            prepared: the frame.
+            previous: the view to register it to first; None where there is none.
+            last: whether it is the last of the sequence.
+            again: whether it was lost before: then there is no step where it still is.
         """
-        pairing, posteriors = replace(self._pairing(), seeking=seeking), ()
-        if seen.view is not None and previous is not None:
-            posteriors = pairing.placed(state, seen.view, previous, last=last, again=again)
+        tracker, posteriors = self.modeler.tracker(self.state), ()
+        if prepared.view is not None and previous is not None:
+            posteriors = yield from tracker.locate(prepared.view, previous, again=again)
+            posteriors += tracker.closures(prepared.view, posteriors, last=last, again=again)
+        steps = self.state.steps(prepared.frame.index, previous)
         lasting = [posterior.without_samples() for posterior in posteriors]
-        steps = state.steps(seen.frame.index, previous)
-        edges = self.closer.judge(lasting, state.map_view, steps=steps)
-        edges = pairing.explained(edges)
-        left_out = _left_out(seen, edges, first=not state.views)
-        state = state.joined(seen, edges, accepted=left_out is None)
-        step = Step(
-            frame=seen.frame,
-            segmentation=seen.segmentation,
-            view=seen.view,
-            posteriors=posteriors,
-            edges=edges,
-            left_out=left_out,
-            solution=state.solution,
-            model=None,
-            edges_so_far=state.graph.edges,
-            views=state.views,
-        )
-        return state, step
+        edges = tracker.explained(self.modeler.closer.judge(lasting, self.state.map_view, steps=steps))
+        prepared = replace(prepared, left_out=_left_out(prepared, edges, first=not self.state.views))
+        self.state = self.state.joined(prepared, edges)
+        if prepared.accepted:
+            self._preview()
+        if prepared.accepted or not again:
+            yield self._step(prepared, posteriors, edges)
 
-    def _caught_up(self, state: State, seeking: Callable[[int], None]) -> Iterator[tuple[State, Step]]:
-        """Yield states and steps of lost frames, newest first, tried once more against a view that followed them."""
-        tried: set[tuple[int, int]] = set()
-        waiting = list(state.overdue())
-        while waiting:
-            seen, neighbour = waiting[0]
-            tried.add((seen.frame.index, neighbour))
-            seeking(seen.frame.index)
-            if seen.view is not None:
-                seen = replace(seen, view=self._ready(state, seen.view))
-            state, step = self._joined(state, seen, neighbour, seeking=seeking, again=True)
-            yield state, step
-            waiting = [(seen, view) for seen, view in state.overdue() if (seen.frame.index, view) not in tried]
+    def _preview(self) -> None:
+        """Bring the growing model up to date."""
+        growing = self.state.growing or IncrementalTsdf(self.modeler.fuser)
+        growing = growing.updated(self.state.views, self.state.solution.trajectory)
+        self.state = replace(self.state, growing=growing, model=growing.model())
 
-    def _spanned(
-        self, state: State, hurry: Callable[[], bool], ending: Callable[[str, int, int], None]
-    ) -> tuple[State, tuple[Edge, ...]]:
-        """Return the state with edges beyond those that placed the frames, each judged, and these.
+    def _solve(self) -> None:
+        """Solve the graph with what its edges share: an axis about which all steps turn, or noise.
 
-        Not where all steps share an axis: beside it the noise that a frame's edges have in common does not count yet.
+        The images of every pair say where the axis lies, so that it makes the first pairs as precise as the last, and
+        what each pair says of it counts once. The noise is that of a frame's image in all its edges, and that of all
+        images.
         """
-        if self.prior.shared_axis(list(state.views.values())) is not None:
-            return state, ()
-        ending("choosing more pairs", 0, 1)
-        pairing, edges, stage = self._pairing(), [], "registering more pairs"
-        pairs = self.closer.span_pairs(state.map_view)
-        ending(stage, 0, len(pairs))
-        for posterior in pairing.spanning(state, pairs):
-            edges.append(self.closer.judge_span(posterior.without_samples(), state.map_view))
-            ending(stage, len(edges), len(pairs))
-            if hurry():
-                break
-        explained = pairing.explained(edges)
-        return state.spanned(explained), explained
-
-    def _solved(self, state: State) -> State:
-        """Return the state solved with what edges have in common.
-
-        That is an axis about which all steps turn: the images of every pair say where it lies, so that it sharpens the
-        first pairs as the last, and what each pair says of it counts once. Or it is the noise of a frame's image, and
-        what all images err by alike.
-        """
-        axis = self.prior.shared_axis(list(state.views.values()))
+        state = self.state.with_spans()
+        axis = self.modeler.prior.shared_axis(list(state.views.values()))
         if axis is None:
-            return state.solved(axis=None, shared=shared_noise(state.graph, state.solution), common=self.common_noise)
-        common = CommonAxis(sigma_tilt_rad=axis.sigma_tilt_rad, sigma_shift_m=axis.sigma_shift_m, sigma_lift_m=np.inf)
-        return state.solved(axis=common)
+            shared = shared_noise(state.graph, state.solution)
+            self.state = state.solved(axis=None, shared=shared, common=self.modeler.common_noise)
+        else:
+            tilt_rad, shift_m = axis.sigma_tilt_rad, axis.sigma_shift_m
+            self.state = state.solved(axis=CommonAxis(tilt_rad, shift_m, sigma_lift_m=np.inf))
 
-    def _pairing(self) -> Pairing:
-        glance = None if self.glance is None else partial(self._asking, self.glance)
-        return Pairing(self.prior, self.closer, self.register, self._ready, self.executor, glance=glance)
-
-    def _ready(self, state: State, view: RayImage) -> RayImage:
-        """Return a view with the images that a likelihood looks up."""
-        if view.layers:
-            return view
-        return state.ready.get(view.index) or self.sensor.ray_image(view.frame, view.plane)
-
-    def _fused(self, state: State, *, last: bool) -> State:
-        """Return the state with its model: that of before brought up to date, or in the end one made with care."""
-        if last:
-            sure = conditional_covariances(state.solution, state.graph.edges)
-            return replace(state, model=self.fuser.fuse(state.views, state.solution.trajectory, sure))
-        growing = (state.growing or IncrementalTsdf(self.fuser)).updated(state.views, state.solution.trajectory)
-        return replace(state, growing=growing, model=growing.model())
+    def _step(
+        self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge], *, last: bool = False
+    ) -> Step:
+        """Return what a frame brought, and what is known after it."""
+        return Step(
+            frame=prepared.frame,
+            segmentation=prepared.segmentation,
+            view=prepared.view,
+            posteriors=tuple(posteriors),
+            edges=tuple(edges),
+            left_out=prepared.left_out,
+            solution=self.state.solution,
+            model=self.state.model,
+            edges_so_far=self.state.graph.edges,
+            views=self.state.views,
+            last=last,
+        )
 
 
 def _with_last(frames: Iterable[Frame]) -> Iterator[tuple[Frame, bool]]:
@@ -252,11 +261,10 @@ def _with_last(frames: Iterable[Frame]) -> Iterator[tuple[Frame, bool]]:
         yield frame, True
 
 
-def _left_out(seen: Seen, edges: Sequence[Edge], *, first: bool) -> Reason | None:
+def _left_out(prepared: Prepared, edges: Sequence[Edge], *, first: bool) -> Reason | None:
     """Return why a frame is left out; None: it is not."""
-    if seen.view is None:
-        outcome = seen.segmentation.outcome
-        return Failed(Outcome.TOO_FEW_POINTS if outcome is Outcome.CONVERGED else outcome)
+    if prepared.view is None:
+        return Failed(prepared.flaw)
     if first or any(edge.accepted for edge in edges):
         return None
     return edges[0].reason

@@ -1,4 +1,4 @@
-"""What the loop knows after some frames."""
+"""What a run knows after some frames."""
 
 from __future__ import annotations
 
@@ -9,20 +9,11 @@ from functools import cached_property
 from modeler.closure import MapView
 from modeler.fusion import IncrementalTsdf
 from modeler.graph import CommonAxis, PoseGraph, Smoother
-from modeler.types import Edge, Frame, InputError, ObjectModel, RayImage, Segmentation, Solution
+from modeler.pipeline.pairs import Prepared
+from modeler.types import Edge, InputError, ObjectModel, RayImage, Solution
 
 _READY = 8  # views kept ready for registration; of others the images that a likelihood looks up are made again
-_SPANNED = 3  # frames between a lost one and a view that followed it, at most, for it to be tried once more
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """A frame, and the object in it."""
-
-    frame: Frame
-    segmentation: Segmentation
-    view: RayImage | None
-    """None where the object was not found."""
+_REVISITED = 3  # frames at most between a lost one and a view that followed it, to which it is registered again
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +30,14 @@ class State:
     """The newest of them with these images."""
     places: Mapping[int, int] = field(default_factory=dict)
     """How many frames were read before each."""
-    lost: Mapping[int, Seen] = field(default_factory=dict)
+    lost: Mapping[int, Prepared] = field(default_factory=dict)
     """Frames that show the object and were left out."""
+    newest: Prepared | None = None
+    """The frame read last in order of time, once it is judged."""
     vain: int = 0
-    """How many frames were searched for in vain since one was last found by it."""
+    """How many frames were searched for in vain since a search last found one."""
+    spans: tuple[Edge, ...] = ()
+    """Edges of the refinement, which the graph does not hold yet."""
     model: ObjectModel | None = None
     """The newest model."""
     growing: IncrementalTsdf | None = None
@@ -67,50 +62,59 @@ class State:
         """Return how many frames apart two that were read are; 1 without another."""
         return 1 if other is None else abs(self.places[frame] - self.places[other])
 
-    def read(self, frame: int) -> State:
+    def read(self, prepared: Prepared) -> State:
         """Return the state once one more frame is read.
 
         Raises:
             InputError: where its number is that of an earlier one.
         """
+        frame = prepared.frame.index
         if frame in self.places:
             raise InputError(f"frame {frame} comes twice; give each frame of the sequence a number of its own")
         return replace(self, places={**self.places, frame: len(self.places)})
 
-    def joined(self, seen: Seen, edges: Sequence[Edge], *, accepted: bool) -> State:
+    def joined(self, prepared: Prepared, edges: Sequence[Edge]) -> State:
         """Return the state once a frame is judged."""
-        number, graph = seen.frame.index, self.graph.plus(edges)
-        if not accepted or seen.view is None:
-            lost = self.lost if seen.view is None else {**self.lost, number: replace(seen, view=_light(seen.view))}
-            return replace(self, graph=graph, lost=lost, vain=self.vain + (seen.view is not None))
+        number, graph = prepared.frame.index, self.graph.plus(edges)
+        light = prepared if prepared.view is None else replace(prepared, view=_light(prepared.view))
+        newest = self.newest if number in self.lost else light
+        if light.view is None:
+            return replace(self, graph=graph, newest=newest)
+        if not prepared.accepted:
+            return replace(self, graph=graph, newest=newest, lost={**self.lost, number: light}, vain=self.vain + 1)
         found = number in self.lost or (bool(edges) and not edges[0].accepted)
         graph = graph if graph.first is not None else replace(graph, first=number)
-        ready = {**self.ready, number: seen.view}
+        ready = {**self.ready, number: prepared.view}
         return replace(
             self,
             graph=graph,
             smoother=self.smoother.to(graph),
-            views={**self.views, number: _light(seen.view)},
+            views={**self.views, number: light.view},
             ready=dict(list(ready.items())[-_READY:]),
+            newest=newest,
             vain=0 if found else self.vain,
             lost={frame: other for frame, other in self.lost.items() if frame != number},
         )
 
-    def spanned(self, edges: Sequence[Edge]) -> State:
-        """Return the state with more edges between views that are in it."""
-        graph = self.graph.plus(edges)
+    def refined(self, edges: Sequence[Edge]) -> State:
+        """Return the state with more edges between views that are in it, of which `with_spans` makes use."""
+        return replace(self, spans=(*self.spans, *edges))
+
+    def with_spans(self) -> State:
+        """Return the state whose graph holds the edges of the refinement."""
+        graph = self.graph.plus(self.spans)
         return replace(self, graph=graph, smoother=self.smoother.to(graph))
 
     def solved(self, *, axis: CommonAxis | None, shared: float = 0.0, common: float = 0.0) -> State:
         """Return the state solved with an axis that all steps share, or the noise that edges do; see `Smoother`."""
         return replace(self, smoother=replace(self.smoother, axis=axis, shared=shared, common=common).to(self.graph))
 
-    def overdue(self) -> Iterator[tuple[Seen, int]]:
+    def overdue(self) -> Iterator[tuple[int, int]]:
         """Yield lost frames, newest first, each with the view that followed it soonest, if that was soon."""
         for frame in sorted(self.lost, key=lambda frame: -self.places[frame]):
-            after = [view for view in self.views if 0 < self.places[view] - self.places[frame] <= _SPANNED]
+            after = [view for view in self.views if 0 < self.places[view] - self.places[frame] <= _REVISITED]
             if after:
-                yield self.lost[frame], min(after, key=lambda view: self.places[view])
+                yield frame, min(after, key=lambda view: self.places[view])
 
 
 def _light(view: RayImage) -> RayImage:

@@ -11,7 +11,11 @@ from modeler.types.densities import AbstractPoseDensity as AbstractPoseDensity
 from modeler.types.densities import EvenSpread as EvenSpread
 from modeler.types.loops import joined_without as joined_without
 from modeler.types.loops import loops_closed as loops_closed
+from modeler.types.model import Event as Event
+from modeler.types.model import Fusing as Fusing
 from modeler.types.model import ObjectModel as ObjectModel
+from modeler.types.model import Refining as Refining
+from modeler.types.model import Searching as Searching
 from modeler.types.model import Step as Step
 from modeler.types.modes import as_one as as_one
 from modeler.types.modes import separate as separate

@@ -42,16 +42,19 @@ class ObjectModel:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What one frame brought: the only thing that leaves the loop."""
+    """What one frame brought, and what is known after it.
+
+    The final step of a run repeats the last frame with the pairs of the refinement and the final model.
+    """
 
     frame: Frame
     """The frame as read."""
     segmentation: Segmentation
     """What of it is the object."""
     view: RayImage | None
-    """The frame made ready; None where the object was not found."""
+    """The frame prepared for registration; None where the object was not found."""
     posteriors: tuple[Posterior, ...]
-    """Registrations tried with this frame as source."""
+    """Registrations since the step before: with this frame as source, in the final step those of the refinement."""
     edges: tuple[Edge, ...]
     """Their judgement."""
     left_out: Reason | None
@@ -65,9 +68,36 @@ class Step:
     views: Mapping[int, RayImage] = field(default_factory=dict)
     """Every accepted view by frame number."""
     last: bool = False
-    """True on the final step, whose model is made with care."""
+    """True for the final step."""
 
     @property
     def accepted(self) -> bool:
         """Whether the frame is part of the model."""
         return self.left_out is None
+
+
+@dataclass(frozen=True)
+class Searching:
+    """The previous view does not place a frame: others are tried."""
+
+    frame: int
+    """Frame number."""
+
+
+@dataclass(frozen=True)
+class Refining:
+    """After the last frame, further pairs of views are registered to make the poses more precise."""
+
+    done: int
+    """Pairs registered so far."""
+    total: int | None
+    """Pairs to register; None while they are being chosen."""
+
+
+@dataclass(frozen=True)
+class Fusing:
+    """The final model is being made."""
+
+
+Event = Step | Searching | Refining | Fusing
+"""What happens in a run."""

@@ -91,8 +91,10 @@ def run(maker: Modeler, case: Case, told: Callable[[Step, float, float], None]) 
     scene = maker.segmenter.scene([case.sequence.frame(index) for index in telling(indices)])
     began = time.process_time()
     before, peak_mib, registrations, step = began, 0.0, 0, None
-    for step in maker.run(case.frames(), scene):
-        now = time.process_time()
+    for event in maker.run(case.frames(), scene):
+        if not isinstance(event, Step):
+            continue
+        step, now = event, time.process_time()
         peak_mib = max(peak_mib, memory_mib())
         registrations += len(step.posteriors)
         told(step, now - before, memory_mib())

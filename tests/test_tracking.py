@@ -1,6 +1,6 @@
 """A view that the prior's limits seem to cut off is sought beyond them, and believed there only for a reason."""
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -10,9 +10,9 @@ from closing import ABOUT_OBJECT, COVARIANCE, turned, view
 
 from modeler import se3
 from modeler.closure import Closer
-from modeler.pipeline.limits import believed
-from modeler.pipeline.pairing import Pairing
 from modeler.pipeline.state import State
+from modeler.pipeline.tracking import Tracker, believed
+from modeler.rays import Sensor
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
@@ -23,6 +23,7 @@ from modeler.types import (
     PoseGaussian,
     Posterior,
     RayImage,
+    Searching,
     Solution,
     as_one,
 )
@@ -58,6 +59,15 @@ class Limits(AbstractPrior):
         return self
 
 
+def result(events: Generator[Searching, None, tuple[Posterior, ...]]) -> tuple[Posterior, ...]:
+    """Return what is found once all events of a search are consumed."""
+    while True:
+        try:
+            next(events)
+        except StopIteration as stop:
+            return stop.value
+
+
 def found(outcome: Outcome, wider_deg: float, gain_nats: float, overlap: float = 0.8) -> float:
     """Return how far in degrees a view is taken to have turned that one registration leaves at 25°, a wider one not."""
 
@@ -71,8 +81,8 @@ def found(outcome: Outcome, wider_deg: float, gain_nats: float, overlap: float =
         return replace(posterior, least_overlap=0.35, log_evidence=nats)
 
     state = State(views={0: view(0)}, places={0: 0, 1: 1})
-    pairing = Pairing(Limits(), Closer(), register, lambda state, view: view, None)
-    (posterior,) = pairing.placed(state, view(1), 0, last=False, again=False)
+    tracker = Tracker(state, Limits(), Closer(), Sensor(), register)
+    (posterior,) = result(tracker.locate(view(1), 0, again=False))
     assert posterior.usable
     assert posterior.seconds == (1.0 if outcome is Outcome.CONVERGED else 2.0)
     sense = np.sign((se3.inverse(ABOUT_OBJECT) @ posterior.pose.mean @ ABOUT_OBJECT)[0, 2] * turned(1.0)[0, 2])
