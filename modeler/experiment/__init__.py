@@ -1,17 +1,16 @@
 """Methods and models compared with what is known to be true: which pairs, which errors, which tables."""
 
 from modeler.experiment.experiment import Experiment as Experiment
+from modeler.experiment.experiment import Pair as Pair
+from modeler.experiment.experiment import Pairing as Pairing
+from modeler.experiment.experiment import Recorded as Recorded
+from modeler.experiment.experiment import sparse_view as sparse_view
 from modeler.experiment.models import Modelled as Modelled
 from modeler.experiment.models import ModelScore as ModelScore
 from modeler.experiment.models import model_scores as model_scores
 from modeler.experiment.models import models_csv as models_csv
 from modeler.experiment.models import models_json as models_json
-from modeler.experiment.pairing import Pair as Pair
-from modeler.experiment.pairing import Pairing as Pairing
-from modeler.experiment.recorded import Recorded as Recorded
-from modeler.experiment.runner import evaluate as evaluate
-from modeler.experiment.sparse import sparse_frame as sparse_frame
-from modeler.experiment.sparse import sparse_view as sparse_view
-from modeler.experiment.summaries import Summary as Summary
-from modeler.experiment.summaries import summaries as summaries
+from modeler.experiment.results import evaluate as evaluate
+from modeler.experiment.trials import Summary as Summary
 from modeler.experiment.trials import Trial as Trial
+from modeler.experiment.trials import summaries as summaries

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import final
+from itertools import groupby
+from typing import NamedTuple, Protocol, TypeVar, final
 
 import numpy as np
 
 from modeler.evaluation import rotation_error_deg, true_motion
-from modeler.experiment.pairing import Pair, Pairing
-from modeler.experiment.recorded import Recorded
-from modeler.experiment.sparse import sparse_frame, sparse_view
 from modeler.experiment.trials import Trial
-from modeler.experiment.viewed import viewed
+from modeler.pipeline import prepare, register
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import (
@@ -30,7 +28,74 @@ from modeler.types import (
     Stated,
 )
 
+_Seen = TypeVar("_Seen")
 _SPARSE_STREAM = 1  # the random stream that thins frame k is [seed, k, this]; pairs draw from [seed, source, target]
+
+
+class Recorded(Protocol):
+    """Frames, and what is known of them; the readers of sequences have it."""
+
+    @property
+    def name(self) -> str:
+        """What the sequence is called."""
+        ...
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Frame numbers, ascending."""
+        ...
+
+    def frame(self, index: int) -> Frame:
+        """Return a frame by its number."""
+        ...
+
+    def truth(self) -> Mapping[int, Array] | None:
+        """Return the true camera_from_model (4, 4) by frame number, where it is known."""
+        ...
+
+    def sensor(self) -> tuple[float, float] | None:
+        """Return the sensor's noise `(sigma_wh, sigma_r_m)`, where it is known."""
+        ...
+
+
+class Pair(NamedTuple):
+    """Two frames, one to be registered to the other."""
+
+    source: int
+    """Frame number of the source."""
+    target: int
+    """Frame number of the target."""
+    offset: int
+    """Frames from one to the other, in the order of the sequence."""
+
+
+@final
+@dataclass(frozen=True)
+class Pairing:
+    """Which frames are registered with each other."""
+
+    offsets: tuple[int, ...] = (1,)
+    """How many frames source and target are apart, in the order of the sequence; each offset is a table."""
+    both_ways: bool = False
+    """Register each pair in both directions, not only the later frame to the earlier."""
+    closed: bool = False
+    """The sequence is a full turn: its last frame is followed by its first."""
+
+    @property
+    def loops(self) -> bool:
+        """Whether each frame is registered to the one before it all the way round: together they should do nothing."""
+        return self.closed and not self.both_ways and self.offsets == (1,)
+
+    def pairs(self, indices: Sequence[int]) -> Iterator[Pair]:
+        """Yield every pair of these frame numbers, offset by offset."""
+        count = len(indices)
+        for offset in self.offsets:
+            for position in range(count if self.closed else count - offset):
+                earlier, later = indices[position], indices[(position + offset) % count]
+                if earlier != later:
+                    yield Pair(later, earlier, offset)
+                    if self.both_ways:
+                        yield Pair(earlier, later, offset)
 
 
 @final
@@ -49,8 +114,6 @@ class Experiment:
     points: int | None = None
     """Surface points of each view that are kept, drawn at random; None = all (paper: very sparse clouds). What the
     images show of empty space stays."""
-    pixels: int | None = None
-    """Object pixels of each frame whose depth is kept, drawn at random; None = all. The mask stays."""
     success_deg: float = 16.2
     """Rotation error below which a registration counts as right (Jian and Vemuri 2011)."""
     learn: bool = False
@@ -114,18 +177,14 @@ class Experiment:
         return lambda index: self._view(recorded.frame(index), scene, sensor)
 
     def _view(self, frame: Frame, scene: Scene, sensor: Sensor) -> RayImage | Outcome:
-        """Return a frame made ready, as sparse as the experiment has it, or why it cannot be."""
-        found = self.segmenter.segment(frame, scene)
-        if found.outcome not in (Outcome.CONVERGED, Outcome.UNSURE_MASK):
-            return found.outcome
-        frame = replace(frame, mask=found.mask)
+        """Return a frame prepared for registration, as sparse as the experiment has it, or why it cannot be."""
+        prepared = prepare(frame, scene, self.segmenter, sensor)
+        if prepared.view is None:
+            return prepared.flaw
+        if self.points is None:
+            return prepared.view
         rng = np.random.default_rng([self.seed, frame.index, _SPARSE_STREAM])
-        if self.pixels is not None:
-            frame = sparse_frame(frame, self.pixels, rng)
-        view = sensor.ray_image(frame, found.plane)
-        if self.points is not None:
-            view = sparse_view(view, self.points, rng)
-        return view if len(view.points_m) else Outcome.TOO_FEW_POINTS
+        return sparse_view(prepared.view, self.points, rng)
 
     def _registered(
         self, method: AbstractRegistrar, source: RayImage, target: RayImage, trusted: Sequence[Edge]
@@ -143,11 +202,50 @@ class Experiment:
             density = prior.between(source, target)
         except InputError as error:
             return str(error)
-        rng = np.random.default_rng([self.seed, source.index, target.index])
-        return method.register(source, target, density, rng=rng)
+        return register(method, source, target, density, seed=self.seed)
 
 
 def _blank(sequence: str, method: str, pair: Pair, truth: Array | None) -> Trial:
     """Return a trial that has not been made, with the true rotation where it is known."""
     blank = Trial(sequence, method, pair.offset, pair.source, pair.target, outcome="", usable=False)
     return blank if truth is None else replace(blank, rotation_deg=rotation_error_deg(np.eye(4), truth))
+
+
+def viewed(pairs: Iterable[Pair], view: Callable[[int], _Seen]) -> Iterator[tuple[Pair, _Seen, _Seen]]:
+    """Yield pairs with the views of source and target.
+
+    A view is made when it is first asked for and let go after the last pair of the same offset that has it, so that of
+    a sequence however long about as many are kept as the offset counts frames; of a closed one, twice as many.
+
+    Args:
+        pairs: offset by offset.
+        view: makes the view of a frame number.
+    """
+    for _, group in groupby(pairs, key=lambda pair: pair.offset):
+        together = list(group)
+        last = {frame: number for number, pair in enumerate(together) for frame in (pair.source, pair.target)}
+        kept: dict[int, _Seen] = {}
+        for number, pair in enumerate(together):
+            for frame in sorted((pair.source, pair.target)):
+                if frame not in kept:
+                    kept[frame] = view(frame)
+            yield pair, kept[pair.source], kept[pair.target]
+            for frame in (pair.source, pair.target):
+                if last[frame] == number:
+                    del kept[frame]
+
+
+def sparse_view(view: RayImage, count: int, rng: np.random.Generator) -> RayImage:
+    """Return a view with at most `count` of its surface points; its images stay whole.
+
+    Args:
+        view: a frame made ready.
+        count: points to keep.
+        rng: chooses them.
+    """
+    total = len(view.points_m)
+    kept = np.sort(rng.permutation(total)[:count])
+    layers = {name: layer[kept] if layer.shape == (total,) else layer for name, layer in view.layers.items()}
+    return replace(
+        view, points_m=view.points_m[kept], normals=view.normals[kept], pixels=view.pixels[kept], layers=layers
+    )

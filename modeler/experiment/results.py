@@ -1,4 +1,4 @@
-"""Experiments as files: everything as JSON, the trials as CSV."""
+"""An experiment from sequences to files: everything as JSON, the trials as CSV and as a plot."""
 
 from __future__ import annotations
 
@@ -6,12 +6,55 @@ import csv
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
+from pathlib import Path
 
-from modeler.experiment.experiment import Experiment
-from modeler.experiment.summaries import Quantiles, Summary
-from modeler.experiment.trials import Trial
+from modeler.experiment.experiment import Experiment, Recorded
+from modeler.experiment.trials import Quantiles, Summary, Trial, summaries
+from modeler.export import write_atomically
+from modeler.types import InputError
+
+
+def evaluate(
+    sequences: Sequence[Recorded],
+    experiment: Experiment,
+    out: Path,
+    *,
+    draw: Callable[[Sequence[Trial]], bytes],
+    told: Callable[[Trial], None],
+) -> list[Summary]:
+    """Run an experiment and write `results.json`, `results.csv` and `rotation_errors.png` into a folder.
+
+    Args:
+        sequences: with ground truth, or such as are a closed turn where that is the pairing.
+        experiment: what to do with each.
+        out: folder, made where there is none; the three files of an earlier experiment are replaced at the end.
+        draw: makes a PNG of the trials.
+        told: hears of every trial as soon as it is done; there are `experiment.size(sequence)` for each sequence.
+
+    Raises:
+        InputError: where a sequence has nothing to be judged by or cannot be read, or `out` cannot be written.
+    """
+    names = [recorded.name for recorded in sequences]
+    for recorded in sequences:
+        if names.count(recorded.name) > 1:
+            raise InputError(f"two sequences are called {recorded.name!r}; give each a name in its sequence.json.")
+        experiment.size(recorded)  # refuses what cannot be judged, before hours are spent on the others
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made ({error.strerror}); choose another folder with --out") from error
+    trials: list[Trial] = []
+    for recorded in sequences:
+        for trial in experiment.trials(recorded):
+            trials.append(trial)
+            told(trial)
+    rows = summaries(trials, experiment.success_deg, loops=experiment.pairing.loops)
+    write_atomically(out / "results.json", results_json(experiment, trials, rows))
+    write_atomically(out / "results.csv", results_csv(trials))
+    write_atomically(out / "rotation_errors.png", draw(trials))
+    return rows
 
 
 def results_json(experiment: Experiment, trials: Sequence[Trial], rows: Sequence[Summary]) -> str:
@@ -24,7 +67,6 @@ def results_json(experiment: Experiment, trials: Sequence[Trial], rows: Sequence
         "methods": {name: repr(method) for name, method in experiment.methods.items()},
         "pairing": asdict(experiment.pairing),
         "points": experiment.points,
-        "pixels": experiment.pixels,
         "success_deg": experiment.success_deg,
         "summaries": [_finite(asdict(row)) for row in rows],
         "trials": [_finite(asdict(trial)) for trial in trials],
