@@ -159,8 +159,8 @@ def _edges(first: Reopened, second: Reopened, match: Match, options: Join) -> tu
     import numpy as np
 
     from modeler import se3
-    from modeler.priors.bumps import KernelMixture
     from modeler.pipeline import register
+    from modeler.priors.bumps import KernelMixture
     from modeler.registration import VisibilityRegistrar
 
     edges = []
