@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler.kernels import planes
-from modeler.kernels.silhouette import silhouette_distance
 from modeler.types import Frame, Plane, RayImage
 
 
@@ -53,7 +52,7 @@ class Sensor:
         cells = planes.local_planes(
             depth_m,
             mask,
-            silhouette_distance(outline, self.max_silhouette_px),
+            planes.silhouette_distance(outline, self.max_silhouette_px),
             intrinsics,
             ball,
             sigma_inverse,

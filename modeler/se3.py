@@ -70,7 +70,7 @@ def moved(pose: Array, xi: Array, about_m: Array) -> Array:
     shape = np.broadcast_shapes(np.shape(pose)[:-2], np.shape(xi)[:-1])
     poses = np.broadcast_to(np.asarray(pose, dtype=np.float64), (*shape, 4, 4)).reshape(-1, 4, 4)
     steps = np.broadcast_to(np.asarray(xi, dtype=np.float64), (*shape, 6)).reshape(-1, 6)
-    return lie_group.turned(poses, steps, np.asarray(about_m, dtype=np.float64)).reshape(*shape, 4, 4)
+    return lie_group.retract_all(poses, steps, np.asarray(about_m, dtype=np.float64)).reshape(*shape, 4, 4)
 
 
 def difference(first: Array, second: Array, about_m: Array) -> Array:

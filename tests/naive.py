@@ -47,9 +47,9 @@ def paper_density(point_b, a_from_b, ranges_m, intrinsics, noise):
 
 
 def visibility(pose, projection, parameters):
-    """Log-likelihood of one pose and number of explained points: every point in turn, as `kernels.visibility` says."""
+    """Log-likelihood of one pose and number of explained points: every point in turn, as `kernels.point_likelihood`."""
     fx, fy, cx, cy, width, height = projection.camera.astype(np.float64)
-    low, high, flat, steep = projection.facing.astype(np.float64)
+    low, high, flat, steep = projection.cosines.astype(np.float64)
     cells, points = projection.cells.reshape(int(height), int(width), -1), projection.points.T.astype(np.float64)
     blur, silhouette_px, dead_band_px, clearance_m, max_point_cost, normal_cost, unmeasured_gain, typical_misfit = map(
         np.float64, parameters[:-1]
@@ -110,7 +110,7 @@ def silhouette_distance(mask):
 
 
 def point_to_plane_equations(found, centre_m):
-    """Twin of `kernels.matching.normal_equations` for the rows of `kernels.matching.matches` under one pose."""
+    """Twin of `point_to_plane.normal_equations` for the rows of `point_to_plane.matches` under one pose."""
     gradient, matrix = np.zeros(6), np.zeros((6, 6))
     for row in found:
         position, own, other, residual, weight = row[:3], row[3:6], row[6:9], row[9], row[10]

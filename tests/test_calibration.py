@@ -17,7 +17,9 @@ from modeler import se3
 from modeler.evaluation import rotation_error_deg, sample_surface, true_motion
 from modeler.priors import TablePrior
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
-from modeler.registration.importance import AdaptiveSampler
+from modeler.registration.visibility import VisibilityLikelihood
+from modeler.registration.visibility.registrar import ModeSampler
+from modeler.registration.visibility.sampling import AdaptiveSampler
 from modeler.types import Outcome, PoseGaussian, Posterior
 from sequences.rendering.renderer import RenderedSequence
 from viz.calibration import coverage_curves
@@ -155,14 +157,14 @@ def test_only_answers_that_are_given_are_judged() -> None:
 
 
 def test_a_study_runs_and_repeats_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    quick = AdaptiveSampler(enough=200.0, kept=300)
+    quick = ModeSampler(adaptive=AdaptiveSampler(enough=200.0, kept=300))
     box = Specimen("box", "n-fold", "tuning")
     small = Study(
         specimens=(box,),
         conditions=(Condition(),),
         frames=3,
         priors={"table": TablePrior()},
-        methods={OURS: VisibilityRegistrar(points=100, sampler=quick), CONTROL: IcpRegistrar()},
+        methods={OURS: VisibilityRegistrar(VisibilityLikelihood(points=100), sampler=quick), CONTROL: IcpRegistrar()},
     )
     trials = run(small, tmp_path)
     assert [(trial.source, trial.method) for trial in trials] == [(1, OURS), (1, CONTROL), (2, OURS), (2, CONTROL)]

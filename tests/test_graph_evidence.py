@@ -11,8 +11,8 @@ from rings import OBJECT_M, edge, nees
 
 from modeler import se3
 from modeler.graph import PoseGraph, solve
-from modeler.registration.importance import AdaptiveSampler
 from modeler.registration.posterior import weighted_gaussian
+from modeler.registration.visibility.sampling import AdaptiveSampler
 from modeler.types import AbstractPoseDensity, Array, PoseGaussian
 
 VARIANCE = 0.02e-2  # the check of the design, in units of a tenth of a radian and of a metre

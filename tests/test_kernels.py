@@ -8,10 +8,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from modeler import kernels, se3
-from modeler.kernels import matching, mixture, paper, patches, planes, ridges, visibility
-from modeler.kernels.projection import Projection, buffers
-from modeler.kernels.silhouette import silhouette_distance
-from modeler.registration.mixture import Gaussians
+from modeler.kernels import mixture, paper, planes, point_likelihood, point_to_plane
+from modeler.kernels.point_likelihood import Projection, buffers
+from modeler.registration.visibility.sampling import GaussianMixture
 from modeler.se3 import matrices, rows
 
 INTRINSICS = np.array([40.0, 42.0, 9.3, 7.1])
@@ -101,10 +100,10 @@ HIDDEN = 0.3
 
 def parameters(blur_m=0.004):
     numbers = [np.float32(value) for value in (blur_m, 1.5, 1.5, 0.006, 10.0, 2.0, -1.2, 0.4)]
-    return visibility.LikelihoodParameters(*numbers, table=visibility.match_table(HIDDEN))
+    return point_likelihood.LikelihoodParameters(*numbers, table=point_likelihood.match_table(HIDDEN))
 
 
-def random_sight(rng, count=40):
+def random_projection(rng, count=40):
     """Points with normals beside cells that they have nothing to do with."""
     normals = rng.normal(size=(count, 3)) - [0, 0, 1.5]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -126,11 +125,11 @@ def far_from_borders(projection, poses):
 @pytest.mark.parametrize("seed", range(10))
 def test_visibility_is_within_its_bound_of_its_twin(seed):
     rng = np.random.default_rng(seed)
-    projections = random_sight(rng, 40), random_sight(rng, 30)
+    projections = random_projection(rng, 40), random_projection(rng, 30)
     poses = np.stack([random_pose(rng, 0.3) for _ in range(60)])
     poses = poses[far_from_borders(projections[0], poses) & far_from_borders(projections[1], se3.inverse(poses))]
     assert len(poses) > 20
-    got = visibility.log_likelihoods(rows(poses), *projections, parameters(), parameters(0.006))
+    got = point_likelihood.log_likelihoods(rows(poses), *projections, parameters(), parameters(0.006))
     want = [
         np.add(
             naive.visibility(pose, projections[0], parameters()),
@@ -142,13 +141,13 @@ def test_visibility_is_within_its_bound_of_its_twin(seed):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_walk_along_a_ridge_rates_places_as_the_likelihood_does(seed):
+def test_ridge_tracing_scores_poses_as_the_likelihood_does(seed):
     rng = np.random.default_rng(seed)
     projections, poses = (
-        (random_sight(rng, 40), random_sight(rng, 30)),
+        (random_projection(rng, 40), random_projection(rng, 30)),
         np.stack([random_pose(rng, 0.3) for _ in range(5)]),
     )
-    ground = ridges.RidgeLikelihood(
+    ridge = point_to_plane.RidgeLikelihood(
         projections[0],
         projections[1],
         projections[0],
@@ -160,38 +159,40 @@ def test_a_walk_along_a_ridge_rates_places_as_the_likelihood_does(seed):
         0.3,
         -np.inf,
     )
-    room = buffers(projections[0]), buffers(projections[1]), np.empty(12)
-    got = [ridges.height(row, ground, room) for row in rows(poses)]
-    plain, explained = visibility.log_likelihoods(rows(poses), *projections, parameters(), parameters()).T
+    workspace = buffers(projections[0]), buffers(projections[1]), np.empty(12)
+    got = [point_to_plane.tempered_log_likelihood(row, ridge, workspace) for row in rows(poses)]
+    plain, explained = point_likelihood.log_likelihoods(rows(poses), *projections, parameters(), parameters()).T
     np.testing.assert_allclose(got, 0.5 * plain - 7.0 * np.exp(-0.3 * explained), rtol=1e-6)
 
 
-def test_a_walk_keeps_its_strides_and_ends_at_the_floor(rng):
-    """Where nothing matches nothing pulls a walker across: it goes straight on, as far as the ground is good."""
-    projections = random_sight(rng), random_sight(rng)
+def test_ridge_tracing_keeps_its_step_length_and_ends_at_the_floor(rng):
+    """Where nothing matches, tracing goes straight on, as far as the likelihood is above the floor."""
+    projections = random_projection(rng), random_projection(rng)
     empty = [projection._replace(cells=np.zeros_like(projection.cells)) for projection in projections]
     start, spread = random_pose(rng, 0.1), np.diag([0.1, 0.1, 0.1, 0.01, 0.01, 0.01])
     axis, centre_m = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.8])
-    regulariser = matching.Regulariser(rows(start), 1e-9 * np.eye(6), np.full(6, 1e-9), 0.2)
+    regulariser = point_to_plane.Regulariser(rows(start), 1e-9 * np.eye(6), np.full(6, 1e-9), 0.2)
     for floor, steps in ((np.inf, 0), (-np.inf, 4)):
-        ground = ridges.RidgeLikelihood(
+        ridge = point_to_plane.RidgeLikelihood(
             empty[0], empty[1], empty[0], empty[1], parameters(), parameters(), 0.5, 0.0, 0.3, floor
         )
-        visited, counts = ridges.walk(
-            rows(start[None]), spread[None], axis[None], 2.0, ground, centre_m, 0.001, regulariser, 4
+        visited, counts = point_to_plane.trace_ridges(
+            rows(start[None]), spread[None], axis[None], 2.0, ridge, centre_m, 0.001, regulariser, 4
         )
         assert counts.tolist() == [steps]
     want = [se3.moved(start, number * 0.2 * axis, centre_m) for number in range(1, 5)]
     np.testing.assert_allclose(matrices(visited[0]), want, atol=1e-6)
 
 
-def test_downhill_is_the_step_of_the_held_normal_equations(rng):
-    projections, centre_m = (random_sight(rng), random_sight(rng)), np.array([0.0, 0.0, 0.8])
+def test_descent_is_the_step_of_the_regularised_normal_equations(rng):
+    projections, centre_m = (random_projection(rng), random_projection(rng)), np.array([0.0, 0.0, 0.8])
     poses = np.stack([random_pose(rng, 0.1) for _ in range(6)])
     root = rng.normal(size=(6, 6))
-    regulariser = matching.Regulariser(rows(random_pose(rng, 0.1)), 100.0 * root @ root.T, np.arange(1.0, 7.0), 0.2)
-    gradients, matrices_ = matching.normal_equations(rows(poses), *projections, centre_m, 0.05)
-    got = matching.descend(rows(poses), *projections, centre_m, 0.05, regulariser, 1)
+    regulariser = point_to_plane.Regulariser(
+        rows(random_pose(rng, 0.1)), 100.0 * root @ root.T, np.arange(1.0, 7.0), 0.2
+    )
+    gradients, matrices_ = point_to_plane.normal_equations(rows(poses), *projections, centre_m, 0.05)
+    got = point_to_plane.descend(rows(poses), *projections, centre_m, 0.05, regulariser, 1)
     assert np.count_nonzero(np.abs(gradients).max(axis=1)) == len(poses)  # something matches
     for pose, gradient, matrix, there in zip(poses, gradients, matrices_, matrices(got), strict=True):
         away = se3.difference(matrices(regulariser.mean[None])[0], pose, centre_m)
@@ -203,13 +204,13 @@ def test_downhill_is_the_step_of_the_held_normal_equations(rng):
 
 @pytest.mark.parametrize("hidden", [0.05, 0.3, 0.6])
 def test_the_table_of_matches_errs_by_less_than_stated(hidden):
-    match = np.linspace(visibility.TABLE_LOW, visibility.TABLE_HIGH, 100_001)
-    nodes = np.linspace(visibility.TABLE_LOW, visibility.TABLE_HIGH, visibility.TABLE_STEPS + 1)
+    match = np.linspace(point_likelihood.TABLE_LOW, point_likelihood.TABLE_HIGH, 100_001)
+    nodes = np.linspace(point_likelihood.TABLE_LOW, point_likelihood.TABLE_HIGH, point_likelihood.TABLE_STEPS + 1)
     exact = np.log((1 - hidden) * np.exp(match) + hidden)
-    np.testing.assert_allclose(np.interp(match, nodes, visibility.match_table(hidden)), exact, rtol=0, atol=4e-6)
+    np.testing.assert_allclose(np.interp(match, nodes, point_likelihood.match_table(hidden)), exact, rtol=0, atol=4e-6)
 
 
-def test_verdicts_follow_from_where_a_point_lies():
+def test_the_class_of_a_point_follows_from_where_it_lies():
     cells = np.zeros((*SHAPE, planes.CELL_SIZE), dtype=np.float32)
     cells[..., planes.NORMAL_Z], cells[..., planes.DISTANCE] = -1.0, 0.8
     cells[..., planes.VARIANCE], cells[..., planes.DEPTH], cells[..., planes.KIND] = 1e-6, 0.8, planes.SURFACE
@@ -217,19 +218,19 @@ def test_verdicts_follow_from_where_a_point_lies():
     cells[:, 15:, planes.SILHOUETTE] = np.arange(1, 6)
     towards, away = [0.0, 0.0, -1.0], [0.0, 0.0, 1.0]
     cases = [
-        ([0.0, 0.0, 0.8], towards, visibility.MATCHED),
-        ([0.0, 0.0, 0.82], towards, visibility.BEHIND),
-        ([0.0, 0.0, 0.78], towards, visibility.IN_FRONT),
-        ([0.0, 0.0, 0.85], away, visibility.HIDDEN),
-        ([0.0, 0.0, 0.75], away, visibility.IN_FRONT),
-        ([0.17, 0.0, 0.8], towards, visibility.IN_EMPTY_SPACE),
-        ([5.0, 0.0, 0.8], towards, visibility.UNKNOWN),
-        ([0.0, 0.0, -0.8], towards, visibility.UNKNOWN),
+        ([0.0, 0.0, 0.8], towards, point_likelihood.MATCHED),
+        ([0.0, 0.0, 0.82], towards, point_likelihood.BEHIND),
+        ([0.0, 0.0, 0.78], towards, point_likelihood.IN_FRONT),
+        ([0.0, 0.0, 0.85], away, point_likelihood.HIDDEN),
+        ([0.0, 0.0, 0.75], away, point_likelihood.IN_FRONT),
+        ([0.17, 0.0, 0.8], towards, point_likelihood.IN_EMPTY_SPACE),
+        ([5.0, 0.0, 0.8], towards, point_likelihood.UNKNOWN),
+        ([0.0, 0.0, -0.8], towards, point_likelihood.UNKNOWN),
     ]
     points = np.array([[*position, *normal, 1e-6] for position, normal, _ in cases], dtype=np.float32).T.copy()
     projection = Projection(points, cells.reshape(-1, planes.CELL_SIZE), CAMERA, FACING)
-    verdicts = visibility.classify(rows(np.eye(4)), projection, parameters(0.001))
-    assert verdicts.tolist() == [want for *_, want in cases]
+    classes = point_likelihood.classify(rows(np.eye(4)), projection, parameters(0.001))
+    assert classes.tolist() == [want for *_, want in cases]
 
 
 def test_local_planes_are_least_squares_in_inverse_depth(rng):
@@ -265,9 +266,9 @@ def test_a_noise_free_plane_is_found_whatever_its_tilt():
 def test_silhouette_distance_is_euclidean_within_the_chamfer_error(rng):
     mask = rng.random((40, 50)) < 0.004
     mask[20, 25] = True
-    got, want = silhouette_distance(mask, 60.0), naive.silhouette_distance(mask)
+    got, want = planes.silhouette_distance(mask, 60.0), naive.silhouette_distance(mask)
     assert (np.abs(got - want) <= 0.09 * want + 1e-5).all()
-    np.testing.assert_allclose(silhouette_distance(mask, 3.0), np.minimum(got, 3.0), atol=1e-4)
+    np.testing.assert_allclose(planes.silhouette_distance(mask, 3.0), np.minimum(got, 3.0), atol=1e-4)
 
 
 def test_compiled_kernels_older_than_any_source_are_dropped(tmp_path):
@@ -286,18 +287,18 @@ def test_compiled_kernels_older_than_any_source_are_dropped(tmp_path):
     assert [path.name for path in cache.iterdir()] == ["b.nbi"]
 
 
-@pytest.mark.parametrize("max_per_basin", [1, 3])
-def test_of_a_crowd_the_first_are_kept(rng, max_per_basin):
+@pytest.mark.parametrize("max_near", [1, 3])
+def test_of_near_poses_the_first_are_kept(rng, max_near):
     centre_m, sigmas = np.array([0.0, 0.0, 0.8]), np.repeat([0.2, 0.01], 3)
     poses = np.stack([random_pose(rng, 0.2) for _ in range(60)])
-    kept = mixture.uncrowded(rows(poses), sigmas, centre_m, max_per_basin, 1000)
+    kept = mixture.suppress_neighbours(rows(poses), sigmas, centre_m, max_near, 1000)
     near = np.linalg.norm(se3.difference(poses[:, None], poses[None], centre_m) / sigmas, axis=2) <= 1.0
     assert kept[0] == 0
     assert (np.diff(kept) > 0).all()
     for number in range(len(poses)):
         before = kept[kept < number]
-        assert (number in kept) == (near[before, number].sum() < max_per_basin)
-    np.testing.assert_array_equal(mixture.uncrowded(rows(poses), sigmas, centre_m, max_per_basin, 5), kept[:5])
+        assert (number in kept) == (near[before, number].sum() < max_near)
+    np.testing.assert_array_equal(mixture.suppress_neighbours(rows(poses), sigmas, centre_m, max_near, 5), kept[:5])
 
 
 @pytest.mark.parametrize("sigma_rad", [0.01, 0.5, 3.0])
@@ -314,23 +315,23 @@ def test_densities_of_a_mixture_leave_out_nothing_that_counts(rng, sigma_rad):
         half_rad = 0.5 * np.linalg.norm(xi[:, :3], axis=1)
         want[k] = log_weights[k] + multivariate_normal.logpdf(xi, cov=spread @ spread.T)
         want[k] += 4.0 * np.log(half_rad / np.sin(half_rad))
-    got = Gaussians(means, spreads, log_weights, centre_m).log_density(poses)
+    got = GaussianMixture(means, spreads, log_weights, centre_m).log_density(poses)
     np.testing.assert_allclose(got, np.logaddexp.reduce(want, axis=0), rtol=1e-9, atol=1e-9)
 
 
 def test_distances_are_in_standard_deviations(rng):
     centre_m, poses = np.array([0.0, 0.0, 0.8]), np.stack([random_pose(rng, 0.2) for _ in range(5)])
     spreads = np.linalg.cholesky(np.stack([np.cov(rng.normal(size=(6, 20))) for _ in range(5)]))
-    got = mixture.distances(rows(poses), spreads, centre_m)
+    got = mixture.mahalanobis_distances(rows(poses), spreads, centre_m)
     for i, root in enumerate(spreads):
         xi = se3.difference(poses[i], poses, centre_m)
         np.testing.assert_allclose(got[i], np.linalg.norm(np.linalg.solve(root, xi.T), axis=0), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 200])
-def test_patches_are_halves_of_halves(rng, count):
+def test_patches_come_from_recursive_bisection(rng, count):
     points = rng.normal(size=(count, 3)) * [1.0, 3.0, 0.2]
-    numbers = patches.halved(points, 3)
+    numbers = point_to_plane.bisected(points, 3)
     sizes = np.bincount(numbers, minlength=8)
     assert len(sizes) == 8
     assert sizes.sum() == count
@@ -342,5 +343,7 @@ def test_patches_are_halves_of_halves(rng, count):
 
 def test_kernels_know_that_they_are_compiled():
     rng = np.random.default_rng(0)
-    visibility.log_likelihoods(rows(np.eye(4)[None]), random_sight(rng), random_sight(rng), parameters(), parameters())
+    point_likelihood.log_likelihoods(
+        rows(np.eye(4)[None]), random_projection(rng), random_projection(rng), parameters(), parameters()
+    )
     assert kernels.compiled()

@@ -7,6 +7,7 @@ from test_pipeline import FRAMES, Oracle, modeler, run, trajectory_error
 
 from modeler.pipeline import glancing
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
+from modeler.registration.visibility import VisibilityLikelihood
 from modeler.segmentation import Scene
 from modeler.types import Reason, Searching, Step
 
@@ -63,10 +64,10 @@ def test_a_search_is_announced_for_lost_frames_and_no_others() -> None:
 
 
 def test_a_glance_is_a_smaller_search_of_the_same_likelihood() -> None:
-    registrar = VisibilityRegistrar(points=500, min_overlap=0.3)
+    registrar = VisibilityRegistrar(likelihood=VisibilityLikelihood(points=500), min_overlap=0.3)
     glance = glancing(registrar)
     assert isinstance(glance, VisibilityRegistrar)
-    assert (glance.points, glance.min_overlap) == (500, 0.3)
-    assert glance.search.max_starts < registrar.search.max_starts
-    assert (glance.max_modes, glance.max_rounds) == (1, 1)
+    assert (glance.likelihood.points, glance.min_overlap) == (500, 0.3)
+    assert glance.search.starts.max_starts < registrar.search.starts.max_starts
+    assert (glance.max_modes, glance.sampler.max_rounds) == (1, 1)
     assert glancing(IcpRegistrar()) is None

@@ -7,11 +7,11 @@ from scipy import ndimage
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
-from modeler.kernels import matching
+from modeler.kernels import point_to_plane
 from modeler.rays import Sensor
 from modeler.registration.posterior import weighted_gaussian
-from modeler.registration.refinement import Refiner, seen_alone, shrunk
-from modeler.registration.visibility import VisibilityRegistrar
+from modeler.registration.visibility import VisibilityLikelihood
+from modeler.registration.visibility.refinement import Refiner, shrunk, visible_share
 from modeler.se3 import rows
 from sequences import bundled, open_sequence
 
@@ -23,7 +23,7 @@ def bundled_pair(name):
     assert truth is not None
     assert noise is not None
     target, source = (Sensor(*noise).ray_image(sequence.frame(index)) for index in (0, 1))
-    pair = VisibilityRegistrar().pair(source, target, np.random.default_rng(0))
+    pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
     return pair, true_motion(truth, target=0, source=1), source.centroid_m
 
 
@@ -46,11 +46,11 @@ def test_normal_equations_are_those_of_the_matching_points(rng):
     gradients, matrices = pair.normal_equations(poses, 0.001)
     for pose, gradient, matrix in zip(poses, gradients, matrices, strict=True):
         want = np.zeros(6), np.zeros((6, 6))
-        for lookup, carried, sign in ((pair.forward, pose, 1.0), (pair.backward, se3.inverse(pose), -1.0)):
+        for directed, carried, sign in ((pair.forward, pose, 1.0), (pair.backward, se3.inverse(pose), -1.0)):
             # ξ moves what is carried forward about the carried centre, turned with it; carried back, by -ξ.
             turned = np.kron(np.eye(2), pose[:3, :3] if sign > 0.0 else -np.eye(3))
             about = se3.transform(pose, centre_m[None])[0] if sign > 0.0 else centre_m
-            equations = point_to_plane_equations(lookup.matches(rows(carried), 0.001), about)
+            equations = point_to_plane_equations(directed.matches(rows(carried), 0.001), about)
             want = want[0] + turned.T @ equations[0], want[1] + turned.T @ equations[1] @ turned
         np.testing.assert_allclose(gradient, want[0], rtol=1e-4, atol=1e-5 * abs(want[0]).max())
         np.testing.assert_allclose(matrix, want[1], rtol=1e-4, atol=1e-5 * abs(want[1]).max())
@@ -61,11 +61,16 @@ def test_matches_are_near_and_face_alike(rng):
     pose = scattered(truth, centre_m, np.repeat([0.02, 0.002], 3), rng, count=1)[0]
     found = pair.forward.matches(rows(pose), 0.001)
     carried = se3.transform(pose, pair.forward.points[:, :3])
-    np.testing.assert_allclose(found[:, matching.POSITION], carried, atol=1e-6)
-    good = found[found[:, matching.WEIGHT] > 0]
+    np.testing.assert_allclose(found[:, point_to_plane.POSITION], carried, atol=1e-6)
+    good = found[found[:, point_to_plane.WEIGHT] > 0]
     assert 0.3 * len(found) < len(good) < len(found)
-    assert (np.sum(good[:, matching.OWN] * good[:, matching.OTHER], axis=1) >= matching.MIN_AGREEMENT - 1e-6).all()
-    assert (good[:, matching.RESIDUAL] ** 2 * good[:, matching.WEIGHT] <= matching.MAX_SIGMAS**2).all()
+    assert (
+        np.sum(good[:, point_to_plane.OWN] * good[:, point_to_plane.OTHER], axis=1)
+        >= point_to_plane.MIN_AGREEMENT - 1e-6
+    ).all()
+    assert (
+        good[:, point_to_plane.RESIDUAL] ** 2 * good[:, point_to_plane.WEIGHT] <= point_to_plane.MAX_SIGMAS**2
+    ).all()
 
 
 def test_what_the_surface_determines_is_sharpened(rng):
@@ -110,7 +115,9 @@ def test_the_scatter_of_patches_leaves_out_what_neighbours_share(width, rng):
     noise = rng.normal(size=(60, side, side))
     smooth = ndimage.uniform_filter(noise, ball, mode="wrap", axes=(1, 2))
     sums = smooth.reshape(60, 20, width, 20, width).sum(axis=(2, 4))
-    assert np.mean(sums**2) / width**2 == pytest.approx(seen_alone((width / ball) ** 2), rel=0.1)  # pixels, not areas
+    assert np.mean(sums**2) / width**2 == pytest.approx(
+        visible_share((width / ball) ** 2), rel=0.1
+    )  # pixels, not areas
 
 
 @pytest.mark.parametrize("departs", [False, True])

@@ -1,4 +1,4 @@
-"""Where the posterior may have its mass: the search, its separate places, and the mixture that samples start from."""
+"""The search for modes: descent, rescue, ridges, and the climb where little surface matches."""
 
 from dataclasses import replace
 
@@ -10,16 +10,18 @@ from calibration.study import Condition, rendered_views, staged
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior
-from modeler.priors.general import GeneralDensity
 from modeler.rays import Sensor
-from modeler.registration.candidates import Candidates
-from modeler.registration.mixture import Gaussians, MixtureProposal
-from modeler.registration.modes import ModeSamples, split_modes, weigh_modes
-from modeler.registration.search import Search
-from modeler.registration.visibility import VisibilityRegistrar
+from modeler.registration.visibility import VisibilityLikelihood, VisibilityRegistrar
+from modeler.registration.visibility.candidates import Candidates
+from modeler.registration.visibility.search import Climb, Descent, LowOverlap, Search, Starts
 from modeler.types import Outcome
 from sequences import bundled, open_sequence
 from sequences.rendering.renderer import RenderedSequence
+
+WIDE = GeneralPrior(max_rotation_deg=95.0, max_offset_m=0.08)  # the other way round a box is beyond
+BASIN = np.repeat([0.2, 0.01], 3)
+NO_CLIMB = LowOverlap(score=-np.inf)
+FEW = Climb(samples=500)
 
 
 def views(name, source, target):
@@ -48,8 +50,8 @@ def turned(angle_rad):
 def test_the_search_finds_the_motion_in_a_wide_prior(name, rng):
     source, target, truth = views(name, source=2, target=0)
     density = GeneralPrior(max_rotation_deg=110.0, max_offset_m=0.08).between(source, target)
-    pair = VisibilityRegistrar().pair(source, target, rng)
-    found = Search().candidates(pair, density, rng)
+    pair = VisibilityLikelihood().between(source, target, rng)
+    found = Search().run(pair, density, rng)
     assert np.isfinite(density.log_density(found.poses)).all()
     assert (np.diff(found.scores[~found.coarse]) <= 0).all()
     rolled_deg = min(rotation_error_deg(pose, truth) for pose in found.poses)
@@ -58,12 +60,12 @@ def test_the_search_finds_the_motion_in_a_wide_prior(name, rng):
 
 def test_a_turn_beyond_the_prior_shows(rng):
     source, target, truth = views("box", source=1, target=0)
-    pair = VisibilityRegistrar().pair(source, target, rng)
+    pair = VisibilityLikelihood().between(source, target, rng)
     narrow = GeneralPrior(max_rotation_deg=12.0).between(source, target)
     assert not np.isfinite(narrow.log_density(truth[None]))[0]
-    assert Search().candidates(pair, narrow, rng).beyond > VisibilityRegistrar().max_beyond
+    assert Search().run(pair, narrow, rng).beyond_gain > VisibilityRegistrar().max_beyond_gain
     wide = GeneralPrior(max_rotation_deg=60.0, max_offset_m=0.08).between(source, target)
-    assert Search().candidates(pair, wide, rng).beyond < VisibilityRegistrar().max_beyond
+    assert Search().run(pair, wide, rng).beyond_gain < VisibilityRegistrar().max_beyond_gain
     assert VisibilityRegistrar().register(source, target, narrow, rng=rng).outcome is Outcome.AT_LIMIT
 
 
@@ -76,89 +78,107 @@ def test_a_stool_may_have_turned_either_way():
     density = GeneralPrior().between(source, target)
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        found = Search().candidates(VisibilityRegistrar().pair(source, target, rng), density, rng)
+        found = Search().run(VisibilityLikelihood().between(source, target, rng), density, rng)
         turned_deg = np.array([rotation_error_deg(pose, right) for pose in found.poses[~found.coarse]])
         assert (turned_deg < 3.0).any()
         assert (np.abs(turned_deg - 90.0) < 3.0).any()
 
 
 def test_the_search_goes_on_along_the_ridge_of_a_roll(rng):
-    """From one good pose of a tube the whole of its roll is found, and what was found coarse is kept."""
+    """From one good pose of a tube the whole of its roll is found, and coarse candidates are kept."""
     source, target, truth = views("tube", source=1, target=0)
     density = GeneralPrior().between(source, target)
-    pair, search = VisibilityRegistrar().pair(source, target, rng), Search()
+    pair, search = VisibilityLikelihood().between(source, target, rng), Search()
     coarse = candidates([truth @ turned(0.1)], [0.1], [0.0], [True])
-    onward = search.onward(pair, density, coarse, truth[None], rng)
-    rolled_deg = [rotation_error_deg(pose, truth) for pose in onward.poses[~onward.coarse]]
+    extended = search.extend(pair, density, coarse, truth[None], rng)
+    rolled_deg = [rotation_error_deg(pose, truth) for pose in extended.poses[~extended.coarse]]
     assert max(rolled_deg) > 20.0
-    assert onward.coarse.sum() == 1
-    sharp = onward.some(~onward.coarse)
-    assert sharp.scores[0] >= search.scores(pair, truth[None], search.blurs[-1] * pair.size_m)[0] - 1e-6
+    assert extended.coarse.sum() == 1
+    sharp = extended.select(~extended.coarse)
+    assert sharp.scores[0] >= search.scores(pair, truth[None], search.fine_m(pair))[0] - 1e-6
     assert sharp.scores[-1] > sharp.scores[0] - search.negligible
 
 
-def test_candidates_that_reach_each_other_share_a_place():
+def test_candidates_within_reach_of_each_other_share_a_mode():
     near, far = turned(0.02), turned(1.5)
-    places = split_modes(candidates([np.eye(4), near, far], [0.01, 0.01, 0.01], [3, 2, 1]), np.zeros(3))
-    assert [len(place) for place in places] == [2, 1]
-    np.testing.assert_array_equal(places[0].poses[0], np.eye(4))
+    modes = candidates([np.eye(4), near, far], [0.01, 0.01, 0.01], [3, 2, 1]).modes(np.zeros(3))
+    assert [len(mode) for mode in modes] == [2, 1]
+    np.testing.assert_array_equal(modes[0].poses[0], np.eye(4))
 
 
-def test_a_blunt_candidate_joins_what_it_covers_and_is_no_place_itself():
+def test_a_coarse_candidate_joins_what_it_covers_and_is_no_mode_itself():
     ends = [turned(-0.2), turned(0.2)]
-    alone = split_modes(candidates(ends, [0.01, 0.01], [2, 1]), np.zeros(3))
-    joined = split_modes(
-        candidates([*ends, np.eye(4), turned(2.0)], [0.01, 0.01, 0.1, 0.1], [2, 1, 0, 0], [False, False, True, True]),
-        np.zeros(3),
-    )
-    assert [len(place) for place in alone] == [1, 1]
-    assert [len(place) for place in joined] == [3]
+    alone = candidates(ends, [0.01, 0.01], [2, 1]).modes(np.zeros(3))
+    sigmas, coarse = [0.01, 0.01, 0.1, 0.1], [False, False, True, True]
+    joined = candidates([*ends, np.eye(4), turned(2.0)], sigmas, [2, 1, 0, 0], coarse).modes(np.zeros(3))
+    assert [len(mode) for mode in alone] == [1, 1]
+    assert [len(mode) for mode in joined] == [3]
 
 
-def test_places_are_weighed_and_those_of_no_weight_dropped(rng):
-    here = turned(0.0) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
-    there = turned(1.5) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
-    even = np.full(200, 1.0 / 200)
-    one = weigh_modes([ModeSamples(here, even, 0.0, 200.0, 0.1), ModeSamples(there, even, -20.0, 200.0, 0.1)])
-    two = weigh_modes([ModeSamples(here, even, 0.0, 200.0, 0.1), ModeSamples(there, even, np.log(3.0), 200.0, 0.1)])
-    assert [share for share, _ in one] == [1.0]
-    np.testing.assert_allclose([share for share, _ in two], [0.75, 0.25])
-    assert rotation_error_deg(two[0][1].gaussian(np.zeros(3)).mean, turned(1.5)) < 1.0
+@pytest.fixture(scope="module")
+def box():
+    """A box turned by 75°: one of its sides is all that both views show."""
+    source, target, truth = views("box", source=3, target=0)
+    pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
+    return pair, WIDE.between(source, target), truth
 
 
-def mixture(rng):
-    """Three Gaussians a few centimetres off the axes of motion, over a general prior."""
-    centre_m = np.array([0.02, -0.05, 0.8])
-    known = GeneralDensity(centre_m, centre_m + 0.01, max_rotation_rad=0.9, max_offset_m=0.04)
-    means = se3.exp(rng.normal(size=(3, 6)) * np.repeat([0.3, 0.02], 3))
-    spreads = np.linalg.cholesky(np.stack([np.cov(rng.normal(size=(6, 20))) for _ in range(3)]))
-    spreads *= np.repeat([0.1, 0.005], 3)[:, None]
-    return MixtureProposal(known, Gaussians(means, spreads, np.log([0.5, 0.3, 0.2]), centre_m))
+def climbed(box, climb, seed=0):
+    pair, density, _ = box
+    problem = replace(Starts().problem(pair, density, np.random.default_rng(0)), basin=BASIN)
+    return climb.run(problem, np.random.default_rng(seed), max_independent=80.0)
 
 
-def test_a_mixture_has_the_density_of_its_samples(rng):
-    """∫ q over a broad known density, by importance: 1; and the mean of log q agrees with the entropy of samples."""
-    density = mixture(rng)
-    broad = replace(density.gaussians, spreads=2.0 * density.gaussians.spreads)
-    samples = broad.sample(40_000, rng)
-    ratio = np.exp(density.log_density(samples) - broad.log_density(samples))
-    assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std() / np.sqrt(len(ratio))
+def heights(box, poses, climb):
+    last = climb.stages[-1]
+    return box[0].tempered(poses, last.blur * box[0].size_m, max_independent=80.0, stride=last.stride)
 
 
-def test_a_narrow_component_has_the_gaussian_density(rng):
-    density = mixture(rng)
-    several = density.gaussians
-    narrow = Gaussians(several.means[:1], 0.01 * several.spreads[:1], np.zeros(1), several.centre_m)
-    centre = se3.translation(several.centre_m)
-    xi = (narrow.spreads[0] @ rng.normal(size=(6, 50))).T
-    poses = narrow.means[0] @ centre @ se3.exp(xi) @ se3.inverse(centre)
-    covariance = narrow.spreads[0] @ narrow.spreads[0].T
-    expected = -0.5 * np.einsum("ni,ij,nj->n", xi, np.linalg.inv(covariance), xi)
-    expected -= 0.5 * np.linalg.slogdet(2.0 * np.pi * covariance)[1]
-    np.testing.assert_allclose(narrow.log_density(poses), expected, atol=1e-4)
+def test_climbers_come_up_only_where_the_prior_allows(box):
+    poses = climbed(box, FEW)
+    assert np.isfinite(box[1].log_density(poses)).all()
+    reached = heights(box, poses, FEW)
+    assert (np.diff(reached) <= 0.0).all()
+    assert reached[0] > heights(box, climbed(box, replace(FEW, rounds=0)), FEW).max()
 
 
-def test_a_mixture_only_proposes(rng):
-    density = mixture(rng)
-    samples = density.sample(200, rng)
-    np.testing.assert_array_equal(density.log_evidence(samples), density.known.log_density(samples))
+def test_more_rounds_never_end_lower(box):
+    """The first rounds of a stage are the same ones, and a climber steps only up."""
+    stage = (replace(FEW.stages[-1], climbers=30),)
+    ends = [
+        heights(box, climbed(box, replace(FEW, stages=stage, rounds=rounds, apart=1e-9)), FEW) for rounds in (1, 4, 16)
+    ]
+    assert (np.diff([end.max() for end in ends]) >= 0.0).all()
+    assert (np.diff([np.median(end) for end in ends]) > 0.0).all()
+
+
+def test_poses_are_apart_and_repeat_with_the_seed(box):
+    poses = climbed(box, FEW)
+    np.testing.assert_array_equal(poses, climbed(box, FEW))
+    assert len(poses) > 3
+    assert min(rotation_error_deg(poses[0], other) for other in poses[1:]) > 1e-3
+
+
+def test_a_turn_is_found_where_surface_leads_astray(box):
+    """Most surface matches with another side of the box, though then it stands in space that was seen to be empty."""
+    pair, density, truth = box
+    dragged = Search(descent=Descent(max_independent=40.0))  # to the prior's mean, so that few end near the truth
+    astray = replace(dragged, low_overlap=NO_CLIMB).run(pair, density, np.random.default_rng(1))
+    found = dragged.run(pair, density, np.random.default_rng(1))
+    assert rotation_error_deg(astray.poses[0], truth) > 45.0
+    assert rotation_error_deg(found.poses[0], truth) < 5.0  # samples find the rest of the way
+    assert not found.low_overlap
+
+
+def test_an_even_prior_does_not_drag(box):
+    """Where little surface holds a motion on its way down, the middle of what is possible is no better than its end."""
+    pair, density, truth = box
+    found = Search(low_overlap=NO_CLIMB).run(pair, density, np.random.default_rng(1))
+    assert rotation_error_deg(found.poses[0], truth) < 5.0
+
+
+def test_what_matches_enough_is_not_climbed(box, monkeypatch):
+    source, target, _ = views("box", source=1, target=0)
+    pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
+    monkeypatch.setattr(Climb, "run", None)
+    assert not Search().run(pair, WIDE.between(source, target), np.random.default_rng(1)).low_overlap

@@ -10,9 +10,9 @@ import numpy.typing as npt
 import rerun as rr
 
 from modeler import se3
-from modeler.kernels import visibility as kernel
+from modeler.kernels import point_likelihood as kernel
 from modeler.rays import Sensor
-from modeler.registration import VisibilityRegistrar
+from modeler.registration.visibility import VisibilityLikelihood
 from modeler.types import Array, RayImage, Step
 from viz import clouds, entities, images
 from viz.drawings import CLEAR, Drawing
@@ -101,10 +101,10 @@ def projection(source: RayImage, target: RayImage, target_from_source: Array) ->
     """
     if min(len(source.points_m), len(target.points_m)) == 0:
         return ProjectedPoints(np.zeros((0, 2)), np.zeros(0, dtype=np.int8))
-    registrar, rng = VisibilityRegistrar(points=_POINTS), np.random.default_rng(0)
-    looked_up = registrar.pair(_ready(source), _ready(target), rng).forward
-    points_m = se3.transform(target_from_source, looked_up.points[:, :3])
-    verdicts = _VERDICT[looked_up.verdicts(se3.rows(target_from_source))]
+    likelihood, rng = VisibilityLikelihood(points=_POINTS), np.random.default_rng(0)
+    projected = likelihood.between(_ready(source), _ready(target), rng).forward
+    points_m = se3.transform(target_from_source, projected.points[:, :3])
+    verdicts = _VERDICT[projected.classify(se3.rows(target_from_source))]
     camera = target.frame.camera
     ahead = points_m[:, 2] > 1e-6
     points_m, verdicts = points_m[ahead], verdicts[ahead]

@@ -1,4 +1,4 @@
-"""The algebra of SE(3), many poses at once: exponentials, logarithms, and steps along differences of poses.
+"""The Lie group SE(3), many poses at once: exponentials, logarithms, retractions and means.
 
 Poses are rows of twelve numbers, the upper three rows of their matrices, or whole matrices; `se3` has the conventions.
 """
@@ -99,7 +99,7 @@ def exponential(wx, wy, wz, ux, uy, uz, r):
 def difference(first, second, centre):
     """Return ξ = log(C⁻¹ first⁻¹ second C) for poses (12,), C the shift to `centre` (3,), as `logarithm` does.
 
-    All in single numbers: with the rotation in an array it takes three times as long.
+    Written out: with the rotation in an array it takes three times as long.
     """
     a0, a1, a2, a4, a5, a6, a8, a9, a10 = (
         first[0],
@@ -123,7 +123,7 @@ def difference(first, second, centre):
         second[9],
         second[10],
     )
-    # Where the poses put the centre, one beside the other; then seen from `first`.
+    # Displacement of the centre between the poses; then seen from `first`.
     x = second[3] - first[3] + b0 * centre[0] + b1 * centre[1] + b2 * centre[2]
     y = second[7] - first[7] + b4 * centre[0] + b5 * centre[1] + b6 * centre[2]
     z = second[11] - first[11] + b8 * centre[0] + b9 * centre[1] + b10 * centre[2]
@@ -155,8 +155,8 @@ def differences(first, second, centre):
 
 
 @numba.njit(cache=True)
-def turn(pose, xi, centre, r, moved):
-    """Write pose · C · exp(ξ) · C⁻¹ into `moved` (12,), C the shift to `centre` (3,); room for a rotation is `r`."""
+def retract(pose, xi, centre, r, moved):
+    """Write pose · C · exp(ξ) · C⁻¹ into `moved` (12,), C the shift to `centre` (3,); `r` (3, 3) is a buffer."""
     x, y, z = exponential(xi[0], xi[1], xi[2], xi[3], xi[4], xi[5], r)
     x += centre[0] - r[0, 0] * centre[0] - r[0, 1] * centre[1] - r[0, 2] * centre[2]
     y += centre[1] - r[1, 0] * centre[0] - r[1, 1] * centre[1] - r[1, 2] * centre[2]
@@ -169,13 +169,13 @@ def turn(pose, xi, centre, r, moved):
 
 
 @numba.njit(cache=True)
-def turned(poses, xi, centre):
-    """Return pose · C · exp(ξ) · C⁻¹ (n, 4, 4) of poses (n, 4, 4) and tangents ξ (n, 6); see `turn`."""
+def retract_all(poses, xi, centre):
+    """Return pose · C · exp(ξ) · C⁻¹ (n, 4, 4) of poses (n, 4, 4) and tangents ξ (n, 6); see `retract`."""
     moved, row, full, r = np.zeros((len(poses), 4, 4)), np.empty(12), np.empty(12), np.empty((3, 3))
     for i in range(len(poses)):
         for k in range(12):
             row[k] = poses[i, k // 4, k % 4]
-        turn(row, xi[i], centre, r, full)
+        retract(row, xi[i], centre, r, full)
         for k in range(12):
             moved[i, k // 4, k % 4] = full[k]
         moved[i, 3, 3] = 1.0
@@ -240,7 +240,7 @@ def mean(poses, weights, start, about, iterations, tolerance):
             square += first[k] * first[k]
         if step == iterations or square < tolerance * tolerance:
             break
-        turn(centre, first, about, r, moved)
+        retract(centre, first, about, r, moved)
         for k in range(12):
             centre[k] = moved[k]
     for k in range(6):

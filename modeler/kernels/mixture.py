@@ -1,4 +1,4 @@
-"""Gaussians on SE(3): the density of their mixtures, how far apart they lie, and which of them crowd."""
+"""Gaussians on SE(3): the density of their mixtures, their distances, and suppression of near duplicates."""
 
 import math
 
@@ -14,8 +14,8 @@ _NEGLIGIBLE = 40.0  # nats below the best Gaussian
 def log_densities(poses, means, roots, widths, log_weights, centre):
     """Return the log density (n,) at each pose, with respect to the uniform measure of rotation (rad³) and translation.
 
-    The trace of a rotation and the way of the centre bound how far a pose is from a Gaussian at least: the most
-    promising one is worked out first, and then only those that may not be negligible beside it.
+    The trace of a rotation and the displacement of the centre bound the distance from each Gaussian below: the most
+    promising is evaluated first, then only those that may not be negligible.
 
     Args:
         poses: (n, 12) upper three rows of their matrices.
@@ -31,10 +31,10 @@ def log_densities(poses, means, roots, widths, log_weights, centre):
         log_tops[k] = log_weights[k] - 3.0 * math.log(2.0 * math.pi)
         for u in range(6):
             log_tops[k] += math.log(roots[k, u, u])
-        places[k, 0], places[k, 1], places[k, 2] = placed(means[k], centre)
+        places[k, 0], places[k, 1], places[k, 2] = image_of_point(means[k], centre)
     result = np.empty(len(poses))
     for i in range(len(poses)):
-        x, y, z = placed(poses[i], centre)
+        x, y, z = image_of_point(poses[i], centre)
         best = 0
         for k in range(count):
             square = (x - places[k, 0]) ** 2 + (y - places[k, 1]) ** 2 + (z - places[k, 2]) ** 2
@@ -56,8 +56,8 @@ def log_densities(poses, means, roots, widths, log_weights, centre):
 
 
 @numba.njit(cache=True, inline="always")
-def placed(pose, point):
-    """Return where a pose (12,) takes a point (3,)."""
+def image_of_point(pose, point):
+    """Return the image of a point (3,) under a pose (12,)."""
     return (
         pose[0] * point[0] + pose[1] * point[1] + pose[2] * point[2] + pose[3],
         pose[4] * point[0] + pose[5] * point[1] + pose[6] * point[2] + pose[7],
@@ -79,7 +79,7 @@ def trace_between(a, b):
 def log_density(mean, pose, root, log_top, centre):
     """Return the log density of ξ at a pose (12,), and the factor that turns it into one of the uniform measure."""
     w0, w1, w2, u0, u1, u2, scale = difference(mean, pose, centre)
-    # In single numbers: a loop over the tuple would take three times as long.
+    # Written out: a loop over the tuple takes three times as long.
     z0 = root[0, 0] * w0 + root[0, 1] * w1 + root[0, 2] * w2 + root[0, 3] * u0 + root[0, 4] * u1 + root[0, 5] * u2
     z1 = root[1, 1] * w1 + root[1, 2] * w2 + root[1, 3] * u0 + root[1, 4] * u1 + root[1, 5] * u2
     z2 = root[2, 2] * w2 + root[2, 3] * u0 + root[2, 4] * u1 + root[2, 5] * u2
@@ -90,8 +90,8 @@ def log_density(mean, pose, root, log_top, centre):
 
 
 @numba.njit(cache=True)
-def distances(means, roots, centre):
-    """Return how far each Gaussian's mean lies from each: (k, k), row i in standard deviations of the i-th Gaussian.
+def mahalanobis_distances(means, roots, centre):
+    """Return the distances (k, k) between means, row i in standard deviations of the i-th Gaussian.
 
     Args:
         means: (k, 12) rows of the poses.
@@ -115,15 +115,15 @@ def distances(means, roots, centre):
 
 
 @numba.njit(cache=True)
-def uncrowded(poses, sigmas, centre, crowd, most):
-    """Return the numbers of the first poses, of each neighbourhood at most `crowd`, and at most so many in all.
+def suppress_neighbours(poses, sigmas, centre, max_near, most):
+    """Return indices of the first poses, at most `max_near` of each neighbourhood and `most` in all.
 
     Args:
         poses: (n, 12), the best first.
         sigmas: (6,) extent of a neighbourhood: ξ about the centre within one standard deviation.
         centre: (3,) point in m.
-        crowd: at most so many lie in the neighbourhood of the next.
-        most: at most so many are returned.
+        max_near: largest number of kept poses in a neighbourhood.
+        most: largest number of kept poses.
     """
     kept, count = np.empty(min(len(poses), most), dtype=np.int64), 0
     for i in range(len(poses)):
@@ -135,7 +135,7 @@ def uncrowded(poses, sigmas, centre, crowd, most):
                 square += (xi[k] / sigmas[k]) ** 2
             if square <= 1.0:
                 near += 1
-        if near < crowd:
+        if near < max_near:
             kept[count] = i
             count += 1
             if count == len(kept):
@@ -165,8 +165,8 @@ def moments(xi, weights):
 
 
 @numba.njit(cache=True)
-def sides(xi, weights, mean, axes):
-    """Return on which side (n,) of a mean (6,) weighted ξ (n, 6) lie along that of some axes where they peak least.
+def split_by_kurtosis(xi, weights, mean, axes):
+    """Return on which side (n,) of their mean (6,) weighted ξ (n, 6) lie along the axis of least kurtosis.
 
     Args:
         xi: (n, 6).

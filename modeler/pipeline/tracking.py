@@ -224,15 +224,12 @@ def glancing(registrar: AbstractRegistrar) -> AbstractRegistrar | None:
     """
     if not isinstance(registrar, VisibilityRegistrar):
         return None
-    search = registrar.search
-    search = replace(
-        search,
-        max_starts=int(_GLANCE_SHARE * search.max_starts),
-        starts_per_basin=_GLANCE_SHARE * search.starts_per_basin,
-        low_overlap_score=-np.inf,
-    )
-    sampler = replace(registrar.sampler, max_draws=int(_GLANCE_SHARE * registrar.sampler.max_draws))
-    return replace(registrar, search=search, sampler=sampler, max_modes=1, max_rounds=1)
+    search = registrar.search.scaled(_GLANCE_SHARE)
+    search = replace(search, low_overlap=replace(search.low_overlap, score=-np.inf))
+    adaptive = registrar.sampler.adaptive
+    adaptive = replace(adaptive, max_draws=int(_GLANCE_SHARE * adaptive.max_draws))
+    sampler = replace(registrar.sampler, adaptive=adaptive, max_rounds=1)
+    return replace(registrar, search=search, sampler=sampler, max_modes=1)
 
 
 def believed(within: Posterior, wider: Posterior, known: AbstractPoseDensity) -> Posterior:

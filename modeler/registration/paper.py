@@ -9,9 +9,8 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import paper as kernel
 from modeler.registration.free_space import Draws, FreeSpace, Measured
-from modeler.registration.importance import effective_samples, pareto_tail
-from modeler.registration.posterior import failed, intrinsics, weighted_gaussian
-from modeler.registration.visibility import VisibilityRegistrar
+from modeler.registration.posterior import effective_samples, failed, intrinsics, pareto_tail, weighted_gaussian
+from modeler.registration.visibility import VisibilityLikelihood
 from modeler.se3 import matrices, rows
 from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Outcome, Posterior, RayImage
 
@@ -68,7 +67,7 @@ class PaperRegistrar(AbstractRegistrar):
             target=target.index,
             pose=pose,
             outcome=Outcome.CONVERGED if effective >= self.min_effective else Outcome.DEGENERATE,
-            overlap=VisibilityRegistrar().pair(source, target, rng).overlap(pose.mean),
+            overlap=VisibilityLikelihood().between(source, target, rng).overlap(pose.mean),
             samples=poses,
             weights=weights / weights.sum(),
             effective_samples=effective,

@@ -25,6 +25,37 @@ def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaus
     return PoseGaussian(mean, se3.covariance_about(covariance + FLOOR, -centre_m))  # from the centre to the camera
 
 
+def normalised(log_weights: Array) -> Array:
+    """Return weights (n,) of sum 1; even ones where all are 0."""
+    top = np.max(log_weights)
+    weights = np.exp(log_weights - top) if np.isfinite(top) else np.ones(len(log_weights))
+    return weights / np.sum(weights)
+
+
+def effective_samples(log_weights: Array) -> float:
+    """Return Kish's effective sample size of unnormalised log weights (n,)."""
+    return 1.0 / float(np.sum(normalised(log_weights) ** 2))
+
+
+def pareto_tail(log_weights: Array) -> float:
+    """Return the Pareto tail index of importance weights (Zhang and Stephens 2009; Vehtari et al. 2024)."""
+    count = len(log_weights)
+    tail = int(min(0.2 * count, 3.0 * np.sqrt(count)))
+    if tail < 5 or not np.isfinite(np.max(log_weights)):
+        return float("nan")
+    ordered = np.sort(log_weights - np.max(log_weights))
+    excess = np.exp(ordered[-tail:]) - np.exp(ordered[-tail - 1])
+    if excess[-1] <= 0.0 or excess[0] <= 0.0:
+        return -np.inf  # equal weights have no tail
+    grid = 30 + int(np.sqrt(tail))
+    quartile = excess[int(tail / 4 + 0.5) - 1]
+    theta = 1.0 / excess[-1] + (1.0 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))) / (3.0 * quartile)
+    shape = np.mean(np.log1p(-theta[:, None] * excess), axis=1)
+    weights = normalised(tail * (np.log(-theta / shape) - shape - 1.0))
+    k = float(np.mean(np.log1p(-np.sum(weights * theta) * excess)))
+    return (tail * k + 10.0 * 0.5) / (tail + 10.0)
+
+
 def share_at_limit(
     density: AbstractPoseDensity, poses: Array, weights: Array, centre_m: Array, rng: np.random.Generator
 ) -> float:

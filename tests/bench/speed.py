@@ -12,8 +12,8 @@ import numpy as np
 import reference
 
 from modeler.evaluation import rotation_error_deg, true_motion
-from modeler.kernels import visibility
-from modeler.kernels.projection import Projection
+from modeler.kernels import point_likelihood
+from modeler.kernels.point_likelihood import Projection
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import PaperRegistrar, VisibilityRegistrar
@@ -158,11 +158,11 @@ def _segmented(sequence: AbstractSequence) -> list[tuple[Frame, Plane | None]]:
 
 def _counted(work: Callable[[], object]) -> tuple[int, float, float]:
     """Return how many points some work looks up in the visibility kernel, the time spent there, and in all."""
-    kernel = visibility.log_likelihoods
+    kernel = point_likelihood.log_likelihoods
     count, spent_s = 0, 0.0
 
     def counting(
-        poses: Array, forward: Projection, backward: Projection, *parameters: visibility.LikelihoodParameters
+        poses: Array, forward: Projection, backward: Projection, *parameters: point_likelihood.LikelihoodParameters
     ) -> Array:
         nonlocal count, spent_s
         began = time.perf_counter()
@@ -171,7 +171,7 @@ def _counted(work: Callable[[], object]) -> tuple[int, float, float]:
         count += len(poses) * (forward.points.shape[1] + backward.points.shape[1])
         return result
 
-    with patch.object(visibility, "log_likelihoods", counting):
+    with patch.object(point_likelihood, "log_likelihoods", counting):
         began = time.perf_counter()
         work()
         return count, spent_s, time.perf_counter() - began

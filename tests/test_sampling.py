@@ -1,15 +1,24 @@
-"""The sampler that learns where to draw: its samples stand for the posterior, whatever it drew from."""
+"""Adaptive importance sampling: its samples stand for the posterior, whatever they were drawn from; mixtures, modes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from modeler import se3
-from modeler.registration.importance import AdaptiveSampler, effective_samples, pareto_tail, thinned
-from modeler.registration.mixture import Gaussians
+from modeler.evaluation import rotation_error_deg
+from modeler.priors.general import GeneralDensity
+from modeler.registration.posterior import effective_samples, pareto_tail, weighted_gaussian
+from modeler.registration.visibility.sampling import (
+    AdaptiveSampler,
+    GaussianMixture,
+    MixtureProposal,
+    WeightedSamples,
+    thinned,
+    weigh_modes,
+)
 from modeler.types import AbstractPoseDensity, Array
 
 CENTRE_M = np.array([0.05, -0.02, 0.7])
@@ -31,8 +40,8 @@ class Around(AbstractPoseDensity):
         return gaussian(ABOUT, self.sigmas).log_density(target_from_source)
 
 
-def gaussian(mean: Array, sigmas: Array) -> Gaussians:
-    return Gaussians(mean[None], np.diag(sigmas)[None], np.zeros(1), CENTRE_M)
+def gaussian(mean: Array, sigmas: Array) -> GaussianMixture:
+    return GaussianMixture(mean[None], np.diag(sigmas)[None], np.zeros(1), CENTRE_M)
 
 
 def away(xi: Array) -> Array:
@@ -64,7 +73,7 @@ def test_samples_are_those_of_prior_times_likelihood(narrower: float) -> None:
 def test_two_heaps_and_a_bent_ridge_keep_their_shares() -> None:
     """What one Gaussian cannot draw well, several do; and the weights are right with either."""
     apart = np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
-    heaps = gaussian(away(apart), 0.8 * SIGMAS).times(3.0).beside(gaussian(away(-apart), 0.8 * SIGMAS))
+    heaps = gaussian(away(apart), 0.8 * SIGMAS).times(3.0).plus(gaussian(away(-apart), 0.8 * SIGMAS))
     wide = Around(np.array([0.3, 0.03, 0.1, 0.006, 0.015, 0.003]))
 
     def bent(poses: Array) -> Array:
@@ -144,3 +153,61 @@ def test_the_tail_of_weights_that_fall_steeply_is_told_without_a_warning() -> No
     log_weights = -np.random.default_rng(0).exponential(400.0, size=2000)
     assert np.isfinite(pareto_tail(log_weights)) or pareto_tail(log_weights) == -np.inf
     assert pareto_tail(3.0 * np.random.default_rng(1).exponential(1.0, size=4000)) > 0.7
+
+
+def turned(angle_rad):
+    return se3.exp(np.array([angle_rad, 0, 0, 0, 0, 0]))
+
+
+def mode(poses, log_evidence):
+    """Samples of equal weight."""
+    return WeightedSamples(poses, np.full(len(poses), 1.0 / len(poses)), np.zeros(len(poses)), log_evidence, 0.1)
+
+
+def test_modes_are_weighed_and_those_of_no_weight_dropped(rng):
+    here = turned(0.0) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
+    there = turned(1.5) @ se3.exp(0.01 * rng.normal(size=(200, 6)))
+    one = weigh_modes([mode(here, 0.0), mode(there, -20.0)])
+    two = weigh_modes([mode(here, 0.0), mode(there, np.log(3.0))])
+    assert [share for share, _ in one] == [1.0]
+    np.testing.assert_allclose([share for share, _ in two], [0.75, 0.25])
+    heaviest = two[0][1]
+    assert rotation_error_deg(weighted_gaussian(heaviest.poses, heaviest.weights, np.zeros(3)).mean, turned(1.5)) < 1.0
+
+
+def mixture(rng):
+    """Three Gaussians a few centimetres off the axes of motion, over a general prior."""
+    centre_m = np.array([0.02, -0.05, 0.8])
+    known = GeneralDensity(centre_m, centre_m + 0.01, max_rotation_rad=0.9, max_offset_m=0.04)
+    means = se3.exp(rng.normal(size=(3, 6)) * np.repeat([0.3, 0.02], 3))
+    spreads = np.linalg.cholesky(np.stack([np.cov(rng.normal(size=(6, 20))) for _ in range(3)]))
+    spreads *= np.repeat([0.1, 0.005], 3)[:, None]
+    return MixtureProposal(known, GaussianMixture(means, spreads, np.log([0.5, 0.3, 0.2]), centre_m))
+
+
+def test_a_mixture_has_the_density_of_its_samples(rng):
+    """∫ q over a broad known density, by importance: 1; and the mean of log q agrees with the entropy of samples."""
+    density = mixture(rng)
+    broad = replace(density.gaussians, spreads=2.0 * density.gaussians.spreads)
+    samples = broad.sample(40_000, rng)
+    ratio = np.exp(density.log_density(samples) - broad.log_density(samples))
+    assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std() / np.sqrt(len(ratio))
+
+
+def test_a_narrow_component_has_the_gaussian_density(rng):
+    density = mixture(rng)
+    several = density.gaussians
+    narrow = GaussianMixture(several.means[:1], 0.01 * several.spreads[:1], np.zeros(1), several.centre_m)
+    centre = se3.translation(several.centre_m)
+    xi = (narrow.spreads[0] @ rng.normal(size=(6, 50))).T
+    poses = narrow.means[0] @ centre @ se3.exp(xi) @ se3.inverse(centre)
+    covariance = narrow.spreads[0] @ narrow.spreads[0].T
+    expected = -0.5 * np.einsum("ni,ij,nj->n", xi, np.linalg.inv(covariance), xi)
+    expected -= 0.5 * np.linalg.slogdet(2.0 * np.pi * covariance)[1]
+    np.testing.assert_allclose(narrow.log_density(poses), expected, atol=1e-4)
+
+
+def test_a_mixture_only_proposes(rng):
+    density = mixture(rng)
+    samples = density.sample(200, rng)
+    np.testing.assert_array_equal(density.log_evidence(samples), density.known.log_density(samples))

@@ -1,9 +1,9 @@
-"""What matching surface says of the motion, and how sure it is: sharpens samples where it says much.
+"""Refinement of samples by the point-to-plane equations of matching surface (method.md, eq. 14 to 16).
 
-A likelihood that multiplies hundreds of points is too sure of what they have in common, so that the sampled one is
-tempered: right for what the images hardly determine, far too wide for what they determine well. There the classical
-way is exact: point-to-plane equations, and the covariance of their solution from how the equations scatter between
-patches of the surface (Godambe 1960: sensitivity J, variability V, information J V⁻¹ J).
+A likelihood that multiplies hundreds of points overstates what errors they share, so that the sampled one is tempered:
+right for what the images hardly determine, far too wide for what they determine well. There the classical equations
+hold, with the covariance of their solution from the scatter between patches of the surface (Godambe 1960: sensitivity
+J, variability V, information J V⁻¹ J).
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
-from modeler.kernels import matching, patches
-from modeler.registration.lookup import DirectedLikelihood
-from modeler.registration.pair import PairLikelihood
+from modeler.kernels import point_to_plane
 from modeler.registration.posterior import FLOOR
+from modeler.registration.visibility.likelihood import DirectedLikelihood, PairLikelihood
 from modeler.se3 import rows
 from modeler.types import Array
 
@@ -26,27 +25,27 @@ class Refiner:
     """Moves each sample of a tempered posterior to where matching surface and the sample together put it."""
 
     halvings: int = 5
-    """The surface is cut in two so many times: 2⁵ patches, whose errors are taken to be independent."""
+    """The surface is bisected this many times: 2⁵ patches, whose errors are taken to be independent."""
     min_matches: float = 6.0
-    """A patch holds at least so many matching points; with fewer in all, there are fewer patches."""
+    """Least number of matches in a patch; with fewer in all, there are fewer patches."""
     min_patches: int = 16
-    """With fewer patches than this nothing is refined: the scatter of six equations would not be known."""
+    """With fewer patches nothing is refined: the scatter of six equations would not be determined."""
 
     def refine(
         self, pair: PairLikelihood, poses: Array, weights: Array, rng: np.random.Generator, *, fine_m: float
     ) -> Array:
-        """Return the refined samples (n, 4, 4): those of posterior × matching surface, if both were Gaussian.
+        """Return refined samples (n, 4, 4): those of posterior × matching surface, if both were Gaussian.
 
-        Each sample takes its own Gauss-Newton step, as far as the surface is surer than the samples' spread, and a
-        share of the surface's uncertainty (randomised maximum likelihood: Oliver, He and Reynolds 1996). Where the
-        surface says nothing, about the axis of a can, samples stay as they are.
+        Each sample takes its own Gauss-Newton step, scaled by how much more certain the surface is than the samples'
+        spread, and a share of the surface's uncertainty (randomised maximum likelihood: Oliver, He and Reynolds 1996).
+        Where the surface determines nothing, as about the axis of a can, samples stay as they are.
 
         Args:
             pair: the two views.
             poses: (n, 4, 4) samples of target_from_source.
             weights: (n,) of the samples, of any sum.
             rng: source of all randomness.
-            fine_m: least blur in m at which surfaces are told apart.
+            fine_m: smallest blur in m at which matches are selected.
         """
         centre_m = pair.centre_m
         mean, covariance = se3.mean(poses, weights, about_m=centre_m)
@@ -59,15 +58,15 @@ class Refiner:
         to_basis = np.linalg.inv(basis)
         step = _steps(pair, poses, noise_m, spread, centre_m) @ to_basis.T @ information
         scatter = rng.normal(size=(len(poses), 6)) @ root.T
-        moved = (step + scatter) @ narrowed.T @ basis.T
+        moved = (step + scatter) @ narrowed.T @ basis.T  # method.md, eq. 16
         return se3.moved(poses, moved, centre_m)
 
     def _information(
         self, pair: PairLikelihood, mode: Array, noise_m: float, spread: Array, centre_m: Array
     ) -> tuple[Array, Array]:
-        """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) about the coordinates in it."""
-        places, by_own, by_other, residuals, weights = _equations(pair, mode, noise_m, centre_m)
-        halvings = min(self.halvings, int(np.log2(max(len(places) / self.min_matches, 1.0))))
+        """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) in it (method.md, eq. 14)."""
+        arms, by_own, by_other, residuals, weights = _equations(pair, mode, noise_m, centre_m)
+        halvings = min(self.halvings, int(np.log2(max(len(arms) / self.min_matches, 1.0))))
         if 2**halvings < self.min_patches:
             return spread, np.zeros((6, 6))
         by_own, by_other = by_own @ spread, by_other @ spread
@@ -75,21 +74,21 @@ class Refiner:
         product = (by_own.T * weights) @ by_other
         sensitivity, axes = np.linalg.eigh(0.5 * (product + product.T))
         count = 2**halvings
-        members = (patches.halved(places, halvings) == np.arange(count)[:, None]).astype(np.float64)
+        members = (point_to_plane.bisected(arms, halvings) == np.arange(count)[:, None]).astype(np.float64)
         by_both = 0.5 * (by_own + by_other) @ axes
         scores = members @ (by_both * (weights * residuals)[:, None])
         variability = shrunk(scores, (by_both.T * weights) @ by_both)
-        sure = np.diag(np.maximum(sensitivity, 0.0))
-        information = seen_alone(pair.patches / count) * sure @ np.linalg.solve(variability, sure)
+        positive = np.diag(np.maximum(sensitivity, 0.0))
+        information = visible_share(pair.patches / count) * positive @ np.linalg.solve(variability, positive)
         return spread @ axes, np.asarray(0.5 * (information + information.T), dtype=np.float64)
 
 
 def shrunk(scores: Array, shape: Array) -> Array:
-    """Return the variability (k, k) of a sum of scores, from their scatter and from what it should look like.
+    """Return the variability (k, k) of a sum of scores: their scatter, shrunk to the shape that it should have.
 
-    A few dozen scores tell it poorly, and what they tell too low makes a posterior too sure. So it is drawn to the
-    shape that errors alike everywhere would give it, the farther, the less their scatter departs from that beyond
-    chance (oracle approximating shrinkage: Chen, Wiesel, Eldar and Hero 2010, equation 23).
+    A few dozen scores determine it poorly, and underestimates make a posterior overconfident. It is drawn to the shape
+    of independent errors of equal size, the more, the less the scatter departs from it beyond chance (oracle
+    approximating shrinkage: Chen, Wiesel, Eldar and Hero 2010, equation 23).
 
     Args:
         scores: (n, k), which sum up to about 0.
@@ -106,12 +105,12 @@ def shrunk(scores: Array, shape: Array) -> Array:
     return np.asarray(root @ ((1.0 - share) * scatter + share * level * np.eye(size)) @ root.T, dtype=np.float64)
 
 
-def seen_alone(size: float) -> float:
-    """Return how much of the variability patches show by their own scatter, each as large as so many balls.
+def visible_share(size: float) -> float:
+    """Return the share of the variability that shows in the scatter of patches of `size` balls (method.md, eq. 15).
 
-    Smoothing spreads a pixel's noise over a ball, across the border of a patch, and what neighbours err by alike their
-    scatter leaves out. Take both for squares, w and d wide: in each direction the patch's sum is a trapezoid of the
-    noise, whose square holds 1 - w / 3d of what the whole surface's does; and (1 - d / 3w) d / w where d < w.
+    Smoothing spreads a pixel's noise over a ball, across the border of a patch, and the scatter misses errors that
+    neighbours share. With both as squares, w and d wide, the patch's sum is in each direction a trapezoid of the noise,
+    whose square holds 1 - w / 3d of what the whole surface's does; and (1 - d / 3w) d / w where d < w.
     """
     width = np.sqrt(size)  # of a patch, in those of a ball
     share = 1.0 - 1.0 / (3.0 * width) if width >= 1.0 else width * (1.0 - width / 3.0)
@@ -119,7 +118,7 @@ def seen_alone(size: float) -> float:
 
 
 def _mode(pair: PairLikelihood, start: Array, spread: Array, centre_m: Array, *, fine_m: float) -> tuple[Array, float]:
-    """Return where matching surface and the spread (6, 6) of the samples about their mean settle, and the noise."""
+    """Return the mode of matching surface × a Gaussian about `start` with the root (6, 6) of its covariance, and b."""
     precision = np.linalg.inv(spread @ spread.T)
     pose, noise_m = start, pair.surface_noise_m(start, fine_m)
     for _ in range(8):
@@ -134,10 +133,10 @@ def _mode(pair: PairLikelihood, start: Array, spread: Array, centre_m: Array, *,
 
 
 def _steps(pair: PairLikelihood, poses: Array, noise_m: float, spread: Array, centre_m: Array) -> Array:
-    """Return the Gauss-Newton steps (n, 6) of motions, held by the samples' spread where nothing else holds them."""
+    """Return Gauss-Newton steps (n, 6), regularised by the samples' spread."""
     gradient, matrix = pair.normal_equations(poses, noise_m, stride=2)
-    held = matrix + np.linalg.inv(spread @ spread.T)
-    return np.asarray(np.linalg.solve(held, gradient[:, :, None])[:, :, 0], dtype=np.float64)
+    regularised = matrix + np.linalg.inv(spread @ spread.T)
+    return np.asarray(np.linalg.solve(regularised, gradient[:, :, None])[:, :, 0], dtype=np.float64)
 
 
 def _equations(
@@ -154,13 +153,13 @@ def _equations(
         (pair.forward, pose, 1.0),
         (pair.backward, se3.inverse(pose), -1.0),
     ]
-    for lookup, there, sign in directions:
-        found = lookup.matches(rows(there), noise_m)
-        found = found[found[:, matching.WEIGHT] > 0.0]
+    for directed, carried, sign in directions:
+        found = directed.matches(rows(carried), noise_m)
+        found = found[found[:, point_to_plane.WEIGHT] > 0.0]
         to_source = np.eye(4) if sign < 0.0 else se3.inverse(pose)
-        arms = se3.transform(to_source, found[:, matching.POSITION]) - centre_m
-        own, other = (found[:, k] @ to_source[:3, :3].T for k in (matching.OWN, matching.OTHER))
+        arms = se3.transform(to_source, found[:, point_to_plane.POSITION]) - centre_m
+        own, other = (found[:, k] @ to_source[:3, :3].T for k in (point_to_plane.OWN, point_to_plane.OTHER))
         derivatives = [sign * np.hstack([np.cross(arms, normals), normals]) for normals in (own, other)]
-        parts.append((arms, *derivatives, found[:, matching.RESIDUAL], found[:, matching.WEIGHT]))
+        parts.append((arms, *derivatives, found[:, point_to_plane.RESIDUAL], found[:, point_to_plane.WEIGHT]))
     arms, by_own, by_other, residuals, weights = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return arms, by_own, by_other, residuals, weights

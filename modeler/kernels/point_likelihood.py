@@ -1,0 +1,334 @@
+"""The visibility likelihood: points of one view against the surface, and the empty space, that the other measured.
+
+Single precision: of a point a metre away it leaves 0.1 µm, and sixteen points go through one instruction.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from modeler.kernels.planes import (
+    BACKGROUND,
+    CELL_SIZE,
+    DEPTH,
+    DISTANCE,
+    KIND,
+    MISSING,
+    NORMAL_X,
+    NORMAL_Y,
+    NORMAL_Z,
+    SILHOUETTE,
+    SURFACE,
+    VARIANCE,
+)
+
+# Classes of a point, see `classify`.
+UNKNOWN, MATCHED, BEHIND, IN_FRONT, HIDDEN, IN_EMPTY_SPACE = 0, 1, 2, 3, 4, 5
+
+# Columns of what `log_likelihoods` returns.
+LOG_LIKELIHOOD, EXPLAINED = 0, 1
+
+MIN_AGREEMENT = np.float32(0.8)
+"""Least cosine between the normals of a point and of the surface that it matches."""
+MAX_SIGMAS = np.float32(3.0)
+"""A point farther from the surface than this many standard deviations does not match it."""
+
+LOOSE_SIGMAS = 4.0
+"""Likewise where points are classified: what may be noise is not counted as a contradiction."""
+
+# Nodes of the table of log((1 - hidden) exp(match) + hidden); below the first it is log(hidden) within 3e-6.
+TABLE_LOW, TABLE_HIGH, TABLE_STEPS = np.float32(-14.0), np.float32(4.0), 2304
+_PER_STEP = np.float32(TABLE_STEPS / (TABLE_HIGH - TABLE_LOW))
+
+_OF_SURFACE, _OF_BACKGROUND, _OF_NOTHING = np.float32(SURFACE), np.float32(BACKGROUND), np.float32(MISSING)
+
+# No flag lets the compiler assume away NaN or infinity; these let it use multiply-add and one reciprocal, and add up
+# in any order. So whatever is called from a kernel is made part of it (`forceinline`): a call may end in another copy,
+# compiled by itself, that adds up in another order, and a kernel just compiled would not answer as one from the cache.
+VECTOR_MATHS = {"contract", "arcp", "nsz", "reassoc"}
+ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)  # a plain 0.5 would make double precision of all
+
+# Rows of the points, and of `transform_points`.
+VARIANCE_M2 = 6
+X, Y, Z, POINT_NORMAL_X, POINT_NORMAL_Y, POINT_NORMAL_Z, FACING, COVERAGE = 0, 1, 2, 3, 4, 5, 6, 7
+CARRIED_ROWS = 8
+
+FloatArray = npt.NDArray[np.float32]
+
+
+class Projection(NamedTuple):
+    """One direction of a comparison: points of one view, and the camera and cells of the other."""
+
+    points: FloatArray
+    """(7, n) position in m, unit normal, variance along the normal in m²."""
+    cells: FloatArray
+    """(h · w, 8) of the other view, see `planes`."""
+    camera: FloatArray
+    """(6,) fx, fy, cx, cy, width and height in px of the other view."""
+    cosines: FloatArray
+    """(4,) cosines between which f rises from 0 to 1, and g (method.md, eq. 4)."""
+
+
+@numba.njit(cache=True, forceinline=True)
+def invert(pose, inverse):
+    """Write the inverse of a pose (12,), the rows of a 3×4 matrix, into `inverse` (12,)."""
+    for k in range(3):
+        inverse[4 * k + 3] = 0.0
+        for m in range(3):
+            inverse[4 * k + m] = pose[4 * m + k]
+            inverse[4 * k + 3] -= pose[4 * m + k] * pose[4 * m + 3]
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+def transform_points(pose, projection, carried, pixels):
+    """Transform points into the other camera (method.md, eq. 4): straight-line code, which compilers vectorise.
+
+    Args:
+        pose: (12,) rows of the 3×4 matrix.
+        projection: the points and the other camera.
+        carried: (8, n) out: position, normal, how much the point faces the camera (f, 0..1), and how reliably the
+            camera measures it (g, 0..1).
+        pixels: (n,) out: number of the pixel it falls on, row by row; -1 outside the image or behind the camera.
+    """
+    p0, p1, p2, p3 = np.float32(pose[0]), np.float32(pose[1]), np.float32(pose[2]), np.float32(pose[3])
+    p4, p5, p6, p7 = np.float32(pose[4]), np.float32(pose[5]), np.float32(pose[6]), np.float32(pose[7])
+    p8, p9, p10, p11 = np.float32(pose[8]), np.float32(pose[9]), np.float32(pose[10]), np.float32(pose[11])
+    points, (fx, fy, cx, cy, width, height) = projection.points, projection.camera
+    low, per_range = projection.cosines[0], ONE / (projection.cosines[1] - projection.cosines[0])
+    flat, per_turn = projection.cosines[2], ONE / (projection.cosines[3] - projection.cosines[2])
+    for j in range(points.shape[1]):
+        a, b, c, d, e, f = points[0, j], points[1, j], points[2, j], points[3, j], points[4, j], points[5, j]
+        x = p0 * a + p1 * b + p2 * c + p3
+        y = p4 * a + p5 * b + p6 * c + p7
+        z = p8 * a + p9 * b + p10 * c + p11
+        normal_x = p0 * d + p1 * e + p2 * f
+        normal_y = p4 * d + p5 * e + p6 * f
+        normal_z = p8 * d + p9 * e + p10 * f
+        cosine = -(normal_x * x + normal_y * y + normal_z * z) / np.sqrt(x * x + y * y + z * z)
+        per_z = ONE / z
+        column, row = fx * x * per_z + cx + HALF, fy * y * per_z + cy + HALF
+        inside = (z > ZERO) & (column >= ZERO) & (column < width) & (row >= ZERO) & (row < height)
+        safe_column, safe_row = min(max(column, ZERO), width - ONE), min(max(row, ZERO), height - ONE)
+        pixel = np.int32(safe_row) * np.int32(width) + np.int32(safe_column)
+        carried[X, j], carried[Y, j], carried[Z, j] = x, y, z
+        carried[POINT_NORMAL_X, j], carried[POINT_NORMAL_Y, j], carried[POINT_NORMAL_Z, j] = (
+            normal_x,
+            normal_y,
+            normal_z,
+        )
+        carried[FACING, j] = min(max((cosine - low) * per_range, ZERO), ONE)
+        carried[COVERAGE, j] = min(max((cosine - flat) * per_turn, ZERO), ONE)
+        pixels[j] = pixel if inside else np.int32(-1)
+
+
+@numba.njit(cache=True, forceinline=True)
+def fetch_cells(pixels, cells, found):
+    """Copy the cells at `pixels` (n,) into the columns of `found` (8, n); outside the image they are `MISSING`."""
+    for j in range(pixels.shape[0]):
+        cell = np.uint32(max(pixels[j], np.int32(0)))
+        for k in range(CELL_SIZE):
+            found[k, j] = cells[cell, k]
+        if pixels[j] < 0:
+            found[KIND, j] = MISSING
+
+
+@numba.njit(cache=True, forceinline=True)
+def project(pose, projection, carried, pixels, found):
+    """Transform points by a pose (12,) and look up their cells: `transform_points`, then `fetch_cells`."""
+    transform_points(pose, projection, carried, pixels)
+    fetch_cells(pixels, projection.cells, found)
+
+
+@numba.njit(cache=True, forceinline=True)
+def buffers(projection):
+    """Return buffers for `project`: transformed points (8, n), pixels (n,), cells (8, n)."""
+    count = projection.points.shape[1]
+    carried, pixels = np.empty((CARRIED_ROWS, count), dtype=np.float32), np.empty(count, dtype=np.int32)
+    return carried, pixels, np.empty((CELL_SIZE, count), dtype=np.float32)
+
+
+class LikelihoodParameters(NamedTuple):
+    """Parameters of one direction (method.md, eq. 4 to 6); all float32."""
+
+    blur_m: np.float32
+    """Noise b of the surfaces."""
+    silhouette_px: np.float32
+    """Standard deviation of the silhouette."""
+    dead_band_px: np.float32
+    """Dead band beside the silhouette."""
+    clearance_m: np.float32
+    """A point this far in front of the background contradicts it."""
+    max_point_cost: np.float32
+    """Upper bound K of the cost of one point (nats)."""
+    normal_cost: np.float32
+    """Cost κ of normals at right angles (nats)."""
+    unmeasured_gain: np.float32
+    """Log-likelihood (nats) of a point that should be seen where nothing was measured."""
+    typical_misfit: np.float32
+    """Misfit μ of a typical match (nats)."""
+    table: FloatArray
+    """`match_table` of η."""
+
+
+@numba.njit(cache=True)
+def match_table(hidden):
+    """Return log((1 - hidden) exp(match) + hidden) at the nodes (method.md, eq. 5)."""
+    table = np.empty(TABLE_STEPS + 1, dtype=np.float32)
+    for k in range(TABLE_STEPS + 1):
+        match = TABLE_LOW + k * (TABLE_HIGH - TABLE_LOW) / TABLE_STEPS
+        table[k] = math.log((1.0 - hidden) * math.exp(match) + hidden)
+    return table
+
+
+@numba.njit(cache=True, inline="always")
+def plane_distance(carried, found, j):
+    """Return the signed distance r in m of a transformed point from the plane of its cell, positive in front."""
+    return (
+        found[DISTANCE, j]
+        + found[NORMAL_X, j] * carried[X, j]
+        + found[NORMAL_Y, j] * carried[Y, j]
+        + found[NORMAL_Z, j] * carried[Z, j]
+    )
+
+
+@numba.njit(cache=True, inline="always")
+def normal_agreement(carried, found, j):
+    """Return the cosine between the normals of a transformed point and of the plane of its cell."""
+    return (
+        found[NORMAL_X, j] * carried[POINT_NORMAL_X, j]
+        + found[NORMAL_Y, j] * carried[POINT_NORMAL_Y, j]
+        + found[NORMAL_Z, j] * carried[POINT_NORMAL_Z, j]
+    )
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+def sum_over_points(points, carried, found, parameters):
+    """Return the log-likelihood of transformed points, and the number explained (method.md, eq. 5 and 6).
+
+    All cases are evaluated for every point, and one selected: code without branches is vectorised.
+
+    Args:
+        points: (7, n), see `Projection`.
+        carried: (8, n) and
+        found: (8, n), see `project`.
+        parameters: see `LikelihoodParameters`.
+    """
+    table, max_point_cost = parameters.table, parameters.max_point_cost
+    log_hidden, last = table[0], np.int32(TABLE_STEPS - 1)
+    total, explained = ZERO, ZERO
+    for j in range(points.shape[1]):
+        faces, kind = carried[FACING, j], found[KIND, j]
+        in_front = plane_distance(carried, found, j)
+        agreement = normal_agreement(carried, found, j)
+        variance = points[VARIANCE_M2, j] + found[VARIANCE, j] + parameters.blur_m * parameters.blur_m
+        half_square = HALF * in_front * in_front / variance
+        match = parameters.typical_misfit - half_square - parameters.normal_cost * (ONE - agreement)
+        matches = (half_square < HALF * MAX_SIGMAS * MAX_SIGMAS) & (agreement > MIN_AGREEMENT)
+        place = (min(max(match, TABLE_LOW), TABLE_HIGH) - TABLE_LOW) * _PER_STEP
+        node = min(np.int32(place), last)
+        low, high = table[np.uint32(node)], table[np.uint32(node + np.int32(1))]
+        seen = low + (place - np.float32(node)) * (high - low)
+        # In front of what was measured nothing can hide it.
+        seen = max(match, -max_point_cost) if (in_front > ZERO) & (match < log_hidden) else seen
+        on_surface = faces * seen - ((ONE - faces) * min(half_square, max_point_cost) if in_front > ZERO else ZERO)
+        beyond = max((found[SILHOUETTE, j] - parameters.dead_band_px) / parameters.silhouette_px, ZERO)
+        in_the_way = carried[Z, j] < found[DEPTH, j] - parameters.clearance_m
+        in_the_open = -min(HALF * beyond * beyond, max_point_cost) if in_the_way else ZERO
+        gain = on_surface if kind == _OF_SURFACE else ZERO
+        gain = in_the_open if kind == _OF_BACKGROUND else gain
+        gain = parameters.unmeasured_gain * carried[COVERAGE, j] if kind == _OF_NOTHING else gain
+        total += gain
+        explained += faces if (kind == _OF_SURFACE) & matches else ZERO
+    return total, explained
+
+
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def pair_log_likelihood(pose, forward, backward, forward_parameters, backward_parameters, workspace):
+    """Return the log-likelihood of one pose (12,) and the number of explained points; see `log_likelihoods`.
+
+    The workspace holds the `buffers` of both directions, and (12,).
+    """
+    there, back, inverse = workspace
+    project(pose, forward, there[0], there[1], there[2])
+    total, explained = sum_over_points(forward.points, there[0], there[2], forward_parameters)
+    invert(pose, inverse)
+    project(inverse, backward, back[0], back[1], back[2])
+    more, further = sum_over_points(backward.points, back[0], back[2], backward_parameters)
+    return np.float64(total) + np.float64(more), np.float64(explained) + np.float64(further)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def log_likelihoods(poses, forward, backward, forward_parameters, backward_parameters):
+    """Return the log-likelihood of each pose, summed over the points of two views (method.md, eq. 3).
+
+    In single precision the error is below 1e-4 nats a point, unless a point falls within 1e-3 px of a pixel's border.
+
+    Args:
+        poses: (m, 12) float64 rows of the 3×4 matrices of target_from_source.
+        forward: the `Projection` of one view's points in the other, and
+        backward: that of the other's in the one.
+        forward_parameters: the `LikelihoodParameters` of the one direction, and
+        backward_parameters: of the other.
+
+    Returns:
+        (m, 2): log-likelihood; number of points that the other view explains, each weighted by f.
+    """
+    block = 16  # poses per set of buffers
+    result = np.empty((poses.shape[0], 2))
+    for group in numba.prange((poses.shape[0] + block - 1) // block):
+        workspace = buffers(forward), buffers(backward), np.empty(12)
+        for i in range(group * block, min((group + 1) * block, poses.shape[0])):
+            result[i, LOG_LIKELIHOOD], result[i, EXPLAINED] = pair_log_likelihood(
+                poses[i], forward, backward, forward_parameters, backward_parameters, workspace
+            )
+    return result
+
+
+@numba.njit(cache=True)
+def classify(pose, projection, parameters):
+    """Return the class (n,) of each point of a `Projection` under one pose (12,)."""
+    carried, pixels, found = buffers(projection)
+    project(pose, projection, carried, pixels, found)
+    classes = np.zeros(pixels.shape[0], dtype=np.int8)
+    for j in range(pixels.shape[0]):
+        if found[KIND, j] == BACKGROUND:
+            if (
+                found[SILHOUETTE, j] > parameters.dead_band_px
+                and carried[Z, j] < found[DEPTH, j] - parameters.clearance_m
+            ):
+                classes[j] = IN_EMPTY_SPACE
+        elif found[KIND, j] == SURFACE:
+            in_front = plane_distance(carried, found, j)
+            variance = projection.points[VARIANCE_M2, j] + found[VARIANCE, j] + parameters.blur_m * parameters.blur_m
+            if in_front > LOOSE_SIGMAS * math.sqrt(variance):
+                classes[j] = IN_FRONT
+            elif carried[FACING, j] > 0.5:
+                classes[j] = MATCHED if in_front > -LOOSE_SIGMAS * math.sqrt(variance) else BEHIND
+            else:
+                classes[j] = HIDDEN
+    return classes
+
+
+@numba.njit(cache=True)
+def residual_excess(pose, projection, blur_m):
+    """Return the excess of squared residuals over their variances under one pose (12,) (method.md, eq. 8).
+
+    Returns:
+        Sum in m² of the squared distances less the variances of point and plane, over the points that face the camera
+        and are within `LOOSE_SIGMAS` standard deviations, `blur_m` included; and their number.
+    """
+    carried, pixels, found = buffers(projection)
+    project(pose, projection, carried, pixels, found)
+    total, count = 0.0, 0
+    for j in range(pixels.shape[0]):
+        if found[KIND, j] != SURFACE or carried[FACING, j] < 0.5:
+            continue
+        square = np.float64(plane_distance(carried, found, j)) ** 2
+        known = np.float64(projection.points[VARIANCE_M2, j]) + np.float64(found[VARIANCE, j])
+        if square < LOOSE_SIGMAS * LOOSE_SIGMAS * (known + blur_m * blur_m):
+            total += square - known
+            count += 1
+    return total, count

@@ -1,0 +1,394 @@
+"""Point-to-plane equations of surface that both views measured: descent, ridge tracing, and patches of the surface."""
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from modeler.kernels.lie_group import difference, retract
+from modeler.kernels.planes import KIND, NORMAL_X, NORMAL_Y, NORMAL_Z, SURFACE, VARIANCE
+from modeler.kernels.point_likelihood import (
+    FACING,
+    HALF,
+    MAX_SIGMAS,
+    MIN_AGREEMENT,
+    POINT_NORMAL_X,
+    POINT_NORMAL_Y,
+    POINT_NORMAL_Z,
+    VARIANCE_M2,
+    VECTOR_MATHS,
+    ZERO,
+    LikelihoodParameters,
+    Projection,
+    X,
+    Y,
+    Z,
+    buffers,
+    invert,
+    normal_agreement,
+    pair_log_likelihood,
+    plane_distance,
+    project,
+)
+
+# Columns of `matches`: transformed position, own normal, the surface's normal, distance from it, weight, f.
+POSITION, OWN, OTHER, RESIDUAL, WEIGHT, FACING_WEIGHT = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11
+
+_OF_SURFACE = np.float32(SURFACE)
+_ROWS = 9  # of one direction's equations: six derivatives, residual, weight, and a buffer for products
+
+
+class Regulariser(NamedTuple):
+    """Gaussian prior and damping of a descent (method.md, eq. 10)."""
+
+    mean: npt.NDArray[np.float64]
+    """(12,) rows of the prior's mean."""
+    precision: npt.NDArray[np.float64]
+    """(6, 6) Λ of ξ about the centre."""
+    damping: npt.NDArray[np.float64]
+    """(6,) diagonal of D."""
+    max_step_rad: float
+    """Largest rotation of a step."""
+
+
+@numba.njit(cache=True, inline="always")
+def match_weight(points, carried, found, residual, surface_m2, j):
+    """Return the weight ω in 1/m² of a transformed point at a distance in m from the surface: 0 for no match."""
+    variance = points[VARIANCE_M2, j] + found[VARIANCE, j] + surface_m2
+    near = residual * residual <= MAX_SIGMAS * MAX_SIGMAS * variance
+    alike = normal_agreement(carried, found, j) >= MIN_AGREEMENT
+    weight = carried[FACING, j] / variance
+    return weight if (found[KIND, j] == _OF_SURFACE) & near & alike else ZERO
+
+
+@numba.njit(cache=True, error_model="numpy")
+def matches(pose, projection, surface_m):
+    """Return the match of each point under one pose.
+
+    Args:
+        pose: (12,) rows of the 3×4 matrix that takes the points into the other camera.
+        projection: the `Projection` of the points.
+        surface_m: noise of the surfaces in m beyond that of points and planes.
+
+    Returns:
+        (n, 12): position in m, own normal and normal of the surface there, all in the other camera's frame; distance
+        in m in front of that surface; weight in 1/m², 0 where nothing matches; f (0..1).
+    """
+    carried, pixels, cells = buffers(projection)
+    project(pose, projection, carried, pixels, cells)
+    found = np.zeros((pixels.shape[0], 12))
+    for j in range(pixels.shape[0]):
+        residual = plane_distance(carried, cells, j)
+        weight = match_weight(projection.points, carried, cells, residual, np.float32(surface_m * surface_m), j)
+        for k in range(3):
+            found[j, k], found[j, 3 + k] = carried[X + k, j], carried[POINT_NORMAL_X + k, j]
+        if weight > ZERO:
+            for k in range(3):
+                found[j, 6 + k] = cells[NORMAL_X + k, j]
+            found[j, RESIDUAL], found[j, WEIGHT], found[j, FACING_WEIGHT] = residual, weight, carried[FACING, j]
+    return found
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+def linearise(points, carried, found, centre, surface_m2, rows):
+    """Write the equations of matches into `rows` (9, n): derivatives by ζ, residual and weight; see `equations`."""
+    cx, cy, cz = np.float32(centre[0]), np.float32(centre[1]), np.float32(centre[2])
+    for j in range(points.shape[1]):
+        residual = plane_distance(carried, found, j)
+        rows[6, j] = residual
+        rows[7, j] = match_weight(points, carried, found, residual, surface_m2, j)
+    for j in range(points.shape[1]):  # a separate loop: compilers prove that no more rows than these do not alias
+        x, y, z = carried[X, j] - cx, carried[Y, j] - cy, carried[Z, j] - cz
+        # The mean of both surfaces' normals, so that neither's noise counts in full.
+        normal_x = HALF * (found[NORMAL_X, j] + carried[POINT_NORMAL_X, j])
+        normal_y = HALF * (found[NORMAL_Y, j] + carried[POINT_NORMAL_Y, j])
+        normal_z = HALF * (found[NORMAL_Z, j] + carried[POINT_NORMAL_Z, j])
+        rows[0, j] = y * normal_z - z * normal_y
+        rows[1, j] = z * normal_x - x * normal_z
+        rows[2, j] = x * normal_y - y * normal_x
+        rows[3, j], rows[4, j], rows[5, j] = normal_x, normal_y, normal_z
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+def accumulate(rows, count, gradient, matrix):
+    """Write the gradient (6,), -Σ w a r, and the matrix (6, 6), Σ w a aᵀ, of the first equations in `rows` (8, n)."""
+    for u in range(6):
+        total = ZERO
+        for j in range(count):
+            rows[8, j] = rows[u, j] * rows[7, j]
+            total += rows[8, j] * rows[6, j]
+        gradient[u] = -np.float64(total)
+        for v in range(u, 6):
+            total = ZERO
+            for j in range(count):
+                total += rows[8, j] * rows[v, j]
+            matrix[u, v] = matrix[v, u] = np.float64(total)
+
+
+@numba.njit(cache=True)
+def new_workspace(forward, backward):
+    """Return the buffers of `equations`."""
+    most = max(forward.points.shape[1], backward.points.shape[1])
+    rows = np.empty((_ROWS, most), dtype=np.float32)
+    small = np.empty(12), np.empty(3), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
+    return buffers(forward), buffers(backward), rows, small
+
+
+@numba.njit(cache=True)
+def rotate_to_source(pose, part, block, retract_all, gradient, matrix):
+    """Write Rᵀ g and Rᵀ M R, by halves and blocks of three, of a gradient (6,) and a symmetric matrix (6, 6)."""
+    for half in range(0, 6, 3):
+        for k in range(3):
+            a, b, c = pose[k], pose[4 + k], pose[8 + k]
+            gradient[half + k] = a * part[half] + b * part[half + 1] + c * part[half + 2]
+            for m in range(6):
+                retract_all[half + k, m] = a * block[half, m] + b * block[half + 1, m] + c * block[half + 2, m]
+    for half in range(0, 6, 3):
+        for k in range(3):
+            a, b, c = pose[k], pose[4 + k], pose[8 + k]
+            for m in range(6):
+                matrix[m, half + k] = (
+                    a * retract_all[m, half] + b * retract_all[m, half + 1] + c * retract_all[m, half + 2]
+                )
+
+
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def equations(pose, forward, backward, centre, surface_m, workspace, gradient, matrix):
+    """Write the point-to-plane normal equations of matches, for ξ of a pose about the centre (method.md, eq. 10).
+
+    For small motions ζ = (ω, v) of transformed points about a point c, x → c + exp(ω)(x - c) + v, the gradient is
+    -Σ w a r and the matrix Σ w a aᵀ with a = ((x - c) × n, n). In the target, a source point moves by ζ = (R ω, R v)
+    about the transformed centre; in the source, a target point moves by -ξ about the centre.
+
+    Args:
+        pose: (12,) rows of target_from_source.
+        forward: the `Projection` of the source's points in the target, and
+        backward: of the target's in the source.
+        centre: (3,) point of the source in m.
+        surface_m: noise of the surfaces in m beyond that of points and planes.
+        workspace: of `new_workspace`.
+        gradient: (6,) out.
+        matrix: (6, 6) out.
+    """
+    there, back, rows, (inverse, carried_centre, part, block, retract_all) = workspace
+    surface_m2 = np.float32(surface_m * surface_m)
+    for k in range(3):
+        carried_centre[k] = pose[4 * k + 3]
+        for m in range(3):
+            carried_centre[k] += pose[4 * k + m] * centre[m]
+    project(pose, forward, there[0], there[1], there[2])
+    linearise(forward.points, there[0], there[2], carried_centre, surface_m2, rows)
+    accumulate(rows, forward.points.shape[1], part, block)
+    rotate_to_source(pose, part, block, retract_all, gradient, matrix)
+    invert(pose, inverse)
+    project(inverse, backward, back[0], back[1], back[2])
+    linearise(backward.points, back[0], back[2], centre, surface_m2, rows)
+    accumulate(rows, backward.points.shape[1], part, block)
+    for k in range(6):
+        gradient[k] -= part[k]
+        for m in range(6):
+            matrix[k, m] += block[k, m]
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def normal_equations(poses, forward, backward, centre, surface_m):
+    """Return gradients (m, 6) and matrices (m, 6, 6) of poses (m, 12), see `equations`."""
+    group = 16  # poses per workspace
+    gradients, matrices = np.empty((poses.shape[0], 6)), np.empty((poses.shape[0], 6, 6))
+    for number in numba.prange((poses.shape[0] + group - 1) // group):
+        workspace = new_workspace(forward, backward)
+        for i in range(number * group, min((number + 1) * group, poses.shape[0])):
+            equations(poses[i], forward, backward, centre, surface_m, workspace, gradients[i], matrices[i])
+    return gradients, matrices
+
+
+@numba.njit(cache=True)
+def normal_equation(pose, forward, backward, centre, surface_m):
+    """Return the gradient (6,) and the matrix (6, 6) of one pose (12,), without the cost of waking other threads."""
+    gradient, matrix = np.empty(6), np.empty((6, 6))
+    equations(pose, forward, backward, centre, surface_m, new_workspace(forward, backward), gradient, matrix)
+    return gradient, matrix
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def descend(poses, forward, backward, centre, surface_m, regulariser, steps):
+    """Return poses (m, 12) after damped Gauss-Newton steps with a `Regulariser`; see `equations`."""
+    group = 4
+    moved = poses.copy()
+    for number in numba.prange((poses.shape[0] + group - 1) // group):
+        workspace, gradient, matrix = new_workspace(forward, backward), np.empty(6), np.empty((6, 6))
+        step, further, rotation = np.empty(6), np.empty(12), np.empty((3, 3))
+        for i in range(number * group, min((number + 1) * group, poses.shape[0])):
+            for _ in range(steps):
+                equations(moved[i], forward, backward, centre, surface_m, workspace, gradient, matrix)
+                regularised_step(moved[i], regulariser, centre, gradient, matrix, step)
+                retract(moved[i], step, centre, rotation, further)
+                moved[i] = further
+    return moved
+
+
+@numba.njit(cache=True)
+def regularised_step(pose, regulariser, centre, gradient, matrix, step):
+    """Write the Gauss-Newton step (6,) of a pose (12,) from its normal equations; overwrites the matrix."""
+    away = difference(regulariser.mean, pose, centre)
+    for k in range(6):
+        step[k] = gradient[k]
+        for m in range(6):
+            step[k] -= regulariser.precision[k, m] * away[m]
+            matrix[k, m] += regulariser.precision[k, m]
+        matrix[k, k] += regulariser.damping[k]
+    solve_positive_definite(matrix, step)
+    angle = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+    if angle > regulariser.max_step_rad:
+        for k in range(6):
+            step[k] *= regulariser.max_step_rad / angle
+
+
+@numba.njit(cache=True)
+def solve_positive_definite(matrix, vector):
+    """Solve a positive definite system (6, 6) in place, by Cholesky factors; overwrites the matrix."""
+    for k in range(6):
+        for m in range(k + 1):
+            total = matrix[k, m]
+            for u in range(m):
+                total -= matrix[k, u] * matrix[m, u]
+            matrix[k, m] = math.sqrt(max(total, 1e-300)) if k == m else total / matrix[m, m]
+        for u in range(k):
+            vector[k] -= matrix[k, u] * vector[u]
+        vector[k] /= matrix[k, k]
+    for k in range(5, -1, -1):
+        for u in range(k + 1, 6):
+            vector[k] -= matrix[u, k] * vector[u]
+        vector[k] /= matrix[k, k]
+
+
+class RidgeLikelihood(NamedTuple):
+    """The tempered likelihood along a ridge, and where tracing ends."""
+
+    forward: Projection
+    """The source's points in the target, and"""
+    backward: Projection
+    """the target's in the source: those of the descent."""
+    scoring_forward: Projection
+    """More of the source's points in the target, for scores, and"""
+    scoring_backward: Projection
+    """of the target's in the source."""
+    forward_parameters: LikelihoodParameters
+    """Parameters of one direction, and"""
+    backward_parameters: LikelihoodParameters
+    """of the other."""
+    temper: float
+    """Factor n / N of the log-likelihood (method.md, eq. 7)."""
+    no_overlap_cost: float
+    """Cost (nats) of a pose under which no surface matches."""
+    per_explained: float
+    """Number of e-folds by which an explained point lowers that."""
+    floor: float
+    """Tracing ends at poses below this (nats)."""
+
+
+@numba.njit(cache=True)
+def tempered_log_likelihood(pose, ridge, workspace):
+    """Return the tempered log-likelihood of a pose (12,); workspace as for `pair_log_likelihood`."""
+    projections, parameters = (
+        (ridge.scoring_forward, ridge.scoring_backward),
+        (ridge.forward_parameters, ridge.backward_parameters),
+    )
+    plain, explained = pair_log_likelihood(
+        pose, projections[0], projections[1], parameters[0], parameters[1], workspace
+    )
+    return ridge.temper * plain - ridge.no_overlap_cost * math.exp(-ridge.per_explained * explained)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def trace_ridges(poses, spreads, axes, step_length, ridge, centre, surface_m, regulariser, max_steps):
+    """Trace ridges from poses along axes: steps along, each followed by two Gauss-Newton steps across.
+
+    Args:
+        poses: (k, 12) starts.
+        spreads: (k, 6, 6) lower triangular roots of the covariances of ξ about the centre.
+        axes: (k, 6) unit vectors in units of those spreads.
+        step_length: length of a step in such units.
+        ridge: the likelihood, and the floor at which a trace ends.
+        centre: (3,) point of the source in m.
+        surface_m: noise of the surfaces in m beyond that of points and planes.
+        regulariser: see `Regulariser`.
+        max_steps: largest number of steps.
+
+    Returns:
+        (k, max_steps, 12) the poses visited, and how many (k,) of them are above the floor.
+    """
+    visited, counts = np.empty((len(poses), max_steps, 12)), np.zeros(len(poses), dtype=np.int64)
+    workspace, gradient, matrix = new_workspace(ridge.forward, ridge.backward), np.empty(6), np.empty((6, 6))
+    looked = buffers(ridge.scoring_forward), buffers(ridge.scoring_backward), np.empty(12)
+    step, z, rotation = np.empty(6), np.empty(6), np.empty((3, 3))
+    pose, moved = np.empty(12), np.empty(12)
+    for i in range(len(poses)):
+        pose[:] = poses[i]
+        for number in range(max_steps):
+            for k in range(6):
+                z[k] = step_length * axes[i, k]
+            multiply_lower(spreads[i], z, step)
+            retract(pose, step, centre, rotation, moved)
+            pose[:] = moved
+            for _ in range(2):
+                equations(pose, ridge.forward, ridge.backward, centre, surface_m, workspace, gradient, matrix)
+                regularised_step(pose, regulariser, centre, gradient, matrix, step)
+                along = 0.0
+                for k in range(6):  # in units of the spread
+                    z[k] = step[k]
+                    for m in range(k):
+                        z[k] -= spreads[i, k, m] * z[m]
+                    z[k] /= spreads[i, k, k]
+                    along += axes[i, k] * z[k]
+                for k in range(6):
+                    z[k] -= along * axes[i, k]
+                multiply_lower(spreads[i], z, step)
+                retract(pose, step, centre, rotation, moved)
+                pose[:] = moved
+            if not tempered_log_likelihood(pose, ridge, looked) > ridge.floor:
+                break
+            visited[i, number] = pose
+            counts[i] = number + 1
+    return visited, counts
+
+
+@numba.njit(cache=True)
+def multiply_lower(root, z, xi):
+    """Write ξ (6,), a lower triangular root (6, 6) times z (6,)."""
+    for k in range(6):
+        xi[k] = 0.0
+        for m in range(k + 1):
+            xi[k] += root[k, m] * z[m]
+
+
+@numba.njit(cache=True)
+def bisected(points, halvings):
+    """Return the patch number (n,) of each point (n, 3): recursive bisection, each across its longest side.
+
+    Args:
+        points: (n, 3).
+        halvings: depth of the recursion; there are 2 to this power patches.
+    """
+    order, starts = np.arange(len(points)), np.array([0, len(points)])
+    for _ in range(halvings):
+        cut = np.empty(2 * len(starts) - 1, dtype=np.int64)
+        for number in range(len(starts) - 1):
+            group = order[starts[number] : starts[number + 1]]
+            best, side = -1.0, 0
+            for k in range(3):
+                extent = 0.0
+                if len(group):
+                    extent = np.max(points[group, k]) - np.min(points[group, k])
+                if extent > best:
+                    best, side = extent, k
+            group[:] = group[np.argsort(points[group, side], kind="mergesort")]
+            cut[2 * number], cut[2 * number + 1] = starts[number], starts[number] + len(group) // 2
+        cut[-1] = len(points)
+        starts = cut
+    patches = np.empty(len(points), dtype=np.int64)
+    for number in range(len(starts) - 1):
+        patches[order[starts[number] : starts[number + 1]]] = number
+    return patches

@@ -1,0 +1,113 @@
+"""What is searched, and the candidates that a search finds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.kernels import mixture
+from modeler.registration.visibility.likelihood import PairLikelihood
+from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
+
+_MODE_DISTANCE = 3.5  # standard deviations between neighbouring candidates of one mode
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Poses found by the search, each with a Gaussian of its surroundings."""
+
+    poses: Array
+    """(k, 4, 4) target_from_source, best first, coarse ones last."""
+    scores: Array
+    """(k,) tempered log-likelihoods (nats)."""
+    spreads: Array
+    """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid (method.md, eq. 11)."""
+    coarse: BoolArray
+    """(k,) whether a candidate stands for what blurred surface leaves open."""
+    beyond_gain: float = -np.inf
+    """How much better (nats) than the best candidate a pose beyond the prior's support is."""
+    low_overlap: bool = False
+    """Whether little surface matches, and scores are those of `Search.low_overlap`."""
+
+    def __len__(self) -> int:
+        """Return the number of candidates."""
+        return len(self.poses)
+
+    def distances(self, centre_m: Array) -> Array:
+        """Return distances (k, k) of ξ about a point (3,), row i in standard deviations of candidate i."""
+        return mixture.mahalanobis_distances(se3.rows(self.poses), self.spreads, centre_m)
+
+    def plus(self, others: Candidates) -> Candidates:
+        """Return both sets of candidates, in this order."""
+        return replace(
+            self,
+            poses=np.concatenate([self.poses, others.poses]),
+            scores=np.concatenate([self.scores, others.scores]),
+            spreads=np.concatenate([self.spreads, others.spreads]),
+            coarse=np.concatenate([self.coarse, others.coarse]),
+        )
+
+    def select(self, chosen: npt.NDArray[np.int64] | BoolArray) -> Candidates:
+        """Return candidates by index or mask."""
+        return replace(
+            self,
+            poses=self.poses[chosen],
+            scores=self.scores[chosen],
+            spreads=self.spreads[chosen],
+            coarse=self.coarse[chosen],
+        )
+
+    def distinct(self, centre_m: Array, reach: float) -> Candidates:
+        """Return the candidates without those within `reach` standard deviations of a better one (greedy)."""
+        kept: list[int] = []
+        left, near = np.ones(len(self), dtype=bool), self.distances(centre_m) <= reach
+        for number in range(len(self)):
+            if left[number]:
+                kept.append(number)
+                left &= ~near[number]
+        return self.select(np.array(kept, dtype=np.int64))
+
+    def modes(self, centre_m: Array) -> list[Candidates]:
+        """Return the candidates by mode, the best mode first.
+
+        Two candidates share a mode where a chain of candidates connects them, each link within 3.5 standard deviations
+        of both its ends, or of a coarse end. A ridge, such as the spin of a can, is one mode.
+        """
+        near = self.distances(centre_m) <= _MODE_DISTANCE
+        linked = (near & near.T) | (near & self.coarse[:, None] & ~self.coarse)
+        linked |= linked.T
+        label = np.arange(len(self))
+        for number in range(len(self)):  # connected components, each labelled by its best candidate
+            neighbours = np.unique(label[linked[number]])
+            label[np.isin(label, neighbours)] = neighbours[0]
+        return [self.select(label == name) for name in np.unique(label[~self.coarse])]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is searched: the likelihood of a pair within a prior."""
+
+    pair: PairLikelihood
+    density: AbstractPoseDensity
+    """The prior."""
+    gaussian: PoseGaussian
+    """Mean and covariance of the prior, of ξ about the pair's centre."""
+    basin: Array
+    """Standard deviations (6,) of a basin of attraction."""
+
+    def possible(self, poses: Array) -> BoolArray:
+        """Return whether (n,) poses (n, 4, 4) are in the prior's support."""
+        return np.isfinite(self.density.log_evidence(poses))
+
+    def best_of_basins(self, ordered: Array, per_basin: int, most: int) -> npt.NDArray[np.int64]:
+        """Return indices of the first of ordered poses (n, 4, 4): at most `per_basin` a basin and `most` in all."""
+        return mixture.suppress_neighbours(se3.rows(ordered), self.basin, self.pair.centre_m, per_basin, most)
+
+    def spreads(self, poses: Array, blur_m: float, max_independent: float, precision: Array) -> Array:
+        """Return roots (n, 6, 6) of covariances from matching surface and a precision (6, 6) (method.md, eq. 11)."""
+        _, matrices = self.pair.normal_equations(poses, blur_m, stride=2)
+        held = max_independent / self.pair.points * matrices + precision
+        return np.asarray(np.linalg.cholesky(np.linalg.inv(held)), dtype=np.float64)

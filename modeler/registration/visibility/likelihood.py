@@ -1,0 +1,370 @@
+"""The likelihood of two views, each looked up in the other, and the point-to-plane equations of matching surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from modeler import se3
+from modeler.kernels import point_likelihood, point_to_plane
+from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
+from modeler.kernels.point_to_plane import Regulariser, RidgeLikelihood
+from modeler.se3 import matrices, rows
+from modeler.types import Array, RayImage
+
+_MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
+_SILHOUETTE_NOISE = 0.5  # error of a silhouette as a share of its pixels' lateral noise: they err independently
+_DEAD_BAND = 0.25  # likewise, beside the silhouette: points lie a pixel or more inside, since the rim has no plane
+_COSINES = np.array([0.1, 0.35, 0.35, 0.6], dtype=np.float32)  # see `Projection`
+_DESCENT_STRIDE, _SCORE_STRIDE = 4, 2  # every fourth point is used for descent, every second for scores
+
+
+@dataclass(frozen=True)
+class VisibilityLikelihood:
+    """Parameters of the likelihood: surface that faces a camera is seen by it, other surface is hidden."""
+
+    points: int = 600
+    """Surface points taken from each view."""
+    surface_noise: float = 0.1
+    """Least error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
+    surface_detail: float = 0.003
+    """Least error of local planes on a curved surface, as a share of the object's size."""
+    hidden_share: float = 0.5
+    """Prior probability η that a point that faces the other camera is hidden by another part of the object.
+
+    Points behind the measured surface lose log η. With a lower value the inside of a bowl, which is hidden at any turn,
+    would say that the bowl had not turned.
+    """
+    max_point_cost: float = 10.0
+    """Upper bound K (nats) of the cost of one point."""
+    normal_cost: float = 2.0
+    """Cost κ (nats) of a match whose normals are at right angles."""
+
+    def between(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> PairLikelihood:
+        """Return the likelihood of target_from_source, at surface points drawn with `rng`."""
+        size_m = 0.5 * (source.size_m + target.size_m)
+        return PairLikelihood(
+            self._directed(source, target, size_m, rng),
+            self._directed(target, source, size_m, rng),
+            size_m=size_m,
+        )
+
+    def _directed(self, view: RayImage, image: RayImage, size_m: float, rng: np.random.Generator) -> DirectedLikelihood:
+        return DirectedLikelihood(
+            spread_points(view, self.points, rng),
+            image,
+            min_blur_m=float(np.hypot(self.surface_detail * size_m, self.surface_noise * image.sigma_r_m)),
+            hidden_share=self.hidden_share,
+            max_point_cost=self.max_point_cost,
+            normal_cost=self.normal_cost,
+            measured_share=measured_share(image),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class DirectedLikelihood:
+    """One direction: p(points of one view | image of the other, pose)."""
+
+    points: Array
+    """(n, 7) position in m, unit normal, variance along the normal in m²."""
+    image: RayImage
+    """The view in which the points are looked up."""
+    min_blur_m: float
+    """Least noise of matching surfaces."""
+    hidden_share: float
+    """See `VisibilityLikelihood`, as are the next two."""
+    max_point_cost: float
+    normal_cost: float
+    measured_share: float
+    """Share of pixels around the surface that carry a measurement."""
+
+    def classify(self, pose: Array) -> np.ndarray:
+        """Return the class (n,) of each point under one pose (12,): `point_likelihood.classify`."""
+        return point_likelihood.classify(pose, self.projection(), self.parameters(0.0))
+
+    def residual_excess(self, pose: Array, blur_m: float) -> tuple[float, int]:
+        """Return Σ (r² - s² - v) in m² over the matches under a pose (12,), and their number (method.md, eq. 8)."""
+        return point_likelihood.residual_excess(pose, self.projection(), float(np.hypot(blur_m, self.min_blur_m)))
+
+    def misfits(self, pose: Array, blur_m: float) -> Array:
+        """Return the loss (k,) in nats of each match under one pose (12,) to its distance and normals."""
+        found = self.matches(pose, float(np.hypot(blur_m, self.min_blur_m)))
+        found = found[found[:, point_to_plane.WEIGHT] > 0.0]
+        variance = found[:, point_to_plane.FACING_WEIGHT] / found[:, point_to_plane.WEIGHT]
+        agreement = np.sum(found[:, point_to_plane.OWN] * found[:, point_to_plane.OTHER], axis=1)
+        return 0.5 * found[:, point_to_plane.RESIDUAL] ** 2 / variance + self.normal_cost * (1.0 - agreement)
+
+    def matches(self, pose: Array, blur_m: float) -> Array:
+        """Return the match of each point under one pose (12,): `point_to_plane.matches`."""
+        return point_to_plane.matches(pose, self.projection(), blur_m)
+
+    def projection(self, stride: int = 1) -> Projection:
+        """Return every `stride`-th point and the other view's cells, as kernels take them."""
+        if stride not in self._projections:
+            columns = np.ascontiguousarray(self._columns[:, ::stride])
+            self._projections[stride] = Projection(columns, self._cells, self._camera, _COSINES)
+        return self._projections[stride]
+
+    def parameters(self, blur_m: float, typical_misfit: float = 0.5) -> LikelihoodParameters:
+        """Return the parameters of the kernel under a blur of the surfaces, see method.md, eq. 4 to 6."""
+        fx = self.image.frame.camera.fx
+        lateral_px = max(self.image.sigma_wh * fx, 1.0)
+        return LikelihoodParameters(
+            blur_m=np.float32(np.hypot(blur_m, self.min_blur_m)),
+            silhouette_px=np.float32(_SILHOUETTE_NOISE * lateral_px + blur_m * fx / self._distance_m),
+            dead_band_px=np.float32(_DEAD_BAND * lateral_px),
+            clearance_m=np.float32(3.0 * self.image.sigma_r_m),
+            max_point_cost=np.float32(self.max_point_cost),
+            normal_cost=np.float32(self.normal_cost),
+            unmeasured_gain=np.float32(np.log(max(self.hidden_share, 1.0 - self.measured_share))),
+            typical_misfit=np.float32(typical_misfit),
+            table=self._table,
+        )
+
+    @cached_property
+    def _projections(self) -> dict[int, Projection]:
+        """Projections made so far, by stride."""
+        return {}
+
+    @cached_property
+    def _columns(self) -> np.ndarray:
+        return np.ascontiguousarray(self.points.T, dtype=np.float32)
+
+    @cached_property
+    def _cells(self) -> np.ndarray:
+        cells = self.image.layers["cells"]
+        return cells.reshape(-1, cells.shape[-1])
+
+    @cached_property
+    def _camera(self) -> np.ndarray:
+        camera = self.image.frame.camera
+        return np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float32)
+
+    @cached_property
+    def _distance_m(self) -> float:
+        return max(float(np.median(self.points[:, 2])), 1e-3)
+
+    @cached_property
+    def _table(self) -> np.ndarray:
+        return point_likelihood.match_table(self.hidden_share)
+
+
+@dataclass(frozen=True, eq=False)
+class PairLikelihood:
+    """p(surface of source | image target, T) · p(surface of target | image source, T) (method.md, eq. 3)."""
+
+    forward: DirectedLikelihood
+    """The source's points looked up in the target."""
+    backward: DirectedLikelihood
+    """The target's points looked up in the source."""
+    size_m: float
+    """Size of the object: root mean square distance in m of the surface points from their centroid."""
+    no_overlap_cost: float = 50.0
+    """Cost (nats) of a pose under which no surface matches."""
+    overlap_scale: float = 0.1
+    """Share of matching points at which that cost has fallen to its e-th part."""
+
+    @property
+    def centre_m(self) -> Array:
+        """The source's centroid (3,), about which tangents are taken."""
+        return self.backward.image.centroid_m
+
+    @property
+    def points(self) -> int:
+        """Number of points of both views."""
+        return len(self.forward.points) + len(self.backward.points)
+
+    @property
+    def patches(self) -> float:
+        """Number of disjoint smoothing balls on the surface of a view, whose errors are independent; mean of both."""
+        return 0.5 * (self.forward.image.patches + self.backward.image.patches)
+
+    def independent_points(self, most: float) -> float:
+        """Return the number n of independent measurements in all points (method.md, eq. 7).
+
+        Errors common to distant points limit it to `most` on an object that covers much of the image, smoothing to the
+        number of patches on a small one.
+        """
+        return 1.0 / (1.0 / most + 1.0 / self.patches)
+
+    def log_likelihoods(
+        self, poses: Array, blur_m: float, *, stride: int = 1, typical_misfit: float = 0.5
+    ) -> tuple[Array, Array]:
+        """Return log-likelihoods (n,), not tempered, and the shares (n,) of points that matching surface explains.
+
+        Args:
+            poses: (n, 4, 4) target_from_source.
+            blur_m: blur of the surfaces in m.
+            stride: every `stride`-th point is used, and counts for as many.
+            typical_misfit: misfit μ of a typical match (nats).
+        """
+        projections = self.forward.projection(stride), self.backward.projection(stride)
+        parameters = (
+            self.forward.parameters(blur_m, typical_misfit),
+            self.backward.parameters(blur_m, typical_misfit),
+        )
+        found = stride * point_likelihood.log_likelihoods(rows(poses), *projections, *parameters)
+        return found[:, point_likelihood.LOG_LIKELIHOOD], found[:, point_likelihood.EXPLAINED] / self.points
+
+    def tempered(
+        self,
+        poses: Array,
+        blur_m: float,
+        *,
+        max_independent: float,
+        stride: int = _SCORE_STRIDE,
+        typical_misfit: float = 0.5,
+    ) -> Array:
+        """Return tempered log-likelihoods (n,) of poses (n, 4, 4) (method.md, eq. 7).
+
+        Args:
+            poses: target_from_source.
+            blur_m: blur of the surfaces in m.
+            max_independent: see `independent_points`.
+            stride: see `log_likelihoods`, as `typical_misfit`.
+            typical_misfit: misfit μ of a typical match (nats).
+        """
+        plain, share = self.log_likelihoods(poses, blur_m, stride=stride, typical_misfit=typical_misfit)
+        temper = self.independent_points(max_independent) / self.points
+        return temper * plain - self.no_overlap_cost * np.exp(-share / self.overlap_scale)  # method.md, eq. 7
+
+    def typical_misfit(self, pose: Array, blur_m: float) -> float:
+        """Return the misfit μ at which matches under a good pose (4, 4) count 0 on average (method.md, eq. 8).
+
+        The stated noise of points and planes is not exact; overstated, it would reward every match, and the spin of a
+        can would lean to where most of its surface is in common.
+        """
+        misfits = np.concatenate(
+            [
+                self.forward.misfits(rows(pose), blur_m),
+                self.backward.misfits(rows(se3.inverse(pose)), blur_m),
+            ]
+        )
+        if len(misfits) <= _MIN_MATCHES:
+            return 0.5
+        hidden = self.forward.hidden_share
+        low, high = 0.0, 2.0
+        for _ in range(16):  # bisection: the mean grows with μ
+            middle = 0.5 * (low + high)
+            mean = np.mean(np.log((1.0 - hidden) * np.exp(middle - misfits) + hidden))
+            low, high = (middle, high) if mean < 0.0 else (low, middle)
+        return 0.5 * (low + high)
+
+    def surface_noise_m(self, pose: Array, blur_m: float) -> float:
+        """Return the noise b of matching surfaces in m, beyond that of points and planes (method.md, eq. 8).
+
+        A nuisance parameter, at its most likely value given a pose (4, 4): what smoothing does to curved surfaces, and
+        sensor noise that neighbours share. `blur_m` is the value at which matches are selected.
+        """
+        forward, matched = self.forward.residual_excess(rows(pose), blur_m)
+        backward, matched_backward = self.backward.residual_excess(rows(se3.inverse(pose)), blur_m)
+        if matched + matched_backward <= _MIN_MATCHES:
+            return blur_m
+        return float(np.sqrt(max((forward + backward) / (matched + matched_backward), 0.0)))
+
+    def overlap(self, target_from_source: Array) -> float:
+        """Return the share of the points that both cameras should see and do."""
+        classes = np.concatenate(
+            [
+                self.forward.classify(rows(target_from_source)),
+                self.backward.classify(rows(se3.inverse(target_from_source))),
+            ]
+        )
+        contradicting = (point_likelihood.BEHIND, point_likelihood.IN_FRONT, point_likelihood.IN_EMPTY_SPACE)
+        wrong = np.isin(classes, contradicting).sum()
+        matched = (classes == point_likelihood.MATCHED).sum()
+        return float(matched / max(matched + wrong, 1))
+
+    def normal_equations(self, poses: Array, blur_m: float, *, stride: int = 1) -> tuple[Array, Array]:
+        """Return gradients (n, 6) and matrices (n, 6, 6) of the matches for ξ of poses (n, 4, 4) about the centre."""
+        projections = self.forward.projection(stride), self.backward.projection(stride)
+        gradients, equations = point_to_plane.normal_equations(rows(poses), *projections, self.centre_m, blur_m)
+        return stride * gradients, stride * equations
+
+    def normal_equation(self, pose: Array, blur_m: float) -> tuple[Array, Array]:
+        """Return gradient (6,) and matrix (6, 6) of one pose (4, 4), see `normal_equations`."""
+        projections = self.forward.projection(), self.backward.projection()
+        return point_to_plane.normal_equation(rows(pose), *projections, self.centre_m, blur_m)
+
+    def descend(self, poses: Array, blur_m: float, regulariser: Regulariser, *, steps: int) -> Array:
+        """Return poses (n, 4, 4) after Gauss-Newton steps on matching surface (method.md, eq. 10)."""
+        projections = self.forward.projection(_DESCENT_STRIDE), self.backward.projection(_DESCENT_STRIDE)
+        regulariser = _per_point(regulariser, _DESCENT_STRIDE)
+        return matrices(point_to_plane.descend(rows(poses), *projections, self.centre_m, blur_m, regulariser, steps))
+
+    def trace_ridges(
+        self,
+        poses: Array,
+        spreads: Array,
+        axes: Array,
+        *,
+        blur_m: float,
+        regulariser: Regulariser,
+        max_independent: float,
+        floor: float,
+        step: float,
+        max_steps: int,
+    ) -> Array:
+        """Return the poses (n, 4, 4) on the way from starts along their axes, while `tempered` is above a floor.
+
+        Args:
+            poses: (k, 4, 4) target_from_source.
+            spreads: (k, 6, 6) lower triangular roots of the covariances of ξ about the centre.
+            axes: (k, 6) unit vectors in units of those spreads.
+            blur_m: blur of the surfaces in m.
+            regulariser: of the descent across the axis.
+            max_independent: as for `tempered`.
+            floor: lowest tempered log-likelihood (nats).
+            step: length of a step in standard deviations.
+            max_steps: largest number of steps from each start.
+        """
+        likelihood = RidgeLikelihood(
+            forward=self.forward.projection(_DESCENT_STRIDE),
+            backward=self.backward.projection(_DESCENT_STRIDE),
+            scoring_forward=self.forward.projection(_SCORE_STRIDE),
+            scoring_backward=self.backward.projection(_SCORE_STRIDE),
+            forward_parameters=self.forward.parameters(blur_m),
+            backward_parameters=self.backward.parameters(blur_m),
+            temper=_SCORE_STRIDE * self.independent_points(max_independent) / self.points,
+            no_overlap_cost=self.no_overlap_cost,
+            per_explained=_SCORE_STRIDE / (self.points * self.overlap_scale),
+            floor=float(floor),
+        )
+        regulariser = _per_point(regulariser, _DESCENT_STRIDE)
+        visited, counts = point_to_plane.trace_ridges(
+            rows(poses), spreads, axes, step, likelihood, self.centre_m, blur_m, regulariser, max_steps
+        )
+        return matrices(visited[np.arange(max_steps) < counts[:, None]])
+
+
+def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:
+    """Return the regulariser for equations of every `stride`-th point, which are left at their own scale."""
+    return regulariser._replace(precision=regulariser.precision / stride, damping=regulariser.damping / stride)
+
+
+def measured_share(view: RayImage) -> float:
+    """Return the share of pixels around the surface points that carry a measurement: low for very sparse images."""
+    rows_, columns = view.pixels[:: max(len(view.pixels) // 500, 1)].T
+    height, width = view.frame.depth_m.shape
+    steps = np.arange(-2, 3)
+    near_rows = np.clip(rows_[:, None, None] + steps[:, None], 0, height - 1)
+    near_columns = np.clip(columns[:, None, None] + steps, 0, width - 1)
+    return float(np.mean(view.frame.depth_m[near_rows, near_columns] > 0))
+
+
+def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> Array:
+    """Return `count` surface points, or all if fewer, evenly spread over the image.
+
+    Returns:
+        (n, 7): position in m, unit normal, variance along the normal in m².
+    """
+    total = len(view.points_m)
+    stride = max(total / count, 1.0)
+    picks = np.arange(min(count, total)) * stride + rng.random() * stride
+    chosen = np.minimum(picks.astype(np.int64), total - 1)
+    variance = np.asarray(view.layers["variance_m2"], dtype=np.float64)[chosen, None]
+    points = np.hstack([view.points_m[chosen], view.normals[chosen], variance])
+    # In random order, so that every stride through them is again spread over the object.
+    return points[rng.permutation(len(points))]

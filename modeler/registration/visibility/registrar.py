@@ -1,0 +1,247 @@
+"""The default registration method: search, sample and refine the posterior of the visibility likelihood."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
+from modeler.registration.visibility.candidates import Candidates
+from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
+from modeler.registration.visibility.refinement import Refiner
+from modeler.registration.visibility.sampling import (
+    AdaptiveSampler,
+    GaussianMixture,
+    MixtureProposal,
+    WeightedSamples,
+    weigh_modes,
+)
+from modeler.registration.visibility.search import Search
+from modeler.types import (
+    AbstractPoseDensity,
+    AbstractRegistrar,
+    Mode,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    as_one,
+    separate,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ModeSamples:
+    """Samples of one mode, and the nuisance parameters (method.md, eq. 8) under which they were weighted."""
+
+    samples: WeightedSamples
+    noise_m: float
+    """Noise b of matching surfaces."""
+    typical_misfit: float
+    """Misfit μ of a typical match (nats)."""
+    gain: float
+    """How much better (nats) the best sample is than the best candidate."""
+    max_compared: float
+    """Independent measurements in all points, for the comparison with other modes."""
+
+    def log_evidence(self, pair: PairLikelihood, reference: ModeSamples) -> float:
+        """Return the log evidence of the mode under the nuisance parameters of another (method.md, eq. 13).
+
+        Under its own noise a mode that matches badly is forgiven.
+        """
+        best = int(np.argmax(self.samples.log_likelihoods))
+        compared = pair.tempered(
+            self.samples.poses[best : best + 1],
+            reference.noise_m,
+            max_independent=self.max_compared,
+            typical_misfit=reference.typical_misfit,
+        )
+        return self.samples.log_evidence + float(compared[0] - self.samples.log_likelihoods[best])
+
+
+@dataclass(frozen=True)
+class ModeSampler:
+    """Draws samples of one mode, starting from its candidates."""
+
+    max_independent: float = 70.0
+    """Independent measurements in the points of both views, see `PairLikelihood.independent_points`."""
+    max_compared: float = 40.0
+    """Likewise between modes: sides that are alike differ by what all points of a side err by, which averages out in
+    none."""
+    widening: float = 1.3
+    """Standard deviations of the first proposal relative to those of the candidates."""
+    coarse_share: float = 0.4
+    """Share of the first proposal at coarse candidates."""
+    restart_gain: float = 3.0
+    """Where samples are this much better (nats) than the best candidate, the search continues from them,"""
+    restarts: int = 20
+    """from this many of the best,"""
+    max_rounds: int = 3
+    """and the mode is sampled at most this many times."""
+    adaptive: AdaptiveSampler = field(default_factory=AdaptiveSampler)
+
+    def run(
+        self,
+        pair: PairLikelihood,
+        density: AbstractPoseDensity,
+        search: Search,
+        found: Candidates,
+        rng: np.random.Generator,
+    ) -> ModeSamples:
+        """Return samples of the mode of some candidates.
+
+        Matching surface alone does not lead to the maximum where free space matters, as at the ends of a tube. Where
+        samples are far better than the candidates, the search continues from the best of them.
+        """
+        mode = self._sampled(pair, density, search, found, rng)
+        for _ in range(self.max_rounds - 1):
+            if mode.gain < self.restart_gain:
+                break
+            order = np.argsort(-mode.samples.log_likelihoods, kind="stable")
+            found = search.extend(pair, density, found, mode.samples.poses[order[: self.restarts]], rng)
+            mode = self._sampled(pair, density, search, found, rng)
+        return mode
+
+    def _sampled(
+        self,
+        pair: PairLikelihood,
+        density: AbstractPoseDensity,
+        search: Search,
+        found: Candidates,
+        rng: np.random.Generator,
+    ) -> ModeSamples:
+        noise_m = pair.surface_noise_m(found.poses[0], search.fine_m(pair))
+        typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
+        within, compared = self.max_independent, self.max_compared
+        if found.low_overlap:
+            within = compared = search.low_overlap.max_independent
+        likelihood = partial(pair.tempered, blur_m=noise_m, max_independent=within, typical_misfit=typical_misfit)
+        scores = likelihood(found.poses)
+        volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
+        log_weights = np.where(found.coarse, found.scores, scores + volumes)
+        for kind, share in ((found.coarse, self.coarse_share), (~found.coarse, 1.0 - self.coarse_share)):
+            if kind.any():
+                log_weights[kind] += np.log(share) - np.logaddexp.reduce(log_weights[kind])
+        gaussians = GaussianMixture(found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
+        samples = self.adaptive.run(MixtureProposal(density, gaussians), likelihood, pair.centre_m, rng)
+        gain = float(samples.log_likelihoods.max() - scores[0])
+        return ModeSamples(samples, noise_m, typical_misfit, gain, compared)
+
+
+@dataclass(frozen=True)
+class VisibilityRegistrar(AbstractRegistrar):
+    """The paper's likelihood with normals: surface that faces a camera is seen by it, other surface is hidden.
+
+    p(surface of B | image A, T) · p(surface of A | image B, T), each a product over points, tempered because
+    neighbouring points err alike. A search finds the modes, each is sampled and weighted, and what matching surface
+    determines well is refined by its own equations. `docs/method.md` has the equations.
+    """
+
+    likelihood: VisibilityLikelihood = field(default_factory=VisibilityLikelihood)
+    search: Search = field(default_factory=Search)
+    sampler: ModeSampler = field(default_factory=ModeSampler)
+    refiner: Refiner = field(default_factory=Refiner)
+    max_modes: int = 4
+    """Largest number of modes that are sampled."""
+    thorough: float = 4.0
+    """Effort of the second search, relative to the first, where the first ends without a usable posterior."""
+    min_points: int = 60
+    """Views with fewer surface points are not registered."""
+    min_overlap: float = 0.35
+    """Least share of the surface that both views should see and do."""
+    max_at_limit: float = 0.2
+    """Largest share of the samples at the limit of the prior."""
+    max_beyond_gain: float = 5.0
+    """Largest gain (nats) of a pose beyond the prior's support."""
+    min_effective: float = 100.0
+    """Least effective sample size."""
+    max_sigma_deg: float = 10.0
+    """Largest standard deviation of a rotation that is not ambiguous."""
+
+    def register(
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+    ) -> Posterior:
+        """Return the posterior of target_from_source; failure is its outcome."""
+        started = time.perf_counter()
+        if min(len(source.points_m), len(target.points_m)) < self.min_points:
+            return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
+        pair = self.likelihood.between(source, target, rng)
+        for search in (self.search, self.search.scaled(self.thorough)):  # a mode may be missed: then search harder
+            posterior = self._posterior(pair, density, search, rng, started)
+            if posterior.usable:
+                break
+        return posterior
+
+    def _posterior(
+        self,
+        pair: PairLikelihood,
+        density: AbstractPoseDensity,
+        search: Search,
+        rng: np.random.Generator,
+        started: float,
+    ) -> Posterior:
+        """Return the posterior that one search leads to."""
+        centre_m, fine_m = pair.centre_m, search.fine_m(pair)
+        found = search.run(pair, density, rng)
+        sampled = [
+            self.sampler.run(pair, density, search, mode, rng) for mode in found.modes(centre_m)[: self.max_modes]
+        ]
+        reference = min(sampled, key=lambda mode: mode.noise_m)
+        refined = [
+            replace(
+                self._refined(pair, density, mode.samples, fine_m, rng),
+                log_evidence=mode.log_evidence(pair, reference),
+            )
+            for mode in sampled
+        ]
+        weighed = weigh_modes(refined)
+        samples = np.concatenate([mode.poses for _, mode in weighed])
+        weights = np.concatenate([share * mode.weights for share, mode in weighed])
+        modes = tuple(Mode(share, weighted_gaussian(mode.poses, mode.weights, centre_m)) for share, mode in weighed)
+        collapse = len(modes) == 1 or separate(modes)
+        pose = as_one(modes) if collapse else weighted_gaussian(samples, weights, centre_m)
+        overlap = pair.overlap(modes[0].pose.mean)
+        effective = 1.0 / sum(share**2 / mode.effective_samples for share, mode in weighed)
+        beyond = found.beyond_gain > self.max_beyond_gain
+        at_limit = 1.0 if beyond else share_at_limit(density, weighed[0][1].poses, weighed[0][1].weights, centre_m, rng)
+        return Posterior(
+            source=pair.backward.image.index,
+            target=pair.forward.image.index,
+            pose=pose,
+            outcome=self._outcome(effective, pose, overlap, at_limit=at_limit),
+            overlap=overlap,
+            least_overlap=self.min_overlap,
+            samples=samples,
+            weights=weights,
+            modes=modes if len(modes) > 1 else (),
+            effective_samples=effective,
+            pareto_k=max(mode.pareto_k for _, mode in weighed),
+            log_evidence=float(np.logaddexp.reduce([mode.log_evidence for _, mode in weighed])),
+            seconds=time.perf_counter() - started,
+        )
+
+    def _refined(
+        self,
+        pair: PairLikelihood,
+        density: AbstractPoseDensity,
+        samples: WeightedSamples,
+        fine_m: float,
+        rng: np.random.Generator,
+    ) -> WeightedSamples:
+        """Return refined samples of a mode; those that would leave the prior's support stay."""
+        refined = self.refiner.refine(pair, samples.poses, samples.weights, rng, fine_m=fine_m)
+        inside = np.isfinite(density.log_evidence(refined))
+        return replace(samples, poses=np.where(inside[:, None, None], refined, samples.poses))
+
+    def _outcome(self, effective_samples: float, pose: PoseGaussian, overlap: float, *, at_limit: float) -> Outcome:
+        if at_limit > self.max_at_limit:
+            return Outcome.AT_LIMIT
+        if overlap < self.min_overlap:
+            return Outcome.NO_OVERLAP
+        if effective_samples < self.min_effective:
+            return Outcome.DEGENERATE
+        sigma_rad = np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])
+        return Outcome.AMBIGUOUS if sigma_rad > np.deg2rad(self.max_sigma_deg) else Outcome.CONVERGED

@@ -1,0 +1,305 @@
+"""Adaptive importance sampling on SE(3): Gaussian mixtures as proposals, and the weights of separate modes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.kernels import mixture
+from modeler.registration.posterior import FLOOR, effective_samples, normalised, pareto_tail
+from modeler.se3 import rows
+from modeler.types import AbstractPoseDensity, Array
+
+LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
+_PARAMETERS = 28.0  # of one more Gaussian: mean 6, covariance 21, weight 1
+_MIN_MODE_SHARE = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMixture:
+    """Weighted Gaussians of ξ, each about a pose of its own."""
+
+    means: Array
+    """(k, 4, 4) target_from_source."""
+    spreads: Array
+    """(k, 6, 6) lower triangular roots of the covariances of ξ about the centre."""
+    log_weights: Array
+    """(k,) of any sum of exponentials."""
+    centre_m: Array
+    """(3,) point of the source."""
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw poses (count, 4, 4), each Gaussian by its share of the weight."""
+        chosen = rng.choice(len(self.means), count, p=np.exp(self.log_weights - self.log_weight))
+        xi = np.einsum("nij,nj->ni", self.spreads[chosen], rng.normal(size=(count, 6)))
+        return se3.moved(self.means[chosen], xi, self.centre_m)
+
+    def log_density(self, target_from_source: Array) -> Array:
+        """Return the log (n,) of the weighted sum of densities at poses (n, 4, 4)."""
+        return mixture.log_densities(
+            rows(target_from_source), rows(self.means), *self._shapes, self.log_weights, self.centre_m
+        )
+
+    def times(self, factor: float) -> GaussianMixture:
+        """Return the mixture with its weight multiplied."""
+        return replace(self, log_weights=self.log_weights + np.log(factor))
+
+    def plus(self, other: GaussianMixture) -> GaussianMixture:
+        """Return the Gaussians of both mixtures, which share a centre."""
+        return GaussianMixture(
+            np.concatenate([self.means, other.means]),
+            np.concatenate([self.spreads, other.spreads]),
+            np.concatenate([self.log_weights, other.log_weights]),
+            self.centre_m,
+        )
+
+    @cached_property
+    def log_weight(self) -> float:
+        """Log of the sum of the weights."""
+        return float(np.logaddexp.reduce(self.log_weights))
+
+    @cached_property
+    def _shapes(self) -> tuple[Array, Array]:
+        """Upper triangular roots (k, 6, 6) of the precisions; largest variances (k, 2) of rotation and translation.
+
+        With C = U Uᵀ and U upper triangular, a root is U⁻¹.
+        """
+        covariances = self.spreads @ self.spreads.transpose(0, 2, 1)
+        upper = np.linalg.cholesky(covariances[:, ::-1, ::-1])[:, ::-1, ::-1]
+        blocks = np.stack([covariances[:, :3, :3], covariances[:, 3:, 3:]], axis=1)
+        roots = np.ascontiguousarray(np.triu(np.linalg.inv(upper)), dtype=np.float64)
+        return roots, np.ascontiguousarray(np.linalg.eigvalsh(blocks)[:, :, -1], dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureProposal(AbstractPoseDensity):
+    """Proposes from a Gaussian mixture; the evidence is that of another density."""
+
+    known: AbstractPoseDensity
+    """The prior."""
+    gaussians: GaussianMixture
+    """The proposal."""
+    evidence: bool = False
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw poses (count, 4, 4)."""
+        return self.gaussians.sample(count, rng)
+
+    def log_density(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of the proposal at poses (n, 4, 4)."""
+        return self.gaussians.log_density(target_from_source) - self.gaussians.log_weight
+
+    def log_evidence(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of the prior at poses (n, 4, 4)."""
+        return self.known.log_evidence(target_from_source)
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedSamples:
+    """Weighted samples of one mode."""
+
+    poses: Array
+    """(n, 4, 4), all different."""
+    weights: Array
+    """(n,), their sum 1."""
+    log_likelihoods: Array
+    """(n,)."""
+    log_evidence: float
+    """Log of the mean likelihood under the prior."""
+    pareto_k: float
+    """Tail index of the weights of everything that was drawn."""
+
+    @property
+    def effective_samples(self) -> float:
+        """Kish's effective size."""
+        return 1.0 / float(np.sum(self.weights**2))
+
+
+def weigh_modes(modes: Sequence[WeightedSamples]) -> list[tuple[float, WeightedSamples]]:
+    """Return the modes with their shares of the mass, heaviest first, without those of negligible mass."""
+    log_mass = np.array([mode.log_evidence for mode in modes])
+    mass = np.exp(log_mass - log_mass.max())
+    mass /= mass.sum()
+    kept = [number for number in np.argsort(-mass, kind="stable") if mass[number] >= _MIN_MODE_SHARE]
+    return [(float(mass[number] / mass[kept].sum()), modes[number]) for number in kept]
+
+
+@dataclass(frozen=True, eq=False)
+class _Draws:
+    """All samples so far and their importance weights."""
+
+    poses: Array
+    """(n, 4, 4)."""
+    log_likelihoods: Array
+    """(n,); -inf where the prior excludes a pose."""
+    log_target: Array
+    """(n,) log of the product of prior and likelihood."""
+    log_density: Array
+    """(n,) log of the expected number of samples at each, per unit of the uniform measure: Σ N_t q_t."""
+
+    @property
+    def log_weights(self) -> Array:
+        """Logs (n,) of weights whose mean is the evidence (method.md, eq. 12)."""
+        return self.log_target - self.log_density + np.log(len(self.poses))
+
+    def reweighted(self, new: GaussianMixture) -> _Draws:
+        """Return the same samples for a mixture of proposals that also has `new`, weighted by its sample count."""
+        return replace(self, log_density=np.logaddexp(self.log_density, new.log_density(self.poses)))
+
+    def plus(self, other: _Draws) -> _Draws:
+        """Return both sets of samples."""
+        return _Draws(
+            np.concatenate([self.poses, other.poses]),
+            np.concatenate([self.log_likelihoods, other.log_likelihoods]),
+            np.concatenate([self.log_target, other.log_target]),
+            np.concatenate([self.log_density, other.log_density]),
+        )
+
+
+@dataclass(frozen=True)
+class AdaptiveSampler:
+    """Adaptive multiple importance sampling (Cornuet, Marin, Mira and Robert 2012; method.md, eq. 12).
+
+    Each round draws from Gaussians with the moments of the weighted samples so far. All samples are weighted against
+    the mixture of all proposals, so that a bad one costs samples, not correctness. While the weights are too uneven to
+    determine a covariance, they are tempered for the next proposal.
+    """
+
+    initial: int = 400
+    """Samples of the first round; regions that it misses altogether, later rounds may miss too."""
+    draws: int = 200
+    """Least number of samples of a later round."""
+    enough: float = 580.0
+    """Effective sample size at which the rounds end."""
+    max_draws: int = 8000
+    """No further round begins after this many samples."""
+    min_fitted: float = 80.0
+    """Least effective size of the samples to which a Gaussian is fitted."""
+    widening: float = 1.1
+    """Standard deviations of a proposal relative to those of the samples that it is fitted to."""
+    efficiency: float = 0.75
+    """Expected effective size per sample of an untempered round, from which its sample count follows."""
+    kept: int = 750
+    """Largest number of samples in the result."""
+
+    def run(
+        self, proposal: AbstractPoseDensity, log_likelihood: LogLikelihood, centre_m: Array, rng: np.random.Generator
+    ) -> WeightedSamples:
+        """Return samples of prior × likelihood.
+
+        Args:
+            proposal: first proposal, normalised; its evidence is the prior.
+            log_likelihood: of poses (n, 4, 4), (n,); called only inside the prior's support.
+            centre_m: (3,) point of the source about which Gaussians are fitted.
+            rng: source of all randomness.
+        """
+        first = proposal.sample(self.initial, rng)
+        log_count = float(np.log(self.initial))
+
+        def weighed(poses: Array, log_density: Array) -> _Draws:
+            log_prior = proposal.log_evidence(poses)
+            possible = np.isfinite(log_prior)
+            log_likelihoods = np.full(len(poses), -np.inf)
+            if possible.any():
+                log_likelihoods[possible] = log_likelihood(poses[possible])
+            return _Draws(poses, log_likelihoods, log_prior + log_likelihoods, log_density)
+
+        drawn, fitted = weighed(first, log_count + proposal.log_density(first)), None
+        log_weights = drawn.log_weights
+        while (effective := effective_samples(log_weights)) < self.enough and len(drawn.poses) < self.max_draws:
+            even = effective >= self.min_fitted
+            power = 1.0 if even else _power(log_weights, self.min_fitted)
+            count = max(int((self.enough - effective) / self.efficiency) + 1, self.draws) if even else self.draws
+            new = self._fitted(drawn.poses, normalised(power * log_weights), centre_m).times(count)
+            fitted = new if fitted is None else fitted.plus(new)
+            poses = new.sample(count, rng)
+            log_density = np.logaddexp(log_count + proposal.log_density(poses), fitted.log_density(poses))
+            drawn = drawn.reweighted(new).plus(weighed(poses, log_density))
+            log_weights = drawn.log_weights
+        chosen, weights = thinned(normalised(log_weights), self.kept, rng)
+        return WeightedSamples(
+            drawn.poses[chosen],
+            weights,
+            drawn.log_likelihoods[chosen],
+            _log_mean_exp(log_weights),
+            pareto_tail(log_weights),
+        )
+
+    def _fitted(self, poses: Array, weights: Array, centre_m: Array) -> GaussianMixture:
+        """Return a Gaussian of weighted poses (n, 4, 4), or several where one does not fit."""
+        mean, _ = se3.mean(poses, weights, about_m=centre_m, iterations=3)
+        shares, means, covariances = zip(*self._parts(se3.difference(mean, poses, centre_m), weights), strict=True)
+        spreads = self.widening * np.linalg.cholesky(np.stack(covariances))
+        return GaussianMixture(se3.moved(mean, np.stack(means), centre_m), spreads, np.log(shares), centre_m)
+
+    def _parts(self, xi: Array, weights: Array) -> list[tuple[float, Array, Array]]:
+        """Return share, mean (6,) and covariance (6, 6) of the Gaussians fitted to weighted ξ (n, 6).
+
+        Samples are split across the principal axis of least kurtosis, where they are uniform or bimodal, if two
+        Gaussians raise their likelihood by more than the additional parameters cost (Akaike 1974).
+        """
+        share, mean, covariance = _moments(xi, weights)
+        whole = [(share, mean, covariance)]
+        effective = share**2 / np.sum(weights**2)
+        if effective < 0.99 * self.min_fitted:
+            return whole
+        scales, axes = np.linalg.eigh(covariance)
+        side = mixture.split_by_kurtosis(xi, weights, mean, axes / np.sqrt(scales))
+        halves = [(xi[chosen], weights[chosen]) for chosen in (side, ~side)]
+        gain = 0.5 * np.linalg.slogdet(covariance)[1]
+        for half in halves:
+            part, _, narrower = _moments(*half)
+            gain += part / share * (np.log(part / share) - 0.5 * np.linalg.slogdet(narrower)[1])
+        return [part for half in halves for part in self._parts(*half)] if gain > _PARAMETERS / effective else whole
+
+
+def _moments(xi: Array, weights: Array) -> tuple[float, Array, Array]:
+    """Return the sum of weights (n,), and mean (6,) and covariance (6, 6) of ξ (n, 6)."""
+    total, mean, covariance = mixture.moments(xi, weights)
+    return total, mean, covariance + FLOOR
+
+
+def thinned(weights: Array, count: int, rng: np.random.Generator) -> tuple[npt.NDArray[np.int64], Array]:
+    """Return indices (k,) of at most `count` samples, and weights (k,) under which they represent all.
+
+    Heavy samples stay as they are. Light ones are resampled systematically to equal weights, such that every sample
+    keeps its weight on average (Fearnhead and Clifford 2003).
+
+    Args:
+        weights: (n,), their sum 1.
+        count: largest number of samples kept.
+        rng: source of all randomness.
+    """
+    possible = np.flatnonzero(weights)
+    if len(possible) <= count:
+        return possible, weights[possible]
+    descending = np.sort(weights)[::-1]
+    remaining = np.cumsum(descending[::-1])[::-1]
+    free = count - np.arange(count)  # slots left after that many of the heaviest
+    heavy = int(np.argmax(descending[:count] * free <= remaining[:count]))
+    level = remaining[heavy] / free[heavy]
+    light = np.flatnonzero(weights < level)
+    ticks = np.floor(np.cumsum(weights[light]) / level + rng.random())
+    chosen = np.concatenate([np.flatnonzero(weights >= level), light[np.diff(ticks, prepend=0.0) > 0.0]])
+    kept = np.maximum(weights[chosen], level)
+    return chosen, kept / kept.sum()
+
+
+def _log_mean_exp(values: Array) -> float:
+    """Return the log of the mean of exponentials (n,)."""
+    return float(np.logaddexp.reduce(values)) - float(np.log(len(values)))
+
+
+def _power(log_weights: Array, least: float) -> float:
+    """Return the largest power of the weights that leaves an effective size of at least `least`."""
+    possible = log_weights[np.isfinite(log_weights)]
+    low, high = 0.0, 1.0
+    for _ in range(16):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if effective_samples(middle * possible) > least else (low, middle)
+    return max(low, 1e-4)
