@@ -234,7 +234,6 @@ def posterior(rng: np.random.Generator) -> Posterior:
         samples=rng.normal(size=(5, 4, 4)),
         weights=rng.random(5),
         modes=(Mode(0.75, gaussian), Mode(0.25, gaussian.inverse())),
-        information=rng.normal(size=(6, 6)),
         effective_samples=float("nan"),
         pareto_k=float("inf"),
         log_evidence=-float("inf"),
@@ -246,12 +245,12 @@ def posterior(rng: np.random.Generator) -> Posterior:
 def test_what_is_kept_comes_back_to_the_bit(tmp_path: Path, rng: np.random.Generator, bare: bool) -> None:
     pairs, kept = Pairs(tmp_path / "pairs"), posterior(rng)
     if bare:
-        kept = replace(kept, modes=(), information=None, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
+        kept = replace(kept, modes=(), samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
     pairs.keep(kept, "question")
     back = pairs.get(7, 3, "question")
     assert back is not None
     assert (back.source, back.target, back.outcome, len(back.modes)) == (7, 3, kept.outcome, len(kept.modes))
-    for name in ("overlap", "samples", "weights", "information", *("effective_samples", "pareto_k", "log_evidence")):
+    for name in ("overlap", "samples", "weights", *("effective_samples", "pareto_k", "log_evidence")):
         np.testing.assert_equal(getattr(back, name), getattr(kept, name))
     gaussians = [
         (back.pose, kept.pose),

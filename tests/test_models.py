@@ -185,7 +185,6 @@ def test_another_sequence_is_not_taken_for_that_of_the_run(
         ("seconds",),
         ("frames",),
         ("frames", 0, "points"),
-        ("edges", 0, "information"),
         ("edges", 0, "covariance"),
         ("edges", 1, "outcome"),
         ("poses", 0, "object_from_camera"),

@@ -129,7 +129,7 @@ class Remembered(AbstractRegistrar):
 
 def _arrays(posterior: Posterior) -> dict[str, np.ndarray]:
     """Return a posterior as arrays."""
-    arrays = {
+    return {
         "mean": posterior.pose.mean,
         "covariance": posterior.pose.covariance,
         "outcome": np.array(posterior.outcome.label),
@@ -140,7 +140,6 @@ def _arrays(posterior: Posterior) -> dict[str, np.ndarray]:
         "mode_means": np.array([mode.pose.mean for mode in posterior.modes]),
         "mode_covariances": np.array([mode.pose.covariance for mode in posterior.modes]),
     }
-    return arrays if posterior.information is None else arrays | {"information": posterior.information}
 
 
 def _posterior(source: int, target: int, arrays: dict[str, np.ndarray]) -> Posterior:
@@ -154,6 +153,5 @@ def _posterior(source: int, target: int, arrays: dict[str, np.ndarray]) -> Poste
         samples=arrays["samples"],
         weights=arrays["weights"],
         modes=tuple(Mode(float(weight), PoseGaussian(mean, covariance)) for weight, mean, covariance in modes),
-        information=arrays.get("information"),
         **dict(zip(_NUMBERS, arrays["numbers"].tolist(), strict=True)),
     )

@@ -78,7 +78,6 @@ def _kind(edge: Mapping[str, Any]) -> EdgeKind:
 
 
 def _posterior(edge: Mapping[str, Any]) -> Posterior:
-    information = edge["information"]
     return Posterior(
         source=edge["source"],
         target=edge["target"],
@@ -86,7 +85,6 @@ def _posterior(edge: Mapping[str, Any]) -> Posterior:
         modes=tuple(Mode(_number(mode["weight"]), _gaussian(mode)) for mode in edge.get("modes") or ()),
         outcome=Outcome(edge["outcome"]),
         overlap=_number(edge["overlap"]),
-        information=None if information is None else _matrix(information, 6),
         effective_samples=_number(edge["effective_samples"]),
         pareto_k=_number(edge["pareto_k"]),
         log_evidence=_number(edge["log_evidence"]),
@@ -219,7 +217,6 @@ _EDGE: dict[str, Test] = {
     "outcome": lambda value: value in [outcome.label for outcome in Outcome],
     "target_from_source": _numbers(16),
     "covariance": _numbers(36),
-    "information": _null_or(_numbers(36)),
     "modes": _null_or(_are_modes),
     "overlap": _is_number_or_null,
     "effective_samples": _is_number_or_null,

@@ -66,8 +66,6 @@ class Posterior:
     """(n,) weights of the samples, summing to 1."""
     modes: tuple[Mode, ...] = ()
     """The separate modes, heaviest first, whose weights sum to 1; empty where there is but one, or none are told."""
-    information: Array | None = None
-    """(6, 6) information about ξ from the images alone, without the prior; None where not known."""
     effective_samples: float = float("nan")
     """Effective sample size."""
     pareto_k: float = float("nan")

@@ -199,7 +199,6 @@ def _report(folder: Path) -> Path:
             "kind": "odometry",
             "accepted": True,
             "outcome": "converged",
-            "information": None,
         }
         | gaussian
         | numbers
