@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -80,7 +79,7 @@ def test_the_report_draws_the_model_and_turns_it(run: Path, page: chromium.Page)
     assert all(address.startswith(("file:", "data:")) for address in page.requested)
 
 
-@pytest.mark.skipif("MODELER_SLOW" not in os.environ, reason="half a minute; set MODELER_SLOW=1 to run it")
+@pytest.mark.slow
 def test_the_web_viewer_draws_the_run(run: Path, page: chromium.Page) -> None:
     served = viewer.view(run, web=True)
     try:

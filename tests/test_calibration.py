@@ -12,6 +12,7 @@ from calibration.specimens import SPECIMENS, Specimen, load_specimen, recipe_nam
 from calibration.study import CONTROL, MEASURES, OURS, OUTSIDE, Condition, Study, Trial, judged, staged
 from calibration.tables import rows, text
 from scipy.spatial import KDTree
+from slow import sampled
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, sample_surface, true_motion
@@ -60,7 +61,7 @@ def test_the_design_is_as_wide_as_promised() -> None:
         assert len(set(values)) >= 3
 
 
-@pytest.mark.parametrize("specimen", SPECIMENS, ids=lambda specimen: specimen.recipe)
+@pytest.mark.parametrize("specimen", sampled(SPECIMENS, every=12), ids=lambda specimen: specimen.recipe)
 def test_shapes_have_the_symmetry_of_their_class(specimen: Specimen) -> None:
     mesh, rng = load_specimen(specimen.recipe).object.mesh(), np.random.default_rng(0)
     surface_m = sample_surface(mesh.vertices_m, mesh.triangles, 62_000, rng)
@@ -88,7 +89,7 @@ def test_shapes_have_the_symmetry_of_their_class(specimen: Specimen) -> None:
             assert min(*shares.values(), *(moved(axis, 180.0) for axis in (0, 1))) > 0.25
 
 
-@pytest.mark.parametrize("name", [specimen.recipe for specimen in SPECIMENS])
+@pytest.mark.parametrize("name", sampled([specimen.recipe for specimen in SPECIMENS], every=12, fast=6))
 def test_staging_changes_what_the_condition_says(name: str) -> None:
     recipe = load_specimen(name)
     usual, other = (

@@ -1,9 +1,11 @@
 """Whole runs of shapes that look alike from several sides are as sure of their poses as they may be."""
 
 import numpy as np
+import pytest
 from loops import covariances
 
 
+@pytest.mark.slow
 def test_poses_of_a_run_are_no_surer_than_they_may_be() -> None:
     """A body with four sides alike, of which two steps match as well a quarter turn on, beyond the prior's limits.
 

@@ -4,6 +4,7 @@ import numba
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from slow import sampled
 from test_kernels import ANISOTROPIC, INTRINSICS, ISOTROPIC, SHAPE, random_pose
 
 from modeler import se3
@@ -39,7 +40,7 @@ def scene(rng, noise, gaps=0.0):
 
 @pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES.keys())
 @pytest.mark.parametrize("options", [(4.0, 1e-6), (2.0, 1e-2), (6.0, 1e-12)])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", sampled(range(4), every=4))
 def test_what_is_forbidden_has_no_likelihood(noise, options, seed):
     rng = np.random.default_rng(seed)
     source, target = (scene(rng, noise, (0.0, 1e-3, 0.02)[seed % 3]) for _ in range(2))
@@ -100,6 +101,7 @@ def test_nearest_ranges_are_least_within_the_ellipse(rng):
         assert near_m[int(v + down + 0.5), int(u + across + 0.5)] <= least
 
 
+@pytest.mark.slow
 def test_motions_drawn_by_number_are_those_of_the_prior():
     count = 200_000
     draws = Draws.of(MOTION.even_spread(), np.random.default_rng(3))

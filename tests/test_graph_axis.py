@@ -155,6 +155,7 @@ def test_axis_settles_what_each_pair_leaves_open() -> None:
         assert np.linalg.slogdet(solution.covariances[frame])[1] < np.linalg.slogdet(plain.covariances[frame])[1]
 
 
+@pytest.mark.slow
 def test_table_on_which_things_are_pushed_about_still_has_one_normal() -> None:
     """Steps shift by centimetres, so that they share no axis's place; its direction settles the roll all the same."""
     pushed, seeds = CommonAxis(sigma_tilt_rad=TABLE.sigma_tilt_rad, sigma_shift_m=0.03), 20

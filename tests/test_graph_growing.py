@@ -53,7 +53,9 @@ def _assert_same(one: Solution, other: Solution) -> None:
         np.testing.assert_allclose(weights, other.mode_weights[pair], atol=1e-3)
 
 
-@pytest.mark.parametrize(("false", "modes"), [(0.0, False), (0.2, False), (0.0, True), (0.2, True)])
+@pytest.mark.parametrize(
+    ("false", "modes"), [(0.0, False), (0.2, False), (0.0, True), pytest.param(0.2, True, marks=pytest.mark.slow)]
+)
 def test_after_any_frame_the_solution_is_that_of_the_batch(false: float, modes: bool) -> None:
     growing = Smoother()
     for number, edges in enumerate(_arrivals(np.random.default_rng(3), false=false, modes=modes)):

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rings import OBJECT_M, edge, nees, ring, spin
 from scipy import stats
+from slow import sampled
 
 from modeler import se3
 from modeler.graph import PoseGraph, Smoother, shared_noise, solve
@@ -62,12 +63,13 @@ def _mean_nees(
 TOLERANCE = 4.0 * np.sqrt(12.0 / 100)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.4, 0.8])
+@pytest.mark.parametrize("share", sampled([0.0, 0.4, 0.8], every=3, fast=1))
 def test_poses_and_motions_are_calibrated_where_the_share_is_known(share: float) -> None:
     for mean in _mean_nees(share, lambda graph: solve(graph, {}, shared=share)):
         assert mean == pytest.approx(6.0, abs=TOLERANCE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "common"), [(0.0, 0.5), (0.6, 0.5)])
 def test_poses_and_motions_are_calibrated_where_all_views_err_alike(share: float, common: float) -> None:
     for mean in _mean_nees(share, lambda graph: solve(graph, {}, shared=share, common=common), common=common):
@@ -86,7 +88,7 @@ def test_edges_taken_for_independent_are_too_sure() -> None:
     assert min(poses, near, far) > 6.0 + 2.0 * TOLERANCE
 
 
-@pytest.mark.parametrize("share", [0.0, 0.4, 0.8])
+@pytest.mark.parametrize("share", sampled([0.0, 0.4, 0.8], every=3, fast=1))
 def test_loops_tell_the_share(share: float) -> None:
     """Found from the graph alone it errs to the side of independence by about a standard error of 0.1 (1 - share)."""
     shares = [shared_noise(graph := _graph(np.random.default_rng(seed), share), solve(graph, {})) for seed in range(40)]

@@ -25,7 +25,7 @@ def _nees(solution: Solution, truth: dict[int, np.ndarray], frame: int) -> float
     return nees(PoseGaussian(solution.trajectory[frame], solution.covariances[frame]), truth[frame])
 
 
-@pytest.mark.parametrize("count", [5, 14, 24])
+@pytest.mark.parametrize("count", [5, 14, pytest.param(24, marks=pytest.mark.slow)])
 def test_poses_of_a_loop_are_calibrated_before_and_after_it_closes(count: int) -> None:
     before, after, every = np.zeros(SEEDS), np.zeros(SEEDS), np.zeros(SEEDS)
     spread_before, spread_after = np.zeros(SEEDS), np.zeros(SEEDS)

@@ -137,7 +137,7 @@ def mixed() -> list[Frame]:
     return [thinned(whole.frame(index), 4 if index % 2 else 2) for index in whole.indices[:4]]
 
 
-@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize("masked", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_frames_of_different_size_are_one_model(
     mixed: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str], masked: bool
 ) -> None:
@@ -174,6 +174,7 @@ def test_frames_of_different_size_need_different_intrinsics(
     assert "000003.png: is 160 x 120 pixels where 000000.png is 320 x 240, with the same cam_K" in said
 
 
+@pytest.mark.slow
 def test_hundreds_of_frames_are_read_and_converted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pattern = tiny(4)
     numbers = range(900, 1200)  # of three digits and of four, which as words come in another order

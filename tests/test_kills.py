@@ -296,7 +296,7 @@ def test_an_answer_is_to_one_question_only(tmp_path: Path, asked: list[tuple[int
     assert [ask(views[0], seed=1), ask(nearer), ask(views[0])] == [3, 4, 4]
 
 
-@pytest.mark.skipif("MODELER_SLOW" not in os.environ, reason="some minutes; set MODELER_SLOW=1 to run it")
+@pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_killed_at_random_moments(tmp_path: Path, rng: np.random.Generator) -> None:
     trials = Trials((BOX, *QUICK), tmp_path)

@@ -169,6 +169,7 @@ def test_steps_share_the_axis_as_far_as_no_edge_holds_it() -> None:
         assert other.shared_axis(bare) is None
 
 
+@pytest.mark.slow
 def test_the_common_axis_is_as_sure_as_it_is_right() -> None:
     squares = []
     for seed in range(60):

@@ -1,6 +1,7 @@
 """What smoothing makes of surfaces: as far aside as noise, no farther."""
 
 import numpy as np
+import pytest
 from calibration.specimens import load_specimen
 from calibration.study import Condition, rendered_views, staged
 
@@ -43,6 +44,7 @@ def test_thin_rods_sink_by_a_share_of_the_noise_whatever_the_noise():
     assert shares.max() < 2.0 * shares.min()
 
 
+@pytest.mark.slow
 def test_thin_legs_are_not_dragged_behind():
     """Turned there and back, a tripod errs to either side alike: what is common goes with the camera, not the turn."""
     sequence = RenderedSequence(staged(load_specimen("tripod"), Condition(noise=0.5), frames=3, seed=5))

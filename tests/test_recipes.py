@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from calibration.specimens import load_specimen, recipe_names
 from refusal import refused
+from slow import sampled
 
 from modeler import se3
 from modeler.types import InputError
@@ -18,7 +19,7 @@ from sequences.rendering.shapes import Box, Cylinder, MeshFile, Sphere
 from sequences.rendering.trajectory import Hand, Place, Places, Tabletop, Turntable
 
 
-@pytest.mark.parametrize("name", recipe_names())
+@pytest.mark.parametrize("name", sampled(recipe_names(), every=12))
 def test_recipes_stand_on_the_table_in_view(name: str) -> None:
     recipe = load_specimen(name)
     assert recipe.name == name

