@@ -10,10 +10,12 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.error
 import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import pytest
 from streamed import read, record
@@ -184,7 +186,13 @@ def test_a_recording_is_viewed_in_the_browser(run: list[Step], tmp_path: Path) -
     served = viewer.view(tmp_path, web=True)
     with urllib.request.urlopen(served.address, timeout=5.0) as page:
         assert b"<html" in page.read()
+    page_address, _, source = served.address.partition("?url=")
+    with urllib.request.urlopen(unquote(source), timeout=5.0) as answer:
+        assert answer.read() == (tmp_path / "recording.rrd").read_bytes()
+        assert answer.headers["Access-Control-Allow-Origin"] == page_address  # to no other page
     served.stop()
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(unquote(source), timeout=5.0)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -203,6 +211,54 @@ def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp
         assert command.wait(timeout=10.0) == 0
     with pytest.raises(ProcessLookupError):
         os.kill(server, 0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux ends a process with its parent")
+def test_the_server_ends_with_its_parent_however_that_ends(run: list[Step], tmp_path: Path) -> None:
+    record(tmp_path / "recording.rrd", run[:1])
+    program = (
+        "import sys, pathlib, time; from viz import viewer;"
+        "print(viewer.view(pathlib.Path(sys.argv[1]), web=True).process.pid, flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as command:
+        assert command.stdout is not None
+        server = int(command.stdout.readline())
+        assert b"rerun" in Path(f"/proc/{server}/cmdline").read_bytes()
+        command.kill()
+    deadline = time.monotonic() + 10.0
+    while running(server):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def running(process: int) -> bool:
+    """Return whether a process runs: one that has ended stays a zombie where nobody waits for it."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_an_idle_server_takes_no_processor_time(run: list[Step], tmp_path: Path) -> None:
+    record(tmp_path / "recording.rrd", run)
+    served = viewer.view(tmp_path, web=True)
+    streamed = open_stream("box", save=None, web=True)
+    streamed(run[0])
+    servers = (served, *streamed.viewers)
+    time.sleep(1.0)
+    before_s = [processor_s(server.process.pid) for server in servers]
+    time.sleep(2.0)
+    for server, start_s in zip(servers, before_s, strict=True):
+        assert processor_s(server.process.pid) - start_s < 0.2
+    served.stop()
+    streamed.close()
+
+
+def processor_s(process: int) -> float:
+    """Return the processor time that a process has taken."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def test_a_run_that_is_terminated_leaves_a_whole_recording_and_no_server(tmp_path: Path) -> None:

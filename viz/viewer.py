@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import atexit
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from urllib.parse import quote
 
 from modeler.types import InputError
@@ -20,6 +25,14 @@ from modeler.types import InputError
 _HOST: Final = "127.0.0.1"
 _START_S: Final = 20.0
 _STOP_S: Final = 3.0
+# Runs the viewer so that Linux kills it when the process that started it ends, however that ends (prctl, option
+# PR_SET_PDEATHSIG, survives exec). That process may have ended before the option was set.
+_DIE_WITH_PARENT: Final = """\
+import ctypes, os, signal, sys
+ctypes.CDLL(None).prctl(1, int(signal.SIGKILL))
+if os.getppid() == int(sys.argv[1]):
+    os.execv(sys.argv[2], sys.argv[2:])
+"""
 
 
 @dataclass(frozen=True)
@@ -34,6 +47,8 @@ class Viewer:
     """What a person opens: the page of the viewer in the browser; the sink for a window."""
     lasting: bool
     """Whether it outlives this process: a window does, a page in the browser does not."""
+    files: ThreadingHTTPServer | None = None
+    """The server of the recording that the page loads."""
 
     def wait(self) -> None:
         """Return when the viewer is closed, or end it when the user interrupts or terminates this process."""
@@ -47,7 +62,10 @@ class Viewer:
             self.stop()
 
     def stop(self) -> None:
-        """End the viewer, by force where it does not answer."""
+        """End the viewer, by force if it does not answer."""
+        if self.files is not None:
+            self.files.shutdown()
+            self.files.server_close()
         self.process.terminate()
         try:
             self.process.wait(_STOP_S)
@@ -68,20 +86,27 @@ def start_window(recordings: Sequence[Path] = ()) -> Viewer:
         )
     port = _free_port()
     sink = _sink(port)
-    return Viewer(_start(["--port", str(port)], recordings, port=port), sink, sink, lasting=True)
+    arguments = ["--port", str(port), *map(str, recordings)]
+    return Viewer(_start(arguments, port=port, lasting=True), sink, sink, lasting=True)
 
 
-def start_web(recordings: Sequence[Path] = ()) -> Viewer:
-    """Serve the viewer in the browser on 127.0.0.1 for as long as this process lives, showing the given recordings.
+def start_web(recording: Path | None = None) -> Viewer:
+    """Serve the viewer in the browser on 127.0.0.1 for as long as this process lives, showing the given recording.
 
     Raises:
         InputError: where the server does not start.
     """
     port, page = _free_port(), _free_port()
     arguments = ["--serve-web", "--port", str(port), "--web-viewer-port", str(page)]
-    process = _start(arguments, recordings, port=page)
-    address = f"http://{_HOST}:{page}?url={quote(_sink(port), safe='')}"
-    served = Viewer(process, _sink(port), address, lasting=False)
+    process = _start(arguments, port=page, lasting=False)
+    source, files = _sink(port), None
+    if recording is not None:
+        # The page loads the recording itself: given a file, Rerun 0.41 forwards it from a thread that polls for more
+        # for ever and takes a whole core (re_grpc_server::spawn_from_rx_set).
+        files = _file_server(recording, f"http://{_HOST}:{page}")
+        source = f"http://{_HOST}:{files.server_port}/{quote(recording.name)}"
+    address = f"http://{_HOST}:{page}?url={quote(source, safe='')}"
+    served = Viewer(process, _sink(port), address, lasting=False, files=files)
     atexit.register(served.stop)  # also where an error ends the run
     return served
 
@@ -95,7 +120,7 @@ def view(run: Path, *, web: bool = False) -> Viewer:
     recording = run / "recording.rrd"
     if not recording.is_file():
         raise InputError(f"{run}: no recording.rrd here; give the folder that `modeler build --out` made")
-    return start_web([recording]) if web else start_window([recording])
+    return start_web(recording) if web else start_window([recording])
 
 
 def reachable(sink: str) -> bool:
@@ -112,14 +137,17 @@ def reachable(sink: str) -> bool:
     return _listens(host.strip("[]"), int(port), patience_s=1.0)
 
 
-def _start(arguments: list[str], recordings: Sequence[Path], *, port: int) -> subprocess.Popen[bytes]:
-    """Start the viewer's executable and return once it listens on `port`."""
+def _start(arguments: list[str], *, port: int, lasting: bool) -> subprocess.Popen[bytes]:
+    """Start the viewer's executable and return once it listens on `port`; without `lasting` it ends with us."""
     from rerun_cli import __main__ as cli
 
     # The executable itself, for the script of that name only waits for it and does not pass signals on.
     executable = Path(cli.__file__).with_name(cli.add_exe_suffix("rerun"))
+    command = [str(executable), "--bind", _HOST, *arguments]
+    if not lasting and sys.platform == "linux":
+        command = [sys.executable, "-I", "-S", "-c", _DIE_WITH_PARENT, str(os.getpid()), *command]
     process = subprocess.Popen(
-        [str(executable), "--bind", _HOST, *arguments, *map(str, recordings)],
+        command,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,  # stdout is for data; the viewer chats
         stderr=subprocess.DEVNULL,
@@ -134,6 +162,33 @@ def _start(arguments: list[str], recordings: Sequence[Path], *, port: int) -> su
             raise InputError("the Rerun viewer did not start; start it by hand to see why: rerun")
         time.sleep(0.05)
     return process
+
+
+class _OneFile(BaseHTTPRequestHandler):
+    """Answers every request with one file, for pages of one origin."""
+
+    def __init__(self, *request: Any, file: Path, origin: str) -> None:
+        self._file, self._origin = file, origin
+        super().__init__(*request)
+
+    def do_GET(self) -> None:
+        """Send the file."""
+        with suppress(ConnectionError), self._file.open("rb") as content:
+            self.send_response(200)
+            self.send_header("Access-Control-Allow-Origin", self._origin)
+            self.send_header("Content-Type", "application/octet-stream")
+            self.end_headers()
+            shutil.copyfileobj(content, self.wfile)
+
+    def log_message(self, format: str, *args: object) -> None:  # the name is that of the base class
+        """Say nothing: stderr is for the run."""
+
+
+def _file_server(file: Path, origin: str) -> ThreadingHTTPServer:
+    """Serve one file on 127.0.0.1 to pages of an origin, from a thread that ends with this process."""
+    server = ThreadingHTTPServer((_HOST, 0), partial(_OneFile, file=file, origin=origin))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    return server
 
 
 def _sink(port: int) -> str:
