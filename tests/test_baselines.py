@@ -17,7 +17,7 @@ from modeler.experiment import sparse_view
 from modeler.features import kabsch, mutual_matches
 from modeler.priors import GeneralPrior
 from modeler.registration import FpfhIcpRegistrar, FpfhRegistrar, GicpRegistrar, IcpRegistrar
-from modeler.registration.clouds import (
+from modeler.registration.baselines.clouds import (
     Cloud,
     Fit,
     Matches,

@@ -3,15 +3,16 @@
 import numba
 import numpy as np
 import pytest
+from prior_cases import views
 from scipy.spatial.transform import Rotation
 from slow import sampled
 from test_kernels import ANISOTROPIC, INTRINSICS, ISOTROPIC, SHAPE, random_pose
 
 from modeler import se3
-from modeler.kernels import free_space as kernel
-from modeler.kernels import paper
+from modeler.kernels import paper as kernel
+from modeler.priors import TablePrior
 from modeler.priors.general import GeneralDensity, GeneralPrior
-from modeler.registration.free_space import Draws, FreeSpace, Measured
+from modeler.registration.baselines.paper import FreeSpace, Measured, NumberedDraws
 from modeler.se3 import matrices, rows
 
 CENTRE_M = np.array([0.02, -0.03, 0.8])
@@ -56,7 +57,7 @@ def test_what_is_forbidden_has_no_likelihood(noise, options, seed):
     for motions, own, other, forbidden in sides:
         for k, point in enumerate(own.points_m):
             rejected = motions[forbidden[:, k]]
-            values = paper.log_likelihoods(
+            values = kernel.log_likelihoods(
                 rejected, point[None], other.ranges_m, other.intrinsics, noise, np.array(options)
             )
             assert np.isneginf(values).all()
@@ -67,7 +68,7 @@ def test_most_of_what_has_no_likelihood_is_forbidden(rng):
     poses = rows(np.stack([random_pose(rng, 0.3) for _ in range(500)]))
     free = FreeSpace.of(source, target, 4.0, 1e-6)
     options = np.array([4.0, 1e-6])
-    values = paper.log_likelihoods(poses, source.points_m, target.ranges_m, target.intrinsics, target.noise, options)
+    values = kernel.log_likelihoods(poses, source.points_m, target.ranges_m, target.intrinsics, target.noise, options)
     assert free.passes(poses).sum() - np.isfinite(values).sum() < 0.1 * len(poses)
 
 
@@ -104,7 +105,7 @@ def test_nearest_ranges_are_least_within_the_ellipse(rng):
 @pytest.mark.slow
 def test_motions_drawn_by_number_are_those_of_the_prior():
     count = 200_000
-    draws = Draws.of(MOTION.even_spread(), np.random.default_rng(3))
+    draws = NumberedDraws.of(MOTION, np.random.default_rng(3))
     assert draws is not None
     poses = matrices(draws.poses(0, count))
     assert np.isfinite(MOTION.log_density(poses)).all()
@@ -137,16 +138,16 @@ def test_motions_drawn_by_number_are_those_of_the_prior():
 
 def test_a_spread_too_wide_to_draw_by_trying_is_left_to_the_prior(rng):
     wide = GeneralDensity(CENTRE_M, CENTRE_M, np.radians(170.0), 0.04)
-    assert Draws.of(wide.even_spread(), rng) is None
-    assert Draws.of(None, rng) is None
+    assert NumberedDraws.of(wide, rng) is None
+    assert NumberedDraws.of(TablePrior().between(*views(np.eye(4))), rng) is None
     narrow = GeneralPrior().relaxed(100.0).max_rotation_deg
-    assert Draws.of(GeneralDensity(CENTRE_M, CENTRE_M, np.radians(narrow), 0.04).even_spread(), rng) is not None
+    assert NumberedDraws.of(GeneralDensity(CENTRE_M, CENTRE_M, np.radians(narrow), 0.04), rng) is not None
 
 
 def test_which_motions_pass_depends_on_no_thread_and_no_batch(rng):
     free = FreeSpace.of(scene(rng, NOISES["isotropic"]), scene(rng, NOISES["isotropic"]), 4.0, 1e-6)
-    spread = GeneralDensity(CENTRE_M, CENTRE_M, 0.3, 0.04).even_spread()
-    draws = Draws.of(spread, rng)
+    spread = GeneralDensity(CENTRE_M, CENTRE_M, 0.3, 0.04)
+    draws = NumberedDraws.of(spread, rng)
     assert draws is not None
     whole = free.passing(draws, 0, 30_000)
     assert 0 < len(whole) < 30_000

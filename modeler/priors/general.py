@@ -8,7 +8,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors.directions import directions
-from modeler.types import AbstractPoseDensity, AbstractPrior, Array, EvenSpread, RayImage
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage
 
 _SMALL_DEG = 30.0  # up to this turn limits of the centroids' offset are what they say
 _WIDEST_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of what was seen of it
@@ -59,16 +59,6 @@ class GeneralDensity(AbstractPoseDensity):
         motion[:, :3, :3] = motion[:, :3, :3] @ self.middle
         motion[:, :3, 3] = self.target_centroid_m + offset_m - motion[:, :3, :3] @ self.source_centroid_m
         return motion
-
-    def even_spread(self) -> EvenSpread:
-        """Return the limits of rotation and offset."""
-        return EvenSpread(
-            self.source_centroid_m,
-            self.target_centroid_m,
-            self.middle,
-            self.max_rotation_rad,
-            self.max_offset_m,
-        )
 
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of motions (n, 4, 4); -inf outside."""

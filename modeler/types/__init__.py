@@ -8,7 +8,6 @@ from modeler.types.arrays import Array as Array
 from modeler.types.arrays import BoolArray as BoolArray
 from modeler.types.arrays import Float32Array as Float32Array
 from modeler.types.densities import AbstractPoseDensity as AbstractPoseDensity
-from modeler.types.densities import EvenSpread as EvenSpread
 from modeler.types.loops import joined_without as joined_without
 from modeler.types.loops import loops_closed as loops_closed
 from modeler.types.model import Event as Event

@@ -3,27 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 
 import numpy as np
 
 from modeler.types.arrays import Array
-
-
-@dataclass(frozen=True, eq=False)
-class EvenSpread:
-    """Motions spread evenly over rotations up to a limit and over a ball of centroid offsets."""
-
-    source_centroid_m: Array
-    """(3,)."""
-    target_centroid_m: Array
-    """(3,)."""
-    middle: Array
-    """(3, 3) rotation from which the limit counts."""
-    max_rotation_rad: float
-    """Largest angle of the rotation from the middle."""
-    max_offset_m: float
-    """Largest distance between the target's centroid and the source's, carried over."""
 
 
 class AbstractPoseDensity(ABC):
@@ -39,10 +22,6 @@ class AbstractPoseDensity(ABC):
     @abstractmethod
     def log_density(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of motions (n, 4, 4) with respect to the uniform measure; -inf outside."""
-
-    def even_spread(self) -> EvenSpread | None:
-        """Return the limits within which motions are spread evenly, where that is all there is to them; else None."""
-        return None
 
     def log_evidence(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of what is independently known, the part of a motion that belongs in an edge.

@@ -1,8 +1,8 @@
-"""Global alignment by FPFH features and RANSAC, as in Open3D's global registration tutorial."""
+"""Global registration by FPFH features and RANSAC, and the same refined by ICP."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from modeler import se3
 from modeler.features import fpfh, kabsch, mutual_matches
-from modeler.registration.clouds import (
+from modeler.registration.baselines.clouds import (
     Cloud,
     Fit,
     cube_edges_m,
@@ -20,6 +20,7 @@ from modeler.registration.clouds import (
     registered,
     whitened_jacobian,
 )
+from modeler.registration.baselines.icp import IcpRegistrar
 from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Posterior, RayImage
 
 _DRAW = 3  # correspondences that fix a motion
@@ -144,3 +145,26 @@ def _draws_needed(agreement: float, confidence: float) -> float:
     """Return how many draws find, with that confidence, one whose matches all agree."""
     chance = agreement**_DRAW
     return 0.0 if chance >= 1.0 else float(np.log1p(-confidence) / np.log1p(-chance)) if chance > 0.0 else np.inf
+
+
+@final
+@dataclass(frozen=True)
+class FpfhIcpRegistrar(AbstractRegistrar):
+    """Take the motion that most FPFH matches agree with, and start point-to-plane ICP there."""
+
+    fpfh: FpfhRegistrar = field(default_factory=FpfhRegistrar)
+    """The global search."""
+    icp: IcpRegistrar = field(default_factory=lambda: IcpRegistrar(voxels=(1 / 32, 1 / 64)))
+    """The refinement, with no coarse levels, whose basins are wide enough to leave a good start."""
+
+    def register(
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+    ) -> Posterior:
+        """Return the local optimum nearest to the feature matches' motion, with its residual-scaled inverse Hessian."""
+        clouds = Cloud.of(source), Cloud.of(target)
+
+        def fit(begin: Array) -> Fit | None:
+            coarse = self.fpfh.search(*clouds, begin, rng)
+            return None if coarse is None else self.icp.refine(*clouds, coarse.target_from_source)
+
+        return registered((source, target), density, rng, min_fitness=self.icp.min_fitness, fit=fit)

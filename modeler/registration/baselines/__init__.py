@@ -1,0 +1,1 @@
+"""Methods of others: ICP, GICP, FPFH with RANSAC, and the paper's sampler as published."""
