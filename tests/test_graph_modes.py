@@ -11,7 +11,7 @@ from rings import covariance, edge, measured, nees, ring, rotation_error, spin, 
 
 from modeler import se3
 from modeler.graph import PoseGraph, Smoother, modes, solve
-from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian, separate
+from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian, are_separate
 
 COUNT = 12
 WRONG_RAD = (np.pi / 2, -np.pi / 2, np.pi)
@@ -211,9 +211,9 @@ def _rippled(of: Edge, sds: float) -> Edge:
 
 def test_modes_are_separate_where_there_is_a_dip_between_them() -> None:
     graph, _ = ring(4, np.random.default_rng(0), [])
-    assert not separate(graph.edges[0].posterior.modes)
-    assert not separate(_rippled(graph.edges[0], 1.9).posterior.modes)
-    assert separate(_rippled(graph.edges[0], 2.1).posterior.modes)
+    assert not are_separate(graph.edges[0].posterior.modes)
+    assert not are_separate(_rippled(graph.edges[0], 1.9).posterior.modes)
+    assert are_separate(_rippled(graph.edges[0], 2.1).posterior.modes)
 
 
 def test_ripples_on_one_peak_are_one_gaussian_and_cost_loops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,7 +25,7 @@ from modeler.types import (
     RayImage,
     Searching,
     Solution,
-    as_one,
+    pooled,
 )
 
 TRUE_DEG, LIMIT_DEG = 25.0, 50.0
@@ -118,7 +118,7 @@ def of_modes(*modes: tuple[float, float]) -> Posterior:
     poses = [turned(deg) for _, deg in modes]
     told = tuple(Mode(weight, PoseGaussian(pose, COVARIANCE)) for (weight, _), pose in zip(modes, poses, strict=True))
     shares = np.array([weight for weight, _ in modes])
-    return Posterior(1, 0, as_one(told), Outcome.AMBIGUOUS, 0.8, np.stack(poses), shares, told, log_evidence=-20.0)
+    return Posterior(1, 0, pooled(told), Outcome.AMBIGUOUS, 0.8, np.stack(poses), shares, told, log_evidence=-20.0)
 
 
 def test_modes_beyond_the_limits_count_as_little_as_motions_beyond_do() -> None:

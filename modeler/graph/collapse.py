@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from modeler.types import Array, PoseGaussian, Posterior, as_one, separate
+from modeler.types import Array, PoseGaussian, Posterior, are_separate, pooled
 
 
 def collapse_modes(posterior: Posterior, weights: Array | None = None) -> PoseGaussian:
@@ -14,4 +14,4 @@ def collapse_modes(posterior: Posterior, weights: Array | None = None) -> PoseGa
         posterior: with its modes.
         weights: (m,) of the modes, as far as loops have decided; None: the posterior's own.
     """
-    return as_one(posterior.modes, weights) if separate(posterior.modes) else posterior.pose
+    return pooled(posterior.modes, weights) if are_separate(posterior.modes) else posterior.pose

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from modeler import se3
-from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian, separate
+from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian, are_separate
 
 ROOT_SIGMA = 1e-9
 """Of a pose relative to itself, in rad and m: nothing, as a covariance that is still positive definite."""
@@ -43,7 +43,7 @@ class Factor:
     @cached_property
     def modes(self) -> tuple[Mode, ...]:
         """Between which loops may decide: those of the posterior, unless they are as good as one."""
-        return self.edge.posterior.modes if separate(self.edge.posterior.modes) else ()
+        return self.edge.posterior.modes if are_separate(self.edge.posterior.modes) else ()
 
     @cached_property
     def between(self) -> gtsam.BetweenFactorPose3:

@@ -35,8 +35,8 @@ from modeler.types import (
     PriorRefused,
     RayImage,
     Searching,
-    as_one,
-    separate,
+    are_separate,
+    pooled,
 )
 
 _BEYOND = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # how a motion beyond the prior may end
@@ -253,7 +253,7 @@ def believed(within: Posterior, wider: Posterior, known: AbstractPoseDensity) ->
 
 def _discounted(posterior: Posterior, known: AbstractPoseDensity) -> Posterior:
     """Return a posterior with modes beyond the limits as unlikely as such motions are."""
-    if not separate(posterior.modes):
+    if not are_separate(posterior.modes):
         return posterior
     inside = _inside(known, np.stack([mode.pose.mean for mode in posterior.modes]))
     if inside.all() or not inside.any():
@@ -267,7 +267,7 @@ def _discounted(posterior: Posterior, known: AbstractPoseDensity) -> Posterior:
     shares = posterior.weights[kept]
     return replace(
         posterior,
-        pose=as_one(modes),
+        pose=pooled(modes),
         modes=modes if len(modes) > 1 else (),
         samples=posterior.samples[kept],
         weights=shares / shares.sum() if shares.sum() > 0.0 else shares,

@@ -1,31 +1,29 @@
-"""The nouns of the package and its abstract interfaces, a family a file. All are frozen values.
+"""The values that pass between the parts of the package, and its abstract interfaces.
 
 Lengths are metres and angles radians unless a name says otherwise; `se3` holds the conventions of poses and tangents.
-Data meets them in this order: views, motions, posteriors, solution, model; priors learn from solutions.
+All values are frozen.
 """
 
-from modeler.types.arrays import Array as Array
-from modeler.types.arrays import BoolArray as BoolArray
-from modeler.types.arrays import Float32Array as Float32Array
-from modeler.types.densities import AbstractPoseDensity as AbstractPoseDensity
-from modeler.types.loops import joined_without as joined_without
-from modeler.types.loops import loops_closed as loops_closed
+from modeler.types.base import Array as Array
+from modeler.types.base import BoolArray as BoolArray
+from modeler.types.base import Float32Array as Float32Array
+from modeler.types.base import InputError as InputError
+from modeler.types.base import Outcome as Outcome
+from modeler.types.interfaces import AbstractPoseDensity as AbstractPoseDensity
+from modeler.types.interfaces import AbstractPrior as AbstractPrior
+from modeler.types.interfaces import AbstractRegistrar as AbstractRegistrar
+from modeler.types.interfaces import SharedAxis as SharedAxis
 from modeler.types.model import Event as Event
 from modeler.types.model import Fusing as Fusing
 from modeler.types.model import ObjectModel as ObjectModel
 from modeler.types.model import Refining as Refining
 from modeler.types.model import Searching as Searching
 from modeler.types.model import Step as Step
-from modeler.types.modes import as_one as as_one
-from modeler.types.modes import separate as separate
-from modeler.types.outcomes import InputError as InputError
-from modeler.types.outcomes import Outcome as Outcome
-from modeler.types.posteriors import AbstractRegistrar as AbstractRegistrar
 from modeler.types.posteriors import Mode as Mode
 from modeler.types.posteriors import PoseGaussian as PoseGaussian
 from modeler.types.posteriors import Posterior as Posterior
-from modeler.types.priors import AbstractPrior as AbstractPrior
-from modeler.types.priors import SharedAxis as SharedAxis
+from modeler.types.posteriors import are_separate as are_separate
+from modeler.types.posteriors import pooled as pooled
 from modeler.types.reasons import ACCEPTED as ACCEPTED
 from modeler.types.reasons import ConfirmedBy as ConfirmedBy
 from modeler.types.reasons import Consistency as Consistency
@@ -48,6 +46,8 @@ from modeler.types.reasons import summary as summary
 from modeler.types.solution import Edge as Edge
 from modeler.types.solution import EdgeKind as EdgeKind
 from modeler.types.solution import Solution as Solution
+from modeler.types.solution import joined_without as joined_without
+from modeler.types.solution import loops_closed as loops_closed
 from modeler.types.views import Camera as Camera
 from modeler.types.views import Frame as Frame
 from modeler.types.views import Plane as Plane

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types.arrays import Array
+from modeler.types.base import Array
 from modeler.types.posteriors import Posterior
 from modeler.types.reasons import Reason
 from modeler.types.solution import Edge, Solution

@@ -1,18 +1,17 @@
-"""What two views say about the motion between them, and who says it."""
+"""Gaussians on SE(3), the modes of a posterior, and the posterior of a pair."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from modeler import se3
-from modeler.types.arrays import Array
-from modeler.types.densities import AbstractPoseDensity
-from modeler.types.outcomes import Outcome
-from modeler.types.views import RayImage
+from modeler.types.base import Array, Outcome
+
+_APART = 2.0  # standard deviations: the sum of two equal Gaussians whose means are nearer has one peak
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,42 +35,42 @@ class PoseGaussian:
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """One of several separate places where a posterior has its mass."""
+    """One of several separate modes of a posterior."""
 
     weight: float
-    """Share (0..1) of the mass."""
+    """Share (0..1) of the posterior's mass."""
     pose: PoseGaussian
-    """target_from_source: mean and covariance of this part alone."""
+    """target_from_source: mean and covariance of this mode alone."""
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """What two views and a prior say about the motion between them."""
+    """The posterior of the motion between two views, from their images and a prior."""
 
     source: int
     """Frame number of the source view."""
     target: int
     """Frame number of the target view."""
     pose: PoseGaussian
-    """target_from_source: mean and covariance; where there are separate modes, at the heaviest, and as wide as all."""
+    """target_from_source: mean and covariance; with separate modes, the heaviest one's mean and the spread of all."""
     outcome: Outcome
     """How the attempt ended."""
     overlap: float
-    """Share (0..1) of the surface that should be seen by both cameras at the mean and is."""
+    """Share (0..1) of the surface that both cameras should see, at the mean, that both do see."""
     least_overlap: float = field(default=0.0, kw_only=True)
-    """Overlap with less of which the method takes the surfaces not to match, whatever else the outcome tells."""
+    """Overlap below which the method considers the surfaces not to match, whatever the outcome."""
     samples: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """(n, 4, 4) samples of target_from_source; empty where the method draws none."""
     weights: Array = field(default_factory=lambda: np.zeros(0))
     """(n,) weights of the samples, summing to 1."""
     modes: tuple[Mode, ...] = ()
-    """The separate modes, heaviest first, whose weights sum to 1; empty where there is but one, or none are told."""
+    """The separate modes, heaviest first, with weights that sum to 1; empty where there is one, or none are stated."""
     effective_samples: float = float("nan")
     """Effective sample size."""
     pareto_k: float = float("nan")
-    """Tail index of the weights; above 0.7 their mean is not to be trusted."""
+    """Tail index of the weights; above 0.7 their mean is unreliable."""
     log_evidence: float = float("nan")
-    """Log of the mean likelihood under the prior, against nothing matching (nats)."""
+    """Log of the mean likelihood under the prior, relative to no match at all (nats)."""
     seconds: float = float("nan")
     """Wall time of the registration in s."""
 
@@ -82,19 +81,36 @@ class Posterior:
 
     @property
     def matches(self) -> bool:
-        """Whether there is enough surface in common at the mean: at a prior's limit a posterior may find none."""
+        """Whether the surfaces overlap enough at the mean; at a limit of the prior they may not."""
         return self.outcome is not Outcome.NO_OVERLAP and self.overlap > 0.0 and self.overlap >= self.least_overlap
 
     def without_samples(self) -> Posterior:
-        """Return the posterior as it is kept once it is judged: nothing asks for its samples, which are most of it."""
+        """Return the posterior without its samples, most of its memory, which are not needed once it is judged."""
         return replace(self, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
 
 
-class AbstractRegistrar(ABC):
-    """A registration method: parameters as fields, one pure method."""
+def are_separate(modes: Sequence[Mode]) -> bool:
+    """Return whether any mode is farther from the first than two equal Gaussians with a single peak may be."""
+    if len(modes) < 2:
+        return False
+    first, *others = (mode.pose for mode in modes)
+    xi = se3.log(se3.inverse(first.mean) @ np.stack([other.mean for other in others]))
+    spread = 0.5 * (first.covariance + np.stack([other.covariance for other in others]))
+    squares = np.sum(xi * np.linalg.solve(spread, xi[..., None])[..., 0], axis=-1)
+    return bool(squares.max() > _APART**2)
 
-    @abstractmethod
-    def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
-    ) -> Posterior:
-        """Return the posterior of target_from_source. Failure is the posterior's outcome, never an exception."""
+
+def pooled(modes: Sequence[Mode], weights: Array | None = None) -> PoseGaussian:
+    """Return a Gaussian with the mean of the heaviest mode, and the second moment of all modes about it.
+
+    The mean of several modes lies at none of them; the heaviest alone would be over-confident.
+
+    Args:
+        modes: at least one.
+        weights: (m,) weights of the modes; None: their own.
+    """
+    weights = np.array([mode.weight for mode in modes]) if weights is None else weights
+    mean = modes[int(np.argmax(weights))].pose.mean
+    offsets = se3.log(se3.inverse(mean) @ np.stack([mode.pose.mean for mode in modes]))
+    spread = np.stack([mode.pose.covariance for mode in modes]) + offsets[:, :, None] * offsets[:, None, :]
+    return PoseGaussian(mean, np.tensordot(weights / np.sum(weights), spread, 1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
-from modeler.types.outcomes import Outcome
+from modeler.types.base import Outcome
 
 ACCEPTED: Final = "accepted"
 """What a report says of a frame that is part of the model."""

@@ -1,14 +1,18 @@
-"""Posteriors as edges of a graph, and the poses that it leads to."""
+"""The edges of a graph, how they hang together, and the poses that they lead to."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
 from modeler import se3
-from modeler.types.arrays import Array
+from modeler.types.base import Array
 from modeler.types.posteriors import PoseGaussian, Posterior
 from modeler.types.reasons import Reason
 
@@ -19,7 +23,7 @@ several steps between frames that others placed."""
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A posterior as the graph sees it: joined, or judged and left out."""
+    """A posterior as an edge of the graph: accepted, or judged and left out."""
 
     posterior: Posterior
     """The registration behind the edge."""
@@ -42,7 +46,7 @@ class Edge:
 
 
 def _unsolved(target: int, source: int) -> Array:
-    """Refuse: nothing was solved."""
+    """Raise: nothing was solved."""
     raise KeyError(f"no motion from frame {source} to frame {target} was solved")
 
 
@@ -57,15 +61,15 @@ class Solution:
     odometry: Mapping[int, Array] = field(default_factory=dict)
     """object_from_camera (4, 4) of the pairwise chain alone, before closure."""
     outliers: tuple[Edge, ...] = ()
-    """Accepted edges that the optimisation left out because all others contradict them."""
+    """Accepted edges that the optimisation left out as outliers, since the others contradict them."""
     relative_covariance: Callable[[int, int], Array] = _unsolved
-    """Covariance (6, 6) of `relative(target, source)`, worked out when called."""
+    """Covariance (6, 6) of `relative(target, source)`, computed when called."""
     edge_poses: Mapping[tuple[int, int], PoseGaussian] = field(default_factory=dict)
-    """target_from_source by (source, target) of edges that took part otherwise than by the posterior's own pose."""
+    """target_from_source by (source, target) of edges that entered with a pose other than their posterior's."""
     mode_weights: Mapping[tuple[int, int], Array] = field(default_factory=dict)
-    """Weights (m,) that all edges together leave to the modes of an edge with several, by (source, target)."""
+    """Weights (m,) of the modes of a multimodal edge, given all edges together, by (source, target)."""
     camera_from_axis: Array | None = None
-    """(4, 4), the third direction that about which all steps turn; None where that was not asked, or does not fit."""
+    """(4, 4), whose third direction is the axis of all steps; None where none was estimated, or it does not fit."""
 
     def takes_part(self, edge: Edge) -> bool:
         """Return whether an edge was accepted and the optimisation did not leave it out since."""
@@ -76,7 +80,7 @@ class Solution:
         return frozenset(self.outliers)
 
     def pose_of(self, edge: Edge) -> PoseGaussian:
-        """Return target_from_source of an edge as it took part: of several modes, as all edges together have it."""
+        """Return target_from_source of an edge as it entered the graph; several modes are weighted by all edges."""
         posterior = edge.posterior
         if not self.edge_poses:
             return posterior.pose
@@ -89,3 +93,29 @@ class Solution:
     def relative(self, target: int, source: int) -> Array:
         """Return target_from_source (4, 4) between two solved frames."""
         return se3.inverse(self.trajectory[target]) @ self.trajectory[source]
+
+
+def loops_closed(edges: Sequence[Edge]) -> int:
+    """Return how many closures close a loop: those without which the graph remains connected.
+
+    A closure that is a bridge of the graph is checked by nothing: where two consecutive views share little surface and
+    an early view places the next frame, the graph is a tree and has no loop.
+    """
+    closures = [edge.kind == "closure" for edge in edges]
+    if not any(closures):
+        return 0
+    without = [edge for edge, closure in zip(edges, closures, strict=True) if not closure]
+    return sum(closures) - (_parts(without, edges) - _parts(edges, edges))
+
+
+def joined_without(edge: Edge, edges: Sequence[Edge]) -> bool:
+    """Return whether the ends of an edge are connected without it."""
+    return _parts([other for other in edges if other is not edge], edges) == _parts(edges, edges)
+
+
+def _parts(edges: Sequence[Edge], everything: Sequence[Edge]) -> int:
+    """Return the number of connected components of the frames of `everything` under `edges`."""
+    frames = np.unique([(edge.source, edge.target) for edge in everything])
+    ends = np.searchsorted(frames, np.reshape([(edge.source, edge.target) for edge in edges], (-1, 2)))
+    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(frames), len(frames)))
+    return int(connected_components(graph, directed=False)[0])

@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types.arrays import Array, BoolArray
-from modeler.types.outcomes import Outcome
+from modeler.types.base import Array, BoolArray, Outcome
 
 
 @dataclass(frozen=True)

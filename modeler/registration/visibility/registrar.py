@@ -28,8 +28,8 @@ from modeler.types import (
     PoseGaussian,
     Posterior,
     RayImage,
-    as_one,
-    separate,
+    are_separate,
+    pooled,
 )
 
 
@@ -201,8 +201,8 @@ class VisibilityRegistrar(AbstractRegistrar):
         samples = np.concatenate([mode.poses for _, mode in weighed])
         weights = np.concatenate([share * mode.weights for share, mode in weighed])
         modes = tuple(Mode(share, weighted_gaussian(mode.poses, mode.weights, centre_m)) for share, mode in weighed)
-        collapse = len(modes) == 1 or separate(modes)
-        pose = as_one(modes) if collapse else weighted_gaussian(samples, weights, centre_m)
+        collapse = len(modes) == 1 or are_separate(modes)
+        pose = pooled(modes) if collapse else weighted_gaussian(samples, weights, centre_m)
         overlap = pair.overlap(modes[0].pose.mean)
         effective = 1.0 / sum(share**2 / mode.effective_samples for share, mode in weighed)
         beyond = found.beyond_gain > self.max_beyond_gain

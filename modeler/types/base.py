@@ -1,12 +1,19 @@
-"""What goes wrong, and how attempts end."""
+"""Array types, the error for unusable input, and how attempts end."""
 
 from __future__ import annotations
 
 import enum
 
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+Float32Array = npt.NDArray[np.float32]
+
 
 class InputError(Exception):
-    """Input that cannot be used: one line that names what, where and what to do. Commands end with status 2."""
+    """Unusable input, in one line: what is wrong, where, and what to do. Commands exit with status 2."""
 
 
 class Outcome(enum.Enum):

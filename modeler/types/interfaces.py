@@ -1,0 +1,128 @@
+"""The abstract interfaces: densities of poses, priors that state them, and registration methods."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from modeler.types.base import Array
+from modeler.types.posteriors import Posterior
+from modeler.types.solution import Edge, Solution
+from modeler.types.views import RayImage
+
+
+class AbstractPoseDensity(ABC):
+    """A density on SE(3) of target_from_source, the motion of the object between two views.
+
+    Poses are (4, 4), in metres, between camera coordinates (see `se3`). Densities are per rad³ m³, with respect to the
+    uniform measure: the Haar measure of rotations, scaled as dω at the identity, times that of translations.
+    """
+
+    evidence: bool
+    """True: independent knowledge, which becomes part of the edge. False: a proposal, which only guides the search."""
+
+    @abstractmethod
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw poses (count, 4, 4)."""
+
+    @abstractmethod
+    def log_density(self, target_from_source: Array) -> Array:
+        """Return the normalised log density (n,) of poses (n, 4, 4); -inf outside the support."""
+
+    def log_evidence(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of the independent knowledge at poses (n, 4, 4), which enters the posterior.
+
+        By default all of the density if it is evidence; if it is a proposal, 0 within its support and -inf outside.
+        """
+        log_density = self.log_density(target_from_source)
+        return log_density if self.evidence else np.where(np.isfinite(log_density), 0.0, -np.inf)
+
+
+@dataclass(frozen=True)
+class SharedAxis:
+    """One axis about which all steps turn: what they have in common beyond the information in each edge."""
+
+    sigma_tilt_rad: float
+    """Standard deviation of the tilt out of the axis in one step; infinite where edges already hold its direction."""
+    sigma_shift_m: float
+    """Standard deviation of the slip across the axis in one step."""
+
+
+class AbstractPrior(ABC):
+    """Nonvisual information: a frozen dataclass whose fields are its parameters, which states a density for each pair.
+
+    To write one, subclass and implement `between`; the other methods have defaults. Ten lines suffice, since densities
+    may be composed of those in `modeler.priors`:
+
+        @dataclass(frozen=True)
+        class ConveyorPrior(AbstractPrior):
+            speed_m: float = 0.05     # per frame, along the camera's x
+
+            def between(self, source, target):
+                shift = se3.translation(np.array([(target.index - source.index) * self.speed_m, 0.0, 0.0]))
+                covariance = np.diag([0.02, 0.02, 0.02, 0.003, 0.003, 0.003]) ** 2
+                return Gaussian(shift, covariance, source.centroid_m)
+
+    Frames: target_from_source (4, 4) takes a point of the object from its camera coordinates in the source frame to
+    those in the target frame; x right, y down, z forward. Units: metres and radians; fields carry units in their names
+    (`_deg`, `_m`), for the command line makes options of them. Source and target are `RayImage`: `index` is the frame
+    number, `frame.time_s` its time, `points_m` (n, 3) and `normals` the surface, `centroid_m` (3,) its mean, `plane`
+    the support plane or None. The source may come before or after the target, and several frames from it.
+
+    Evidence or proposal: a density from an independent instrument (a turntable, a robot, a table) has `evidence = True`
+    and is multiplied into the edge. One derived from the images themselves must have `evidence = False`, or the images
+    would be counted twice: `defensive_mixture(known, [guess])` lets it guide the search only. Uncertainties should be
+    honest: a pose outside the support is never found.
+
+    Raise `InputError` in `__post_init__` for parameters out of range (`modeler.priors.checks`), and in `between` where
+    the views lack what the prior needs: the pair is skipped, with the message as its reason.
+    """
+
+    @abstractmethod
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
+        """Return the density of target_from_source, the same for the same views.
+
+        Raises:
+            InputError: where the views lack what the prior needs (a table, say).
+        """
+
+    def relaxed(self, steps: float) -> AbstractPrior:
+        """Return the prior with limits that hold for a motion of several steps; by default the prior itself.
+
+        Used after lost frames, and where the motion seems to exceed the limits.
+
+        Args:
+            steps: number of steps, at least 1.
+        """
+        return self
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
+        """Return the prior updated with the sequence so far (a common axis, a velocity); by default the prior itself.
+
+        What is learned from images may only propose, since the images already count in their own edges.
+
+        Args:
+            solution: the poses so far.
+            edges: every edge judged so far, in order.
+        """
+        return self
+
+    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
+        """Return the axis that all steps between consecutive views share; by default None.
+
+        It must hold only information that no edge holds, so that nothing is counted twice.
+        """
+        return None
+
+
+class AbstractRegistrar(ABC):
+    """A registration method: parameters as fields, one pure method."""
+
+    @abstractmethod
+    def register(
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+    ) -> Posterior:
+        """Return the posterior of target_from_source. Failure is the posterior's outcome, never an exception."""
