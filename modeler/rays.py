@@ -1,4 +1,4 @@
-"""From a segmented frame to what registration looks up: smoothed surface points, local planes, empty space."""
+"""From a segmented frame to the image that registration uses: smoothed surface points, local planes, silhouette."""
 
 from dataclasses import dataclass
 
@@ -19,24 +19,24 @@ class Sensor:
     smoothing: float = 0.28
     """Radius of the ball in which planes are fitted, as a share of the geometric mean of noise and object's extent.
 
-    In a ball of radius r a surface that curves as the object does, with radius of about the extent, sinks by some r² /
-    extent, away from the camera where it is thin: as the object turns, its image drags behind. So the ball is such that
-    surface sinks by the same share of the noise, whatever the noise.
+    Smoothing over a ball of radius r displaces a surface whose radius of curvature is about the extent by r² / extent,
+    away from the camera, so that the image of a turning object lags behind it. With this radius the displacement is the
+    same share of the noise, whatever the noise (method.md, eq. 1).
     """
     min_neighbours: float = 25.0
-    """The ball grows until it holds about so many pixels of a surface that faces the camera."""
+    """The ball grows until it holds about this many pixels of a surface that faces the camera."""
     correlation_px: float = 0.5
-    """So far beyond the ball the noise of a pixel is felt: depth cameras compare windows, and neighbours err alike."""
+    """Correlation length of the sensor's noise in px, added to the ball's radius: depth cameras compare windows."""
     min_cosine: float = 0.35
-    """Surface seen at a flatter angle than this gives no points: its noise and its smoothing are not to be trusted."""
+    """Least cosine between normal and viewing ray: surface seen at a flatter angle gives no points."""
     max_silhouette_px: float = 60.0
-    """Distance from the silhouette beyond which all empty space counts alike."""
+    """Distance from the silhouette at which its transform is cut off."""
 
     def ray_image(self, frame: Frame, plane: Plane | None = None) -> RayImage:
         """Make a segmented frame ready for registration; without object pixels it has no points.
 
         Args:
-            frame: with its mask; a frame without one is taken to show nothing but the object.
+            frame: with its mask; without one, every measured pixel is the object's.
             plane: the support plane, where one is seen.
         """
         camera = frame.camera
@@ -44,7 +44,7 @@ class Sensor:
         mask = (depth_m > 0) & (depth_m < np.inf)  # not NaN either
         if frame.mask is not None:
             mask &= frame.mask
-        # Object pixels that carry no depth still hide what is behind them: the silhouette is the whole mask's.
+        # Object pixels without depth still occlude: the silhouette is that of the whole mask.
         outline = mask if frame.mask is None else frame.mask
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         rows, columns = _places(mask)
@@ -73,11 +73,11 @@ class Sensor:
     def _smoothing(
         self, frame: Frame, rows: np.ndarray, columns: np.ndarray
     ) -> tuple[tuple[float, int, int], float, float]:
-        """Return how the object at some pixels is smoothed.
+        """Return how the object at given pixels is smoothed (method.md, eq. 1 and 2).
 
         Returns:
-            Radius in m of the ball, in px at the nearest point, and the step between its pixels; the least noise of
-            inverse depth (1/m) that a plane's residuals are taken to show; and how many points share a pixel's noise.
+            Radius of the ball in m, in px at the nearest point, and the stride between its pixels; the least standard
+            deviation of inverse depth (1/m); and the number of points that share the noise of a pixel.
         """
         if rows.size == 0:  # nothing to smooth
             return (0.0, 1, 1), 0.0, 1.0
@@ -87,13 +87,14 @@ class Sensor:
         extent_m = metres_per_px * float(np.hypot(np.ptp(rows), np.ptp(columns)))
         density = rows.size / max(float(frame.mask.sum()) if frame.mask is not None else rows.size, 1.0)
         sparse_px = np.sqrt(self.min_neighbours / (np.pi * max(density, 0.01)))
+        # method.md, eq. 1
         radius_m = max(self.smoothing * np.sqrt(self.sigma_r_m * extent_m), sparse_px * metres_per_px)
         reach_px = int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, 16))
-        # Every second pixel in a row is enough where a wide window holds many.
+        # A stride of 2 px is enough where a wide window holds many pixels.
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours
         ball = (radius_m, reach_px, 2 if reach_px > 4 and enough else 1)
         sharing = max(density * np.pi * (radius_m / metres_per_px + self.correlation_px) ** 2, 1.0)
-        # A tenth of the sensor's noise: neighbouring pixels may agree better than they are true.
+        # A tenth of the sensor's noise: neighbouring pixels err alike, so that residuals understate it.
         return ball, 0.1 * self.sigma_r_m / middle_m**2, float(sharing)
 
 

@@ -136,6 +136,14 @@ def test_variability_of_few_scores_is_told_better_with_the_shape_it_should_have(
     assert shrinking < (1.0 if departs else 0.4) * scattering
 
 
+@pytest.mark.parametrize("scores", [np.zeros((32, 6)), 1e-12 * np.eye(32)[:, :6]])
+def test_variability_is_positive_definite_where_residuals_vanish(scores, rng):
+    root = rng.normal(size=(6, 3))  # three directions are determined, as by a plane
+    variability = shrunk(scores, root @ root.T)
+    assert np.linalg.eigvalsh(variability)[0] > 0.0
+    assert np.linalg.eigvalsh(variability)[-1] < 0.01 * np.linalg.norm(root @ root.T)
+
+
 def test_variability_is_the_scatter_of_many_scores_and_follows_a_change_of_coordinates(rng):
     root, turned = rng.normal(size=(2, 6, 6))
     scores = rng.normal(size=(100_000, 6)) @ root.T

@@ -1,4 +1,4 @@
-"""Local planes of a depth image, and the distance to the object's silhouette."""
+"""Local planes of a depth image, and the distance from the object's silhouette."""
 
 import math
 
@@ -14,7 +14,7 @@ DEPTH = 6  # measured z, m
 SILHOUETTE = 7  # distance of a pixel outside the object from its silhouette, px
 CELL_SIZE = 8
 
-_NOWHERE_M = 1e9  # far from every ball
+_NOWHERE_M = 1e9  # outside every ball
 MISSING, SURFACE, RAGGED, BACKGROUND = 0.0, 1.0, 2.0, 3.0  # RAGGED: object, but no plane to be trusted
 
 
@@ -111,16 +111,16 @@ def add_line(points, row, shift, pad, radius_m2, step, sums):
 def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse):
     """Fit a plane to every object pixel's neighbours within a ball.
 
-    A plane is linear in inverse depth over the image (1/z = N · (w, h, 1)), and the noise of a triangulating camera
-    is even there. The ball keeps the neighbourhood the same piece of surface from wherever it is seen, so that what
-    smoothing does to a curved surface is the same in both views and cancels.
+    A plane is linear in inverse depth over the image (1/z = N · (w, h, 1)), where triangulating cameras have constant
+    noise. The ball selects the same piece of surface from every view, so that the effect of smoothing on a curved
+    surface cancels between views.
 
     Args:
         depth_m: (h, w) z in m, NaN = missing.
         mask: (h, w) bool, object.
-        silhouette_px: (h, w) of `silhouette_distance`, taken over into the cells.
+        silhouette_px: (h, w) of `silhouette_distance`, copied into the cells.
         intrinsics: (4,) fx, fy, cx, cy in px.
-        ball: radius in m; half-width of its window in px; step between the pixels that are read.
+        ball: radius in m; half-width of its window in px; stride between the pixels that are read.
         sigma_inverse: sensor noise of 1/z, in 1/m.
 
     Returns:
@@ -167,7 +167,7 @@ def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse):
 
 @numba.njit(cache=True)
 def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse):
-    """Write the plane through a pixel's neighbours into its cell (8,), where they determine one.
+    """Write the plane through a pixel's neighbours into its cell (8,), where they determine one (method.md, eq. 1).
 
     Args:
         cell: with the depth of the pixel.
@@ -191,26 +191,27 @@ def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse):
     plane_x, plane_y = slope_x * fx, slope_y * fy
     plane_z = along - plane_x * w - plane_y * h
     norm = math.sqrt(plane_x * plane_x + plane_y * plane_y + plane_z * plane_z)
+    # method.md, eq. 2
     residual = sbb - offset * sb - slope_x * sxb - slope_y * syb
     spread = max(residual / max(n - 3.0, 1.0), sigma_inverse * sigma_inverse)
     cell[NORMAL_X], cell[NORMAL_Y], cell[NORMAL_Z] = -plane_x / norm, -plane_y / norm, -plane_z / norm
     cell[DISTANCE] = 1.0 / norm
     # The distance of a point from the plane is (1 - N · p) / |N|: its noise is z times that of 1/z over |N|.
     cell[VARIANCE] = z * z * spread * leverage / (norm * norm)
-    # A lopsided neighbourhood is the rim of a silhouette or a fold: its plane leans on one side only.
+    # A one-sided neighbourhood is the rim of a silhouette or a fold: the leverage of its pixel is high.
     if n >= 8.0 and leverage * n < 1.6:
         cell[KIND] = SURFACE
 
 
 @numba.njit(cache=True)
 def frontal_points(cells, mask, intrinsics, min_cosine):
-    """Return the points where pixels' rays meet their local planes, of those that are seen at no flatter an angle.
+    """Return the points where pixels' rays meet their local planes, of those that face the camera enough.
 
     Args:
         cells: (h, w, 8) of `local_planes`.
         mask: (h, w) bool, object.
         intrinsics: (4,) fx, fy, cx, cy in px.
-        min_cosine: least cosine of the angle between a plane's normal and the way to the camera.
+        min_cosine: least cosine between a plane's normal and the direction to the camera.
 
     Returns:
         Points (n, 3) in m, unit normals (n, 3), rows and columns (n, 2), variances along the normals (n,) in m².
@@ -261,19 +262,19 @@ def silhouette_distance(mask, limit_px):
             if mask[row, near.start + column]:
                 line[column] = 0.0
         if row > first:
-            take_over(line, distance[row - 1, near])
-        run_along(line)
+            propagate_from_row(line, distance[row - 1, near])
+        propagate_along_row(line)
     for row in range(last, first - 1, -1):
         line = distance[row, near]
         if row < last:
-            take_over(line, distance[row + 1, near])
-        run_along(line[::-1])
+            propagate_from_row(line, distance[row + 1, near])
+        propagate_along_row(line[::-1])
     return distance
 
 
 @numba.njit(cache=True)
-def take_over(line, above):
-    """Lower distances (w,) to what the neighbouring row hands on, straight and across."""
+def propagate_from_row(line, above):
+    """Propagate distances (w,) from the neighbouring row, straight and diagonally."""
     last = line.shape[0] - 1
     for column in range(1, last):
         across = min(above[column - 1], above[column + 1]) + _DIAGONAL
@@ -283,10 +284,10 @@ def take_over(line, above):
 
 
 @numba.njit(cache=True)
-def run_along(line):
-    """Hand distances (w,) on from each pixel to the next.
+def propagate_along_row(line):
+    """Propagate distances (w,) along a row.
 
-    As the least of distance less place so far: what each step waits for is one comparison, and no addition.
+    As a running minimum of distance less column: each step depends on one comparison, and no addition.
     """
     least = line[0]
     for column in range(1, line.shape[0]):

@@ -19,6 +19,8 @@ from modeler.registration.visibility.likelihood import DirectedLikelihood, PairL
 from modeler.se3 import rows
 from modeler.types import Array
 
+_MIN_LEVEL = 1e-4  # of the scatter, relative to its shape: residuals are no smaller than a hundredth of their stated sd
+
 
 @dataclass(frozen=True)
 class Refiner:
@@ -88,17 +90,18 @@ def shrunk(scores: Array, shape: Array) -> Array:
 
     A few dozen scores determine it poorly, and underestimates make a posterior overconfident. It is drawn to the shape
     of independent errors of equal size, the more, the less the scatter departs from it beyond chance (oracle
-    approximating shrinkage: Chen, Wiesel, Eldar and Hero 2010, equation 23).
+    approximating shrinkage: Chen, Wiesel, Eldar and Hero 2010, equation 23). Images without noise, where residuals
+    vanish, do not make it singular.
 
     Args:
         scores: (n, k), which sum up to about 0.
-        shape: (k, k) positive semi-definite, of any scale.
+        shape: (k, k) positive semi-definite: the variability if residuals have their stated variances.
     """
     count, size = scores.shape
     root = np.linalg.cholesky(shape + max(1e-9 * np.trace(shape), 1e-300) * np.eye(size))
     white = np.linalg.solve(root, scores.T)
     scatter = white @ white.T * count / (count - 1.0)
-    level, square = np.trace(scatter) / size, np.sum(scatter**2)
+    level, square = max(np.trace(scatter) / size, _MIN_LEVEL), np.sum(scatter**2)
     departure = (count + 1.0 - 2.0 / size) * (square - size * level**2)
     chance = (1.0 - 2.0 / size) * square + (size * level) ** 2
     share = chance / max(chance, departure, 1e-300)
