@@ -1,4 +1,4 @@
-"""What edges to earlier views are expected to tell, and which of them are then asked for."""
+"""What information edges to earlier views are expected to add, and which of them are then tried."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import pytest
 from closing import CENTROID_M, Run, posterior_of, turned
 
 from modeler import se3
-from modeler.closure import Closer, MapView
-from modeler.closure.consistency_model import ConsistencyModel
-from modeler.closure.extrapolation import came_back, composed
+from modeler.closure import Closer, ConsistencyModel, MapView
 from modeler.closure.information_gain import InformationGain
+from modeler.closure.map_view import composed
 
 SYSTEMATIC = ConsistencyModel().systematic(1, CENTROID_M)
 
@@ -24,51 +23,51 @@ def chain(angles_deg: Sequence[float]) -> tuple[MapView, Run]:
     return MapView(run.views, run.solution, run.graph.edges), run
 
 
-@pytest.mark.parametrize("hangs", [True, False])
+@pytest.mark.parametrize("has_own_edge", [True, False])
 @pytest.mark.parametrize("power", [2.0, 6.0])
-def test_an_edge_promises_what_it_would_tell_of_the_motion_by_the_chance_to_find_it(hangs: bool, power: float) -> None:
+def test_expected_gain_is_that_of_a_gaussian_measurement_times_the_probability_of_finding_it(
+    has_own_edge: bool, power: float
+) -> None:
     map_view, _ = chain([8.0 * k for k in range(7)])
     angle_deg = np.array([48.0, 40.0, 32.0, 24.0, 16.0])
     frames = [0, 1, 2, 3, 4]
     information_gain = InformationGain(
-        map_view, 6, map_view.solution.trajectory[6], SYSTEMATIC, 60.0, hangs=hangs, power=power
+        map_view, 6, map_view.solution.trajectory[6], SYSTEMATIC, 60.0, has_own_edge=has_own_edge, power=power
     )
     found = information_gain.candidates(frames, angle_deg, 0.01)
     assert [candidate.gain_nats for candidate in found] == sorted((p.gain_nats for p in found), reverse=True)
     assert {candidate.frame for candidate in found} == set(frames)
     one_edge = SYSTEMATIC + np.mean([edge.posterior.pose.covariance for edge in map_view.edges], axis=0)
-    within = information_gain.within(frames, angle_deg)
+    within = information_gain.probability_within(frames, angle_deg)
     for candidate in found:
         turn_rad = np.radians(candidate.angle_deg)
         chance = 0.5 * (1.0 + np.cos(turn_rad)) * within[frames.index(candidate.frame)]
         known = map_view.solution.relative_covariance(candidate.frame, 6) + (6 - candidate.frame) * SYSTEMATIC
-        known = known + one_edge if hangs else known
+        known = known + one_edge if has_own_edge else known
         told = candidate.overlap * np.cos(turn_rad) ** power * np.linalg.inv(one_edge)
         wanted = 0.5 * chance * np.linalg.slogdet(np.eye(6) + known @ told)[1]
         assert candidate.gain_nats == pytest.approx(wanted, rel=1e-6)
 
 
-def test_a_registration_is_held_against_the_way_there_as_long_as_that_is() -> None:
+def test_systematic_error_grows_with_the_length_of_the_path() -> None:
     map_view, run = chain([20.0 * k for k in range(6)])
-    consistency_model, base = ConsistencyModel(drift_deg=2.0), posterior_of(6, 5, run.truth_between(4, 5))
+    model, base = ConsistencyModel(drift_deg=2.0), posterior_of(6, 5, run.truth_between(4, 5))
     posterior = posterior_of(6, 2, se3.inverse(turned(40.0)) @ turned(121.0))
-    foretold = composed(map_view.solution.relative_gaussian(2, 5), base.pose)
-    found = consistency_model.consistency_through(base, posterior, map_view, map_view.shortest_paths(5))
+    foretold = composed(base.pose, map_view.solution.relative_gaussian(2, 5))
+    found = model.consistency_through(base, posterior, map_view, map_view.shortest_paths(5))
     centroid_m = se3.transform(se3.inverse(base.pose.mean), CENTROID_M[None])[0]
-    over_four = consistency_model.agreement(
-        posterior, [(1.0, foretold)], length=4, centroid_m=centroid_m
-    )  # 6, 5, 4, 3, 2
+    over_four = model.consistency(posterior, [(1.0, foretold)], length=4, centroid_m=centroid_m)  # 6, 5, 4, 3, 2
     assert found.distance == pytest.approx(over_four.distance)
     assert found.angle_deg == pytest.approx(1.0, abs=0.8)
 
 
-def test_what_turned_away_on_the_way_came_back_whatever_the_frames_numbers() -> None:
+def test_coming_back_depends_on_the_path_not_on_frame_numbers() -> None:
     """A frame that was lost hangs on a view far round; its number lies beside that of the first."""
     run = Run([0.0, 0.0, *(40.0 * np.arange(1, 5))], [0, 1, 2, 3, 4, 5])
     run.run(Closer(max_closures=0), lambda posterior: posterior)
     map_view = MapView(run.views, run.solution, run.graph.edges)
-    assert came_back(0, 1, map_view.shortest_paths(5), map_view, away_deg=90.0)
-    assert not came_back(0, 1, map_view.shortest_paths(1), map_view, away_deg=90.0)
+    assert map_view.came_back(0, 1, map_view.shortest_paths(5), away_deg=90.0)
+    assert not map_view.came_back(0, 1, map_view.shortest_paths(1), away_deg=90.0)
 
 
 def test_of_views_in_reach_the_first_is_closed_on_rather_than_another() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rings import edge
 
-from modeler.closure.paths import PathNetwork, ShortestPaths
+from modeler.closure.map_view import PathNetwork, ShortestPaths
 from modeler.types import Edge, PoseGaussian, Solution
 
 COUNT = 12
@@ -38,7 +38,7 @@ def _naive(edges: list[Edge]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_ways_are_the_surest_and_lead_where_they_say(seed: int) -> None:
+def test_paths_are_shortest_and_lead_where_they_say(seed: int) -> None:
     edges = _edges(np.random.default_rng(seed))
     network, wanted = PathNetwork.of(edges, Solution()), _naive(edges)
     for start in range(COUNT):
@@ -56,7 +56,7 @@ def test_ways_are_the_surest_and_lead_where_they_say(seed: int) -> None:
             assert way.variance_rad2 == pytest.approx(sum(steps))
 
 
-def test_no_way_leads_where_nothing_hangs_together() -> None:
+def test_there_is_no_path_between_frames_that_no_edges_connect() -> None:
     found = PathNetwork.of([edge(0, 2, PoseGaussian(np.eye(4), np.eye(6)))], Solution()).shortest_paths(0)
     assert 1 not in found
     assert found.along(1) == ShortestPaths().along(1) == []

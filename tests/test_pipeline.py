@@ -12,7 +12,7 @@ import pytest
 import tabletop
 
 from modeler import se3
-from modeler.closure import Closer
+from modeler.closure import Closer, Thresholds
 from modeler.fusion import Fuser
 from modeler.graph import CommonAxis, PoseGraph, shared_noise, solve
 from modeler.pipeline import Modeler, Prepared
@@ -226,7 +226,10 @@ def test_a_previous_view_to_which_the_prior_does_not_apply_gives_way_to_others()
 
 
 def test_at_the_end_views_two_steps_apart_are_registered_too_and_judged() -> None:
-    registrar, closer = Oracle(noise=1.0), Closer(max_span_deg=85.0, min_span_gain_nats=0.0, min_overlap=0.2)
+    registrar, closer = (
+        Oracle(noise=1.0),
+        Closer(max_span_deg=85.0, min_span_gain_nats=0.0, thresholds=Thresholds(min_overlap=0.2)),
+    )
     *steps, last = run(registrar=registrar, closer=closer)
     assert all(edge.source - edge.target in (1, 8) for step in steps for edge in step.edges)
     spans = [edge for edge in last.edges if (edge.source - edge.target) % 9 in (2, 7)]
@@ -244,7 +247,7 @@ def test_at_the_end_views_two_steps_apart_are_registered_too_and_judged() -> Non
 
 
 def test_the_end_tells_how_far_it_is_and_can_be_cut_short() -> None:
-    closer = Closer(max_span_deg=85.0, min_span_gain_nats=0.0, min_overlap=0.2)
+    closer = Closer(max_span_deg=85.0, min_span_gain_nats=0.0, thresholds=Thresholds(min_overlap=0.2))
     building = modeler(registrar=Oracle(noise=1.0), closer=closer)
     events = list(building.run(FRAMES, Scene()))
     told = [event for event in events if not isinstance(event, Step)]

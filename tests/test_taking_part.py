@@ -10,8 +10,8 @@ from prior_cases import edges, solution
 from rings import edge
 
 from modeler import se3
-from modeler.closure.consistency import thresholds_from
-from modeler.closure.paths import PathNetwork
+from modeler.closure import Thresholds
+from modeler.closure.map_view import PathNetwork
 from modeler.export import edge_record, edges_of
 from modeler.priors import TurntablePrior
 from modeler.types import Edge, EdgeKind, PoseGaussian, Solution
@@ -39,33 +39,31 @@ def test_an_edge_took_part_by_the_pose_that_the_solution_names() -> None:
     assert poses.pose_of(second) is chosen
 
 
-def test_no_way_leads_over_an_edge_that_was_left_out() -> None:
+def test_no_path_leads_over_an_edge_that_was_left_out() -> None:
     chain = [edge(k, k + 1, SURE) for k in range(5)]
     loop = edge(0, 5, SURE, "closure")
     assert PathNetwork.of([*chain, loop], Solution()).shortest_paths(5)[0].edges == 1
     assert PathNetwork.of([*chain, loop], Solution(outliers=(loop,))).shortest_paths(5)[0].edges == 5
 
 
-def test_a_way_is_as_sure_as_its_edges_took_part() -> None:
+def test_a_path_has_the_variance_of_its_edges_as_they_took_part() -> None:
     vague = PoseGaussian(HERE, np.eye(6))
     found = PathNetwork.of([edge(0, 1, vague)], Solution(edge_poses={(1, 0): SURE})).shortest_paths(0)
     assert found[1].variance_rad2 == pytest.approx(3e-6)
 
 
-def test_what_is_usual_is_told_by_edges_that_take_part() -> None:
+def test_median_evidence_is_that_of_edges_that_take_part() -> None:
     good = [of_evidence(edge(k, k + 1, SURE), 100.0) for k in range(5)]
     lying = [of_evidence(edge(k, k + 1, SURE), -1000.0) for k in range(7)]
-    thresholds = thresholds_from([*good, *lying], Solution(outliers=tuple(lying)), min_overlap=0.4, drop_nats=40.0)
-    assert thresholds.usual_nats == 100.0
-    assert not np.isfinite(
-        thresholds_from(lying, Solution(outliers=tuple(lying)), min_overlap=0.4, drop_nats=40.0).usual_nats
-    )
+    left_out = Solution(outliers=tuple(lying))
+    assert Thresholds().evidence_bound([*good, *lying], left_out).median_nats == 100.0
+    assert not np.isfinite(Thresholds().evidence_bound(lying, left_out).median_nats)
 
 
-def test_spans_do_not_tell_what_is_usual_between_neighbours() -> None:
+def test_spans_do_not_count_for_the_median_evidence_between_neighbours() -> None:
     good = [of_evidence(edge(k, k + 1, SURE), 100.0) for k in range(5)]
     wide = [of_evidence(edge(k, k + 2, SURE, "span"), 50.0) for k in range(9)]
-    assert thresholds_from([*good, *wide], Solution(), min_overlap=0.4, drop_nats=40.0).usual_nats == 100.0
+    assert Thresholds().evidence_bound([*good, *wide], Solution()).median_nats == 100.0
 
 
 def test_a_turntable_learns_nothing_from_edges_that_were_left_out() -> None:

@@ -1,4 +1,6 @@
 """Which pairs of views to register, and which of their posteriors become edges of the graph."""
 
 from modeler.closure.closer import Closer as Closer
+from modeler.closure.consistency import ConsistencyModel as ConsistencyModel
+from modeler.closure.consistency import Thresholds as Thresholds
 from modeler.closure.map_view import MapView as MapView

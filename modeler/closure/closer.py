@@ -1,4 +1,4 @@
-"""What a new view is registered against besides the previous one, and the judgement of the results."""
+"""Which pairs of views are registered besides consecutive ones, and which registrations become edges."""
 
 from __future__ import annotations
 
@@ -8,74 +8,47 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from modeler import se3
-from modeler.closure.consistency import Thresholds, flaw, modes, open_turn, thresholds_from
-from modeler.closure.consistency_model import ConsistencyModel
-from modeler.closure.extrapolation import came_back, composed
+from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresholds, broken, modes
 from modeler.closure.information_gain import InformationGain
-from modeler.closure.map_view import MapView
-from modeler.closure.paths import ShortestPaths
+from modeler.closure.map_view import MapView, ShortestPaths, composed
 from modeler.closure.relocaliser import Relocaliser
-from modeler.types import (
-    Consistency,
-    Edge,
-    EdgeKind,
-    NotPlaced,
-    OpenRotation,
-    PoseGaussian,
-    Posterior,
-    Reason,
-    Solution,
-)
+from modeler.types import Edge, EdgeKind, NotPlaced, PoseGaussian, Posterior, Reason, Solution
 
-_LEAST_CHANCE = 0.02  # that a view is in reach: one that comes back after a turn that nothing told tells very much
-_NO_NEWS = 0.5  # of a sigma: who knows a turn better learns little of it, and what else an edge tells is welcome
-_SPAN_POWER = 6.0  # an edge over 25° tells half as much as one over none, over 50° a fourteenth
+_MIN_PROBABILITY = 0.02  # that a view is within reach: a return whose turn was uncertain adds much information
+_SPAN_POWER = 6.0  # an edge over 25° adds half the information of one over none, over 50° a fourteenth
 
 
 @dataclass(frozen=True)
 class Closer:
-    """Chooses what a new view is registered against and judges the results, in words.
+    """Chooses what a new view is registered against, and judges the results.
 
-    Every view is registered against the previous one. Further views are tried where an edge to them would tell much:
-    where the object comes back after having turned away, or where many small steps can be spanned by a large one. A
-    result is accepted where it agrees with what the other edges predict.
+    Every view is registered against the previous one. Further pairs are tried where their edge is expected to add much
+    information: where the object comes back after turning away, or where one edge spans many small steps. A result is
+    accepted where it is consistent with the other edges (method.md, "Closure gate").
     """
 
     max_angle_deg: float = 45.0
-    """Largest rotation in degrees to an earlier view for it to be tried as a closure, as far as the graph can tell."""
+    """Largest predicted rotation in degrees to an earlier view for it to be tried."""
     away_deg: float = 90.0
     """How far in degrees the object must have turned away from an earlier view before it counts as coming back."""
     max_closures: int = 2
     """At most so many views besides the previous one are tried for a frame; 0 = never close."""
     min_gain_nats: float = 4.16
-    """Least information that an edge must promise: the default makes six directions twice as sure, 6 log 2."""
+    """Least expected information of a closure: 6 log 2 halves all six standard deviations."""
     max_spans: int = 1
     """Once all frames are in, at most so many more views are tried for each of them; 0 = none."""
     max_span_deg: float = 55.0
     """Largest rotation in degrees to such a view: two steps of the usual 25°."""
     min_span_gain_nats: float = 0.1
-    """Least information that it must promise: an edge over two steps of 25° does."""
+    """Least expected information of such an edge: one over two steps of 25° adds that."""
     max_relocations: int = 4
     """At most so many earlier views are tried for a frame that the previous view does not place."""
-    min_overlap: float = 0.4
-    """Smallest overlap (0..1) of an edge to any but the previous view, predicted and found."""
-    max_evidence_drop_nats: float = 40.0
-    """How far the evidence of such an edge may lie below that of the others, a nat an effective point."""
-    max_open_deg: float = 5.0
-    """Largest standard deviation in degrees of the turn about any axis of such an edge, where the graph knows that turn
-    as badly. What leaves a turn open, about the axis of a bottle, is bounded by the same limits as the edges that
-    placed the frames, which hold these already; and where that axis lies it knows too badly for a wide turn about it
-    not to contradict the others."""
-    consistency_model: ConsistencyModel = field(default_factory=ConsistencyModel)
-    """In covariances that edges state."""
+    thresholds: Thresholds = field(default_factory=Thresholds)
+    """What edges other than that to the previous view must fulfil."""
+    consistency: ConsistencyModel = field(default_factory=ConsistencyModel)
+    """How far they may be from what the graph predicts."""
 
-    def closure_targets(
-        self,
-        base: Posterior,
-        map_view: MapView,
-        *,
-        last: bool = False,
-    ) -> tuple[int, ...]:
+    def closure_targets(self, base: Posterior, map_view: MapView, *, last: bool = False) -> tuple[int, ...]:
         """Return the views to register a frame against besides the one that places it, best first.
 
         Args:
@@ -88,26 +61,25 @@ class Closer:
             return ()
         expected = map_view.solution.trajectory[base.target] @ modes(base)[0][1].mean
         angle_deg = np.degrees(se3.rotation_angle(se3.inverse(map_view.all_poses) @ expected))
-        own = self.consistency_model.systematic(1, map_view.views[base.target].centroid_m)
-        information_gain = InformationGain(map_view, base.target, expected, own, self.max_angle_deg)
-        in_reach = information_gain.within(frames, angle_deg) >= _LEAST_CHANCE
-        near = [int(number) for number in np.flatnonzero(in_reach) if frames[number] != base.target]
+        systematic = self.consistency.systematic(1, map_view.views[base.target].centroid_m)
+        gain = InformationGain(map_view, base.target, expected, systematic, self.max_angle_deg)
+        in_reach = gain.probability_within(frames, angle_deg) >= _MIN_PROBABILITY
+        near = [int(k) for k in np.flatnonzero(in_reach) if frames[k] != base.target]
         chosen, spanned = [], False
-        for candidate in information_gain.candidates(
-            [frames[number] for number in near], angle_deg[near], self.min_gain_nats
-        ):
-            if candidate.overlap >= self.min_overlap:
-                back = self._back(candidate.frame, base.source, information_gain.reach, map_view)
-                if back or not spanned:  # one large step over many small ones is enough
+        for candidate in gain.candidates([frames[k] for k in near], angle_deg[near], self.min_gain_nats):
+            if candidate.overlap >= self.thresholds.min_overlap:
+                back = map_view.came_back(candidate.frame, base.source, gain.paths, away_deg=self.away_deg)
+                if back or not spanned:  # one span a frame is enough
                     chosen.append(candidate.frame)
                 spanned = spanned or not back
-        first = frames[0]
-        if first in chosen or (last and 0 in near and self._back(first, base.source, information_gain.reach, map_view)):
-            chosen = [first, *(frame for frame in chosen if frame != first)]  # to close on the first is best
+        first = frames[0]  # a closure on the first view is best
+        wanted = last and 0 in near and map_view.came_back(first, base.source, gain.paths, away_deg=self.away_deg)
+        if wanted or first in chosen:
+            chosen = [first, *(frame for frame in chosen if frame != first)]
         return tuple(chosen[: self.max_closures])
 
     def span_pairs(self, map_view: MapView) -> tuple[tuple[int, int], ...]:
-        """Return pairs (source, target) of views to register once all are in: for each view those that tell most."""
+        """Return pairs (source, target) of views to register once all are in: those of most information for each."""
         frames = sorted(map_view.frames)
         poses = map_view.poses(frames)
         tried = {frozenset((edge.source, edge.target)) for edge in map_view.edges}
@@ -116,21 +88,17 @@ class Closer:
         for number, source in enumerate(frames if self.max_spans else ()):
             angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses[:number]) @ poses[number]))
             near = [k for k in np.flatnonzero(angle_deg <= limit_deg) if {source, frames[k]} not in tried]
-            own = self.consistency_model.systematic(1, map_view.views[source].centroid_m)
-            information_gain = InformationGain(
-                map_view, source, poses[number], own, limit_deg, hangs=False, power=_SPAN_POWER
+            systematic = self.consistency.systematic(1, map_view.views[source].centroid_m)
+            gain = InformationGain(
+                map_view, source, poses[number], systematic, limit_deg, has_own_edge=False, power=_SPAN_POWER
             )
-            found = information_gain.candidates([frames[k] for k in near], angle_deg[near], self.min_span_gain_nats)
-            telling = [(source, candidate.frame) for candidate in found if candidate.overlap >= self.min_overlap]
-            pairs += telling[: self.max_spans]
+            found = gain.candidates([frames[k] for k in near], angle_deg[near], self.min_span_gain_nats)
+            overlapping = [candidate for candidate in found if candidate.overlap >= self.thresholds.min_overlap]
+            pairs += [(source, candidate.frame) for candidate in overlapping[: self.max_spans]]
         return tuple(pairs)
 
-    def predicted_motion(self, base: Posterior, target: int, solution: Solution) -> PoseGaussian:
-        """Return target_from_source of the frame that a registration places and a view, as all edges tell it."""
-        return composed(solution.relative_gaussian(target, base.target), modes(base)[0][1])
-
     def relocalisation_target(self, posteriors: Sequence[Posterior], map_view: MapView) -> int | None:
-        """Return the earlier view to register a lost frame against next; None: it is given up. See `Relocaliser.next`.
+        """Return the earlier view to register a lost frame against next; None: it is given up.
 
         Args:
             posteriors: what was tried for the frame, the previous view first.
@@ -138,19 +106,23 @@ class Closer:
         """
         if len(posteriors) > self.max_relocations:
             return None
-        return self._placing(map_view).next(posteriors)
+        return self._relocaliser(map_view, self._evidence(map_view)).next_target(posteriors)
 
     def placement(
         self, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1
     ) -> tuple[Posterior | None, Reason]:
-        """Return the posterior that places a frame, and why: the previous view's, or else another's. See `Relocaliser`.
+        """Return the posterior that places a frame, and why: that of the previous view, or else of another.
 
         Args:
             posteriors: registrations of the frame, the previous view first.
             map_view: what is known so far.
             steps: how many frames lie between the previous view and this frame, this one counted.
         """
-        return self._placing(map_view, steps=steps).base(posteriors)
+        return self._relocaliser(map_view, self._evidence(map_view), steps=steps).placement(posteriors)
+
+    def predicted_motion(self, base: Posterior, target: int, solution: Solution) -> PoseGaussian:
+        """Return target_from_source of the frame that a registration places and a view, as all edges predict it."""
+        return composed(modes(base)[0][1], solution.relative_gaussian(target, base.target))
 
     def judge(self, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1) -> tuple[Edge, ...]:
         """Return one judged edge per posterior, in their order. The frame joins the graph if any is accepted.
@@ -164,60 +136,45 @@ class Closer:
             steps: how many frames lie between the previous view and this frame, this one counted.
         """
         base, base_reason = self.placement(posteriors, map_view, steps=steps)
-        reach = map_view.shortest_paths(base.target) if base is not None and len(posteriors) > 1 else ShortestPaths()
-        edges, thresholds = [], self._thresholds(map_view)
+        paths = map_view.shortest_paths(base.target) if base is not None and len(posteriors) > 1 else ShortestPaths()
+        evidence, edges = self._evidence(map_view), []
         for number, posterior in enumerate(posteriors):
-            back = number > 0 and self._back(posterior.target, posterior.source, reach, map_view)
+            consecutive = number == 0 and steps == 1
+            back = number > 0 and self._came_back(posterior, map_view, paths)
             places = number == 0 or base is None or posterior is base
             kind: EdgeKind = "closure" if back else "odometry" if places else "span"
             if posterior is base:
-                edge = Edge(posterior, kind, accepted=True, reason=base_reason)
-            elif (found := flaw(posterior, thresholds if number or steps > 1 else None)) is not None:
-                edge = Edge(posterior, kind, accepted=False, reason=found)
+                edges.append(Edge(posterior, kind, True, base_reason))
+            elif reason := broken(posterior) if consecutive else self.thresholds.defect(posterior, evidence):
+                edges.append(Edge(posterior, kind, False, reason))
             elif base is None:
-                edge = Edge(posterior, kind, accepted=False, reason=NotPlaced())
-            elif (
-                found := self._open(posterior, self.predicted_motion(base, posterior.target, map_view.solution))
-            ) is not None:
-                edge = Edge(posterior, kind, accepted=False, reason=found)
+                edges.append(Edge(posterior, kind, False, NotPlaced()))
+            elif reason := self.thresholds.open_rotation(
+                posterior, self.predicted_motion(base, posterior.target, map_view.solution)
+            ):
+                edges.append(Edge(posterior, kind, False, reason))
             else:
-                edge = _judged(
-                    posterior, kind, self.consistency_model.consistency_through(base, posterior, map_view, reach)
-                )
-            edges.append(edge)
+                found = self.consistency.consistency_through(base, posterior, map_view, paths)
+                edges.append(Edge(posterior, kind, found.consistent, found))
         return tuple(edges)
 
     def judge_span(self, posterior: Posterior, map_view: MapView) -> Edge:
         """Return the judged edge between two views of the graph, from a registration that it does not hold yet."""
-        reach = map_view.shortest_paths(posterior.source)
-        kind = "closure" if self._back(posterior.target, posterior.source, reach, map_view) else "span"
-        foretold = map_view.solution.relative_gaussian(posterior.target, posterior.source)
-        if (found := flaw(posterior, self._thresholds(map_view)) or self._open(posterior, foretold)) is not None:
-            return Edge(posterior, kind, accepted=False, reason=found)
-        length, centroid_m = reach[posterior.target].edges, map_view.views[posterior.source].centroid_m
-        agreed = self.consistency_model.agreement(posterior, [(1.0, foretold)], length=length, centroid_m=centroid_m)
-        return _judged(posterior, kind, agreed)
+        paths = map_view.shortest_paths(posterior.source)
+        kind = "closure" if self._came_back(posterior, map_view, paths) else "span"
+        predicted = map_view.solution.relative_gaussian(posterior.target, posterior.source)
+        defect = self.thresholds.defect(posterior, self._evidence(map_view))
+        if reason := defect or self.thresholds.open_rotation(posterior, predicted):
+            return Edge(posterior, kind, False, reason)
+        length, centroid_m = paths[posterior.target].edges, map_view.views[posterior.source].centroid_m
+        found = self.consistency.consistency(posterior, [(1.0, predicted)], length=length, centroid_m=centroid_m)
+        return Edge(posterior, kind, found.consistent, found)
 
-    def _open(self, posterior: Posterior, foretold: PoseGaussian) -> Reason | None:
-        """Return what keeps a registration out that tells too little of a turn nobody else tells of; None: nothing."""
-        sigma_rad, axis = open_turn(posterior)
-        known_rad = float(np.sqrt(axis @ foretold.covariance[:3, :3] @ axis))
-        if np.degrees(sigma_rad) <= self.max_open_deg or known_rad <= _NO_NEWS * sigma_rad:
-            return None
-        return OpenRotation(float(np.degrees(sigma_rad)))
+    def _came_back(self, posterior: Posterior, map_view: MapView, paths: ShortestPaths) -> bool:
+        return map_view.came_back(posterior.target, posterior.source, paths, away_deg=self.away_deg)
 
-    def _back(self, target: int, source: int, reach: ShortestPaths, map_view: MapView) -> bool:
-        return came_back(target, source, reach, map_view, away_deg=self.away_deg)
+    def _evidence(self, map_view: MapView) -> EvidenceBound:
+        return self.thresholds.evidence_bound(map_view.edges, map_view.solution)
 
-    def _placing(self, map_view: MapView, *, steps: int = 1) -> Relocaliser:
-        return Relocaliser(map_view, self._thresholds(map_view), self.consistency_model, self.max_angle_deg, steps)
-
-    def _thresholds(self, map_view: MapView) -> Thresholds:
-        return thresholds_from(
-            map_view.edges, map_view.solution, min_overlap=self.min_overlap, drop_nats=self.max_evidence_drop_nats
-        )
-
-
-def _judged(posterior: Posterior, kind: EdgeKind, found: Consistency) -> Edge:
-    """Return an edge that is accepted where it agrees with the others."""
-    return Edge(posterior, kind, found.consistent, found)
+    def _relocaliser(self, map_view: MapView, evidence: EvidenceBound, *, steps: int = 1) -> Relocaliser:
+        return Relocaliser(map_view, self.thresholds, evidence, self.consistency, self.max_angle_deg, steps)

@@ -1,4 +1,4 @@
-"""What is said of a registration before it joins the graph, in numbers and in words."""
+"""The gate: what a registration must fulfil to become an edge, and how far it is from what the graph predicts."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from itertools import islice, product
 import numpy as np
 
 from modeler import se3
+from modeler.closure.map_view import MapView, ShortestPaths, composed
 from modeler.types import (
     Array,
     Consistency,
@@ -17,6 +18,7 @@ from modeler.types import (
     Failed,
     LowEvidence,
     LowOverlap,
+    OpenRotation,
     Outcome,
     PoseGaussian,
     Posterior,
@@ -24,47 +26,79 @@ from modeler.types import (
     Solution,
 )
 
-RADIUS = 4.7390  # √χ²₆(0.999): Mahalanobis distance that 1 of 1000 true closures exceeds
-_RECENT, _FEWEST = 30, 5  # edges whose evidence tells what is usual
-_LEAST_WEIGHT = 0.05  # modes that agree with the prediction must hold so much of the posterior's mass
-
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What is asked of a registration besides that it came to an end."""
+    """What edges other than that to the previous view must fulfil; method.md tells where the numbers come from."""
 
-    min_overlap: float
-    """Smallest overlap (0..1)."""
-    usual_nats: float = float("nan")
-    """Median log evidence of the run's edges; NaN: not known yet."""
-    least_nats: float = -float("inf")
-    """Below it the images speak against any surface in common, and rather for none."""
+    min_overlap: float = 0.4
+    """Smallest overlap (0..1), predicted and found."""
+    max_evidence_drop_nats: float = 40.0
+    """How far the log evidence may lie below the median of the run's edges, a nat an effective point."""
+    max_evidence_drop_sigmas: float = 8.0
+    """The same in robust standard deviations of the run's edges; the larger of both counts."""
+    min_edges: int = 5
+    """Edges from which on their median evidence is known."""
+    max_edges: int = 30
+    """Newest edges that it is taken of."""
+    max_open_deg: float = 5.0
+    """Largest standard deviation in degrees of the rotation about any axis, where the graph knows it as badly. What
+    leaves a rotation open, about the axis of a bottle, is bounded by the prior's limits, which the edges that placed
+    the frames hold already; and that axis is known too badly for a wide rotation about it not to contradict others."""
+    known_share: float = 0.5
+    """The graph knows a rotation better where its standard deviation is below this share of the edge's."""
+
+    def evidence_bound(self, edges: Sequence[Edge], solution: Solution) -> EvidenceBound:
+        """Return what the edges of a run so far, between neighbours, say of the evidence of further ones.
+
+        How well two views match depends on shape and sensor, so that evidence says little by itself. A wrong pose
+        matches far worse than the edges of the run scatter.
+        """
+        joining = (edge for edge in reversed(edges) if edge.kind == "odometry" and solution.takes_part(edge))
+        all_nats = [edge.posterior.log_evidence for edge in islice(joining, self.max_edges)]
+        nats = np.array([evidence for evidence in all_nats if np.isfinite(evidence)])
+        if len(nats) < self.min_edges:
+            return EvidenceBound()
+        median = float(np.median(nats))
+        scatter = 1.4826 * float(np.median(np.abs(nats - median)))
+        drop_nats = max(self.max_evidence_drop_nats, self.max_evidence_drop_sigmas * scatter)  # method.md, eq. C5
+        return EvidenceBound(median, median - drop_nats)
+
+    def defect(self, posterior: Posterior, evidence: EvidenceBound) -> Reason | None:
+        """Return what keeps a posterior out of the graph, whatever the other edges say; None: nothing."""
+        if (found := broken(posterior)) is not None:
+            return found
+        if not posterior.overlap >= self.min_overlap:
+            return LowOverlap(posterior.overlap, self.min_overlap)
+        if posterior.log_evidence < evidence.min_nats:
+            return LowEvidence(posterior.log_evidence, evidence.median_nats)
+        return None
+
+    def open_rotation(self, posterior: Posterior, predicted: PoseGaussian) -> OpenRotation | None:
+        """Return that a posterior leaves a rotation open that the prediction knows no better; None: it does not."""
+        sigma_rad, axis = widest_rotation(posterior)
+        known_rad = float(np.sqrt(axis @ predicted.covariance[:3, :3] @ axis))
+        if np.degrees(sigma_rad) <= self.max_open_deg or known_rad <= self.known_share * sigma_rad:  # eq. C6
+            return None
+        return OpenRotation(float(np.degrees(sigma_rad)))
+
+    def stands_alone(self, posterior: Posterior, evidence: EvidenceBound) -> bool:
+        """Return whether a registration could place a frame without the previous view."""
+        return posterior.outcome is Outcome.CONVERGED and self.defect(posterior, evidence) is None
 
 
-def thresholds_from(edges: Sequence[Edge], solution: Solution, *, min_overlap: float, drop_nats: float) -> Thresholds:
-    """Return what the edges of a run so far, between neighbours, ask of further ones.
+@dataclass(frozen=True)
+class EvidenceBound:
+    """The log evidence of a run's edges, and what is too little beside it."""
 
-    How well two views of one object match depends on its shape and on the sensor, so that evidence tells little by
-    itself. Beside that of others it does: a wrong place matches by far worse than the edges of the run scatter.
-
-    Args:
-        edges: every edge judged so far.
-        solution: the poses so far.
-        min_overlap: smallest overlap (0..1).
-        drop_nats: how far evidence may lie below the median; or eight times their scatter, if that is more.
-    """
-    joining = (edge for edge in reversed(edges) if edge.kind == "odometry" and solution.takes_part(edge))
-    nats = [edge.posterior.log_evidence for edge in islice(joining, _RECENT)]
-    told = np.array([evidence for evidence in nats if np.isfinite(evidence)])
-    if len(told) < _FEWEST:
-        return Thresholds(min_overlap)
-    usual = float(np.median(told))
-    scatter = 1.4826 * float(np.median(np.abs(told - usual)))
-    return Thresholds(min_overlap, usual, usual - max(drop_nats, 8.0 * scatter))
+    median_nats: float = float("nan")
+    """Median of the run's edges; NaN: not known yet."""
+    min_nats: float = -float("inf")
+    """Below it the images contradict an edge."""
 
 
-def flaw(posterior: Posterior, thresholds: Thresholds | None = None) -> Reason | None:
-    """Return what keeps a posterior out of the graph whatever the others say; None: nothing."""
+def broken(posterior: Posterior) -> Reason | None:
+    """Return why a posterior is no Gaussian that a graph can take; None: it is one."""
     if not posterior.usable:
         return Failed(posterior.outcome)
     pose = posterior.pose
@@ -73,26 +107,7 @@ def flaw(posterior: Posterior, thresholds: Thresholds | None = None) -> Reason |
     variances = np.linalg.eigvalsh(pose.covariance)
     if variances[0] <= 1e-15 * variances[-1]:
         return Degenerate(finite=True)
-    if thresholds is not None and not posterior.overlap >= thresholds.min_overlap:
-        return LowOverlap(posterior.overlap, thresholds.min_overlap)
-    if thresholds is not None and posterior.log_evidence < thresholds.least_nats:
-        return LowEvidence(posterior.log_evidence, thresholds.usual_nats)
     return None
-
-
-def open_turn(posterior: Posterior) -> tuple[float, Array]:
-    """Return the standard deviation in rad of the turn that a registration knows least, and its axis (3,).
-
-    The axis is told in the camera of the source. Of several modes the vaguest counts.
-    """
-    variances, axes = np.linalg.eigh(np.stack([pose.covariance[:3, :3] for _, pose in modes(posterior)]))
-    vaguest = int(np.argmax(variances[:, -1]))
-    return float(np.sqrt(variances[vaguest, -1])), axes[vaguest, :, -1]
-
-
-def stands(posterior: Posterior, thresholds: Thresholds) -> bool:
-    """Return whether a registration could place a frame without the previous view."""
-    return posterior.outcome is Outcome.CONVERGED and flaw(posterior, thresholds) is None
 
 
 def modes(posterior: Posterior) -> list[tuple[float, PoseGaussian]]:
@@ -100,37 +115,95 @@ def modes(posterior: Posterior) -> list[tuple[float, PoseGaussian]]:
     return [(mode.weight, mode.pose) for mode in posterior.modes] or [(1.0, posterior.pose)]
 
 
-def agreement(
-    posterior: Posterior,
-    predictions: Sequence[tuple[float, PoseGaussian]],
-    *,
-    systematic: Array,
-    scale: float,
-    centroid_m: Array,
-) -> Consistency:
-    """Compare a posterior, mode by mode, with predictions of the same target_from_source.
+def widest_rotation(posterior: Posterior) -> tuple[float, Array]:
+    """Return the largest standard deviation in rad of the rotation about any axis, and that axis (3,).
 
-    Args:
-        posterior: of the new registration.
-        predictions: what other edges say, with weights that sum to 1.
-        systematic: covariance (6, 6) of what neither covariance knows of.
-        scale: how many times the standard deviations may understate the random errors.
-        centroid_m: (3,) of the object in the source camera.
+    The axis is given in the source camera. Of several modes the widest counts.
     """
-    agreeing, nearest, difference = 0.0, np.inf, np.eye(4)
-    for (weight, predicted), (own_weight, own) in product(predictions, modes(posterior)):
-        apart = se3.inverse(predicted.mean) @ own.mean
-        xi = se3.log(apart)
-        spread = scale**2 * (predicted.covariance + own.covariance) + systematic
-        distance = float(np.sqrt(xi @ np.linalg.solve(spread, xi)))
-        agreeing += weight * own_weight if distance <= RADIUS else 0.0
-        if distance < nearest:
-            nearest, difference = distance, apart
-    return Consistency(
-        distance=nearest,
-        max_distance=RADIUS,
-        angle_deg=float(np.degrees(se3.rotation_angle(difference))),
-        offset_m=float(np.linalg.norm(se3.transform(difference, centroid_m[None])[0] - centroid_m)),
-        weight=1.0 if len(predictions) * len(modes(posterior)) == 1 else agreeing,
-        min_weight=_LEAST_WEIGHT,
-    )
+    variances, axes = np.linalg.eigh(np.stack([pose.covariance[:3, :3] for _, pose in modes(posterior)]))
+    widest = int(np.argmax(variances[:, -1]))
+    return float(np.sqrt(variances[widest, -1])), axes[widest, :, -1]
+
+
+@dataclass(frozen=True)
+class ConsistencyModel:
+    """How far a registration may be from what a chain of edges predicts.
+
+    Pairwise covariances hold no systematic error, which adds up along a chain instead of averaging out. Registrations
+    are compared with wider covariances than they state.
+    """
+
+    sigma_scale: float = 2.0
+    """How many times the standard deviations of edges may understate their random errors."""
+    drift_deg: float = 0.15
+    """Systematic rotation error of an edge in degrees; along a chain it adds up."""
+    drift_m: float = 0.00025
+    """Systematic translation error of an edge in m, at the object; along a chain it adds up."""
+    max_distance: float = 4.7390
+    """Largest Mahalanobis distance: √χ²₆(0.999), which 1 of 1000 true closures exceeds."""
+    min_weight: float = 0.05
+    """Share (0..1) of the posterior's mass that the agreeing modes must hold."""
+
+    def systematic(self, length: int, centroid_m: Array) -> Array:
+        """Return the covariance (6, 6) of the systematic error of a chain of `length` edges, seen from its end.
+
+        Args:
+            length: number of edges.
+            centroid_m: (3,) of the object in the camera at the chain's end.
+        """
+        sigmas = length * np.repeat([np.radians(self.drift_deg), self.drift_m], 3)  # method.md, eq. C3
+        return se3.covariance_about(np.diag(sigmas**2), -centroid_m)
+
+    def consistency(
+        self,
+        posterior: Posterior,
+        predictions: Sequence[tuple[float, PoseGaussian]],
+        *,
+        length: int,
+        centroid_m: Array,
+    ) -> Consistency:
+        """Compare a registration, mode by mode, with what a chain of edges predicts of the same target_from_source.
+
+        Args:
+            posterior: the registration.
+            predictions: what the chain says, with weights that sum to 1.
+            length: number of edges of the chain.
+            centroid_m: (3,) of the object in the source camera.
+        """
+        systematic = self.systematic(length, centroid_m)
+        agreeing, nearest, difference = 0.0, np.inf, np.eye(4)
+        for (weight, predicted), (own_weight, own) in product(predictions, modes(posterior)):
+            apart = se3.inverse(predicted.mean) @ own.mean
+            xi = se3.log(apart)
+            spread = self.sigma_scale**2 * (predicted.covariance + own.covariance) + systematic
+            distance = float(np.sqrt(xi @ np.linalg.solve(spread, xi)))  # method.md, eq. C4
+            agreeing += weight * own_weight if distance <= self.max_distance else 0.0
+            if distance < nearest:
+                nearest, difference = distance, apart
+        return Consistency(
+            distance=nearest,
+            max_distance=self.max_distance,
+            angle_deg=float(np.degrees(se3.rotation_angle(difference))),
+            offset_m=float(np.linalg.norm(se3.transform(difference, centroid_m[None])[0] - centroid_m)),
+            weight=1.0 if len(predictions) * len(modes(posterior)) == 1 else agreeing,
+            min_weight=self.min_weight,
+        )
+
+    def consistency_through(
+        self, base: Posterior, posterior: Posterior, map_view: MapView, paths: ShortestPaths
+    ) -> Consistency:
+        """Compare a registration of a frame with the path through the graph and another registration of the frame.
+
+        Args:
+            base: the other, which places the frame.
+            posterior: target_from_source of the frame and some view.
+            map_view: what is known so far.
+            paths: from the view of `base`.
+        """
+        through = map_view.solution.relative_gaussian(posterior.target, base.target)
+        predictions = [(weight, composed(pose, through)) for weight, pose in modes(base)]
+        centroid_m = se3.transform(se3.inverse(modes(base)[0][1].mean), map_view.views[base.target].centroid_m[None])[0]
+        path = paths.get(posterior.target)
+        order = list(map_view.views)
+        length = abs(order.index(base.target) - order.index(posterior.target)) if path is None else path.edges
+        return self.consistency(posterior, predictions, length=1 + length, centroid_m=centroid_m)

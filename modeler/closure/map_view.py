@@ -1,20 +1,23 @@
-"""What a closer goes by: all that is known of the frames so far."""
+"""What the closer knows of the frames so far: poses, edges, shortest paths between frames, and steady motion."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import heapq
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csgraph, csr_array
 
-from modeler.closure.paths import PathNetwork, ShortestPaths
-from modeler.types import Array, Edge, RayImage, Solution
+from modeler import se3
+from modeler.types import Array, Edge, PoseGaussian, RayImage, Solution
 
 
 @dataclass(frozen=True, eq=False)
 class MapView:
-    """The accepted views, their poses, and the edges that these rest on."""
+    """The accepted views, their poses, and the edges that constrain these."""
 
     views: Mapping[int, RayImage]
     """By frame number, in order of acceptance."""
@@ -33,14 +36,150 @@ class MapView:
         """object_from_camera (n, 4, 4) of these."""
         return self.poses(self.frames)
 
-    def shortest_paths(self, start: int) -> ShortestPaths:
-        """Return the surest ways from a frame to all others."""
-        return self._network.shortest_paths(start)
-
     def poses(self, frames: Sequence[int]) -> Array:
         """Return object_from_camera (n, 4, 4) of frames."""
         return np.array([self.solution.trajectory[frame] for frame in frames]).reshape(-1, 4, 4)
 
+    def shortest_paths(self, start: int) -> ShortestPaths:
+        """Return the paths of least rotation variance from a frame to all others."""
+        return self._network.shortest_paths(start)
+
+    def extrapolated(self, frame: int) -> Array:
+        """Return object_from_camera (4, 4) of a frame if the motion between the two views nearest to it is steady.
+
+        For a new frame these are the last two; a frame that was left out lies between two, or before the first.
+        """
+        near, *other = heapq.nsmallest(2, self.frames, key=lambda view: abs(view - frame))
+        if not other:
+            return self.solution.trajectory[near]
+        pace = (frame - near) / (near - other[0])  # method.md, eq. C8
+        return self.solution.trajectory[near] @ se3.exp(pace * se3.log(self.solution.relative(other[0], near)))
+
+    def came_back(self, target: int, source: int, paths: ShortestPaths, *, away_deg: float) -> bool:
+        """Return whether the object turned away from a view before another frame, or on the path between the two.
+
+        Args:
+            target: number of the view.
+            source: number of the other frame.
+            paths: from the view that the other frame is registered against.
+            away_deg: rotation that counts as having turned away.
+        """
+        frames = np.array(self.frames)
+        between = (frames > min(target, source)) & (frames < max(target, source))
+        rotations = [self.all_poses[between, :3, :3], self.poses(paths.along(target))[:, :3, :3]]
+        cosine = 0.5 * (np.tensordot(np.concatenate(rotations), self.solution.trajectory[target][:3, :3], 2) - 1.0)
+        return bool(cosine.min(initial=1.0) <= np.cos(np.radians(away_deg)))
+
     @cached_property
     def _network(self) -> PathNetwork:
         return PathNetwork.of(self.edges, self.solution)
+
+
+def composed(first: PoseGaussian, then: PoseGaussian) -> PoseGaussian:
+    """Return the motion `first`, then `then`, of independent errors: mean `then.mean @ first.mean`."""
+    return PoseGaussian(then.mean @ first.mean, se3.composed_covariance(then.covariance, first.mean, first.covariance))
+
+
+@dataclass(frozen=True)
+class ShortestPath:
+    """The path of least rotation variance from one frame to another."""
+
+    edges: int
+    """Number of edges."""
+    variance_rad2: float
+    """Sum of their rotation variances: an upper bound of the motion's, which other paths reduce."""
+    before: int
+    """The frame before the last on the path; the start itself at the start."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShortestPaths(Mapping[int, ShortestPath]):
+    """The paths of least rotation variance from one frame to all that edges connect with it, by frame number."""
+
+    index: Mapping[int, int] = field(default_factory=dict)
+    """Index of each frame in the arrays."""
+    distances_rad2: Array = field(default_factory=lambda: np.zeros(0))
+    """(n,) sums of variances; infinite where there is no path."""
+    before: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """(n,) index of the frame before the last on the path; its own at the start, and where there is no path."""
+
+    def __getitem__(self, frame: int) -> ShortestPath:
+        """Return the path to one frame."""
+        index = self.index[frame]
+        if np.isinf(self.distances_rad2[index]):
+            raise KeyError(frame)
+        before = self._frames[self.before[index]]
+        return ShortestPath(int(self.lengths[index]), float(self.distances_rad2[index]), before)
+
+    def __iter__(self) -> Iterator[int]:
+        """Yield the connected frames."""
+        return (frame for frame, index in self.index.items() if np.isfinite(self.distances_rad2[index]))
+
+    def __len__(self) -> int:
+        """Return the number of connected frames."""
+        return int(np.count_nonzero(np.isfinite(self.distances_rad2)))
+
+    @cached_property
+    def lengths(self) -> npt.NDArray[np.int64]:
+        """Number of edges of each path, (n,)."""
+        length, before = (self.before != np.arange(len(self.before))).astype(np.int64), self.before
+        while True:  # pointer doubling
+            further = length[before]
+            if not further.any():
+                return length
+            length, before = length + further, before[before]
+
+    def to(self, frames: Sequence[int]) -> tuple[Array, npt.NDArray[np.int64]]:
+        """Return variances (n,) in rad² of the paths to frames, infinite without one, and their lengths (n,)."""
+        indices = np.array([self.index.get(frame, -1) for frame in frames], dtype=np.int64)
+        known = indices >= 0
+        return np.where(known, self.distances_rad2[indices], np.inf), np.where(known, self.lengths[indices], 0)
+
+    def along(self, frame: int) -> list[int]:
+        """Return the frames on the path from the start to one, both included; none where there is no path."""
+        if frame not in self:
+            return []
+        path = [self.index[frame]]
+        while self.before[path[-1]] != path[-1]:
+            path.append(int(self.before[path[-1]]))
+        return [self._frames[index] for index in reversed(path)]
+
+    @cached_property
+    def _frames(self) -> list[int]:
+        return list(self.index)
+
+
+@dataclass(frozen=True, eq=False)
+class PathNetwork:
+    """The edges that take part, weighted by their rotation variance."""
+
+    index: Mapping[int, int]
+    """Index of each frame in the matrix."""
+    variances_rad2: csr_array
+    """(n, n), from frame to frame."""
+
+    @classmethod
+    def of(cls, edges: Sequence[Edge], solution: Solution) -> PathNetwork:
+        """Return the network of judged edges, with the poses by which a solution took them."""
+        taking_part = [edge for edge in edges if solution.takes_part(edge)]
+        ends = np.array([(edge.posterior.source, edge.posterior.target) for edge in taking_part], dtype=np.int64)
+        variances = np.array([solution.pose_of(edge).rotation_variance_rad2 for edge in taking_part])
+        frames, indices = np.unique(ends.reshape(-1, 2), return_inverse=True)
+        indices = indices.reshape(-1, 2)
+        rows, columns = np.concatenate([indices, indices[:, ::-1]]).T
+        order = np.lexsort((np.tile(variances, 2), columns, rows))
+        rows, columns, variances = rows[order], columns[order], np.tile(variances, 2)[order]
+        first = np.ones(len(order), dtype=bool)  # of several edges between two frames, that of least variance
+        first[1:] = (np.diff(rows) != 0) | (np.diff(columns) != 0)
+        size = len(frames)
+        matrix = csr_array((variances[first], (rows[first], columns[first])), shape=(size, size))
+        return cls({frame: index for index, frame in enumerate(frames.tolist())}, matrix)
+
+    def shortest_paths(self, start: int) -> ShortestPaths:
+        """Return the shortest path from a frame to every other that edges connect with it (Dijkstra 1959)."""
+        if start not in self.index:
+            return ShortestPaths({start: 0}, np.zeros(1), np.zeros(1, dtype=np.int64))
+        index = self.index[start]
+        distances, before = csgraph.dijkstra(self.variances_rad2, indices=index, return_predecessors=True)
+        own = np.arange(len(before))
+        return ShortestPaths(self.index, distances, np.where(before < 0, own, before).astype(np.int64))

@@ -1,4 +1,4 @@
-"""Which registration places a frame among the views, and what to register it against next where none does."""
+"""Which registration places a frame, and what to register the frame against next where none does."""
 
 from __future__ import annotations
 
@@ -8,34 +8,34 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
-from modeler.closure.consistency import Thresholds, flaw, modes, stands
-from modeler.closure.consistency_model import ConsistencyModel
-from modeler.closure.extrapolation import extrapolated
+from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresholds, broken, modes
 from modeler.closure.map_view import MapView
 from modeler.types import ConfirmedBy, JoinsPrevious, NearExtrapolation, NotPlaced, Posterior, Reason, Relocalised
 
 
 @dataclass(frozen=True, eq=False)
 class Relocaliser:
-    """Tells which of a frame's registrations places it.
+    """Decides which of a frame's registrations places it.
 
-    The previous view's is believed frame by frame. After lost frames, and where another view has to take its place, an
-    object may be taken for another side of itself, which matches as well: such a registration is believed by itself
-    only near where the motion led, and farther from there if that of another view agrees.
+    The previous view's does, frame by frame. After lost frames, and where another view has to take its place, one side
+    of the object may match another: such a registration is accepted alone only near the extrapolated motion, and
+    farther away if that of another view agrees.
     """
 
     map_view: MapView
     """What is known so far."""
     thresholds: Thresholds
     """Of registrations."""
-    consistency_model: ConsistencyModel
-    """In what the graph foretells."""
+    evidence: EvidenceBound
+    """Of the run's edges."""
+    consistency: ConsistencyModel
+    """Of a registration with another."""
     max_angle_deg: float
-    """How far in degrees from where the motion led a registration is believed by itself."""
+    """Rotation in degrees from the extrapolated motion up to which a registration is accepted alone."""
     steps: int = 1
     """How many frames lie between the previous view and this frame, this one counted."""
 
-    def base(self, posteriors: Sequence[Posterior]) -> tuple[Posterior | None, Reason]:
+    def placement(self, posteriors: Sequence[Posterior]) -> tuple[Posterior | None, Reason]:
         """Return the posterior that places a frame, and why.
 
         Args:
@@ -44,24 +44,28 @@ class Relocaliser:
         if not posteriors:
             return None, NotPlaced()
         odometry = posteriors[0]
-        if self._follows(odometry) and (self.steps == 1 or self._off_deg(odometry) <= self.max_angle_deg):
+        if self._follows(odometry) and (self.steps == 1 or self._angle_off_deg(odometry) <= self.max_angle_deg):
             return odometry, JoinsPrevious(odometry.outcome, odometry.overlap)
-        standing = [posterior for posterior in posteriors if stands(posterior, self.thresholds)]
+        standing = [posterior for posterior in posteriors if self.thresholds.stands_alone(posterior, self.evidence)]
         for posterior in sorted(standing, key=lambda posterior: -posterior.overlap):
-            off_deg = self._off_deg(posterior)
-            # Near the end of what views can be registered across, one alone may be cut off there.
-            turned_deg = float(np.degrees(se3.rotation_angle(posterior.pose.mean)))
-            if max(off_deg, turned_deg) <= self.max_angle_deg:
-                return posterior, _reason(posterior, odometry, NearExtrapolation(off_deg))
-            if (witness := self._witness(posterior, standing)) is not None:
-                return posterior, _reason(posterior, odometry, ConfirmedBy(witness.target))
+            off_deg = self._angle_off_deg(posterior)
+            # At the largest rotation that can be registered, the posterior may be cut off.
+            rotation_deg = float(np.degrees(se3.rotation_angle(posterior.pose.mean)))
+            support: NearExtrapolation | ConfirmedBy | None = NearExtrapolation(off_deg)
+            if max(off_deg, rotation_deg) > self.max_angle_deg:
+                support = self._confirmation(posterior, standing)
+            if support is None:
+                continue
+            if posterior is odometry:
+                return posterior, JoinsPrevious(posterior.outcome, posterior.overlap, support)
+            return posterior, Relocalised(posterior.overlap, support)
         return None, NotPlaced()
 
-    def next(self, posteriors: Sequence[Posterior]) -> int | None:
+    def next_target(self, posteriors: Sequence[Posterior]) -> int | None:
         """Return the earlier view to register a lost frame against next; None where none is left.
 
-        A posterior that stands alone wants a witness: the view nearest to where it puts the frame. Otherwise the view
-        nearest to where the motion leads comes first, then those farthest from all views tried.
+        A posterior that stands alone needs confirmation: by the view nearest to its pose. Otherwise the view nearest to
+        the extrapolated motion comes first, then those farthest from all views tried.
 
         Args:
             posteriors: what was tried for the frame, the previous view first.
@@ -71,46 +75,39 @@ class Relocaliser:
         if not left:
             return None
         poses = self.map_view.poses(left)
-        for posterior in (posterior for posterior in posteriors if stands(posterior, self.thresholds)):
-            placed = self.map_view.solution.trajectory[posterior.target] @ posterior.pose.mean
-            angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ placed))
-            if angle_deg.min() <= self.max_angle_deg:
-                return left[int(np.argmin(angle_deg))]
+        for posterior in posteriors:
+            if self.thresholds.stands_alone(posterior, self.evidence):
+                placed = self.map_view.solution.trajectory[posterior.target] @ posterior.pose.mean
+                angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ placed))
+                if angle_deg.min() <= self.max_angle_deg:
+                    return left[int(np.argmin(angle_deg))]
         if len(tried) == 1:
-            expected = extrapolated(self.map_view.solution, self.map_view.frames, posteriors[0].source)
+            expected = self.map_view.extrapolated(posteriors[0].source)
             return left[int(np.argmin(se3.rotation_angle(se3.inverse(poses) @ expected)))]
         apart = [se3.rotation_angle(se3.inverse(pose) @ poses) for pose in self.map_view.poses(tried)]
         return left[int(np.argmax(np.min(apart, axis=0)))]
 
     def _follows(self, odometry: Posterior) -> bool:
-        """Return whether the previous view's registration came to an end, and after lost frames matches like others."""
-        matches = self.steps == 1 or not odometry.log_evidence < self.thresholds.least_nats
-        return flaw(odometry) is None and matches
+        """Return whether the previous view's registration is sound, and after lost frames matches like others."""
+        matches = self.steps == 1 or not odometry.log_evidence < self.evidence.min_nats
+        return broken(odometry) is None and matches
 
-    def _witness(self, posterior: Posterior, standing: Sequence[Posterior]) -> Posterior | None:
-        """Return a registration of another view that agrees with one not too far from where the motion led."""
-        # A pace that changes at random from step to step goes astray with the root of their number.
-        if self._off_deg(posterior) > float(np.sqrt(self.steps)) * self.max_angle_deg:
+    def _confirmation(self, posterior: Posterior, standing: Sequence[Posterior]) -> ConfirmedBy | None:
+        """Return that a registration of another view agrees with one not too far from the extrapolated motion."""
+        # Extrapolation of a random pace errs with the root of the number of steps.
+        if self._angle_off_deg(posterior) > float(np.sqrt(self.steps)) * self.max_angle_deg:
             return None
-        reach = self.map_view.shortest_paths(posterior.target)
-        others = (other for other in standing if other is not posterior)
-        agreeing = (
-            other
-            for other in others
-            if self.consistency_model.consistency_through(posterior, other, self.map_view, reach).consistent
-        )
-        return next(agreeing, None)
+        paths = self.map_view.shortest_paths(posterior.target)
+        for other in standing:
+            if other is not posterior:
+                if self.consistency.consistency_through(posterior, other, self.map_view, paths).consistent:
+                    return ConfirmedBy(other.target)
+        return None
 
-    def _off_deg(self, posterior: Posterior) -> float:
-        """Return the angle between where a registration puts a frame and where the motion going on would have."""
+    def _angle_off_deg(self, posterior: Posterior) -> float:
+        """Return the angle between a registration's pose of the frame and the extrapolated motion's."""
         if len(self.map_view.frames) == 1:
             return 0.0
-        expected = extrapolated(self.map_view.solution, self.map_view.frames, posterior.source)
+        expected = self.map_view.extrapolated(posterior.source)
         placed = self.map_view.solution.trajectory[posterior.target] @ modes(posterior)[0][1].mean
         return float(np.degrees(se3.rotation_angle(se3.inverse(expected) @ placed)))
-
-
-def _reason(posterior: Posterior, odometry: Posterior, support: NearExtrapolation | ConfirmedBy) -> Reason:
-    if posterior is odometry:
-        return JoinsPrevious(posterior.outcome, posterior.overlap, support)
-    return Relocalised(posterior.overlap, support)
