@@ -8,8 +8,8 @@ from rings import OBJECT_M, covariance, edge, nees, ring, rotation_error, spin
 
 from modeler import se3
 from modeler.graph import CommonAxis, PoseGraph, solve
-from modeler.graph.factors import Factor
-from modeler.graph.turning import estimated_axis, slip, surest_point
+from modeler.graph.axis import best_known_point, estimated_axis, slip
+from modeler.graph.pose_graph import Factor
 from modeler.types import Array, Edge, PoseGaussian
 
 COUNT, STEP_RAD, SIGMA_STEP_RAD = 14, np.radians(25.0), np.radians(1.0)
@@ -61,16 +61,16 @@ def test_derivatives_are_those_of_the_slip() -> None:
                 np.testing.assert_allclose(derivative[0, :, column], (ends[0] - ends[1]) / 2e-6, atol=1e-6)
 
 
-def test_surest_point_is_where_the_object_is() -> None:
+def test_best_known_point_is_where_the_object_is() -> None:
     rng = np.random.default_rng(2)
     graph, _ = ring(14, rng, [])
     factors = [Factor(e, e.posterior.pose) for e in graph.edges]
     np.testing.assert_allclose(
-        surest_point(factors), OBJECT_M, atol=0.05
+        best_known_point(factors), OBJECT_M, atol=0.05
     )  # covariances couple turns and shifts at random
     exact = se3.adjoint(se3.translation(OBJECT_M))
     pose = PoseGaussian(np.eye(4), exact @ np.diag([1e-3, 2e-4, 5e-4, 1e-6, 1e-6, 1e-6]) @ exact.T)
-    np.testing.assert_allclose(surest_point([Factor(edge(0, 1, pose), pose)]), OBJECT_M, atol=1e-9)
+    np.testing.assert_allclose(best_known_point([Factor(edge(0, 1, pose), pose)]), OBJECT_M, atol=1e-9)
 
 
 def test_perfect_table_has_no_slip_and_shows_its_axis() -> None:

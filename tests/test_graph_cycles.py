@@ -9,9 +9,8 @@ import pytest
 from rings import covariance, edge, ring, spin
 
 from modeler import se3
-from modeler.graph.collapse import collapse_modes
-from modeler.graph.cycles import cycles
-from modeler.graph.factors import Factor, SpanningTree
+from modeler.graph.modes import cycles
+from modeler.graph.pose_graph import Factor, SpanningTree, collapse_modes
 from modeler.types import Array, Edge, Mode, PoseGaussian
 
 COUNT = 8
@@ -45,7 +44,7 @@ def _gaps(edges: list[Edge], root: int) -> dict[int, tuple[Array, Array]]:
     several = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T
     hypotheses = several[:, [OPEN.index(source) for source in order]]
     spans = [abs(loop.source - loop.target) for loop in frames.loops]
-    return {span: cycle.gap(hypotheses) for span, cycle in zip(spans, found, strict=True)}
+    return {span: cycle.residual(hypotheses) for span, cycle in zip(spans, found, strict=True)}
 
 
 @pytest.mark.parametrize("root", [0, 4, 7])
@@ -67,7 +66,7 @@ def test_a_gap_is_told_by_the_covariances_of_both_ways() -> None:
     edges = [_two_modes(edge(0, 1, first)), edge(0, 1, second, "closure")]
     factors = [Factor(one, collapse_modes(one.posterior)) for one in edges]
     _, (cycle,) = cycles(factors[:1], factors[1:], 0, {})
-    error, log_volume = cycle.gap(np.array([[0]]))
+    error, log_volume = cycle.residual(np.array([[0]]))
     xi, spread = se3.log(se3.inverse(second.mean) @ first.mean), first.covariance + second.covariance
     assert error[0] == pytest.approx(0.5 * xi @ np.linalg.solve(spread, xi))
     assert log_volume[0] == pytest.approx(0.5 * np.linalg.slogdet(spread)[1])
@@ -80,4 +79,4 @@ def test_what_is_settled_is_open_no_more() -> None:
     columns, found = cycles(frames.tree, frames.loops, 0, settled)
     assert [one.source for one in columns] == [OPEN[2]]
     whole = _gaps(edges, 0)[7][0]
-    np.testing.assert_allclose(found[0].gap(np.array([[0], [1]]))[0], whole[[6, 7]], rtol=1e-9)
+    np.testing.assert_allclose(found[0].residual(np.array([[0], [1]]))[0], whole[[6, 7]], rtol=1e-9)

@@ -12,7 +12,7 @@ import pytest
 from rings import edge, measured, spin, spun, turntable
 
 from modeler import se3
-from modeler.graph import PoseGraph, Smoother, closing, marginals, solve
+from modeler.graph import PoseGraph, Smoother, covariance, optimise, solve
 from modeler.types import Edge, Mode, PoseGaussian, Solution
 
 COUNT, PER_TURN = 40, 12
@@ -106,10 +106,10 @@ def test_the_whole_graph_is_solved_but_once(monkeypatch: pytest.MonkeyPatch) -> 
 
     def counted(tree: Sequence[object], *args: object, **options: object) -> object:
         calls.append(len(tree))
-        return optimise(tree, *args, **options)  # pyright: ignore[reportArgumentType]
+        return batch(tree, *args, **options)  # pyright: ignore[reportArgumentType]
 
-    optimise = closing.optimise
-    monkeypatch.setattr(closing, "optimise", counted)
+    batch = optimise.optimise
+    monkeypatch.setattr(optimise, "optimise", counted)
     growing = Smoother()
     arrivals = _arrivals(np.random.default_rng(7))
     for edges in arrivals[:-1]:
@@ -159,11 +159,11 @@ def test_covariances_of_all_are_worked_out_again_only_where_a_loop_has_closed(mo
         asked.append(len(factors))
         return rows(factors, *args)  # pyright: ignore[reportArgumentType]
 
-    growing, rows = Smoother(), marginals._rows
+    growing, rows = Smoother(), covariance._linearise
     for edges in _arrivals(np.random.default_rng(12)):
         growing = growing.plus(edges)
     assert growing.solution.covariances[1].shape == (6, 6)
-    monkeypatch.setattr(marginals, "_rows", counted)
+    monkeypatch.setattr(covariance, "_linearise", counted)
     for number, edges in enumerate(_tail(6, np.random.default_rng(13))):
         growing = growing.plus(edges)
         assert growing.solution.covariances[COUNT + number].shape == (6, 6)
@@ -194,7 +194,7 @@ def test_a_pose_that_is_asked_alone_is_worked_out_alone(monkeypatch: pytest.Monk
         growing = growing.plus(edges)
     wanted = dict(solve(growing.graph, {}).covariances.items())
     with monkeypatch.context() as patch:
-        patch.setattr(marginals, "_spread", None)  # without which not all can be worked out
+        patch.setattr(covariance, "_root_covariance", None)  # without which not all can be worked out
         covariances = growing.solution.covariances
         assert COUNT - 1 in covariances
         assert COUNT not in covariances

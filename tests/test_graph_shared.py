@@ -14,7 +14,7 @@ from slow import sampled
 
 from modeler import se3
 from modeler.graph import PoseGraph, Smoother, shared_noise, solve
-from modeler.graph.chi_square import chi_square_quantile
+from modeler.graph.covariance import chi_square_quantile
 from modeler.types import Array, PoseGaussian, Solution
 
 COUNT = 14

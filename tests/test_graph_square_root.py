@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from modeler.graph.square_root import Rows, SquareRoot
+from modeler.graph.covariance import Rows, SquareRoot
 from modeler.types import Array
 
 
@@ -24,26 +24,28 @@ def _information(rows: Sequence[Rows]) -> Array:
 
 
 def _square(root: SquareRoot) -> Array:
-    variables, cliques = sorted(root.homes), root.all()
+    variables, cliques = sorted(root.clique_of), root.cliques()
     size = 6 * len(variables)
     total = np.zeros((size, size))
     for clique in cliques:
-        columns = np.concatenate([6 * variables.index(v) + np.arange(6) for v in (*clique.inner, *clique.outer)])
-        block = np.hstack([clique.upper, clique.beside])
+        columns = np.concatenate([6 * variables.index(v) + np.arange(6) for v in (*clique.frontals, *clique.separator)])
+        block = np.hstack([clique.r, clique.s])
         total[np.ix_(columns, columns)] += block.T @ block
     return total
 
 
 def _assert_hangs_together(root: SquareRoot) -> None:
     """Ways lead from every clique to a root, and parents hold what hangs on them."""
-    for clique in root.all():
+    for clique in root.cliques():
         parent = root.parent(clique)
         if parent is not None:
-            assert set(clique.outer) <= {*parent.inner, *parent.outer}
-            assert clique in root.below[parent]
-            assert root.rank[clique.inner[-1]] < root.rank[parent.inner[-1]]
-    assert sum(len(below) for below in root.below.values()) == sum(bool(clique.outer) for clique in root.all())
-    np.testing.assert_array_equal(sorted(v for clique in root.all() for v in clique.inner), sorted(root.homes))
+            assert set(clique.separator) <= {*parent.frontals, *parent.separator}
+            assert clique in root.children[parent]
+            assert root.rank[clique.frontals[-1]] < root.rank[parent.frontals[-1]]
+    assert sum(len(below) for below in root.children.values()) == sum(
+        bool(clique.separator) for clique in root.cliques()
+    )
+    np.testing.assert_array_equal(sorted(v for c in root.cliques() for v in c.frontals), sorted(root.clique_of))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -62,15 +64,15 @@ def test_it_is_the_square_root_of_the_rows_that_are_left(seed: int) -> None:
         np.testing.assert_allclose(_square(root), _information([*tree, *loops]), atol=1e-9)
         np.testing.assert_array_equal(_square(before), square)  # a value
         _assert_hangs_together(root)
-    assert len(root.all()) > 5
+    assert len(root.cliques()) > 5
 
 
 def test_what_hangs_on_one_row_leaves_all_else_alone() -> None:
     rng = np.random.default_rng(0)
     trunk = SquareRoot().plus([_row(rng, 0), *(_row(rng, k, k + 1) for k in range(20)), _row(rng, 0, 20)])
     grown = trunk.plus([_row(rng, 21, 20), _row(rng, 31)]).plus([_row(rng, 30, 21)])
-    assert set(trunk.all()) < set(grown.all())
-    assert len(grown.all()) == len(trunk.all()) + 3
+    assert set(trunk.cliques()) < set(grown.cliques())
+    assert len(grown.cliques()) == len(trunk.cliques()) + 3
     _assert_hangs_together(grown)
 
 
@@ -79,8 +81,8 @@ def test_a_row_concerns_the_cliques_above_its_variables_alone() -> None:
     chain = [_row(rng, 0), *(_row(rng, k, k + 1) for k in range(300))]
     root = SquareRoot().plus(chain)
     grown = root.plus([_row(rng, 150, 300)])
-    assert set(root.all()) - set(grown.all()) == set(root.way([150, 300]))
-    assert len(root.way([150, 300])) < 30
+    assert set(root.cliques()) - set(grown.cliques()) == set(root.path_to_roots([150, 300]))
+    assert len(root.path_to_roots([150, 300])) < 30
 
 
 def test_ways_stay_short_however_long_a_chain_grows() -> None:
@@ -88,6 +90,6 @@ def test_ways_stay_short_however_long_a_chain_grows() -> None:
     root, rows = SquareRoot(), [_row(rng, 0), *(_row(rng, k, k + 1) for k in range(400))]
     for row in rows:
         root = root.plus([row])
-        assert len(root.way([max(root.homes)])) <= 41
+        assert len(root.path_to_roots([max(root.clique_of)])) <= 41
     _assert_hangs_together(root)
     np.testing.assert_allclose(_square(root), _information(rows), atol=1e-9)

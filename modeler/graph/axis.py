@@ -1,7 +1,7 @@
-"""A turntable in the graph: one axis, unknown but the same for all steps, about which the object turns.
+"""A turntable in the graph: one axis, unknown but common to all steps, about which the object turns.
 
-Between consecutive frames target_from_source = A Rz(θ) exp(slip) A⁻¹, with A = camera_from_axis, the axis its third
-direction. A is a variable that all steps share, so that what the images of each say of it serves all, and counts once.
+Between consecutive frames target_from_source = A Rz(θ) exp(slip) A⁻¹, with A = camera_from_axis, whose third direction
+is the axis (method.md, eq. G7). A is a variable of all steps, so that what each pair of images says of it counts once.
 """
 
 from __future__ import annotations
@@ -15,20 +15,90 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.graph.chi_square import chi_square_quantile
-from modeler.graph.factors import Factor, inverse_right_jacobian
-from modeler.graph.square_root import Rows
-from modeler.graph.turning import estimated_axis, slip, surest_point
+from modeler.graph.covariance import Rows, chi_square_quantile
+from modeler.graph.pose_graph import Factor, inverse_right_jacobian
 from modeler.types import Array
 
-_AXIS = gtsam.symbol("a", 0)  # frames are numbered far below
-# Standard deviations of A about where it is sought, rad and m. A turn about the axis changes nothing and is held; a
-# shift along it moves the point about which the object tilts, which lies within the object; the rest is all but free.
+_MIN_TURN_RAD = np.radians(5.0)  # a table that has turned by less in all shows no axis
+_SLIP = [0, 1, 3, 4, 5]  # components of ξ other than the rotation about the axis
+_AXIS = gtsam.symbol("a", 0)  # beyond all frame numbers
+# Standard deviations of A about its initial estimate, rad and m. A rotation about the axis changes nothing and is held;
+# the origin lies along the axis within the object; the rest is all but free.
 _AXIS_SIGMAS = np.array([1.0, 1.0, 1e-4, 1.0, 1.0, 0.03])
-_PLACE_SIGMAS = np.array([0.01, 0.01, *_AXIS_SIGMAS[2:]])  # where steps say nothing of its direction
-_ITERATIONS, _HALVINGS = 50, 10  # of Gauss and Newton, and of one step of theirs that overshoots
-_TOLERANCE = 1e-6  # of half the squared Mahalanobis distance: where a step lowers it by less, the next is nothing
-_FITS = 1.0 - 1e-6  # of tables that are as they are said to be; the others cost a hundred times more
+_PLACE_SIGMAS = np.array([0.01, 0.01, *_AXIS_SIGMAS[2:]])  # where edges hold the direction
+_MAX_ITERATIONS, _MAX_HALVINGS = 50, 10  # of Gauss–Newton, and of one of its steps
+_TOLERANCE = 1e-6  # of half the squared Mahalanobis distance
+_CONFIDENCE = 1.0 - 1e-6  # of the gate: a false axis costs a hundred times more than a true one
+
+
+def best_known_point(factors: Sequence[Factor]) -> Array:
+    """Return the point (3,) in camera coordinates whose motion has the least variance: where the object is."""
+    inertia, moment = np.zeros((3, 3)), np.zeros(3)
+    for factor in factors:  # least Σ E|υ + ω × p|²
+        spread = factor.pose.covariance / np.trace(factor.pose.covariance[:3, :3])
+        turns, mixed = spread[:3, :3], spread[:3, 3:]
+        inertia += np.trace(turns) * np.eye(3) - turns
+        moment += np.array([mixed[1, 2] - mixed[2, 1], mixed[2, 0] - mixed[0, 2], mixed[0, 1] - mixed[1, 0]])
+    return np.asarray(np.linalg.solve(inertia, moment), dtype=np.float64)
+
+
+def estimated_axis(trajectory: Mapping[int, Array], near_m: Array) -> Array | None:
+    """Return camera_from_axis (4, 4) that the steps between consecutive frames share best; None without rotation.
+
+    The object turns about its third direction in the positive sense, seen from camera coordinates, as time goes back.
+
+    Args:
+        trajectory: object_from_camera (4, 4) by frame number.
+        near_m: (3,) a point in camera coordinates, to which the origin is the nearest on the axis.
+    """
+    steps = np.stack([se3.inverse(trajectory[t]) @ trajectory[s] for t, s in itertools.pairwise(sorted(trajectory))])
+    turns = se3.log(steps)[:, :3]
+    if np.sum(np.linalg.norm(turns, axis=1)) < _MIN_TURN_RAD:
+        return None
+    axis = np.linalg.svd(turns)[2][0]
+    axis = axis if np.sum(turns @ axis) > 0.0 else -axis
+    fixed = (np.eye(3) - steps[:, :3, :3]).reshape(-1, 3)
+    # Points on the axis stay where they are.
+    point = np.linalg.lstsq(np.vstack([fixed, axis]), np.append(steps[:, :3, 3].ravel(), axis @ near_m), rcond=None)[0]
+    across = np.linalg.svd(axis[None])[2][1]
+    camera_from_axis = np.eye(4)
+    camera_from_axis[:3, :3] = np.stack([across, np.cross(axis, across), axis], axis=1)
+    camera_from_axis[:3, 3] = point
+    return camera_from_axis
+
+
+def slip(
+    object_from_target: Array, object_from_source: Array, camera_from_axis: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return the slip of steps (n, 5), and its derivatives (n, 5, 6) by ξ of the three poses (method.md, eq. G7).
+
+    Tilt about the first two directions in rad, then shift along all three in m.
+
+    Args:
+        object_from_target: (n, 4, 4).
+        object_from_source: (n, 4, 4).
+        camera_from_axis: (4, 4).
+    """
+    target_from_source = se3.inverse(object_from_target) @ object_from_source
+    step = se3.inverse(camera_from_axis) @ target_from_source @ camera_from_axis
+    rotation = step[:, :3, :3]
+    sine, cosine = rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1]
+    turned = rotation[:, None] @ se3.hat(np.eye(3))  # derivatives by a turn from the right, (n, 3, 3, 3)
+    slope = np.zeros((len(step), 6))  # of the angle
+    slope[:, :3] = cosine[:, None] * (turned[:, :, 1, 0] - turned[:, :, 0, 1])
+    slope[:, :3] -= sine[:, None] * (turned[:, :, 0, 0] + turned[:, :, 1, 1])
+    slope /= (cosine**2 + sine**2)[:, None]
+    angle = np.arctan2(sine, cosine)
+    back = np.zeros((len(step), 6))
+    back[:, 2] = -angle
+    rest = se3.exp(back) @ step
+    xi = se3.log(rest)
+    across = np.eye(6) - se3.adjoint(se3.inverse(rest))[:, :, 2, None] * slope[:, None]
+    derivative = (inverse_right_jacobian(xi) @ across)[:, _SLIP]
+    of_source = derivative @ se3.adjoint(se3.inverse(camera_from_axis))
+    of_target = -of_source @ se3.adjoint(se3.inverse(target_from_source))
+    of_axis = derivative @ (np.eye(6) - se3.adjoint(se3.inverse(step)))
+    return xi[:, _SLIP], of_target, of_source, of_axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,29 +108,29 @@ class AxisSolution:
     poses: Mapping[int, Array]
     """object_from_camera (4, 4) by frame number."""
     rows: Sequence[Rows]
-    """What the axis says there: whitened, of errors in object coordinates, as `marginals` takes them."""
+    """What the axis says there: whitened rows of errors in object coordinates."""
     camera_from_axis: Array
     """(4, 4), the axis the third direction."""
 
 
 @dataclass(frozen=True)
 class CommonAxis:
-    """What is known of a turntable, beyond what the edges know: they must not hold it already.
+    """What is known of a turntable, beyond what the edges hold.
 
-    How far it turns in a step is none of it: where that is known, edges hold it.
+    The angle of a step is not part of it: where that is known, edges hold it.
     """
 
     sigma_tilt_rad: float = float(np.radians(0.2))
-    """How far the object tilts against the axis in a step: wobble of the table, slip on it. Infinite where edges hold
-    the axis' direction: what steps then share is its place."""
+    """Tilt of the object against the axis in a step, by wobble or slip. Infinite where edges hold the axis' direction:
+    steps then share its place only."""
     sigma_shift_m: float = 0.0005
-    """How far it slips across the axis in a step. Some centimetres make a table on which it is pushed about: what steps
-    then share is the table's normal."""
+    """Slip across the axis in a step. Some centimetres make a table on which the object is pushed about: steps then
+    share the table's normal only."""
     sigma_lift_m: float = 0.0005
-    """How far it moves along the axis in a step; infinite where edges hold that."""
+    """Slip along the axis in a step; infinite where edges hold that."""
 
-    def solved(self, factors: Sequence[Factor], trajectory: Mapping[int, Array], root: int) -> AxisSolution | None:
-        """Return the poses that meet factors and axis best; None where there is no axis that factors allow.
+    def solve(self, factors: Sequence[Factor], trajectory: Mapping[int, Array], root: int) -> AxisSolution | None:
+        """Return the poses of least error under factors and axis; None where factors contradict every axis.
 
         Args:
             factors: all that take part.
@@ -69,37 +139,37 @@ class CommonAxis:
         """
         if len(trajectory) < 2:
             return None
-        start = estimated_axis(trajectory, surest_point(factors))
+        start = estimated_axis(trajectory, best_known_point(factors))
         if start is None:
             return None
-        known = _Known(self, factors, list(trajectory), root, start)
-        alone = _half_square(known.rows({**trajectory, _AXIS: start})[: len(factors)])
-        poses, rows = known.minimised({**trajectory, _AXIS: start})
+        problem = _Problem(self, factors, list(trajectory), root, start)
+        alone = _half_square(problem.rows({**trajectory, _AXIS: start})[: len(factors)])
+        poses, rows = problem.minimised({**trajectory, _AXIS: start})
         if not self._fits(rows[len(factors) + 1 :], 2.0 * (_half_square(rows) - alone)):
             return None
         to_object = {key: se3.adjoint(se3.inverse(pose)) for key, pose in poses.items() if key != _AXIS}
-        said: list[Rows] = [
+        rows_in_object: list[Rows] = [
             {key: block @ to_object[key] if key in to_object else block for key, block in blocks.items()}
             for blocks, _ in rows[len(factors) :]
         ]
-        return AxisSolution({frame: poses[frame] for frame in trajectory}, said, poses[_AXIS])
+        return AxisSolution({frame: poses[frame] for frame in trajectory}, rows_in_object, poses[_AXIS])
 
     def _fits(self, steps: Sequence[tuple[Rows, Array]], cost: float) -> bool:
-        """Return whether steps may share an axis that adds `cost` to the squared distance of factors from poses.
+        """Return whether steps may share an axis that adds `cost` to the squared Mahalanobis distance (eq. G8).
 
-        That is chi² with as many degrees of freedom as the axis says more than has to be found: two numbers of its
-        direction, two of its place.
+        That is χ² with as many degrees of freedom as the steps have conditions beyond the axis' own parameters: two of
+        its direction, two of its place.
         """
-        told = np.isfinite([self.sigma_tilt_rad, self.sigma_shift_m])
+        free = np.isfinite([self.sigma_tilt_rad, self.sigma_shift_m])
         stacked = [np.hstack(list(blocks.values())) for blocks, _ in steps]
         conditions = sum(int(np.count_nonzero(step.any(axis=1))) for step in stacked)
-        conditions -= 2 * int(np.count_nonzero(told))
-        return conditions <= 0 or cost <= chi_square_quantile(_FITS, conditions)
+        conditions -= 2 * int(np.count_nonzero(free))
+        return conditions <= 0 or cost <= chi_square_quantile(_CONFIDENCE, conditions)
 
 
 @dataclass(frozen=True, eq=False)
-class _Known:
-    """All that is known of poses and axis: factors, a loose guess of the axis, and how little steps slip."""
+class _Problem:
+    """Poses and axis under factors, a loose prior of the axis, and the slip of each step."""
 
     axis: CommonAxis
     factors: Sequence[Factor]
@@ -108,7 +178,7 @@ class _Known:
     start: Array
 
     def rows(self, poses: Mapping[int, Array]) -> list[tuple[Rows, Array]]:
-        """Return whitened derivatives by variable, blocks (m, 6), and errors (m,): of factors, the guess, and steps.
+        """Return whitened derivatives by variable, blocks (m, 6), and errors (m,): of factors, the prior, and steps.
 
         Args:
             poses: object_from_camera (4, 4) by frame number, and camera_from_axis.
@@ -137,15 +207,15 @@ class _Known:
         return rows
 
     def minimised(self, poses: dict[int, Array]) -> tuple[dict[int, Array], list[tuple[Rows, Array]]]:
-        """Return poses and axis that meet all best, and what `rows` says there: Gauss and Newton, from not far off."""
+        """Return poses and axis of least error, and `rows` there, by Gauss–Newton with step halving."""
         rows = self.rows(poses)
-        for _ in range(_ITERATIONS):
+        for _ in range(_MAX_ITERATIONS):
             linear = gtsam.GaussianFactorGraph()
             for blocks, error in rows:
                 linear.add(_gaussian_factor(blocks, -error))
             step = linear.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR).optimize()
             moved, moved_rows = poses, rows
-            for halvings in range(_HALVINGS):
+            for halvings in range(_MAX_HALVINGS):
                 moved = {
                     key: pose if key == self.root else pose @ se3.exp(0.5**halvings * step.at(key))
                     for key, pose in poses.items()
@@ -153,11 +223,11 @@ class _Known:
                 moved_rows = self.rows(moved)
                 if _half_square(moved_rows) <= _half_square(rows):
                     break
-            fallen = _half_square(rows) - _half_square(moved_rows)
-            if fallen < 0.0:
+            decrease = _half_square(rows) - _half_square(moved_rows)
+            if decrease < 0.0:
                 break
             poses, rows = moved, moved_rows
-            if fallen <= _TOLERANCE:
+            if decrease <= _TOLERANCE:
                 break
         return poses, rows
 
@@ -165,7 +235,7 @@ class _Known:
         return {key: block for key, block in blocks.items() if key != self.root}
 
     def _slips(self, poses: Mapping[int, Array], steps: npt.NDArray[np.int64]) -> list[Array]:
-        """Return `slip` of steps (n, 2) between a target and a source, whitened."""
+        """Return the whitened `slip` of steps (n, 2) between a target and a source."""
         axis, apart = self.axis, steps[:, 1] - steps[:, 0]
         targets, sources = (np.stack([poses[int(frame)] for frame in ends]) for ends in steps.T)
         across = (axis.sigma_shift_m, axis.sigma_shift_m, axis.sigma_lift_m)
@@ -180,7 +250,7 @@ def _half_square(rows: Sequence[tuple[Rows, Array]]) -> float:
 
 
 def _gaussian_factor(rows: Rows, right: Array) -> gtsam.JacobianFactor:
-    """Return rows of one to three variables, and their right sides (m,), as GTSAM takes them."""
+    """Return rows of one to three variables with right sides (m,) as a GTSAM factor."""
     (key, block), *more = rows.items()
     unit = gtsam.noiseModel.Unit.Create(len(block))
     if not more:

@@ -1,14 +1,7 @@
-"""Edges whose posterior has several modes: which of them the loops and the other edges single out.
+"""Edges whose posterior has several modes: which of them the loops and the other edges select.
 
-A hypothesis names one mode for every edge with several that lies on a loop. Its evidence is the product of the weights
-of its modes and of how well each loop then closes. Loops are first taken one by one, along the tree, for thousands of
-hypotheses at once; the few that are left are solved whole, and their evidence is Laplace's: with e the error at the
-optimum, Σ_m the covariances of the modes and UᵀU the information of all poses,
-
-    log evidence = Σ log(w_m |Σ_m|^-1/2) − e − log |U|.
-
-Without a loop that is Σ log w_m: what one edge says of itself. (Olson and Agarwal, Inference on networks of mixtures
-for robust robot mapping, IJRR 2013, choose by w_m |Σ_m|^-1/2 exp(−e) alone, which favours narrow modes.)
+A hypothesis names one mode for every such edge on a loop. Hypotheses are first scored loop by loop, along the tree,
+thousands at once; the best few are then optimised, and their evidence is Laplace's (method.md, eq. G3).
 """
 
 from __future__ import annotations
@@ -19,21 +12,131 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from modeler.graph.cycles import Cycle, cycles
-from modeler.graph.factors import Factor, chain
-from modeler.graph.marginals import RelativeCovariance
-from modeler.graph.optimise import joining, optimise
+from modeler import se3
+from modeler.graph.covariance import RelativeCovariance
+from modeler.graph.optimise import optimise, selected
+from modeler.graph.pose_graph import Factor, chain, walk
 from modeler.types import Array, Edge
 
 _BEAM = 4096  # hypotheses kept while loops are taken one by one: all of twelve edges with two modes
-_SOLVED = 8  # hypotheses solved whole
-_MARGIN = 15.0  # nats below the best at which a hypothesis is no longer worth solving
+_MAX_OPTIMISED = 8  # hypotheses that are optimised
+_MARGIN_NATS = 15.0  # below the best: hypotheses farther off are not optimised
 _DECIDED = 0.9999  # weight from which a mode is taken for the only one
-_REFUTED = 1.5  # false loops more than the best hypothesis has, and one is dropped: two, for one may lie
-_PAIRS = 16  # edges up to which the modes of two of them are changed at once
+_MAX_REFUTED = 1.5  # outlier loops beyond the best hypothesis' before one is dropped: one loop may be wrong itself
+_MAX_PAIRED = 16  # edges up to which the modes of two of them are changed at once
 
 
-def decide(
+@dataclass(frozen=True, eq=False)
+class _Segment:
+    """A part of a cycle: a motion with one or several modes."""
+
+    column: int | None
+    """Of the hypotheses, which names the mode; None: there is but one."""
+    means: Array
+    """(m, 4, 4)."""
+    covariances: Array
+    """(m, 6, 6)."""
+
+    def of(self, hypotheses: npt.NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return mean and covariance for each hypothesis (h, edges), or one for all (1, …)."""
+        if self.column is None:
+            return self.means, self.covariances
+        modes = hypotheses[:, self.column]
+        return self.means[modes], self.covariances[modes]
+
+
+@dataclass(frozen=True, eq=False)
+class Cycle:
+    """The path along the tree from a loop's target to its source, and the loop's own motion."""
+
+    path: tuple[_Segment, ...]
+    own: _Segment
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """Of the hypotheses on which it depends."""
+        return tuple(segment.column for segment in (*self.path, self.own) if segment.column is not None)
+
+    def residual(self, hypotheses: npt.NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return for hypotheses (h, edges) how far the loop is from closing.
+
+        Returns:
+            Half the squared Mahalanobis distance (h,), and half the log determinant of its covariance (h,).
+        """
+        mean, covariance = np.eye(4)[None], np.zeros((1, 6, 6))
+        for segment in self.path:
+            mean, covariance = _composed((mean, covariance), segment.of(hypotheses))
+        own, own_covariance = self.own.of(hypotheses)
+        spread = covariance + own_covariance
+        xi = se3.log(se3.inverse(own) @ mean)
+        error = 0.5 * np.sum(xi * np.linalg.solve(spread, xi[..., None])[..., 0], axis=-1)
+        return error, 0.5 * np.linalg.slogdet(spread)[1]
+
+
+def cycles(
+    tree: Sequence[Factor], loops: Sequence[Factor], root: int, settled: Mapping[Edge, Array]
+) -> tuple[tuple[Edge, ...], list[Cycle]]:
+    """Return the edges on loops whose mode is undecided, one a column of hypotheses, and the cycles that name them.
+
+    Args:
+        tree: factors that connect the frames.
+        loops: the factors beyond those.
+        root: a frame of the tree.
+        settled: weights of modes, by edge, of which the heaviest is taken.
+    """
+    above = {neighbour: (frame, factor) for frame, neighbour, factor in walk(tree, root)}
+    depth = {root: 0}
+    for neighbour, (frame, _) in above.items():  # outwards
+        depth[neighbour] = depth[frame] + 1
+    columns: dict[Edge, int] = {}
+    found = []
+    for loop in loops:
+        ahead: list[tuple[Factor, bool]] = []  # each with whether the path goes from its target to its source
+        back: list[tuple[Factor, bool]] = []
+        target, source = loop.target, loop.source
+        while target != source:
+            if depth[target] >= depth[source]:
+                target, factor = above[target]
+                ahead.append((factor, factor.source == target))
+            else:
+                source, factor = above[source]
+                back.append((factor, factor.target == source))
+        path = [*ahead, *reversed(back), (loop, True)]
+        if any(factor.modes and factor.edge not in settled for factor, _ in path):
+            *segments, own = (_segment(factor, settled, columns, forwards=forwards) for factor, forwards in path)
+            found.append(Cycle(_merged(segments), own))
+    return tuple(columns), found
+
+
+def _segment(factor: Factor, settled: Mapping[Edge, Array], columns: dict[Edge, int], *, forwards: bool) -> _Segment:
+    """Return a factor as part of a cycle, along it or against it; an undecided edge is given a column."""
+    edge, poses, column = factor.edge, [factor.pose], None
+    if factor.modes:
+        if edge in settled:
+            poses = [factor.modes[int(np.argmax(settled[edge]))].pose]
+        else:
+            poses, column = [mode.pose for mode in factor.modes], columns.setdefault(edge, len(columns))
+    poses = poses if forwards else [pose.inverse() for pose in poses]
+    return _Segment(column, np.stack([pose.mean for pose in poses]), np.stack([pose.covariance for pose in poses]))
+
+
+def _merged(segments: Sequence[_Segment]) -> tuple[_Segment, ...]:
+    """Return the segments, consecutive ones of one mode composed."""
+    merged: list[_Segment] = []
+    for segment in segments:
+        if merged and segment.column is None and merged[-1].column is None:
+            last = merged.pop()
+            segment = _Segment(None, *_composed((last.means, last.covariances), (segment.means, segment.covariances)))
+        merged.append(segment)
+    return tuple(merged)
+
+
+def _composed(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return means (h, 4, 4) and covariances (h, 6, 6) of one motion after another, for independent errors."""
+    return first[0] @ second[0], se3.composed_covariance(first[1], *second)
+
+
+def select_modes(
     tree: Sequence[Factor],
     loops: Sequence[Factor],
     *,
@@ -44,11 +147,11 @@ def decide(
     """Return the weights (m,) that the loops leave to the modes of each edge with several that lies on a loop.
 
     Args:
-        tree: factors along which the frames hang together.
+        tree: factors that connect the frames.
         loops: the factors beyond those.
         root: a frame of the tree.
-        threshold: half the squared Mahalanobis distance at which a loop is taken to be false.
-        before: weights that fewer loops left; modes settled there are not put in question.
+        threshold: half the squared Mahalanobis distance from which a loop is an outlier.
+        before: weights that fewer loops left; modes settled there stay.
     """
     settled = {edge: weights for edge, weights in (before or {}).items() if weights.max() >= _DECIDED}
     if not any(factor.modes and factor.edge not in settled for factor in (*tree, *loops)):
@@ -58,8 +161,8 @@ def decide(
     decided = dict(settled)
     if best is not None:
         hypotheses, scores = best
-        near = scores >= scores[0] - _MARGIN
-        hypotheses, scores = hypotheses[near][:_SOLVED], scores[near][:_SOLVED]
+        near = scores >= scores[0] - _MARGIN_NATS
+        hypotheses, scores = hypotheses[near][:_MAX_OPTIMISED], scores[near][:_MAX_OPTIMISED]
         if len(hypotheses) > 1:
             chosen = (dict(zip(search.edges, row, strict=True)) for row in hypotheses)
             scores = np.array([search.evidence(tree, loops, root, modes, settled) for modes in chosen])
@@ -75,14 +178,14 @@ def decide(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Hypotheses against loops taken one by one."""
+    """Scores hypotheses loop by loop."""
 
     edges: tuple[Edge, ...]
-    """Whose mode is open, by column."""
+    """Whose mode is undecided, by column."""
     cycles: tuple[Cycle, ...]
-    """That depend on them, those with the fewest open edges first."""
+    """That depend on them, those with the fewest undecided edges first."""
     threshold: float
-    """Half the squared Mahalanobis distance at which a loop is taken to be false."""
+    """Half the squared Mahalanobis distance from which a loop is an outlier."""
 
     @classmethod
     def of(
@@ -98,15 +201,15 @@ class _Search:
         for cycle in self.cycles:
             for column in cycle.columns:
                 if hypotheses[0, column] < 0:
-                    hypotheses, scores = self._grown(hypotheses, scores, column)
-            scores = scores + self._closes(cycle, hypotheses)
-            alive = scores >= scores.max() - _REFUTED * self.threshold
+                    hypotheses, scores = self._expanded(hypotheses, scores, column)
+            scores = scores + self._loop_score(cycle, hypotheses)
+            alive = scores >= scores.max() - _MAX_REFUTED * self.threshold
             hypotheses, scores = hypotheses[alive], scores[alive]
-        hypotheses = hypotheses[np.argsort(-scores, kind="stable")[:_SOLVED]]
-        while True:  # what the beam has dropped may be a change or two away
+        hypotheses = hypotheses[np.argsort(-scores, kind="stable")[:_MAX_OPTIMISED]]
+        while True:  # recovers hypotheses that the beam dropped
             around = np.unique(np.concatenate([hypotheses, self._neighbours(hypotheses[0])]), axis=0)
             scores = self._score(around)
-            order = np.argsort(-scores, kind="stable")[: 2 * _SOLVED]
+            order = np.argsort(-scores, kind="stable")[: 2 * _MAX_OPTIMISED]
             if np.array_equal(around[order[0]], hypotheses[0]):
                 return around[order], scores[order]
             hypotheses = around[order]
@@ -119,12 +222,12 @@ class _Search:
         hypothesis: Mapping[Edge, np.int64],
         settled: Mapping[Edge, Array],
     ) -> float:
-        """Return Laplace's log evidence of a hypothesis, but for what all hypotheses share."""
+        """Return Laplace's log evidence of a hypothesis (eq. G3), up to a constant of all hypotheses."""
         of = {edge: int(mode) for edge, mode in hypothesis.items()}
         of |= {edge: int(np.argmax(weights)) for edge, weights in settled.items()}
         tree, loops = ([_chosen(factor, of) for factor in some] for some in (tree, loops))
         optimum = optimise(tree, loops, chain(tree, root, {}), root=root, threshold=self.threshold)
-        chosen = joining(loops, optimum.inlier)
+        chosen = selected(loops, optimum.inlier)
         evidence = -optimum.error - RelativeCovariance(optimum.poses, root, (*tree, *chosen)).log_determinant
         for edge, mode in hypothesis.items():
             chosen_mode = edge.posterior.modes[int(mode)]
@@ -134,22 +237,22 @@ class _Search:
     def _weights(self, column: int) -> Array:
         return np.log([max(mode.weight, 1e-300) for mode in self.edges[column].posterior.modes])
 
-    def _grown(
+    def _expanded(
         self, hypotheses: npt.NDArray[np.int64], scores: Array, column: int
     ) -> tuple[npt.NDArray[np.int64], Array]:
         """Return the hypotheses with every mode of one more edge, the best of them."""
         weights = self._weights(column)
-        grown = np.repeat(hypotheses, len(weights), axis=0)
-        grown[:, column] = np.tile(np.arange(len(weights)), len(hypotheses))
+        expanded = np.repeat(hypotheses, len(weights), axis=0)
+        expanded[:, column] = np.tile(np.arange(len(weights)), len(hypotheses))
         scores = np.repeat(scores, len(weights)) + np.tile(weights, len(hypotheses))
         order = np.argsort(-scores, kind="stable")[:_BEAM]
-        return grown[order], scores[order]
+        return expanded[order], scores[order]
 
     def _neighbours(self, hypothesis: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Return the hypotheses that differ from one (edges,) in one edge, or in two where those are few."""
         single = [(column, mode) for column, edge in enumerate(self.edges) for mode in range(len(edge.posterior.modes))]
         changes = [(change,) for change in single]
-        if len(self.edges) <= _PAIRS:
+        if len(self.edges) <= _MAX_PAIRED:
             changes += [(one, other) for one in single for other in single if one[0] < other[0]]
         neighbours = np.tile(hypothesis, (len(changes), 1))
         for row, change in zip(neighbours, changes, strict=True):
@@ -162,14 +265,14 @@ class _Search:
         scores = np.zeros(len(hypotheses))
         for column in range(len(self.edges)):
             scores = scores + self._weights(column)[hypotheses[:, column]]
-        return scores + np.sum([self._closes(cycle, hypotheses) for cycle in self.cycles], axis=0)
+        return scores + np.sum([self._loop_score(cycle, hypotheses) for cycle in self.cycles], axis=0)
 
-    def _closes(self, cycle: Cycle, hypotheses: npt.NDArray[np.int64]) -> Array:
-        """Return how well a loop closes (h,), as a log density that is cut off where it is false."""
-        error, log_volume = cycle.gap(hypotheses)
+    def _loop_score(self, cycle: Cycle, hypotheses: npt.NDArray[np.int64]) -> Array:
+        """Return the truncated log density (h,) of a loop's residual."""
+        error, log_volume = cycle.residual(hypotheses)
         return -np.minimum(error, self.threshold) - log_volume
 
 
 def _chosen(factor: Factor, modes: Mapping[Edge, int]) -> Factor:
-    """Return a factor with the mode that is named for it."""
+    """Return a factor with the mode that a hypothesis names."""
     return Factor(factor.edge, factor.edge.posterior.modes[modes[factor.edge]].pose) if factor.edge in modes else factor

@@ -1,20 +1,14 @@
-"""Edges share noise, of their frames and of all views: what that makes of the uncertainty of a solution.
+"""Noise that edges share, of their frames and of all views: its effect on the uncertainty of a solution.
 
-Of an edge's covariance Σ a share ρ is its two images' own: noise of their pixels, which moves an image as a whole and
-does so in every edge that the image has. Then frame k does not look as if it stood at T_k but at T_k exp(η_k), with one
-η_k ~ N(0, Q_k) for all edges, and edges are independent measurements, of covariance (1 − ρ) Σ, between where frames
-seem to stand. These places are solved for as ever, as one factor for all covariances moves nothing; and
+Of an edge's covariance Σ a share ρ is its two images' own: pixel noise moves an image as a whole, alike in all its
+edges. Frame k then appears not at T_k but at T_k exp(η_k), with one η_k ~ N(0, Q_k) for all its edges, and edges are
+independent measurements of covariance (1 − ρ) Σ between these apparent poses. The optimum is the same, as one factor on
+all covariances moves nothing; relative covariances are those of method.md, eq. G9: a single edge keeps its covariance,
+several edges of a frame make it no smaller than the images allow, and along a chain the images' noise cancels.
 
-    cov(T_target⁻¹ T_source) = (1 − ρ) cov_independent + Q_source + Ad(source_from_target) Q_target Ad(…)ᵀ.
-
-An edge alone keeps the covariance that it came with. Several edges between two frames and their neighbours make it no
-smaller than the images allow; along a chain the images' own noise cancels from edge to edge.
-
-Beside that all views may err alike: one camera sees one object from one height, and puts it too near, say. Every frame
-then seems to stand at T_k exp(β), with one β ~ N(0, B) in camera coordinates for all. Every loop closes as it should,
-so that no graph tells β; it cancels between frames to which the object shows the same side, and adds to the covariance
-
-    (1 - Ad(source_from_target)) B (1 - Ad(source_from_target))ᵀ.
+All views may also err alike: one camera sees one object from one height, and puts it too near, say. Every frame then
+appears at T_k exp(β), with one β ~ N(0, B) in camera coordinates (eq. G10). Every loop still closes, so that no graph
+observes β; it cancels between frames that see the same side of the object.
 """
 
 from __future__ import annotations
@@ -26,10 +20,8 @@ from functools import cached_property
 import numpy as np
 
 from modeler import se3
-from modeler.graph.chi_square import chi_square_quantile
-from modeler.graph.factors import Factor
-from modeler.graph.marginals import RelativeCovariance
-from modeler.graph.pose_graph import PoseGraph
+from modeler.graph.covariance import RelativeCovariance, chi_square_quantile
+from modeler.graph.pose_graph import Factor, PoseGraph
 from modeler.types import Array, Solution
 
 _CAUTION = 0.16  # one standard error to the side on which covariances are larger

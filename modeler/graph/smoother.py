@@ -1,4 +1,4 @@
-"""From a pose graph to its solution, afresh or from the solution of the graph it grew out of."""
+"""From a pose graph to its solution, in one batch or as the graph grows."""
 
 from __future__ import annotations
 
@@ -10,47 +10,41 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler.graph.axis import AxisSolution, CommonAxis
-from modeler.graph.closing import closed
-from modeler.graph.collapse import collapse_modes
-from modeler.graph.factors import Factor, SpanningTree, anchored, chain
-from modeler.graph.incremental import Incremental
-from modeler.graph.marginals import PoseCovariances, RelativeCovariance
-from modeler.graph.modes import decide
-from modeler.graph.optimise import agree, joining, values_of
-from modeler.graph.pose_graph import PoseGraph
+from modeler.graph.covariance import PoseCovariances, RelativeCovariance
+from modeler.graph.modes import select_modes
+from modeler.graph.optimise import IncrementalSolver, inliers, selected, solve_loops, values_of
+from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, chain, collapse_modes
 from modeler.graph.shared import SharedCovariance
 from modeler.types import Array, Edge, Solution
 
-_ROUNDS = 5  # in which an axis may change which loops agree
+_MAX_ROUNDS = 5  # in which an axis may change which loops take part
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What a solution rests on, by identity of edges and factors: where it stands, it need not be worked out again."""
+    """What a solution was computed from; by identity of edges and factors it is known what stays."""
 
     root: int | None = None
     factors: Mapping[Edge, Factor] = field(default_factory=dict)
     """Every accepted edge as one Gaussian, before any loop."""
-    frames: SpanningTree = field(default_factory=SpanningTree)
-    """How these hang together."""
+    spanning: SpanningTree = field(default_factory=SpanningTree)
+    """Their tree and loops."""
     decided: Mapping[Edge, Factor] = field(default_factory=dict)
-    """Edges with several modes on loops, after them."""
+    """Edges of several modes on loops, by the modes that the loops select."""
     weights: Mapping[Edge, Array] = field(default_factory=dict)
-    """What the loops leave to their modes."""
+    """Weights that the loops leave to their modes."""
     inlier: tuple[bool, ...] = ()
     """Which loops take part."""
-    engine: Incremental | None = None
-    """The solution as iSAM2 has it."""
+    solver: IncrementalSolver | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Smoother:
-    """Solves a graph that grows, with as much work as the new edges ask for. A value: `plus` makes a new one.
+    """Solves a growing graph incrementally. A value: `plus` makes a new one.
 
-    A frame that hangs on one edge is placed by it and moves no other. An edge that closes a loop moves those around it,
-    see `incremental`. Which loops to leave out, and which modes to choose, is asked again only where the choice no
-    longer stands. So each solution is that of the whole graph, within the tolerance of the optimisation, however it
-    grew.
+    A frame with one edge is placed by it and moves no other; an edge that closes a loop is handed to iSAM2. Outlier
+    loops and modes are chosen again only where the earlier choice no longer stands. Each solution is that of the whole
+    graph, within the tolerance of the optimisation, however it grew.
     """
 
     outlier_distance: float = 14.2
@@ -58,11 +52,11 @@ class Smoother:
     the 99.9 % radius of six dimensions: pairwise covariances may be optimistic."""
     shared: float = 0.0
     """Share (0..1) of edges' covariances that is their images' own noise, the same in all edges of an image; see
-    `shared_noise`, which tells it."""
+    `shared_noise`, which estimates it."""
     common: float = 0.0
-    """Covariance of what all views err by alike, as a share of an edge's; see `SharedCovariance`."""
+    """Covariance of the error common to all views, as a share of an edge's; see `SharedCovariance`."""
     axis: CommonAxis | None = None
-    """The turntable, where there is one. Each solution is then made afresh; not together with noise that is shared."""
+    """The turntable, where there is one; not together with shared noise. Each solution is then a batch solution."""
     graph: PoseGraph = field(default_factory=PoseGraph)
     """What is solved."""
     solution: Solution = field(default_factory=Solution)
@@ -78,42 +72,49 @@ class Smoother:
         return self.to(self.graph.plus(edges))
 
     def to(self, graph: PoseGraph) -> Smoother:
-        """Return the smoother of a graph, which costs the less the more of its edges are in this one's.
+        """Return the smoother of a graph, with as little work as its new edges ask for.
 
         Raises:
             ValueError: where an accepted edge's covariance is not positive definite, or with an axis and shared noise.
         """
         if self.axis is not None and (self.shared or self.common):
-            raise ValueError("an axis and shared noise were given: the noise of frames is not told apart from slip yet")
+            raise ValueError("an axis and shared noise cannot be separated; give one of them")
         root = graph.root
         if root is None:
             return replace(self, graph=graph, solution=Solution(), state=_State())
         known = self.state.factors
         factors = {edge: known.get(edge) or Factor(edge, collapse_modes(edge.posterior)) for edge in graph.accepted}
-        frames, grew = self._frames(list(factors.values()), root)
-        tree, loops, closes = frames.tree, frames.loops, not grew or len(frames.loops) > len(self.state.frames.loops)
+        spanning, grew = self._spanning(list(factors.values()), root)
+        tree, loops = spanning.tree, spanning.loops
+        closes = not grew or len(loops) > len(self.state.spanning.loops)
         odometry = chain(tree, root, self.solution.odometry if grew else {})
         weights, decided = self.state.weights, self.state.decided
         if closes:
             weights, decided = self._decided(tree, loops, root, grew=grew)
-        taken, closing = (
-            [decided.get(factor.edge, factor) for factor in some] if decided else some for some in (tree, loops)
-        )
-        jumped = _jumped(decided, self.state)
-        start = chain(taken, root, {} if jumped else anchored(self.solution.trajectory, root))
-        threshold, inlier, engine = 0.5 * self.outlier_distance**2, self.state.inlier, self.state.engine
-        trajectory: Mapping[int, Array] = start if grew or loops else chain(taken, root, {})
-        if closes:  # otherwise the new frames hang on one edge each
-            before = ((), None) if jumped or not grew else (inlier, engine)
-            trajectory, inlier, engine = closed(taken, closing, start, root=root, threshold=threshold, before=before)
-        state = _State(root, factors, frames, decided, weights, inlier, engine)
+        if decided:
+            tree, loops = ([decided.get(factor.edge, factor) for factor in some] for some in (tree, loops))
+        jumped = _mode_changed(decided, self.state)
+        start = chain(tree, root, {} if jumped else anchored(self.solution.trajectory, root))
+        inlier, solver = self.state.inlier, self.state.solver
+        trajectory: Mapping[int, Array] = start if grew or loops else chain(tree, root, {})
+        if closes:  # otherwise each new frame has one edge
+            before = ((), None) if jumped or not grew else (inlier, solver)
+            trajectory, inlier, solver = solve_loops(
+                tree, loops, start, root=root, threshold=self._threshold, before=before
+            )
+        state = _State(root, factors, spanning, decided, weights, inlier, solver)
         if grew and decided and inlier.count(False) > self.state.inlier.count(False):
-            # Modes that were settled may have been so by a lie: all are put in question.
+            # A false loop may have settled modes: all are selected anew.
             again = replace(self, state=_State()).to(graph)
             if len(again.solution.outliers) <= inlier.count(False):
                 return again
-        solution = self._solution(state, (taken, closing), trajectory, grew=grew and graph is not self.graph)
+        solution = self._solution(state, (tree, loops), trajectory, grew=grew and graph is not self.graph)
         return replace(self, graph=graph, solution=replace(solution, odometry=odometry), state=state)
+
+    @property
+    def _threshold(self) -> float:
+        """Half the squared outlier distance."""
+        return 0.5 * self.outlier_distance**2
 
     def _solution(
         self,
@@ -123,37 +124,37 @@ class Smoother:
         *,
         grew: bool,
     ) -> Solution:
-        """Return the solution but for its odometry.
+        """Return the solution without its odometry.
 
         Args:
-            state: what it rests on.
-            factors: tree and loops, of several modes as loops have decided.
-            trajectory: object_from_camera (4, 4) by frame number, as all but an axis has it.
+            state: what it was computed from.
+            factors: tree and loops, with the modes that the loops select.
+            trajectory: object_from_camera (4, 4) by frame number, without an axis.
             grew: whether the graph grew from that of the solution before.
         """
-        root, (taken, closing), inlier = state.root or 0, factors, state.inlier
-        turned: AxisSolution | None = None
+        root, (tree, loops), inlier = state.root or 0, factors, state.inlier
+        with_axis: AxisSolution | None = None
         if self.axis is not None:
-            inlier, turned = self._turned(self.axis, taken, closing, trajectory, state)
-        trajectory = trajectory if turned is None else turned.poses
-        taking_part = [*taken, *joining(closing, inlier)]
-        relative_covariance = self._covariance(taking_part, trajectory, turned, root=root, grew=grew)
-        several = [factor for factor in (*taken, *closing) if factor.modes]
+            inlier, with_axis = self._with_axis(self.axis, tree, loops, trajectory, state)
+        trajectory = trajectory if with_axis is None else with_axis.poses
+        taking_part = [*tree, *selected(loops, inlier)]
+        relative_covariance = self._covariance(taking_part, trajectory, with_axis, root=root, grew=grew)
+        several = [factor for factor in (*tree, *loops) if factor.modes]
         return Solution(
             trajectory=trajectory,
             covariances=PoseCovariances(
                 trajectory, functools.partial(relative_covariance, root), relative_covariance.marginals
             ),
-            outliers=tuple(loop.edge for loop, good in zip(closing, inlier, strict=True) if not good),
+            outliers=tuple(loop.edge for loop, good in zip(loops, inlier, strict=True) if not good),
             relative_covariance=relative_covariance,
             edge_poses={(factor.source, factor.target): factor.pose for factor in several},
             mode_weights={(factor.source, factor.target): _weights(factor, state.weights) for factor in several},
-            camera_from_axis=None if turned is None else turned.camera_from_axis,
+            camera_from_axis=None if with_axis is None else with_axis.camera_from_axis,
         )
 
-    def _frames(self, factors: list[Factor], root: int) -> tuple[SpanningTree, bool]:
-        """Return how factors hang together, and whether those before hung together so and have but grown."""
-        before = self.state.frames
+    def _spanning(self, factors: list[Factor], root: int) -> tuple[SpanningTree, bool]:
+        """Return tree and loops, and whether they have only grown."""
+        before = self.state.spanning
         count = len(before.factors)
         if root == self.state.root and len(factors) >= count and all(map(operator.is_, factors, before.factors)):
             grown = before.plus(factors[count:])
@@ -165,24 +166,24 @@ class Smoother:
         self,
         factors: Sequence[Factor],
         trajectory: Mapping[int, Array],
-        turned: AxisSolution | None,
+        with_axis: AxisSolution | None,
         *,
         root: int,
         grew: bool,
     ) -> RelativeCovariance | SharedCovariance:
-        """Return the covariances of a solution, where the graph grew from those before as far as these stayed."""
+        """Return the covariances of a solution; where the graph grew, from those before."""
         before = self.solution.relative_covariance
         if isinstance(before, SharedCovariance):
             before = before.independent
-        if turned is None and isinstance(before, RelativeCovariance) and grew:
-            found = before.to(trajectory, factors)
+        if with_axis is None and isinstance(before, RelativeCovariance) and grew:
+            found = before.at(trajectory, factors)
         else:
-            found = RelativeCovariance(trajectory, root, factors, () if turned is None else turned.rows)
+            found = RelativeCovariance(trajectory, root, factors, () if with_axis is None else with_axis.rows)
         if not (factors and (self.shared or self.common)):
             return found
         return SharedCovariance(found, factors, self.shared, self.common)
 
-    def _turned(
+    def _with_axis(
         self,
         axis: CommonAxis,
         tree: Sequence[Factor],
@@ -190,24 +191,24 @@ class Smoother:
         trajectory: Mapping[int, Array],
         state: _State,
     ) -> tuple[tuple[bool, ...], AxisSolution | None]:
-        """Return which loops take part where steps share an axis, and the solution then; None: they do not."""
-        inlier, turned = state.inlier, None
-        for _ in range(_ROUNDS):
-            found = axis.solved([*tree, *joining(loops, inlier)], trajectory, state.root or 0)
+        """Return which loops take part where steps share an axis, and the solution; None: they share none."""
+        inlier, with_axis = state.inlier, None
+        for _ in range(_MAX_ROUNDS):
+            found = axis.solve([*tree, *selected(loops, inlier)], trajectory, state.root or 0)
             if found is None:
                 return state.inlier, None
-            agreeing, turned = agree(loops, values_of(found.poses), 0.5 * self.outlier_distance**2), found
+            agreeing, with_axis = inliers(loops, values_of(found.poses), self._threshold), found
             if agreeing == inlier:
                 break
             inlier = agreeing
-        return inlier, turned
+        return inlier, with_axis
 
     def _decided(
         self, tree: Sequence[Factor], loops: Sequence[Factor], root: int, *, grew: bool
     ) -> tuple[dict[Edge, Array], dict[Edge, Factor]]:
-        """Return what the loops leave to the modes of edges with several, and those edges as one Gaussian each."""
-        threshold, before = 0.5 * self.outlier_distance**2, self.state.weights if grew else {}
-        weights = decide(tree, loops, root=root, threshold=threshold, before=before)
+        """Return the weights that loops leave to the modes of edges, and these edges as one Gaussian each."""
+        before = self.state.weights if grew else {}
+        weights = select_modes(tree, loops, root=root, threshold=self._threshold, before=before)
         decided = {
             edge: self.state.decided[edge]
             if edge in before and np.array_equal(before[edge], left)
@@ -218,11 +219,40 @@ class Smoother:
 
 
 def _weights(factor: Factor, decided: Mapping[Edge, Array]) -> Array:
-    """Return the weights of a factor's modes: as loops have decided, or else the posterior's own."""
+    """Return the weights of a factor's modes: what loops leave, or else the posterior's own."""
     return decided.get(factor.edge, np.array([mode.weight for mode in factor.modes]))
 
 
-def _jumped(decided: Mapping[Edge, Factor], state: _State) -> bool:
-    """Return whether another mode was chosen than the one that the poses so far rest on."""
+def _mode_changed(decided: Mapping[Edge, Factor], state: _State) -> bool:
+    """Return whether another mode was selected than that of the poses so far."""
     before = ((factor, state.decided.get(edge) or state.factors.get(edge)) for edge, factor in decided.items())
     return any(old is not None and not np.array_equal(factor.pose.mean, old.pose.mean) for factor, old in before)
+
+
+def solve(
+    graph: PoseGraph,
+    guess: Mapping[int, Array],
+    *,
+    outlier_distance: float = 14.2,
+    shared: float = 0.0,
+    common: float = 0.0,
+    axis: CommonAxis | None = None,
+) -> Solution:
+    """Optimise the poses of all frames that accepted edges connect with the first.
+
+    Edges that first connect a frame, odometry before closures, cannot be contradicted and are trusted. The others close
+    loops; outliers are left out, see `optimise`. Of an edge with several modes the loops select one, see `modes`. A
+    growing graph is solved faster by `Smoother`.
+
+    Args:
+        graph: the edges.
+        guess: object_from_camera (4, 4) by frame number, to start from; frames without one start on the chain.
+        outlier_distance: see `Smoother`.
+        shared: see `Smoother`.
+        common: see `Smoother`.
+        axis: the turntable, where there is one.
+
+    Raises:
+        ValueError: where an accepted edge's covariance is not positive definite.
+    """
+    return Smoother(outlier_distance, shared, common, axis, solution=Solution(guess)).to(graph).solution
