@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -18,9 +19,18 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.types import Array, BoolArray, Camera, Frame, InputError
 from sequences.base import AbstractSequence
-from sequences.image_files import check_same_size, check_size, metres, read_colour, read_depth, read_mask, write_image
-from sequences.input_files import Node, entries, frame_number, inside, read_tree
-from sequences.intrinsics import Intrinsics, Overrides, of_matrix
+from sequences.image_files import (
+    check_same_size,
+    check_size,
+    metres,
+    no_depth,
+    read_colour,
+    read_depth,
+    read_mask,
+    write_image,
+)
+from sequences.input_files import Node, entries, first_folder, frame_number, inside, is_there, read_tree
+from sequences.intrinsics import RANGE, Intrinsics, Overrides, of_matrix
 from sequences.recording import AbstractRecording
 from sequences.rendering.meshes import Mesh, read_mesh
 
@@ -34,7 +44,7 @@ def intrinsics(node: Node) -> Intrinsics:
     entry = node.need("cam_K")
     found = of_matrix(entry.numbers(9).reshape(3, 3))
     if found is None:
-        raise entry.fault("[fx, 0, cx, 0, fy, cy, 0, 0, 1] in px with fx and fy of at least 1")
+        raise entry.fault(f"[fx, 0, cx, 0, fy, cy, 0, 0, 1] in px, {RANGE}")
     return found
 
 
@@ -74,6 +84,10 @@ def pose_entry(pose: Array) -> dict[str, object]:
     """Return the entry of `scene_gt.json` for camera_from_model (4, 4) in m."""
     rotation, shift = pose[:3, :3].ravel(), pose[:3, 3] * 1000.0
     return {"cam_R_m2c": [float(v) for v in rotation], "cam_t_m2c": [float(v) for v in shift], "obj_id": 1}
+
+
+MASKS = "mask_visib"
+"""Folder of the masks."""
 
 
 @final
@@ -118,7 +132,7 @@ class BopSequence(AbstractRecording):
     def truth(self) -> dict[int, Array] | None:
         """Return the true camera_from_model (4, 4), in m, by frame number; None without `scene_gt.json`."""
         path = self.path / "scene_gt.json"
-        if not path.is_file():
+        if not is_there(path):
             return None
         objects = {index: node.elements() for index, node in read_tree(inside(path, self.path)).frames().items()}
         firsts = {index: objects[index][0] for index in self.indices if objects.get(index)}
@@ -148,9 +162,29 @@ class BopSequence(AbstractRecording):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the reader left out."""
+        """What the reader left out, or took as it stands although it is unusual."""
+        notes = []
         left = [index for index in self._colour_paths if index not in self._depth_paths]
-        return (f"{len(left)} colour images have no depth image and are left out",) if left else ()
+        if left:
+            notes.append(f"{len(left)} colour images have no depth image and are left out")
+        stems = {path.stem for path in self._depth_paths.values()}
+        masks = [path for path in entries(self.path / MASKS) if path.suffix.lower() == ".png"]
+        strange = [path.name for path in masks if re.sub(r"_\d+$", "", path.stem) not in stems]
+        if strange:
+            expected = f"{next(iter(self._depth_paths.values())).stem}_000000.png"
+            notes.append(
+                f"{len(strange)} of {len(masks)} masks belong to no depth image and are left out ({strange[0]}; a name "
+                f"such as {expected} is expected)"
+            )
+        elif not masks and (other := first_folder(self.path, ("mask", "masks"))) is not None:
+            notes.append(f"masks are read from {MASKS}/; those in {other.name}/ are left out")
+        scales = {scale for _, scale in self._intrinsics.values()}
+        if len(scales) > 1:
+            notes.append(
+                f"depth_scale differs from frame to frame, from {min(scales):g} to {max(scales):g} mm per unit: is "
+                "every one right?"
+            )
+        return tuple(notes)
 
     @cached_property
     def _depth_paths(self) -> dict[int, Path]:
@@ -158,7 +192,7 @@ class BopSequence(AbstractRecording):
             raise InputError(f"{self.path}: no such folder; give a BOP scene folder with depth/ and scene_camera.json.")
         paths = _numbered(self.path, "depth", (".png", ".tif", ".tiff"))
         if not paths:
-            raise InputError(f"{self.path / 'depth'}: holds no depth image; put 000000.png, 000001.png, ... there.")
+            raise no_depth(self.path / "depth", "000000.png, 000001.png, ...")
         return dict(sorted(paths.items()))
 
     @cached_property
@@ -203,8 +237,8 @@ class BopSequence(AbstractRecording):
         return {self._intrinsics[index][0]: index for index in reversed(self.indices)}
 
     def _mask(self, index: int, size: tuple[int, ...]) -> BoolArray | None:
-        path = self.path / "mask_visib" / f"{self._depth_paths[index].stem}_000000.png"
-        if not path.is_file():
+        path = self.path / MASKS / f"{self._depth_paths[index].stem}_000000.png"
+        if not is_there(path):
             return None
         mask = read_mask(inside(path, self.path))
         check_size(path, mask.shape, size)
@@ -365,7 +399,7 @@ def true_mesh(sequence: AbstractSequence) -> Mesh:
 def _of_dataset(scene: Path) -> Path | None:
     """Return the model of a scene's first object, beside the scene or its split."""
     truth = scene / "scene_gt.json"
-    if not truth.is_file():
+    if not is_there(truth):
         return None
     objects = [node.elements() for node in read_tree(truth).frames().values()]
     number = next((first[0].need("obj_id").value for first in objects if first), None)
@@ -375,4 +409,4 @@ def _of_dataset(scene: Path) -> Path | None:
     candidates = [
         folder / models / name for folder in (place, *place.parents[:2]) for models in ("models", "models_eval")
     ]
-    return next((path for path in candidates if path.is_file()), None)
+    return next((path for path in candidates if is_there(path)), None)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import final
+from typing import BinaryIO, final
 
 import numpy as np
 import numpy.typing as npt
 
+from modeler.regular_files import open_regular, unreadable
 from modeler.types import Array, Camera, Frame, InputError
 from sequences.image_files import MAX_PIXELS
 from sequences.image_folders import frame_numbers
@@ -24,6 +26,7 @@ SUFFIXES = (".pcd", ".ply")
 MAX_OFF_PX = 1.0
 """Points that lie farther (half of them) from their pixels were not seen by a pinhole camera."""
 _HEADER_BYTES = 65536
+_MOST_BYTES = 1000  # a point, as text with many fields
 _LZF_RATIO = 20  # points a byte: its longest match is 264 bytes in 3, and a point has 6 at the least
 
 
@@ -127,10 +130,10 @@ def organised(path: Path) -> tuple[int, int]:
         InputError: where it is no cloud or is not organised as an image.
     """
     try:
-        with path.open("rb") as file:
-            head = file.read(_HEADER_BYTES)
+        with open_regular(path) as file:
+            head, size = file.read(_HEADER_BYTES), os.fstat(file.fileno()).st_size
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
+        raise unreadable(path, error) from None
     if path.suffix.lower() == ".pcd":
         end, width, height = r"(?m)^DATA\s+\w+", r"(?m)^WIDTH\s+(\d{1,9})\s*$", r"(?m)^HEIGHT\s+(\d{1,9})\s*$"
         count = r"(?m)^POINTS\s+(\d{1,12})\s*$"
@@ -151,8 +154,10 @@ def organised(path: Path) -> tuple[int, int]:
     if points > MAX_PIXELS:
         raise InputError(f"{path}: has more than {MAX_PIXELS // 1_000_000} million points; thin it out.")
     least = points // _LZF_RATIO if "binary_compressed" in stop[0] else 2 * points
-    if path.stat().st_size < stop.end() + least:
+    if size < stop.end() + least:
         raise InputError(f"{path}: is cut off, or has fewer points than its header says; save it anew.")
+    if size > stop.end() + _MOST_BYTES * points:
+        raise InputError(f"{path}: is larger than the points of its header can be; save it anew.")
     return columns, rows
 
 
@@ -188,7 +193,8 @@ def _points(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8] 
     """Return the points (h, w, 3) of a cloud, NaN where there is none, and their colours (h, w, 3)."""
     width, height = organised(path)
     with input_errors(path, "cloud", "save it anew"):
-        points, colours = _read_pcd(path) if path.suffix.lower() == ".pcd" else _read_ply(path)
+        with open_regular(path) as file:
+            points, colours = (_read_pcd if path.suffix.lower() == ".pcd" else _read_ply)(file)
     if points.shape != (width * height, 3):
         raise InputError(f"{path}: is cut off or broken, {len(points)} points could be read; save it anew.")
     points = np.where(np.isfinite(points) & (np.abs(points) < 1e9), points, np.nan).reshape(height, width, 3)
@@ -197,21 +203,22 @@ def _points(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8] 
     return points, colours[:, :3].astype(np.uint8).reshape(height, width, 3)
 
 
-def _read_pcd(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _read_pcd(file: BinaryIO) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return points (n, 3) and colours (n, 3) from 0 to 255, or (0, 3), of a PCD file."""
     import open3d as o3d  # takes a second
 
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
+        open_file = Path(f"/dev/fd/{file.fileno()}")  # Open3D takes no open files
+        cloud = o3d.io.read_point_cloud(open_file, format="pcd", remove_nan_points=False, remove_infinite_points=False)
     shares = np.nan_to_num(np.asarray(cloud.colors, dtype=np.float64)).clip(0.0, 1.0)
     return np.asarray(cloud.points, dtype=np.float64), np.rint(255.0 * shares)
 
 
-def _read_ply(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _read_ply(file: BinaryIO) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return points (n, 3) and colours (n, 3 or 4) from 0 to 255, or (0, 3), of a PLY file."""
     from trimesh.exchange.ply import load_ply
 
-    with path.open("rb") as file, warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         read = load_ply(file)
     colours = np.asarray(read.get("vertex_colors", np.zeros((0, 3))), dtype=np.float64)

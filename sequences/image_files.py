@@ -11,56 +11,74 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import IO, final
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from modeler.regular_files import open_regular, unreadable
 from modeler.types import BoolArray, InputError
+from sequences.input_files import entries
 
 MAX_PIXELS = 50_000_000
-"""Larger pictures are refused before they are decoded: no depth camera makes them, decompression bombs do."""
+"""Larger images are refused before they are decoded: no depth camera makes them, decompression bombs do."""
 
-_KINDS = {"L": "an 8-bit picture", "P": "an 8-bit picture", "RGB": "a colour picture", "RGBA": "a colour picture"}
+_KINDS = {"L": "an 8-bit image", "P": "an 8-bit image", "RGB": "a colour image", "RGBA": "a colour image"}
 
 
 @final
 @dataclass(frozen=True)
 class EmbeddedImage:
-    """A picture that lies within another file."""
+    """An image that is stored within another file."""
 
     content: bytes
     """Its bytes."""
     where: str
-    """The file and the place in it, for messages."""
+    """The file and the place in it, for error messages."""
 
     def __str__(self) -> str:
         return self.where
 
 
 def _open(path: Path | EmbeddedImage, formats: tuple[str, ...]) -> Image.Image:
-    """Return a picture fully decoded."""
+    """Return an image fully decoded."""
     wanted = " or ".join(formats)
     try:
-        with warnings.catch_warnings(), _unlogged():
-            warnings.simplefilter("ignore")  # what is wrong with a picture is told below, in one line
+        with _stream(path) as stream, warnings.catch_warnings(), _unlogged():
+            warnings.simplefilter("ignore")  # what is wrong is reported below, in one line
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            source = io.BytesIO(path.content) if isinstance(path, EmbeddedImage) else path
-            with Image.open(source, formats=formats) as picture:
+            with Image.open(stream, formats=formats) as picture:
                 if picture.width * picture.height > MAX_PIXELS:
                     raise Image.DecompressionBombError
                 with _quiet() if picture.format == "TIFF" else contextlib.nullcontext():
                     picture.load()
                 return picture
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the folder is complete.") from None
+    except InputError:
+        raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise InputError(f"{path}: has more than {MAX_PIXELS // 1_000_000} million pixels; scale it down.") from None
-    except Exception as error:  # a broken picture can make the library raise anything
-        said = re.sub(r"<_io\.BytesIO[^>]*>", "it", " ".join(str(error).split()))
-        why = said.replace(str(path), "the file") or type(error).__name__
-        raise InputError(f"{path}: is not a readable {wanted} picture ({why}); replace it.") from None
+    except Exception as error:  # a broken image can make the library raise anything
+        why = re.sub(r"<_io\.[^>]*>", "it", " ".join(str(error).split())) or type(error).__name__
+        raise InputError(f"{path}: is not a readable {wanted} image ({why}); replace it.") from None
+
+
+@contextlib.contextmanager
+def _stream(path: Path | EmbeddedImage) -> Iterator[IO[bytes]]:
+    """Open an image for reading.
+
+    Raises:
+        InputError: where it is no regular file, missing or cannot be opened.
+    """
+    if isinstance(path, EmbeddedImage):
+        yield io.BytesIO(path.content)
+        return
+    try:
+        stream = open_regular(path)
+    except OSError as error:
+        raise unreadable(path, error) from None
+    with stream:
+        yield stream
 
 
 @contextlib.contextmanager
@@ -77,7 +95,7 @@ def _unlogged() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep the library for TIFF from writing to stderr itself; what is wrong is told in one line."""
+    """Keep the library for TIFF from writing to stderr itself."""
     stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
@@ -89,18 +107,31 @@ def _quiet() -> Iterator[None]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) of a picture as its header says.
+    """Return (width, height) of an image from its header.
 
     Raises:
-        InputError: where the file is missing or no picture.
+        InputError: where the file is missing or no image.
     """
     try:
-        with warnings.catch_warnings(), _unlogged():
+        with _stream(path) as stream, warnings.catch_warnings(), _unlogged():
             warnings.simplefilter("ignore")
-            with Image.open(path, formats=("PNG", "TIFF", "JPEG")) as picture:
+            with Image.open(stream, formats=("PNG", "TIFF", "JPEG")) as picture:
                 return picture.size
+    except InputError:
+        raise
     except Exception as error:
-        raise InputError(f"{path}: is not a readable picture ({type(error).__name__}); replace it.") from None
+        raise InputError(f"{path}: is not a readable image ({type(error).__name__}); replace it.") from None
+
+
+def no_depth(folder: Path, wanted: str) -> InputError:
+    """Return the error for a folder without depth images that can be read; `wanted` is what should be there."""
+    others = sorted({path.suffix.lower() for path in entries(folder) if path.suffix and not path.name.startswith(".")})
+    if others:
+        return InputError(
+            f"{folder}: holds no depth image that can be read, but files {', '.join(others[:3])}; 16-bit PNG and TIFF "
+            "are read, convert them."
+        )
+    return InputError(f"{folder}: holds no depth image; put {wanted} there.")
 
 
 def read_depth(path: Path | EmbeddedImage) -> npt.NDArray[np.uint16]:
@@ -112,15 +143,15 @@ def read_depth(path: Path | EmbeddedImage) -> npt.NDArray[np.uint16]:
     picture = _open(path, ("PNG", "TIFF"))
     if picture.mode not in ("I;16", "I;16B", "I"):
         kind = _KINDS.get(picture.mode, f"of mode {picture.mode}")
-        raise InputError(f"{path}: is {kind}; depth must be a 16-bit greyscale picture, one unit a step.")
+        raise InputError(f"{path}: is {kind}; depth must be a 16-bit greyscale PNG or TIFF image.")
     pixels = np.asarray(picture)
     if picture.mode == "I" and (pixels.min(initial=0) < 0 or pixels.max(initial=0) > np.iinfo(np.uint16).max):
-        raise InputError(f"{path}: holds values beyond 16 bits; depth must be a 16-bit greyscale picture.")
+        raise InputError(f"{path}: holds values beyond 16 bits; depth must be a 16-bit greyscale PNG or TIFF image.")
     return pixels.astype(np.uint16)
 
 
 def read_mask(path: Path) -> BoolArray:
-    """Return a mask (h, w), True where the picture is not black.
+    """Return a mask (h, w), True where the image is not black.
 
     Raises:
         InputError: where the file is missing, broken or too large.

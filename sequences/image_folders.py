@@ -20,12 +20,13 @@ from sequences.image_files import (
     image_size,
     is_finer,
     metres,
+    no_depth,
     read_colour,
     read_depth,
     read_mask,
     resize_to_depth,
 )
-from sequences.input_files import entries, first_folder, frame_number, inside, list_images, read_text
+from sequences.input_files import entries, first_folder, frame_number, inside, is_there, list_images, read_text
 from sequences.intrinsics import CameraFacts, Intrinsics, Overrides, find_intrinsics
 from sequences.recording import AbstractRecording, paired
 
@@ -141,7 +142,7 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
     depth = _list(path / "depth.txt", 2)
     if not depth:
         raise InputError(f"{path / 'depth.txt'}: lists no depth image; write lines 'time path'.")
-    colour = _list(path / "rgb.txt", 2) if (path / "rgb.txt").exists() else []
+    colour = _list(path / "rgb.txt", 2) if is_there(path / "rgb.txt") else []
     folder = first_folder(path, ("mask", "masks"))
     masks = {} if folder is None else list_images(folder, (".png",), path)
     pairs, remarks = paired(depth, colour)
@@ -151,6 +152,13 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
         shot_colour = None if pair.colour is None else _listed(path, "rgb.txt", pair.colour[0])
         mask = masks.get(picture.stem) or (None if shot_colour is None else masks.get(shot_colour.stem))
         files[index] = FrameFiles(pair.time_s, picture, shot_colour, mask)
+    used = {one.mask for one in files.values()}
+    strange = [mask.name for mask in masks.values() if mask not in used]
+    if strange:
+        remarks.append(
+            f"{len(strange)} of {len(masks)} masks belong to no depth image and are left out ({strange[0]}; give each "
+            "the name of its depth image)"
+        )
     found, (width, height) = find_intrinsics(path, overrides), image_size(files[0].depth)
     if found is None:
         if (width, height) != (640, 480):
@@ -199,7 +207,7 @@ def trajectory(path: Path) -> list[tuple[float, Array]]:
 
 def _tum_truth(path: Path, times_s: Sequence[float]) -> dict[int, Array] | None:
     """Return camera_from_world by frame number, on the way between the two nearest poses in time."""
-    if not path.exists():
+    if not is_there(path):
         return None
     known = trajectory(path)
     stamps = np.array([time for time, _ in known])
@@ -250,7 +258,7 @@ def _listed(root: Path, by: str, name: str) -> Path:
     if not name.isprintable():
         raise InputError(f"{root / by}: names a picture with control characters; correct it there.")
     path = inside(root / name, root)
-    if not path.is_file():
+    if not is_there(path):
         raise InputError(f"{root / by}: names {name}, which is not there; add the picture or remove the line.")
     return path
 
@@ -270,7 +278,7 @@ def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
     """
     depth = list_images(path / "depth", (".png", ".tif", ".tiff"), path)
     if not depth:
-        raise InputError(f"{path / 'depth'}: holds no depth image; put 16-bit PNG pictures there.")
+        raise no_depth(path / "depth", "16-bit PNG or TIFF images")
     found = find_intrinsics(path, overrides)
     if found is None:
         raise InputError(
@@ -279,12 +287,14 @@ def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
         )
     numbers = frame_numbers(list(depth)) or {stem: place for place, stem in enumerate(depth)}
     remarks = found.doubts(image_size(next(iter(depth.values()))))
-    colour = _partners(path, COLOUR_FOLDERS, (".png", ".jpg", ".jpeg"), depth)
-    masks = _partners(path, MASK_FOLDERS, (".png",), depth)
-    for what, partners in (("colour image", colour), ("mask", masks)):
+    colour, left = _partners(path, COLOUR_FOLDERS, (".png", ".jpg", ".jpeg"), depth)
+    masks, left_masks = _partners(path, MASK_FOLDERS, (".png",), depth)
+    for what, partners, others in (("colour image", colour, left), ("mask", masks, left_masks)):
         lacking = sum(stem not in partners for stem in depth)
         if partners and lacking:
             remarks.append(f"{lacking} of {len(depth)} depth images have no {what}")
+        if others:
+            remarks.append(f"{len(others)} {what}s belong to no depth image and are left out ({others[0]})")
     files = {
         numbers[stem]: FrameFiles(_time_s(stem, numbers[stem]), picture, colour.get(stem), masks.get(stem))
         for stem, picture in depth.items()
@@ -336,15 +346,15 @@ def _time_s(stem: str, number: int) -> float:
 
 def _partners(
     root: Path, names: tuple[str, ...], suffixes: tuple[str, ...], depth: Mapping[str, Path]
-) -> dict[str, Path]:
-    """Return the pictures of a folder by the name of the depth image to which they belong.
+) -> tuple[dict[str, Path], list[str]]:
+    """Return the images of a folder by the name of the depth image to which they belong, and the names of the others.
 
     Raises:
         InputError: where neither names nor numbers nor order tell.
     """
     folder = first_folder(root, names)
     if folder is None:
-        return {}
+        return {}, []
     found = list_images(folder, suffixes, root)
     same = {stem: found[stem] for stem in depth if stem in found}
     ours, theirs = frame_numbers(list(depth)) or {}, frame_numbers(list(found)) or {}
@@ -352,11 +362,12 @@ def _partners(
     alike = {stem: found[named[number]] for stem, number in ours.items() if number in named}
     best = alike if len(alike) > len(same) else same
     if best or not found:
-        return best
+        used = set(best.values())
+        return best, [path.name for path in found.values() if path not in used]
     if len(found) == len(depth):  # names are times of two clocks
-        return dict(zip(depth, found.values(), strict=True))
+        return dict(zip(depth, found.values(), strict=True)), []
     raise InputError(
-        f"{folder}: its {len(found)} pictures cannot be told to belong to the {len(depth)} depth images; "
+        f"{folder}: its {len(found)} images cannot be matched with the {len(depth)} depth images; "
         "give those of one frame the same name."
     )
 
@@ -367,7 +378,7 @@ def _posed_truth(root: Path, numbers: Mapping[str, int]) -> dict[int, Array] | N
     if posed:
         found = {number: _pose(inside(posed[stem], root)) for stem, number in numbers.items() if stem in posed}
         return dict(sorted(found.items())) or None
-    log = next((path for path in (root / "trajectory.log", root / "scene" / "trajectory.log") if path.is_file()), None)
+    log = next((path for path in (root / "trajectory.log", root / "scene" / "trajectory.log") if is_there(path)), None)
     if log is None:
         return None
     rows = [line.split() for line in read_text(inside(log, root)).splitlines() if line.strip()]

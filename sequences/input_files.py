@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 import os
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import final
 
 import numpy as np
 
+from modeler.regular_files import parse_json, read_regular
 from modeler.types import Array, InputError
 
 
@@ -61,6 +63,11 @@ def entries(folder: Path) -> list[Path]:
         return []
     except OSError as error:
         raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions.") from None
+
+
+def is_there(path: Path) -> bool:
+    """Return whether a name is taken, also by a link to nothing: what is no regular file is refused, not missed."""
+    return os.path.lexists(path)
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...], root: Path) -> dict[str, Path]:
@@ -110,7 +117,7 @@ MAX_BYTES = 64_000_000
 """Larger text is refused."""
 
 
-_CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f]")
+_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 @final
@@ -130,9 +137,18 @@ class Node:
 
     def fault(self, expected: str) -> InputError:
         """Return the error that says what should stand here."""
-        shown = json.dumps(self.value, default=str)
+        try:
+            shown = json.dumps(self.value, default=str)
+        except RecursionError:
+            shown = "nested too deeply"
         shown = shown if len(shown) <= 60 else shown[:57] + "..."
         return InputError(f"{self.path}: {self.where} is {shown}; it must be {expected}.")
+
+    def unknown(self, known: Sequence[str]) -> InputError:
+        """Return the error for an entry whose key is none of the known ones."""
+        near = difflib.get_close_matches(self.keys[-1], known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"it takes {', '.join(known)}."
+        return InputError(f"{self.path}: {self.where} is not known; {hint}")
 
     @property
     def where(self) -> str:
@@ -174,8 +190,8 @@ class Node:
         return node
 
     def text(self) -> str:
-        """Return a string that is not empty, without control characters, which would steer a terminal."""
-        if not isinstance(self.value, str) or not self.value.strip() or _CONTROLS.search(self.value):
+        """Return a string that is not empty, without control characters, which steer terminals, and lone surrogates."""
+        if not isinstance(self.value, str) or not self.value.strip() or _UNPRINTABLE.search(self.value):
             raise self.fault("a printable text that is not empty")
         return self.value
 
@@ -213,12 +229,12 @@ def read_tree(path: Path) -> Node:
     """
     kind = "TOML" if path.suffix == ".toml" else "JSON"
     text = read_text(path, kind)
+    if kind == "JSON":
+        return Node(parse_json(text, path), path)
     try:
-        return Node(tomllib.loads(text) if kind == "TOML" else json.loads(text), path)
-    except json.JSONDecodeError as error:
-        why = f"line {error.lineno}, column {error.colno}: {error.msg}"
+        return Node(tomllib.loads(text), path)
     except (ValueError, RecursionError) as error:
-        why = " ".join(str(error).split())
+        why = "nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())
     raise InputError(f"{path}: is not valid {kind} ({why}); correct it there.")
 
 
@@ -230,18 +246,9 @@ def read_text(path: Path, kind: str = "text") -> str:
         kind: what it should be, for messages.
 
     Raises:
-        InputError: where it is missing, larger, or not UTF-8.
+        InputError: where it is no regular file, missing, larger, or not UTF-8.
     """
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the path.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
-    if len(content) > MAX_BYTES:
-        raise InputError(f"{path}: is larger than {MAX_BYTES // 1_000_000} MB; {kind} of a sequence is not.")
-    try:
-        return content.decode("utf-8-sig")
+        return read_regular(path, MAX_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not UTF-8 text (byte {error.start}); save it as {kind}.") from None

@@ -10,10 +10,12 @@ from typing import final
 import numpy as np
 
 from modeler.types import Array, InputError
-from sequences.input_files import Node, inside, read_text, read_tree
+from sequences.input_files import Node, inside, is_there, read_text, read_tree
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy in px."""
+RANGE = "fx and fy from 1 to 1e6, cx and cy from -1e6 to 1e6"
+"""What intrinsics can be, in words."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Overrides:
         if self.intrinsics is not None and not sane(self.intrinsics):
             shown = " ".join(f"{value:g}" for value in self.intrinsics)
             raise InputError(
-                f"--intrinsics {shown} are those of no camera; give FX FY CX CY in px, FX and FY at least 1."
+                f"--intrinsics {shown} are those of no camera; give FX FY CX CY in px, FX and FY from 1 to 1e6."
             )
         if self.depth_scale_mm is not None and not 1e-6 <= self.depth_scale_mm <= 1e3:
             raise InputError(
@@ -116,7 +118,7 @@ def find_intrinsics(folder: Path, overrides: Overrides) -> CameraFacts | None:
         return CameraFacts(overrides.intrinsics, "--intrinsics")
     for name in NAMES:
         path = folder / name
-        if path.exists():
+        if is_there(path):
             inside(path, folder)
             return _from_json(read_tree(path), name) if path.suffix == ".json" else CameraFacts(_from_text(path), name)
     return None
@@ -143,7 +145,7 @@ def _from_text(path: Path) -> Intrinsics:
     else:
         found = None
     if found is None:
-        raise InputError(f"{path}: does not describe a pinhole camera; it must be {expected}, in px.")
+        raise InputError(f"{path}: does not describe a pinhole camera; it must be {expected}, in px, {RANGE}.")
     return found
 
 
@@ -184,7 +186,7 @@ def _pinhole(node: Node) -> Intrinsics:
     if names is not None:
         fx, fy, cx, cy = (node.need(name).number() for name in names)
         if not sane((fx, fy, cx, cy)):
-            raise node.fault("intrinsics in px with fx and fy of at least 1")
+            raise node.fault(f"intrinsics in px, {RANGE}")
         return fx, fy, cx, cy
     entry = next((found for key in _MATRICES if (found := node.get(key)) is not None), None)
     if entry is None:
@@ -195,7 +197,7 @@ def _pinhole(node: Node) -> Intrinsics:
         matrix = entry.numbers(9).reshape(3, 3)
     found = of_matrix(matrix) or of_matrix(matrix.T)
     if found is None:
-        raise entry.fault("the matrix of a pinhole camera in px with fx and fy of at least 1")
+        raise entry.fault(f"the matrix of a pinhole camera in px, {RANGE}")
     return found
 
 

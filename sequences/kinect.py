@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
+from modeler.regular_files import check_regular
 from modeler.types import Array, Camera, InputError
 from sequences.image_files import MAX_PIXELS, EmbeddedImage, metres, read_colour
 from sequences.input_files import Node, input_errors
@@ -255,6 +256,7 @@ class Matroska:
             av = importlib.import_module("av")
         except ImportError:
             raise InputError(f"{self.path}: recordings of the Azure Kinect are read by PyAV; {ADVICE}") from None
+        check_regular(self.path)
         container = av.open(str(self.path), mode="r")
         weakref.finalize(self, container.close)
         return container

@@ -6,13 +6,14 @@ import contextlib
 import difflib
 from pathlib import Path
 
+from modeler.regular_files import check_regular
 from modeler.types import InputError
 from sequences.base import AbstractSequence
 from sequences.bop import BopSequence
 from sequences.clouds import SUFFIXES as CLOUD_SUFFIXES
 from sequences.clouds import open_clouds
 from sequences.image_folders import COLOUR_FOLDERS, open_colour_depth, open_tum
-from sequences.input_files import entries
+from sequences.input_files import entries, is_there
 from sequences.intrinsics import Overrides
 from sequences.live import SCHEME, open_camera
 
@@ -56,11 +57,13 @@ def _meant(path: Path) -> str:
 def _open(path: Path, overrides: Overrides) -> AbstractSequence:
     if not path.exists():
         raise InputError(f"{path}: no such folder or file; {_meant(path)}give {FORMATS}.")
-    if path.suffix.lower() in BAGS or (path / "metadata.yaml").exists():
+    if not path.is_dir():
+        check_regular(path)
+    if path.suffix.lower() in BAGS or is_there(path / "metadata.yaml"):
         from sequences.ros.sequence import open_ros
 
         return open_ros(path, overrides)
-    if (path / "report.json").is_file():
+    if is_there(path / "report.json"):
         raise InputError(f"{path}: is the folder of a run; give the sequence it was made from, or convert its poses.")
     if path.is_file() and path.suffix.lower() == ".mkv":
         from sequences.kinect import open_kinect
@@ -70,9 +73,9 @@ def _open(path: Path, overrides: Overrides) -> AbstractSequence:
         return open_clouds(path, overrides)
     if not path.is_dir():
         raise InputError(f"{path}: a file of this kind holds no sequence; give {FORMATS}.")
-    if (path / "scene_camera.json").exists():
+    if is_there(path / "scene_camera.json"):
         return BopSequence(path, overrides)
-    if (path / "depth.txt").exists():
+    if is_there(path / "depth.txt"):
         return open_tum(path, overrides)
     if (path / "depth").is_dir():
         return open_colour_depth(path, overrides)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from modeler.types import Array, Frame, InputError
 from sequences.base import AbstractSequence, span
-from sequences.input_files import Node, inside, read_tree
+from sequences.input_files import Node, inside, is_there, read_tree
 from sequences.lens import Lens
 
 
@@ -46,7 +46,7 @@ class AbstractRecording(AbstractSequence):
     def motion(self) -> Mapping[str, object] | None:
         """What `sequence.json` says of the motion; None where it says nothing."""
         node = None if self._meta is None else self._meta.get("motion")
-        return None if node is None else {key: entry.value for key, entry in node.items().items()}
+        return None if node is None else _motion(node)
 
     @property
     def robot_path(self) -> Path | None:
@@ -65,7 +65,7 @@ class AbstractRecording(AbstractSequence):
     def _beside(self, name: str) -> Path | None:
         """Return a file in the folder, where there is one; one to which a link leads out of it is refused."""
         path = self.path / name
-        return inside(path, self.path) if self._is_folder and path.is_file() else None
+        return inside(path, self.path) if self._is_folder and is_there(path) else None
 
     @cached_property
     def _is_folder(self) -> bool:
@@ -74,7 +74,50 @@ class AbstractRecording(AbstractSequence):
     @cached_property
     def _meta(self) -> Node | None:
         path = inside(self.path / "sequence.json", self.path) if self._is_folder else self.path.with_suffix(".json")
-        return read_tree(path) if path.is_file() else None
+        return read_tree(path) if is_there(path) else None
+
+
+MOTIONS = ("general", "table", "turntable", "held", "poke")
+"""Kinds of motion, each a prior."""
+_RANGES = {"step_deg": (-360.0, 360.0), "sigma_deg": (0.0, 180.0), "shift_m": (0.0, 10.0)}
+
+
+def _motion(node: Node) -> dict[str, object]:
+    """Return the entry `motion` of `sequence.json` after a check of everything in it.
+
+    Raises:
+        InputError: where a key or the kind is not known, or a value cannot be.
+    """
+    values: dict[str, object] = {}
+    for key, entry in node.items().items():
+        if key == "kind":
+            if entry.value not in MOTIONS:
+                raise entry.fault(f"one of {', '.join(MOTIONS)}")
+            values[key] = entry.value
+        elif key in _RANGES:
+            values[key] = entry.number(*_RANGES[key])
+        elif key == "pokes":
+            values[key] = {str(number): _poke(poke) for number, poke in entry.frames().items()}
+        else:
+            raise entry.unknown(("kind", *_RANGES, "pokes"))
+    return values
+
+
+def _poke(node: Node) -> dict[str, object]:
+    """Return one entry of `pokes`, in camera coordinates.
+
+    Raises:
+        InputError: where something is missing, not known, or cannot be.
+    """
+    known = ("point_m", "direction", "length_m")
+    for key, entry in node.items().items():
+        if key not in known:
+            raise entry.unknown(known)
+    point_m, direction = node.need("point_m").numbers(3), node.need("direction").numbers(3)
+    if not direction.any():
+        raise node.need("direction").fault("a direction that is not zero")
+    length_m = node.need("length_m").number(1e-6, 10.0)
+    return {"point_m": point_m.tolist(), "direction": direction.tolist(), "length_m": length_m}
 
 
 Stamp = TypeVar("Stamp")

@@ -22,6 +22,12 @@ OFF_MIDDLE = 0.1
 exchanged."""
 FAR_OFF_MIDDLE = 0.3
 """Beyond such a share no camera has it, but intrinsics of larger images do."""
+USUAL_FIELD_DEG = (1.0, 135.0)
+"""Fields of view of depth cameras, crops included."""
+WIDEST_FIELD_DEG = 170.0
+"""No pinhole camera sees more."""
+MAX_ASPECT = 1.5
+"""Pixels are nearly square."""
 LEAST_JOINED = 0.3
 """Depth cameras measure whole areas; where fewer pixels have measured neighbours, it is lines or single points."""
 
@@ -86,6 +92,15 @@ class Survey:
                 f"half of the depth lies within {middle_m:.2f} m, very {what} for an object: is the unit right? "
                 "If not, convert with --depth-scale-mm"
             )
+        for camera in self.cameras:
+            fields_deg = (field_of_view_deg(camera.width, camera.fx), field_of_view_deg(camera.height, camera.fy))
+            stretched = max(camera.fx, camera.fy) > MAX_ASPECT * min(camera.fx, camera.fy)
+            if stretched or min(fields_deg) < USUAL_FIELD_DEG[0] or max(fields_deg) > USUAL_FIELD_DEG[1]:
+                doubts.append(
+                    f"fx {camera.fx:g} and fy {camera.fy:g} px mean a field of view of {fields_deg[0]:.1f}° by "
+                    f"{fields_deg[1]:.1f}°: are the focal lengths right?"
+                )
+                break
         for camera in self.cameras[:1]:
             off_px, swapped_px = (
                 float(np.hypot(x - camera.width / 2, y - camera.height / 2))
@@ -128,7 +143,8 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
     empty, empty_masks, repeated, masks, colours = [], [], [], 0, 0
     before_m = None
     for frame in sequence:
-        cameras.setdefault(frame.camera)
+        if frame.camera not in cameras:
+            cameras[_checked(sequence, frame.camera)] = None
         times_s.append(frame.time_s)
         pixels = measured_pixels(frame)
         measured = frame.depth_m[pixels]
@@ -170,6 +186,26 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
         colours=colours,
         truths=(0 if poses is None else len(poses)) if truth else None,
     )
+
+
+def field_of_view_deg(size_px: int, focal_px: float) -> float:
+    """Return the angle that an image of some width, or height, spans."""
+    return float(np.degrees(2.0 * np.arctan(0.5 * size_px / focal_px)))
+
+
+def _checked(sequence: AbstractSequence, camera: Camera) -> Camera:
+    """Return a camera that can be one.
+
+    Raises:
+        InputError: where its focal length is far too short for its images.
+    """
+    for name, focal_px, size_px in (("fx", camera.fx, camera.width), ("fy", camera.fy, camera.height)):
+        if field_of_view_deg(size_px, focal_px) > WIDEST_FIELD_DEG:
+            raise InputError(
+                f"{sequence.name}: {name} of {focal_px:g} px is no focal length for images of {camera.width} x "
+                f"{camera.height}; correct the intrinsics, which are in px, or convert with --intrinsics FX FY CX CY."
+            )
+    return camera
 
 
 def measured_pixels(frame: Frame) -> np.ndarray:

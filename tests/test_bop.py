@@ -1,14 +1,17 @@
 """BOP scenes: what is written is what is read, and nothing is half written."""
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from refusal import refused
 from small_scene import CAMERA, INDICES, META, random_frames, random_truth, written
 
 from modeler.types import Frame, InputError
-from sequences import BopSequence, open_sequence, write_bop
+from sequences import BopSequence, open_sequence, survey, write_bop
 
 
 @pytest.fixture
@@ -149,3 +152,88 @@ def test_real_scenes_are_read() -> None:
         assert truth is not None
         assert tuple(truth) == sequence.indices
         assert 0.3 < np.nanmedian(first.depth_m) < 4.0
+
+
+def entered(scene: Path, name: str, change: Callable[[dict], object]) -> None:
+    tree = json.loads((scene / name).read_text())
+    change(tree)
+    (scene / name).write_text(json.dumps(tree))
+
+
+def test_masks_of_no_frame_are_reported(scene: Path) -> None:
+    assert BopSequence(scene).notes == ()
+    masks = sorted((scene / "mask_visib").iterdir())
+    masks[0].rename(masks[0].with_name("mask0.png"))
+    (note,) = BopSequence(scene).notes
+    assert f"1 of {len(masks)} masks belong to no depth image and are left out (mask0.png" in note
+    (scene / "mask_visib").rename(scene / "masks")
+    (note,) = BopSequence(scene).notes
+    assert "those in masks/ are left out" in note
+
+
+def test_a_changing_depth_scale_is_reported(scene: Path) -> None:
+    entered(scene, "scene_camera.json", lambda tree: tree[str(INDICES[1])].update(depth_scale=1.0))
+    (note,) = BopSequence(scene).notes
+    assert "depth_scale differs from frame to frame, from 0.1 to 1 mm" in note
+
+
+POKE = {"point_m": [0, 0, 1], "direction": [1, 0, 0], "length_m": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("motion", "words"),
+    [
+        ({"kind": "rocket"}, "one of general, table, turntable, held, poke"),
+        ({"kind": ["table"]}, "one of general"),
+        ({"kind": "turntable", "step_deg": 1e308}, "a number from -360 to 360"),
+        ({"kind": "turntable", "step_deg": float("nan")}, "step_deg"),
+        ({"kind": "turntable", "step_deg": "25"}, "step_deg"),
+        ({"kind": "turntable", "step-deg": 25}, "did you mean step_deg?"),
+        ({"kind": "table", "colour": 1}, "it takes kind, step_deg, sigma_deg, shift_m, pokes"),
+        ({"kind": "table", "sigma_deg": -1}, "sigma_deg"),
+        ({"kind": "poke", "pokes": {"one": {}}}, "is not a frame number"),
+        ({"kind": "poke", "pokes": {"1": POKE | {"point_m": [0, 0]}}}, "point_m"),
+        (
+            {"kind": "poke", "pokes": {"1": {"point_m": [0, 0, 1], "direction": [0, 0, 0], "length_m": 0.1}}},
+            "direction",
+        ),
+        ([], "an object"),
+    ],
+)
+def test_motion_is_read_strictly(scene: Path, motion: object, words: str) -> None:
+    entered(scene, "sequence.json", lambda tree: tree.update(motion=motion))
+    with refused("sequence.json", words):
+        BopSequence(scene)
+
+
+@pytest.mark.parametrize("name", ["\ud800", "a\u0007b", " "])
+def test_names_can_be_printed(scene: Path, name: str) -> None:
+    entered(scene, "sequence.json", lambda tree: tree.update(name=name))
+    with refused("sequence.json", '"name"', "printable"):
+        BopSequence(scene)
+
+
+def test_focal_lengths_are_those_of_cameras(scene: Path) -> None:
+    def focal_px(fx: float, fy: float) -> Callable[[dict], object]:
+        def change(tree: dict) -> None:
+            for entry in tree.values():
+                entry["cam_K"][0], entry["cam_K"][4] = fx, fy
+
+        return change
+
+    entered(scene, "scene_camera.json", focal_px(1e7, 1e7))
+    with refused("scene_camera.json", "fx and fy from 1 to 1e6"):
+        BopSequence(scene)
+    entered(scene, "scene_camera.json", focal_px(1.0, 1.0))
+    with refused("is no focal length for images of"):
+        survey(BopSequence(scene))
+    entered(scene, "scene_camera.json", focal_px(500.0, 100.0))
+    assert any("are the focal lengths right?" in doubt for doubt in survey(BopSequence(scene)).doubts)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".exr", ".jpg"])
+def test_depth_of_other_formats_is_refused_by_name(scene: Path, suffix: str) -> None:
+    for path in (scene / "depth").iterdir():
+        path.rename(path.with_suffix(suffix))
+    with refused(suffix, "16-bit PNG and TIFF are read"):
+        BopSequence(scene)

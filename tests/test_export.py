@@ -236,7 +236,7 @@ def test_bop_model_is_in_mm_about_its_centre_with_its_entry(tmp_path: Path) -> N
     header = (folder / "obj_000007.ply").read_bytes().split(b"end_header")[0].decode()
     kinds = {line.split()[1] for line in header.splitlines() if line.startswith("property") and "list" not in line}
     assert kinds <= {"float", "double", "int", "uchar"}  # what BOP's own reader takes
-    for broken, words in (("{", "cannot be read"), ("[1]", "lists no objects"), ('{"cup": {}}', "lists no objects")):
+    for broken, words in (("{", "not valid JSON"), ("[1]", "lists no objects"), ('{"cup": {}}', "lists no objects")):
         (folder / "models_info.json").write_text(broken)
         with pytest.raises(InputError, match=words):
             write_bop(ball(), folder / "obj_000007.ply")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,7 +68,7 @@ def test_pictures_of_two_clocks_pair_by_number_or_order(tmp_path: Path, frames: 
     for index in range(4):
         path = next((folder / "depth").glob(f"{index + 1:05d}-*"))
         path.rename(path.with_name(f"{1000.1 + index:.3f}.png"))
-    with pytest.raises(InputError, match="3 pictures cannot be told"):
+    with pytest.raises(InputError, match="3 images cannot be matched"):
         open_sequence(folder)
     save(folder / "color" / "00002.jpg", raw_depth(frames[0], 1.0).astype(np.uint8))
     assert all(frame.colour is not None for frame in open_sequence(folder))
@@ -80,6 +81,18 @@ def test_a_mask_of_the_first_frame_alone_is_taken(tmp_path: Path, frames: list[F
     sequence = open_sequence(tmp_path / "s")
     assert [frame.mask is None for frame in sequence] == [False, True, True, True]
     assert sequence.notes == ("3 of 4 depth images have no mask",)
+
+
+@pytest.mark.parametrize("write", [write_open3d, write_tum])
+def test_masks_of_no_frame_are_reported(
+    tmp_path: Path, frames: list[Frame], write: Callable[[Path, list[Frame]], None]
+) -> None:
+    write(tmp_path / "s", frames)
+    stem = sorted((tmp_path / "s" / "depth").iterdir())[0].stem
+    for name in (stem, "999999"):
+        save(tmp_path / "s" / "mask" / f"{name}.png", np.full((120, 160), 255, np.uint8))
+    sequence = open_sequence(tmp_path / "s")
+    assert any("belong to no depth image and are left out (999999.png" in note for note in sequence.notes)
 
 
 def test_numbers_within_names_tell_the_order(tmp_path: Path, frames: list[Frame]) -> None:

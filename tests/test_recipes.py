@@ -166,7 +166,7 @@ def test_unknown_recipes_and_meshes_are_named(tmp_path: Path) -> None:
         load_recipe("teapott")
     with pytest.raises(InputError, match="no such file"):
         load_recipe(tmp_path / "nothing.json")
-    with pytest.raises(InputError, match="no such mesh"):
+    with pytest.raises(InputError, match="no such file"):
         MeshFile(tmp_path / "nothing.ply").mesh()
     (tmp_path / "broken.ply").write_bytes(b"ply\nnonsense")
     (tmp_path / "empty.obj").write_bytes(b"# nothing\n")

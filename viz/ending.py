@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from modeler.regular_files import open_regular
+
 _BEGINS, _ENDS = b"RRF2", b"FOOT"
 _LAST = 64  # bytes in which the end is told
 
@@ -14,7 +16,7 @@ def ends_whole(recording: Path) -> bool:
 
     Of other formats than today's nothing is known: they count as whole.
     """
-    with recording.open("rb") as file:
+    with open_regular(recording) as file:
         if file.read(len(_BEGINS)) != _BEGINS:
             return True
         file.seek(max(0, os.fstat(file.fileno()).st_size - _LAST))

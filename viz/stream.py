@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from modeler.regular_files import create_regular
 from modeler.types import InputError, Step
 from viz import entities, viewer
 
@@ -175,7 +176,7 @@ def _file_sink(save: Path) -> rr.FileSink:
     import rerun as rr
 
     try:
-        save.open("wb").close()
+        create_regular(save)
     except OSError as error:
         raise InputError(f"{save}: cannot write the recording ({error.strerror}); choose another folder") from error
     return rr.FileSink(save)

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
+from modeler.regular_files import check_regular
 from modeler.types import InputError
 
 _HOST: Final = "127.0.0.1"
@@ -118,8 +119,9 @@ def view(run: Path, *, web: bool = False) -> Viewer:
         InputError: where the folder has no recording, or the viewer does not start.
     """
     recording = run / "recording.rrd"
-    if not recording.is_file():
+    if not os.path.lexists(recording):
         raise InputError(f"{run}: no recording.rrd here; give the folder that `modeler build --out` made")
+    check_regular(recording)
     return start_web(recording) if web else start_window([recording])
 
 

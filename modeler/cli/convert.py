@@ -45,6 +45,7 @@ class Convert:
             InputError: where the input cannot be used or the output cannot be written.
         """
         from modeler.cli.inputs import reading, while_it_lasts
+        from modeler.regular_files import read_regular
         from modeler.types import InputError
         from sequences import CalibratedSequence, frame_range, open_sequence, read_noise, survey, write_bop
 
@@ -71,7 +72,7 @@ class Convert:
                 _meta(sequence),
                 depth_scale_mm=unit_mm,
                 files={
-                    path.name: path.read_bytes()
+                    path.name: read_regular(path)
                     for path in (sequence.robot_path, sequence.model_path)
                     if path is not None
                 },

@@ -52,7 +52,7 @@ def settle(*paths: Path) -> None:
         OSError: where one cannot be brought there.
     """
     for path in paths:
-        opened = os.open(path, os.O_RDONLY)
+        opened = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         try:
             os.fsync(opened)
         except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from scipy.spatial.distance import pdist
 from modeler.export.files import write_atomically
 from modeler.export.formats import mesh_ply, ply_bytes
 from modeler.export.texture import Texture
+from modeler.regular_files import read_json
 from modeler.types import Array, InputError, ObjectModel
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
@@ -281,13 +283,11 @@ def _entries(path: Path) -> dict[str, Any]:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        entries = json.loads(path.read_text()) if path.exists() else {}
     except OSError as error:
         raise InputError(
             f"{path.parent}: cannot be used ({error.strerror}); choose another place with --out"
         ) from error
-    except ValueError as error:
-        raise InputError(f"{path}: cannot be read ({error}); mend it or choose another folder") from error
+    entries = read_json(path) if os.path.lexists(path) else {}
     if not isinstance(entries, dict) or not all(number.isdecimal() for number in entries):
         raise InputError(f"{path}: lists no objects by their numbers; mend it or choose another folder")
     return entries

@@ -15,6 +15,7 @@ from typing import final
 import numpy as np
 
 from modeler.export.files import settle_soon, write_atomically
+from modeler.regular_files import read_regular
 from modeler.types import (
     AbstractPoseDensity,
     AbstractRegistrar,
@@ -50,10 +51,10 @@ class Pairs:
             question: a digest of all that the answer depends on.
         """
         try:
-            packed = io.BytesIO(self._path(source, target, question).read_bytes())
+            packed = io.BytesIO(read_regular(self._path(source, target, question)))
             with np.load(packed, allow_pickle=False) as kept:
                 return _posterior(source, target, {name: kept[name] for name in kept.files})
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        except (InputError, OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
 
     def keep(self, posterior: Posterior, question: str) -> None:

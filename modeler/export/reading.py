@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from modeler import se3
+from modeler.regular_files import read_regular
 from modeler.types import Array, Edge, EdgeKind, InputError, Mode, ObjectModel, Outcome, PoseGaussian, Posterior, Stated
 
 Test = Callable[[Any], bool]
@@ -46,10 +49,11 @@ def read_model(path: Path) -> ObjectModel:
     import trimesh
     from trimesh.visual import ColorVisuals
 
-    if not path.is_file():
+    if not os.path.lexists(path):
         raise InputError(f"{path}: there is no such mesh; give a run folder in which `modeler build` has finished")
+    content = io.BytesIO(read_regular(path))
     try:
-        mesh = trimesh.load(path, process=False)  # load_mesh would drop the normals
+        mesh = trimesh.load(content, file_type="ply", process=False)  # load_mesh would drop the normals
     except Exception as error:  # trimesh lets whatever its parser trips over through
         raise InputError(f"{path}: not a mesh that can be read ({error}); build the model again") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):

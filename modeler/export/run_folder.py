@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from modeler.export.formats import cloud_ply, g2o_text, mesh_ply, tum_text
 from modeler.export.pairs import Pairs
 from modeler.export.reading import fault
 from modeler.export.report import FrameRecord, RunMeta, frame_record, report_of
+from modeler.regular_files import read_json
 from modeler.types import InputError, Step
 
 _REPORT = "report.json"
@@ -102,12 +104,9 @@ class RunFolder:
             InputError: where there is none or it cannot be read.
         """
         path = self.path / _REPORT
-        try:
-            report = json.loads(path.read_bytes())
-        except (FileNotFoundError, NotADirectoryError):
-            raise InputError(f"{path}: there is no report; is {self.path} the folder of a run?") from None
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path}: the report cannot be read ({error}); build again with --overwrite") from error
+        if not os.path.lexists(path):
+            raise InputError(f"{path}: there is no report; is {self.path} the folder of a run?")
+        report = read_json(path)
         if not isinstance(report, dict) or report.get("schema") != 1:
             raise InputError(f"{path}: not a report of schema 1; build again with --overwrite")
         return report

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
+from modeler.regular_files import read_regular
 from modeler.types import Array, BoolArray, InputError
 
 if TYPE_CHECKING:
@@ -98,10 +100,9 @@ def read_mesh(path: Path, scale: float) -> Mesh:
     """
     import trimesh  # slow to import, and only needed here
 
-    if not path.is_file():
-        raise InputError(f"{path}: no such mesh; check the path, which is relative to the recipe.")
+    content = read_regular(path)
     try:
-        loaded = trimesh.load_mesh(path, process=True)
+        loaded = trimesh.load_mesh(io.BytesIO(content), file_type=path.suffix[1:].lower(), process=True)
         vertices, triangles = np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces, np.int64)
     except Exception as error:  # trimesh's readers raise whatever their parsers raise
         why = " ".join(str(error).split()) or type(error).__name__

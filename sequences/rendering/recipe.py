@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import types
 import typing
@@ -87,9 +86,7 @@ def _dataclass(cls: type, node: Node) -> object:
     known = {field.name: field for field in fields(cls)}
     for key, entry in items.items():
         if key not in known and not (key == "kind" and entry.value == kind_of(cls)):
-            close = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean {close[0]}?" if close else "it takes " + ", ".join(known) + "."
-            raise InputError(f"{entry.path}: {entry.where} is not known; {hint}")
+            raise entry.unknown(tuple(known))
     values = {key: build(hints[key], entry) for key, entry in items.items() if key in known}
     for name, entry in known.items():
         if name not in values and entry.default is MISSING and entry.default_factory is MISSING:

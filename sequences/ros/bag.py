@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import io
+import os
 import struct
 import sys
 import weakref
@@ -23,8 +24,9 @@ from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from modeler.regular_files import open_regular
 from modeler.types import InputError
-from sequences.input_files import entries, input_errors, inside
+from sequences.input_files import entries, input_errors, inside, read_text
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -106,11 +108,12 @@ def check_file(path: Path) -> None:
     Raises:
         ValueError: where it would.
     """
-    with path.open("rb") as file:
-        if not is_zstd(file.read(len(_ZSTD))):
+    with open_regular(path) as packed:
+        if not is_zstd(packed.read(len(_ZSTD))):
             return
-    left = max(MAX_BYTES, MAX_RATIO * path.stat().st_size)
-    with zstd.open(path, "rb") as file:
+        packed.seek(0)
+        left = max(MAX_BYTES, MAX_RATIO * os.fstat(packed.fileno()).st_size)
+        file = zstd.open(packed, "rb")
         while piece := file.read(_PIECE):
             left -= len(piece)
             if left < 0:
@@ -125,6 +128,7 @@ def _whole(unpacked: bytes, *, ended: bool, most: int) -> bytes:
     return unpacked
 
 
+_ROS1 = b"#ROSBAG V"
 _MCAP = b"\x89MCAP0\r\n\x01"  # what its files begin with: the format, and that a header follows
 _PROFILE_AT = 21  # behind the header's length and that of the profile's name
 _ROS1_SCHEMA = "ros1msg"  # what MCAP calls definitions of ROS 1's messages
@@ -231,6 +235,7 @@ class Bag:
         """Return the open reader, which is closed when this bag is forgotten."""
         with input_errors(self.path, "bag", self._advice):
             if self._is_bag:
+                _check_start(self.path)
                 reader = rosbag1.Reader(self.path)
                 reader.open()
                 reader.chunks = {place: _bounded(chunk) for place, chunk in reader.chunks.items()}
@@ -272,12 +277,24 @@ def _bounded(chunk: Chunk) -> Chunk:
     return chunk if unpack is None else chunk._replace(decompressor=unpack)
 
 
+def _check_start(path: Path) -> None:
+    """Refuse a file that does not start as a bag of ROS 1: the library would look for the end of its first line.
+
+    Raises:
+        ValueError: where it does not.
+    """
+    with open_regular(path) as file:
+        if not file.read(len(_ROS1)).startswith(_ROS1):
+            raise ValueError("it does not start with #ROSBAG")
+
+
 def _ros2(path: Path) -> rosbag2.Reader:
     """Return an open reader of a bag of ROS 2."""
+    for entry in entries(path):
+        check_file(inside(entry, path))
     reader = rosbag2.Reader(path)
     if isinstance(reader.storage, DirectoryReader):
-        for entry in entries(path):
-            check_file(inside(entry, path))
+        read_text(path / "metadata.yaml")
         storage: Any = reader.storage
         storage.STORAGE_PLUGINS = {**storage.STORAGE_PLUGINS, "sqlite3": lambda file: Sqlite3Reader(_in_address(file))}
     elif isinstance(reader.storage, Sqlite3Reader):
@@ -317,7 +334,7 @@ class _Renamed(io.FileIO):
 
 def _profile(path: Path) -> str | None:
     """Return whose messages an MCAP file says to hold, as in `ros2`; None where it is none."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         start = file.read(_PROFILE_AT + 64)
     if not start.startswith(_MCAP) or len(start) < _PROFILE_AT:
         return None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+import io
 import json
 import shutil
 from collections.abc import Callable
@@ -19,11 +21,13 @@ import test_inputs_realsense as realsense
 import test_inputs_ros as ros
 
 import sequences
+from fuzz.special import remove
 from modeler import se3
+from modeler.cli import main
 from modeler.cli.convert import Convert
 from modeler.cli.inputs import solved
 from modeler.export import RunFolder, edges_of, poses_of
-from modeler.types import Camera, Frame
+from modeler.types import Camera, Frame, InputError
 from sequences import open_sequence, read_noise, survey, write_bop
 from sequences.image_folders import trajectory
 from sequences.rendering.recipe import load_recipe
@@ -227,6 +231,34 @@ def _poses(path: Path) -> None:
     Convert(path, path.parent / "poses.json").run()
 
 
+def _runs(folder: Path) -> Path:
+    """Write a sequence and two runs of it."""
+    write_bop(folder / "s", recordings.small_frames(3), recordings.small_truth(3), depth_scale_mm=1.0)
+    for name in ("a", "b"):
+        arguments = ["build", str(folder / "s"), "--out", str(folder / name), "--prior", "table", "--method", "icp"]
+        with contextlib.redirect_stderr(io.StringIO()):
+            main(arguments)
+    return folder
+
+
+def _command(*arguments: str) -> Callable[[Path], None]:
+    """Return what runs a command; names that begin with @ are those of files in the folder of the input."""
+
+    def run(folder: Path) -> None:
+        for name in ("out", "out.obj", "out.html"):
+            remove(folder / name)
+        said = io.StringIO()
+        placed = [str(folder / argument[1:]) if argument.startswith("@") else argument for argument in arguments]
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            status = main(placed)
+        last = said.getvalue().rstrip("\n").rpartition("\n")[2]
+        if status == 2:
+            raise InputError(last)
+        assert status in (0, 3), f"status {status}: {said.getvalue()}"
+
+    return run
+
+
 _MODES = bags.rosbag2.CompressionMode
 TARGETS |= {
     "mcap packed": Target(_packed(_MODES.STORAGE), ("s/*.mcap",), read_all, 2.0),
@@ -248,6 +280,18 @@ TARGETS |= {
     "recipe": Target(_recipe, ("s.json",), load_recipe),
     "run": Target(_report, ("report.json",), _poses),
     "report": Target(_report, ("report.json",), _reopen),
+    "export": Target(_runs, ("a/model.ply", "a/report.json"), _command("export", "@a", "--out", "@out.obj"), 0.3),
+    "export anew": Target(
+        _runs, ("a/report.json",), _command("export", "@a", "--out", "@out.obj", "--voxel-m", "0.01"), 0.1
+    ),
+    "page": Target(_runs, ("a/report.json", "a/recording.rrd"), _command("report", "@a", "--out", "@out.html"), 0.1),
+    "join": Target(_runs, ("a/report.json", "b/report.json"), _command("join", "@a", "@b", "--out", "@out"), 0.1),
+    "resume": Target(
+        _runs,
+        ("a/report.json", "a/recording.rrd"),
+        _command("build", "@s", "--out", "@a", "--resume", "--prior", "table", "--method", "icp"),
+        0.1,
+    ),
     "realsense 2.56": Target(_recorded("realsense-2.56.bag"), ("*.bag",), read_all, 0.5),
     "realsense 2.58": Target(_recorded("realsense-2.58.db3"), ("*.db3",), read_all),
     "foxglove": Target(_recorded("foxglove.mcap"), ("*.mcap",), read_all),

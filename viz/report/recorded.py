@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from collections.abc import Mapping
@@ -12,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from modeler.regular_files import check_regular
 from modeler.types import Array
 from viz import entities
 
@@ -31,6 +33,9 @@ def recorded(recording: Path) -> dict[str, dict[int, dict[str, Any]]]:
     later stands there beside the latest. Of a frame that was tried more than once the last attempt counts.
     """
     rows: dict[str, dict[int, dict[str, Any]]] = {path: {} for path in _READ}
+    if not os.path.lexists(recording):
+        return rows
+    check_regular(recording)
     try:
         steps = _steps(recording)
     except (OSError, ValueError, RuntimeError):

@@ -1,0 +1,139 @@
+"""Regular files: the one place where files that a user names, or that lie in a folder the user names, are opened.
+
+A FIFO, a socket or a device can block whoever opens it, or never end; only regular files are read.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from modeler.types import InputError
+
+MAX_BYTES = 1 << 30
+"""Larger files are not read into memory at once."""
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file for reading, never waiting for anybody.
+
+    The file is looked at before it is opened, because opening a device can have effects, and again once it is open,
+    because another program may have replaced it in between.
+
+    Raises:
+        InputError: where it is anything else than a regular file.
+        OSError: where it is missing or cannot be opened.
+    """
+    _check(path, os.stat(path).st_mode)
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    except OSError as error:
+        if error.errno == errno.ENXIO:  # a socket
+            _check(path, stat.S_IFSOCK)
+        raise
+    try:
+        _check(path, os.fstat(descriptor).st_mode)
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def check_regular(path: Path) -> None:
+    """Refuse what is no regular file, for libraries that open a path by themselves.
+
+    Raises:
+        InputError: where it is anything else, missing, or cannot be opened.
+    """
+    try:
+        open_regular(path).close()
+    except OSError as error:
+        raise unreadable(path, error) from None
+
+
+def create_regular(path: Path) -> None:
+    """Create an empty regular file, or empty the one that is there.
+
+    Raises:
+        InputError: where something else has its name.
+        OSError: where it cannot be created or written to.
+    """
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC, 0o666)
+    try:
+        _check(path, os.fstat(descriptor).st_mode)
+        os.ftruncate(descriptor, 0)
+    finally:
+        os.close(descriptor)
+
+
+def read_regular(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
+    """Return the content of a regular file.
+
+    Raises:
+        InputError: where it is anything else, larger than `most_bytes`, missing, or cannot be read.
+    """
+    try:
+        with open_regular(path) as file:
+            content = file.read(most_bytes + 1) if os.fstat(file.fileno()).st_size <= most_bytes else None
+    except OSError as error:
+        raise unreadable(path, error) from None
+    if content is None or len(content) > most_bytes:
+        raise InputError(f"{path}: is larger than {most_bytes // 1_000_000} MB; is it the right file?")
+    return content
+
+
+def read_json(path: Path, most_bytes: int = MAX_BYTES) -> Any:
+    """Return what a JSON file holds.
+
+    Raises:
+        InputError: where it is no regular file, too large, missing, cannot be read, or is not valid JSON.
+    """
+    return parse_json(read_regular(path, most_bytes), path)
+
+
+def parse_json(content: str | bytes, path: Path) -> Any:
+    """Return what JSON text holds; `path` is where it comes from, for messages.
+
+    Raises:
+        InputError: where it is not valid JSON, or nested too deeply.
+    """
+    try:
+        return json.loads(content)
+    except json.JSONDecodeError as error:
+        why = f"line {error.lineno}, column {error.colno}: {error.msg}"
+    except RecursionError:
+        why = "nested too deeply"
+    except ValueError as error:  # numbers of too many digits, bytes that are not UTF-8
+        why = " ".join(str(error).split())
+    raise InputError(f"{path}: is not valid JSON ({why}); correct it there.")
+
+
+def unreadable(path: Path, error: OSError) -> InputError:
+    """Return the error for a file that could not be opened or read."""
+    if isinstance(error, FileNotFoundError):
+        broken = os.path.islink(path)
+        why = "is a link to nothing; put the file itself there" if broken else "no such file; check the path"
+        return InputError(f"{path}: {why}.")
+    return InputError(f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions.")
+
+
+def _check(path: Path, mode: int) -> None:
+    """Refuse what is no regular file by its mode.
+
+    Raises:
+        InputError: where it is none.
+    """
+    if not stat.S_ISREG(mode):
+        kind = _KINDS.get(stat.S_IFMT(mode), "something else")
+        raise InputError(f"{path}: is {kind}, not a regular file; put the file itself there.")
