@@ -20,7 +20,7 @@ demo: setup
 	$(BIN)/modeler build sequences/bundled/box --prior table --out runs/demo --overwrite
 	@echo
 	@echo "The mesh is runs/demo/model.ply (any mesh viewer opens it); in another format:"
-	@echo "    $(BIN)/modeler export runs/demo --out runs/demo/box.glb"
+	@echo "    $(BIN)/modeler export runs/demo --out runs/box.glb"
 	@echo "The recording is runs/demo/recording.rrd; look at the run with:"
 	@echo "    $(BIN)/modeler report runs/demo        (one page: runs/demo/report.html)"
 	@echo "    $(BIN)/modeler view runs/demo          (in a window)"

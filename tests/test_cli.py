@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -215,13 +216,13 @@ def test_build_says_nothing_on_stdout_and_one_line_on_stderr(run: Run, tmp_path:
 
 def test_same_seed_same_bytes_and_nothing_is_replaced_unasked(run: Run, built: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    folder.mkdir()
+    shutil.copytree(built, folder)
     (folder / "model.ply").write_text("an earlier model")
     (folder / "notes.txt").write_text("the user's own")
     refused = run("build", BOX, "--out", folder, *QUICK)
     assert refused.status == 2
     assert (folder / "model.ply").read_text() == "an earlier model"
-    assert {path.name for path in folder.iterdir()} == {"model.ply", "notes.txt"}
+    assert {path.name for path in folder.iterdir()} == FILES | {"notes.txt"}
     assert run("build", BOX, "--out", folder, *QUICK, "--overwrite").status == 0
     assert contents(folder) == contents(built)
     assert (folder / "notes.txt").read_text() == "the user's own"

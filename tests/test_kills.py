@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -110,10 +110,9 @@ def test_a_run_whose_report_is_damaged_is_not_resumed(
     del report[missing]
     (tmp_path / "report.json").write_text(json.dumps(report))
     assert main(["build", str(scene), "--out", str(tmp_path), *QUICK, "--resume"]) == 2
-    assert capsys.readouterr().err == (
-        f"modeler: {tmp_path / 'report.json'}: {missing!r} is missing or is not what it should be; build again with "
-        "--overwrite\n"
-    )
+    said = capsys.readouterr().err
+    assert said.startswith(f"modeler: {tmp_path / 'report.json'}: {missing!r} is missing")
+    assert said.count("\n") == 1
 
 
 def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(
@@ -218,7 +217,7 @@ def test_two_runs_do_not_write_into_one_folder(scene: Path, tmp_path: Path, caps
     with alone(tmp_path / "run"):
         assert list((tmp_path / "run").iterdir()) == []
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="choose another --out"), alone(tmp_path / "file"):
+    with pytest.raises(InputError, match="choose another place"), alone(tmp_path / "file"):
         pass
 
 
@@ -238,6 +237,7 @@ def posterior(rng: np.random.Generator) -> Posterior:
         pareto_k=float("inf"),
         log_evidence=-float("inf"),
         seconds=0.1,
+        least_overlap=0.35,
     )
 
 
@@ -249,9 +249,11 @@ def test_what_is_kept_comes_back_to_the_bit(tmp_path: Path, rng: np.random.Gener
     pairs.keep(kept, "question")
     back = pairs.get(7, 3, "question")
     assert back is not None
-    assert (back.source, back.target, back.outcome, len(back.modes)) == (7, 3, kept.outcome, len(kept.modes))
-    for name in ("overlap", "samples", "weights", *("effective_samples", "pareto_k", "log_evidence")):
-        np.testing.assert_equal(getattr(back, name), getattr(kept, name))
+    assert len(back.modes) == len(kept.modes)
+    for field in fields(Posterior):
+        if field.name not in ("pose", "modes"):
+            np.testing.assert_equal(getattr(back, field.name), getattr(kept, field.name))
+    assert [mode.weight for mode in back.modes] == [mode.weight for mode in kept.modes]
     gaussians = [
         (back.pose, kept.pose),
         *((ours.pose, theirs.pose) for ours, theirs in zip(back.modes, kept.modes, strict=True)),

@@ -160,7 +160,7 @@ def test_another_sequence_is_not_taken_for_that_of_the_run(
 ) -> None:
     sequence, run = _without(scene, built, tmp_path)
     moved = sequence.rename(tmp_path / "moved")
-    page = ("report", run, "--out", tmp_path / "page.html")
+    page = ("report", run, "--overwrite", "--out", tmp_path / "page.html")
     status, _, _ = _told(capsys, "report", "--sequence", moved, *page[1:])
     assert status == 0
     assert "Errors against ground truth" in (tmp_path / "page.html").read_text()
@@ -215,7 +215,7 @@ def test_a_damaged_report_is_one_line(
         status, out, err = _told(capsys, command[0], tmp_path / "run", *command[1:])
         assert (status, out, err.count("\n")) == (2, "", 1)
         assert f"{path}: " in err
-        assert "build again with --overwrite" in err
+        assert "build the run again" in err
 
 
 def test_a_joined_run_is_judged_where_its_parts_know_one_surface(

@@ -216,7 +216,7 @@ def test_the_command_writes_the_page_and_says_where(run: Path, tmp_path: Path, c
     assert said.out == ""
     assert str(out) in said.err
     assert "The true motion is not known here" in out.read_text()  # the sequence is not there
-    assert main(["report", str(run), "--out", str(out), "--sequence", str(tmp_path / "moved")]) == 2
+    assert main(["report", str(run), "--out", str(out), "--sequence", str(tmp_path / "moved"), "--overwrite"]) == 2
     assert "moved" in capsys.readouterr().err
     out.unlink()
     assert main(["report", str(run), "--out", str(out), "--sequence", str(bundled("box"))]) == 2

@@ -29,7 +29,9 @@ def test_run_folder_is_complete_after_the_last_step(tmp_path: Path) -> None:
     for step in steps:
         run.write(step, META)
         expected = FILES if step.last else FILES - {"cloud.ply", "model.ply"}
-        assert {path.name for path in run.path.iterdir()} == expected
+        assert {path.name for path in run.path.iterdir()} == expected | {".pairs"}
+    run.finish()
+    assert {path.name for path in run.path.iterdir()} == FILES
     solution = steps[-1].solution
     for name, poses in (("trajectory.txt", solution.trajectory), ("odometry.txt", solution.odometry)):
         lines = np.loadtxt(run.path / name)
@@ -45,27 +47,27 @@ def test_existing_run_is_not_written_over_unasked(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / ".model.ply.1234.part").write_text("half")
     before = (tmp_path / "report.json").read_bytes()
-    with pytest.raises(InputError, match=r"not empty; choose another --out, or give --overwrite or --resume") as caught:
+    with pytest.raises(InputError, match=r"not empty; choose another place, or replace or resume the run") as caught:
         RunFolder.open(tmp_path)
     assert "\n" not in str(caught.value)
     assert (tmp_path / "report.json").read_bytes() == before
     (tmp_path / "report.html").write_text("a page about this run")
     RunFolder.open(tmp_path, resume=True)
-    assert {path.name for path in tmp_path.iterdir()} == FILES | {"notes.txt", "report.html"}
+    assert {path.name for path in tmp_path.iterdir()} == FILES | {"notes.txt", "report.html", ".pairs"}
     RunFolder.open(tmp_path, overwrite=True)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert {path.name for path in tmp_path.iterdir()} == {"notes.txt", ".pairs"}
 
 
 def test_place_that_cannot_hold_a_run_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "file", tmp_path / "file" / "run"):
-        with pytest.raises(InputError, match="choose another --out"):
+        with pytest.raises(InputError, match="choose another place"):
             RunFolder.open(path, overwrite=True)
     with pytest.raises(InputError, match=r"is .* the folder of a run"):
         RunFolder(tmp_path).report()
     for content in ("{", "[]", '{"schema": 2}'):
         (tmp_path / "report.json").write_text(content)
-        with pytest.raises(InputError, match="build again with --overwrite"):
+        with pytest.raises(InputError, match="build the run again"):
             RunFolder(tmp_path).report()
 
 
@@ -154,7 +156,49 @@ def test_what_no_report_tells_of_is_not_resumed(tmp_path: Path) -> None:
     (tmp_path / "report.json").unlink()
     (tmp_path / "notes.txt").write_text("mine")
     RunFolder.open(tmp_path, resume=True)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert {path.name for path in tmp_path.iterdir()} == {"notes.txt", ".pairs"}
+    assert list((tmp_path / ".pairs").iterdir()) == []
+
+
+@pytest.mark.parametrize("how", [{"overwrite": True}, {"resume": True}])
+def test_a_folder_that_is_no_run_is_left_alone(tmp_path: Path, how: dict[str, bool]) -> None:
+    (tmp_path / "model.ply").write_text("somebody's own")
+    for report in (None, "{", '{"schema": 2}'):
+        if report is not None:
+            (tmp_path / "report.json").write_text(report)
+        before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+        with pytest.raises(InputError, match="not empty, and not the folder of a run"):
+            RunFolder.open(tmp_path, **how)
+        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_run_with_a_damaged_report_can_be_replaced(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path)
+    for step in made_up_steps():
+        run.write(step, META)
+    run.finish()
+    (tmp_path / "report.json").write_text("{")
+    RunFolder.open(tmp_path, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == [".pairs"]
+
+
+def test_what_a_kill_left_of_the_registrations_goes_with_the_next_run(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path)
+    run.pairs.keep(made_up_steps()[-1].edges_so_far[0].posterior, "question")
+    (tmp_path / ".pairs").rename(tmp_path / ".pairs.dropped")
+    assert run.is_run
+    RunFolder.open(tmp_path, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == [".pairs"]
+
+
+def test_a_recording_that_is_another_name_of_a_file_is_not_written_through(tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("precious")
+    run = RunFolder.open(tmp_path / "run")
+    run.write(made_up_steps()[0], META)
+    os.link(tmp_path / "precious", run.path / "recording.rrd")
+    RunFolder.open(run.path, resume=True)
+    assert not (run.path / "recording.rrd").exists()
+    assert (tmp_path / "precious").read_text() == "precious"
 
 
 def test_file_is_whole_whatever_happens_while_it_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

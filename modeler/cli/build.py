@@ -64,11 +64,14 @@ class Build:
         """
         from modeler.cli import compose
         from modeler.cli.advice import comes_back
+        from modeler.cli.outputs import check_run_folder
         from modeler.export import Remembered, RunFolder, RunMeta, alone
         from viz.ending import ends_whole
 
         began_s = time.perf_counter()
         _check(self)
+        inputs = [self.sequence, *([] if self.sensor is None else [self.sensor])]
+        check_run_folder(self.out, inputs, overwrite=self.overwrite, resume=self.resume)
         whole, frames = _opened(self)
         modeler = compose.modeler(whole, self.prior, self.method, self.where)
         modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=self.voxel_m))
@@ -81,6 +84,7 @@ class Build:
             closure_expected=comes_back(frames, self.prior.step_deg, modeler.closer.max_angle_deg),
         )
         if self.resume and RunFolder(self.out).finished(meta):
+            RunFolder(self.out).pairs.drop()  # what a kill at the very end left of them
             say("the run had come to its end; --overwrite makes it anew")
             return _told(RunFolder(self.out).report(), self, modeler.prior)
         scene = compose.scene(modeler, whole)

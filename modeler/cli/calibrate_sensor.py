@@ -27,7 +27,9 @@ class CalibrateSensor:
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
     """At least 3 frames in any format that is read."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
-    """JSON file to write; one that is there is replaced."""
+    """JSON file to write."""
+    overwrite: bool = False
+    """Replace the file where there is one."""
     given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
@@ -37,11 +39,13 @@ class CalibrateSensor:
             InputError: where the input cannot be used or the file cannot be written.
         """
         from modeler.cli.inputs import reading
+        from modeler.cli.outputs import check_files
         from modeler.export import write_atomically
         from sequences import open_sequence
         from sequences.noise_calibration import calibrate
         from sequences.noise_model import noise_text, object_distance_m
 
+        check_files([self.out], [self.input], overwrite=self.overwrite)
         sequence = open_sequence(self.input, self.given.stated())
         with reading() as watched:
             found = calibrate(watched(sequence.recorded(), "reading"))

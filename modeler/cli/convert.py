@@ -33,6 +33,8 @@ class Convert:
     """A sequence in any format that is read, or a run folder."""
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """BOP scene folder to make; scene_gt.json or poses.txt for a run."""
+    overwrite: bool = False
+    """Replace the poses of a run that OUT holds; a folder is never replaced."""
     sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as INPUT says")] = None
     """Noise of the depth camera, as `modeler calibrate-sensor` measured it, to write into sequence.json."""
     selection: FrameOptions = field(default_factory=FrameOptions)
@@ -45,6 +47,7 @@ class Convert:
             InputError: where the input cannot be used or the output cannot be written.
         """
         from modeler.cli.inputs import reading, while_it_lasts
+        from modeler.cli.outputs import check_files, check_folder, run_inputs
         from modeler.regular_files import read_regular
         from modeler.types import InputError
         from sequences import CalibratedSequence, frame_range, open_sequence, read_noise, survey, write_bop
@@ -52,9 +55,11 @@ class Convert:
         if (self.input / "report.json").is_file():
             if self.sensor is not None or self.selection != FrameOptions() or self.given != InputOptions():
                 raise InputError(f"{self.input}: the poses of a run are written as they are; leave out other options")
+            check_files([self.out], run_inputs([self.input]), overwrite=self.overwrite)
             return _poses(self.input, self.out)
         if self.out.suffix in (".json", ".txt"):
             raise InputError(f"{self.input}: is no folder of a run, whose poses {self.out} could hold; give one")
+        check_folder(self.out, [self.input, *([] if self.sensor is None else [self.sensor])])
         whole = open_sequence(self.input, self.given.stated())
         whole = whole if self.sensor is None else CalibratedSequence(whole, read_noise(self.sensor))
         kept = frame_range(self.selection.frames)

@@ -39,7 +39,9 @@ class Evaluate:
     ]
     """Sequences with ground truth (scene_gt.json; none is needed with --closed), or run folders made of such."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Folder for the results; those of an earlier evaluation are replaced at the end."""
+    """Folder for the results."""
+    overwrite: bool = False
+    """Replace the results of an earlier evaluation in the folder."""
     methods: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ",".join(get_args(Method))
     """Methods to compare."""
     offsets: Annotated[str, tyro.conf.arg(metavar="N,...")] = "1"
@@ -67,6 +69,7 @@ class Evaluate:
         Raises:
             InputError: where an option, a sequence or the folder cannot be used.
         """
+        from modeler.cli.outputs import check_files, run_inputs
         from modeler.types import InputError
 
         if not self.sequences:
@@ -75,12 +78,16 @@ class Evaluate:
             raise InputError(f"--points {self.points} leaves nothing; give a whole number from 1 on")
         runs = [path for path in self.sequences if (path / "report.json").is_file()]
         if not runs:
+            names = ("results.json", "results.csv", "rotation_errors.png")
+            check_files([self.out / name for name in names], self.sequences, overwrite=self.overwrite)
             return _evaluate_pairs(self)
         if len(runs) < len(self.sequences):
             lacking = next((path for path in self.sequences if not path.exists()), None)
             if lacking is not None:
                 raise InputError(f"{lacking}: no such folder; give folders of runs")
             raise InputError("sequences and run folders are evaluated apart; give one kind at a time")
+        outs = [self.out / name for name in ("models.json", "models.csv")]
+        check_files(outs, run_inputs(runs), overwrite=self.overwrite)
         return _evaluate_models(runs, self.out, self.seed)
 
 

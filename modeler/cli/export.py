@@ -29,6 +29,8 @@ class Export:
     """Run folder, as `modeler build` makes it."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.{ply,obj,glb,stl}")]
     """File to write; its ending selects the format. STL carries no colour."""
+    overwrite: bool = False
+    """Replace files that are there."""
     watertight: bool = False
     """Close what nobody saw with made-up surface. In PLY its vertices have 0 `views` and a `sigma_m` of -1."""
     triangles: Annotated[int | None, tyro.conf.arg(metavar="N"), default("all")] = None
@@ -50,10 +52,13 @@ class Export:
             InputError: where options exclude each other, or something cannot be read or written.
         """
         from modeler import export as files
+        from modeler.cli.outputs import check_files, run_inputs
         from modeler.export.texture import TRIANGLES
         from modeler.types import InputError
 
         _check(self)
+        outs = files.files_of(self.out, textured=self.texture)
+        check_files(outs, run_inputs([self.run_folder], self.moved.sequence), overwrite=self.overwrite)
         report = files.RunFolder(self.run_folder).result()  # a sequence may hold a model.ply as well: the true one
         if not report.get("poses"):
             raise InputError(f"{self.run_folder}: no frame of this run was accepted; report.json says why")

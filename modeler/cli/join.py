@@ -109,6 +109,7 @@ def _check(options: Join) -> None:
     Raises:
         InputError: where they are such, or another program is writing to the folder.
     """
+    from modeler.cli.outputs import check_run_folder, run_inputs
     from modeler.export import alone
     from modeler.types import InputError
 
@@ -116,8 +117,7 @@ def _check(options: Join) -> None:
         raise InputError(f"--pairs {options.pairs} leaves nothing to join by; give at least 1")
     if options.run_a.resolve() == options.run_b.resolve():
         raise InputError(f"RUN_A and RUN_B are both {options.run_a}; name two runs")
-    if options.out.is_dir() and any(options.out.iterdir()) and not options.overwrite:
-        raise InputError(f"{options.out}: not empty; choose another --out, or give --overwrite")
+    check_run_folder(options.out, run_inputs([options.run_a, options.run_b]), overwrite=options.overwrite)
     if options.out.is_dir():
         with alone(options.out):  # asked now, not only when the work is done
             pass

@@ -25,9 +25,11 @@ class Render:
     def run(self) -> int:
         """Render the sequence."""
         from modeler.cli.inputs import reading
+        from modeler.cli.outputs import check_folder
         from sequences.rendering.recipe import load_recipe
         from sequences.rendering.renderer import render
 
+        check_folder(self.out, [Path(self.recipe)])
         recipe = load_recipe(self.recipe)
         with reading() as watched:
             render(recipe if self.seed is None else replace(recipe, seed=self.seed), self.out, watched)

@@ -27,16 +27,21 @@ class Report:
     """Run folder, as `modeler build` makes it."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html"), default("RUN/report.html")] = None
     """Page to write."""
+    overwrite: bool = False
+    """Replace the page where there is one."""
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:
         """Write the page."""
+        from modeler.cli.outputs import check_files, run_inputs
         from modeler.export import RunFolder
         from modeler.export.run_folder import PAGE
         from modeler.types import InputError
         from viz.report import write_page
 
         out = self.run_folder / PAGE if self.out is None else self.out
+        inputs = run_inputs([self.run_folder], self.moved.sequence)
+        check_files([out], inputs[1:] if self.out is None else inputs, overwrite=self.overwrite)
         RunFolder(self.run_folder).result()  # without which there is nothing to tell
         try:
             truth = _truth(self.run_folder, self.moved.sequence)

@@ -42,7 +42,7 @@ def write_atomically(path: Path, content: str | bytes, *, lasting: bool = False)
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place with --out") from error
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
 
 
 def settle(*paths: Path) -> None:
@@ -86,16 +86,16 @@ def alone(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
-        raise InputError(f"{folder}: no run folder can be made ({error.strerror}); choose another --out") from error
+        raise InputError(f"{folder}: no run folder can be made ({error.strerror}); choose another place") from error
     except UnicodeEncodeError:
-        raise InputError(f"{folder}: its name is not UTF-8; rename it, or choose another --out") from None
+        raise InputError(f"{folder}: its name is not UTF-8; rename it, or choose another place") from None
     try:
         with contextlib.suppress(OSError):  # not every file system has locks
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise InputError(
-                    f"{folder}: another run is writing to it; wait for its end, or choose another --out"
+                    f"{folder}: another run is writing to it; wait for its end, or choose another place"
                 ) from None
         yield
     finally:

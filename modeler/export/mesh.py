@@ -54,6 +54,14 @@ def format_of(out: Path) -> str:
     return suffix
 
 
+def files_of(out: Path, *, textured: bool = False) -> tuple[Path, ...]:
+    """Return the files that `write_mesh` writes: `out`, and of a textured OBJ its material and its image."""
+    if not textured or out.suffix.lower() != ".obj":
+        return (out,)
+    stem = "_".join(out.stem.split())  # many programs take spaces for the end of a name
+    return out, out.with_name(f"{stem}.mtl"), out.with_name(f"{stem}.png")
+
+
 def write_mesh(
     model: ObjectModel, out: Path, texture: Texture | None = None, *, object_from_upright: Array | None = None
 ) -> None:
@@ -74,20 +82,20 @@ def write_mesh(
     """
     suffix = format_of(out)
     if texture is not None and suffix not in TEXTURED:
-        raise InputError(f"{out}: {suffix[1:]} holds no texture; use {' or '.join(TEXTURED)}, or leave out --texture")
+        raise InputError(f"{out}: {suffix[1:]} holds no texture; use {' or '.join(TEXTURED)}, or leave out the texture")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{out.parent}: cannot be made ({error.strerror}); choose another place with --out") from error
+        raise InputError(f"{out.parent}: cannot be made ({error.strerror}); choose another place") from error
     match suffix:
         case ".ply":
             write_atomically(out, mesh_ply(model))
         case ".obj":
-            beside = "_".join(out.stem.split())  # many programs take spaces for the end of a name
             if texture is not None:
-                write_atomically(out.with_name(f"{beside}.png"), _png(texture))
-                write_atomically(out.with_name(f"{beside}.mtl"), _material(f"{beside}.png"))
-            write_atomically(out, _obj(model, beside, texture))
+                _, material, image = files_of(out, textured=True)
+                write_atomically(image, _png(texture))
+                write_atomically(material, _material(image.name))
+            write_atomically(out, _obj(model, "_".join(out.stem.split()), texture))
         case ".glb":
             write_atomically(out, _glb(model, texture, object_from_upright))
         case _:
@@ -176,7 +184,7 @@ def simplified(model: ObjectModel, triangles: int) -> ObjectModel:
     import open3d as o3d
 
     if triangles < 4:
-        raise InputError(f"--triangles {triangles} is too few for a solid; give at least 4")
+        raise InputError(f"{triangles} triangles are too few for a solid; at least 4 are needed")
     if len(model.triangles) <= triangles:
         return model
     mesh = o3d.geometry.TriangleMesh(
@@ -193,7 +201,7 @@ def simplified(model: ObjectModel, triangles: int) -> ObjectModel:
     fewer.compute_vertex_normals()
     vertices_m = np.asarray(fewer.vertices)
     if not len(fewer.triangles):
-        raise InputError(f"--triangles {triangles} leaves nothing of the mesh; ask for more")
+        raise InputError(f"{triangles} triangles leave nothing of the mesh; allow more")
     _, nearest = KDTree(model.vertices_m).query(vertices_m)
     return replace(
         model,
@@ -256,7 +264,7 @@ def write_bop(model: ObjectModel, out: Path) -> None:
         InputError: where the name is not that of a PLY file, or a file cannot be read or written.
     """
     if out.suffix.lower() != ".ply":
-        raise InputError(f"{out}: BOP models are PLY files; give --out a name such as obj_000001.ply")
+        raise InputError(f"{out}: BOP models are PLY files; choose a name such as obj_000001.ply")
     digits = re.search(r"(\d+)$", out.stem)
     number = str(int(digits.group(1))) if digits else "1"
     low, high = model.vertices_m.min(axis=0), model.vertices_m.max(axis=0)
@@ -284,9 +292,7 @@ def _entries(path: Path) -> dict[str, Any]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f"{path.parent}: cannot be used ({error.strerror}); choose another place with --out"
-        ) from error
+        raise InputError(f"{path.parent}: cannot be used ({error.strerror}); choose another place") from error
     entries = read_json(path) if os.path.lexists(path) else {}
     if not isinstance(entries, dict) or not all(number.isdecimal() for number in entries):
         raise InputError(f"{path}: lists no objects by their numbers; mend it or choose another folder")

@@ -8,9 +8,9 @@ import io
 import shutil
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from modeler.types import (
     RayImage,
 )
 
-_NUMBERS = ("overlap", "effective_samples", "pareto_k", "log_evidence", "seconds")
 _DRAWN = 64  # poses by which one prior is told from another
 
 
@@ -53,7 +52,7 @@ class Pairs:
         try:
             packed = io.BytesIO(read_regular(self._path(source, target, question)))
             with np.load(packed, allow_pickle=False) as kept:
-                return _posterior(source, target, {name: kept[name] for name in kept.files})
+                return _posterior({name: kept[name] for name in kept.files})
         except (InputError, OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
 
@@ -67,17 +66,45 @@ class Pairs:
             write_atomically(path, packed.getvalue())
             settle_soon(path, self.folder)  # waiting for the disk would take as long as registering
 
-    def drop(self) -> None:
-        """Forget everything, or, where the program is killed at it, nothing.
+    @property
+    def marked(self) -> bool:
+        """Whether the folder is there, or what a killed program left of it: the sign of a run that has not ended."""
+        return any(folder.is_dir() and not folder.is_symlink() for folder in (self.folder, self._dropped))
+
+    def mark(self) -> None:
+        """Make the folder.
 
         Raises:
             OSError: where that cannot be.
         """
-        gone = self.folder.with_name(f"{self.folder.name}.dropped")
-        shutil.rmtree(gone, ignore_errors=True)
+        self.folder.mkdir(exist_ok=True)
+
+    def empty(self) -> None:
+        """Forget everything, or, where the program is killed at it, nothing; the folder stays.
+
+        Raises:
+            OSError: where that cannot be.
+        """
+        shutil.rmtree(self._dropped, ignore_errors=True)
         if self.folder.is_dir() and not self.folder.is_symlink():
-            self.folder.rename(gone)
-            shutil.rmtree(gone)
+            self.folder.rename(self._dropped)
+        self.mark()
+        shutil.rmtree(self._dropped, ignore_errors=True)
+
+    def drop(self) -> None:
+        """Forget everything, or, where the program is killed at it, nothing; the folder goes.
+
+        Raises:
+            OSError: where that cannot be.
+        """
+        shutil.rmtree(self._dropped, ignore_errors=True)
+        if self.folder.is_dir() and not self.folder.is_symlink():
+            self.folder.rename(self._dropped)
+            shutil.rmtree(self._dropped)
+
+    @property
+    def _dropped(self) -> Path:
+        return self.folder.with_name(f"{self.folder.name}.dropped")
 
     def _path(self, source: int, target: int, question: str) -> Path:
         return self.folder / f"{source:06d}-{target:06d}-{question}.npz"
@@ -129,30 +156,44 @@ class Remembered(AbstractRegistrar):
 
 
 def _arrays(posterior: Posterior) -> dict[str, np.ndarray]:
-    """Return a posterior as arrays."""
-    return {
-        "mean": posterior.pose.mean,
-        "covariance": posterior.pose.covariance,
-        "outcome": np.array(posterior.outcome.label),
-        "samples": posterior.samples,
-        "weights": posterior.weights,
-        "numbers": np.array([getattr(posterior, name) for name in _NUMBERS]),
-        "mode_weights": np.array([mode.weight for mode in posterior.modes]),
-        "mode_means": np.array([mode.pose.mean for mode in posterior.modes]),
-        "mode_covariances": np.array([mode.pose.covariance for mode in posterior.modes]),
-    }
+    """Return every field of a posterior as arrays."""
+    arrays: dict[str, np.ndarray] = {}
+    for field in fields(posterior):
+        value, name = getattr(posterior, field.name), field.name
+        match value:
+            case None:
+                arrays[f"{name}.none"] = np.zeros(0)
+            case PoseGaussian():
+                arrays |= {f"{name}.mean": value.mean, f"{name}.covariance": value.covariance}
+            case Outcome():
+                arrays[f"{name}.label"] = np.array(value.label)
+            case tuple():  # modes
+                arrays[f"{name}.weights"] = np.array([mode.weight for mode in value])
+                arrays[f"{name}.means"] = np.array([mode.pose.mean for mode in value])
+                arrays[f"{name}.covariances"] = np.array([mode.pose.covariance for mode in value])
+            case _:
+                arrays[name] = np.asarray(value)
+    return arrays
 
 
-def _posterior(source: int, target: int, arrays: dict[str, np.ndarray]) -> Posterior:
-    """Return the posterior that arrays hold."""
-    modes = zip(arrays["mode_weights"], arrays["mode_means"], arrays["mode_covariances"], strict=True)
-    return Posterior(
-        source=source,
-        target=target,
-        pose=PoseGaussian(arrays["mean"], arrays["covariance"]),
-        outcome=Outcome(str(arrays["outcome"])),
-        samples=arrays["samples"],
-        weights=arrays["weights"],
-        modes=tuple(Mode(float(weight), PoseGaussian(mean, covariance)) for weight, mean, covariance in modes),
-        **dict(zip(_NUMBERS, arrays["numbers"].tolist(), strict=True)),
-    )
+def _posterior(arrays: dict[str, np.ndarray]) -> Posterior:
+    """Return the posterior that arrays hold.
+
+    Raises:
+        KeyError: where they are those of a posterior with other fields.
+    """
+    values: dict[str, Any] = {}
+    for field in fields(Posterior):
+        name = field.name
+        if f"{name}.none" in arrays:
+            values[name] = None
+        elif f"{name}.mean" in arrays:
+            values[name] = PoseGaussian(arrays[f"{name}.mean"], arrays[f"{name}.covariance"])
+        elif f"{name}.label" in arrays:
+            values[name] = Outcome(str(arrays[f"{name}.label"]))
+        elif f"{name}.weights" in arrays:
+            parts = (arrays[f"{name}.{part}"] for part in ("weights", "means", "covariances"))
+            values[name] = tuple(Mode(float(weight), PoseGaussian(*pose)) for weight, *pose in zip(*parts, strict=True))
+        else:
+            values[name] = arrays[name] if arrays[name].ndim else arrays[name].item()
+    return Posterior(**values)

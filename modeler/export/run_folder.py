@@ -75,22 +75,68 @@ class RunFolder:
             resume: keep them until they are replaced, unless no report says what they are of.
 
         Raises:
-            InputError: where the folder has content and neither is given, or where it cannot be made or resumed.
+            InputError: where the folder has content that is not a run's, or is a run's and neither is given, or where
+                it cannot be made or resumed.
         """
+        folder = cls(path)
+        folder.check(overwrite=overwrite, resume=resume)
         try:
             path.mkdir(parents=True, exist_ok=True)
-            if any(path.iterdir()) and not (overwrite or resume):
-                raise InputError(f"{path}: not empty; choose another --out, or give --overwrite or --resume")
+            if folder.pairs.folder.is_symlink():
+                folder.pairs.folder.unlink()
+            folder.pairs.mark()  # from here on the folder is that of a run, also after a kill
             resumes = resume and (path / _REPORT).exists()
             leftovers = [part for name in _OURS for part in path.glob(f".{name}.*{PART}")]
-            links = [file for file in (path / _OURS[-1], cls(path).pairs.folder) if file.is_symlink()]
-            for file in [*leftovers, *links, *(path / name for name in (*_OURS, PAGE) if not resumes)]:
+            # The recording is written in place: whatever else its name leads to stays as it is.
+            for file in [*leftovers, *(path / name for name in (_OURS[-1:] if resumes else (*_OURS, PAGE)))]:
                 file.unlink(missing_ok=True)
             if not resumes:
-                cls(path).pairs.drop()
+                folder.pairs.empty()
         except OSError as error:
-            raise InputError(f"{path}: no run folder can be made ({error.strerror}); choose another --out") from error
-        return cls(path, len(cls(path).report()["frames"]) if resumes else 0)
+            raise InputError(f"{path}: no run folder can be made ({error.strerror}); choose another place") from error
+        return cls(path, len(folder.report()["frames"]) if resumes else 0)
+
+    def check(self, *, overwrite: bool = False, resume: bool = False) -> None:
+        """Refuse to make a run where other things are, or, unless asked for, where another run is.
+
+        Args:
+            overwrite: whether a run there may be replaced.
+            resume: whether it may be continued.
+
+        Raises:
+            InputError: where that is so.
+        """
+        if self.is_empty:
+            return
+        if not self.is_run:
+            raise InputError(f"{self.path}: not empty, and not the folder of a run; choose another place")
+        if not (overwrite or resume):
+            raise InputError(f"{self.path}: not empty; choose another place, or replace or resume the run")
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing would be lost here.
+
+        Raises:
+            InputError: where one cannot look.
+        """
+        try:
+            entries = list(self.path.iterdir()) if self.path.exists() else []
+            return not entries or (entries == [self.pairs.folder] and not any(self.pairs.folder.iterdir()))
+        except OSError as error:
+            what = f"no run folder can be made ({error.strerror}); choose another place"
+            raise InputError(f"{self.path}: {what}") from error
+
+    @property
+    def is_run(self) -> bool:
+        """Whether a run was made here, though it may not have come to its end."""
+        if self.pairs.marked:
+            return True
+        try:
+            self.report()
+        except InputError:  # perhaps damaged: then the files beside it tell
+            return all((self.path / name).is_file() for name in (_REPORT, "trajectory.txt", "graph.g2o"))
+        return True
 
     @property
     def pairs(self) -> Pairs:
@@ -108,7 +154,7 @@ class RunFolder:
             raise InputError(f"{path}: there is no report; is {self.path} the folder of a run?")
         report = read_json(path)
         if not isinstance(report, dict) or report.get("schema") != 1:
-            raise InputError(f"{path}: not a report of schema 1; build again with --overwrite")
+            raise InputError(f"{path}: not a report of schema 1; build the run again")
         return report
 
     def result(self) -> dict[str, Any]:
@@ -120,7 +166,7 @@ class RunFolder:
         report = self.report()
         wrong = fault(report)
         if wrong is not None:
-            raise InputError(f"{self.path / _REPORT}: {wrong}; build again with --overwrite")
+            raise InputError(f"{self.path / _REPORT}: {wrong}; build the run again")
         return report
 
     def finished(self, meta: RunMeta) -> bool:
@@ -142,7 +188,7 @@ class RunFolder:
             if was != is_now:
                 raise InputError(
                     f"{self.path}: cannot resume, {name.replace('_', '-')} was {was} and is now {is_now}; "
-                    "use the same, or --overwrite"
+                    "use the same, or build the run anew"
                 )
         return report.get("complete") is True and not self.pairs.folder.exists()
 
@@ -198,7 +244,7 @@ class RunFolder:
         try:
             settle(*(file for file in (recording,) if file.is_file()))
         except OSError as error:
-            raise InputError(f"{recording}: cannot be written ({error.strerror}); choose another --out") from error
+            raise InputError(f"{recording}: cannot be written ({error.strerror}); choose another place") from error
         if self.report()["complete"]:
             try:
                 self.pairs.drop()

@@ -1,0 +1,132 @@
+"""Where a command may write: never into or over what it reads, and over an earlier result only with --overwrite."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from modeler.types import InputError
+
+
+def check_folder(out: Path, inputs: Iterable[Path]) -> None:
+    """Refuse a folder that is, or lies in, something that the command reads.
+
+    Args:
+        out: folder that the command is about to make or fill.
+        inputs: files and folders that it reads; what is not there is passed over.
+
+    Raises:
+        InputError: where writing there would change an input.
+    """
+    found = {name: path for path in inputs for name in _identities(path)}
+    place = Path(os.path.realpath(out))
+    for part in (place, *place.parents):
+        identity = _identity(part)
+        source = None if identity is None else found.get(identity)
+        if source is not None:
+            where = "is" if part == place else "lies in"
+            raise InputError(f"{out}: {where} {source}, which is only read; choose another --out")
+
+
+def check_files(outs: Sequence[Path], inputs: Sequence[Path], *, overwrite: bool) -> None:
+    """Refuse files that would change what the command reads, and files that are there unless `overwrite` is set.
+
+    Args:
+        outs: files that the command is about to write.
+        inputs: files and folders that it reads; what is not there is passed over.
+        overwrite: whether regular files may be replaced.
+
+    Raises:
+        InputError: where a file may not be written.
+    """
+    for out in outs:
+        check_folder(out, inputs)
+        if not os.path.lexists(out):
+            continue
+        if not out.is_file():
+            what = "a folder" if out.is_dir() else "not a regular file"
+            raise InputError(f"{out}: is {what}; choose another --out")
+        if out.stat().st_nlink > 1 and _identity(out) in {_identity(file) for file in _files(inputs)}:
+            raise InputError(f"{out}: is a file that is only read; choose another --out")
+        if not overwrite:
+            raise InputError(f"{out}: exists already; choose another --out, or give --overwrite")
+
+
+def check_run_folder(out: Path, inputs: Iterable[Path], *, overwrite: bool, resume: bool | None = None) -> None:
+    """Refuse a run folder where something else is, or, unless asked for, where another run is.
+
+    Args:
+        out: folder of the run that the command is about to make.
+        inputs: files and folders that it reads.
+        overwrite: whether a run may be replaced.
+        resume: whether it may be continued; None where the command cannot.
+
+    Raises:
+        InputError: where no run may be made there.
+    """
+    from modeler.export import RunFolder
+
+    check_folder(out, inputs)
+    folder = RunFolder(out)
+    folder.check(overwrite=True)
+    if not (overwrite or resume or folder.is_empty):
+        options = "--overwrite" if resume is None else "--overwrite or --resume"
+        raise InputError(f"{out}: not empty; choose another --out, or give {options}")
+
+
+def run_inputs(runs: Iterable[Path], moved: Iterable[Path] = ()) -> tuple[Path, ...]:
+    """Return run folders with all that they were made from: sequences, and the runs that they join.
+
+    Args:
+        runs: run folders; what is none is returned as it is.
+        moved: where sequences are now.
+    """
+    from modeler.export import RunFolder
+
+    found: dict[Path, None] = {}
+    waiting = list(runs)
+    while waiting:
+        run = waiting.pop()
+        if run in found:
+            continue
+        found[run] = None
+        try:
+            report = RunFolder(run).report()
+        except InputError:
+            continue
+        settings = report.get("settings")
+        joined = settings.get("joined") if isinstance(settings, dict) else None
+        if isinstance(joined, list):
+            waiting += [Path(part) for part in joined if isinstance(part, str)]
+        elif isinstance(report.get("sequence"), str):
+            found[Path(report["sequence"])] = None
+    return (*found, *moved)
+
+
+def _identities(path: Path) -> Iterator[tuple[int, int]]:
+    """Yield what identifies a file or folder, and what the links in it lead to: parts of it may lie elsewhere."""
+    try:
+        places = [path, *(entry for entry in (path.iterdir() if path.is_dir() else ()) if entry.is_symlink())]
+    except (OSError, ValueError):  # ValueError: a NUL in the name
+        return
+    for place in places:
+        identity = _identity(place)
+        if identity is not None:
+            yield identity
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return what is the same for all names of a file or folder; None where there is none."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _files(inputs: Iterable[Path]) -> Iterator[Path]:
+    for path in inputs:
+        yield path
+        for folder, _, names in os.walk(path):
+            yield from (Path(folder) / name for name in names)
