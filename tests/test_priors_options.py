@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +14,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from modeler.cli import main
 from modeler.cli.compose import chosen_prior, prior_name
 from modeler.cli.options import PriorOptions
 from modeler.priors import (
@@ -26,8 +30,32 @@ from modeler.priors import (
     VelocityPrior,
 )
 from modeler.types import Array, Frame
-from sequences import AbstractSequence
+from sequences import AbstractSequence, bundled
 
+OWN = """
+from dataclasses import dataclass
+from modeler.priors import TablePrior
+from modeler.types import AbstractPrior, AbstractPoseDensity, RayImage
+
+@dataclass(frozen=True)
+class Slow(AbstractPrior):
+    max_turn_deg: float = 20.0
+    axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
+        return TablePrior(self.max_turn_deg).between(source, target)
+
+@dataclass
+class Thawed(AbstractPrior):
+    def between(self, source, target): ...
+
+class Bare(Slow): ...
+
+@dataclass(frozen=True)
+class Choosy(Slow):
+    def __post_init__(self):
+        raise ValueError("never")
+"""
 POKE = {"point_m": [0.0, 0.1, 0.8], "direction": [1, 0, 0], "length_m": 0.03}
 
 
@@ -172,3 +200,54 @@ def test_pokes_are_read() -> None:
 def test_what_cannot_be_used_is_told_in_a_line(options: PriorOptions, sequence: Telling | None, says: str) -> None:
     with refused(says):
         chosen_prior(options, sequence)
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have a module `own_priors` with priors of a user in the current folder."""
+    (tmp_path / "own_priors.py").write_text(OWN)
+    (tmp_path / "broken_priors.py").write_text("1 / 0")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", list(sys.path))
+
+
+@pytest.mark.usefixtures("own")
+def test_a_prior_of_the_users_own_is_used_with_its_fields() -> None:
+    found = chosen_prior(PriorOptions(prior="own_priors:Slow"), TURNTABLE)
+    assert dataclasses.asdict(found) == {"max_turn_deg": 20.0, "axis": (0.0, 1.0, 0.0)}  # pyright: ignore[reportArgumentType]
+    found = chosen_prior(
+        PriorOptions(prior="own_priors:Slow+velocity", prior_args=("max_turn_deg=15", "axis=(1, 0, 0)")), TURNTABLE
+    )
+    assert isinstance(found, VelocityPrior)
+    assert dataclasses.asdict(found.known) == {"max_turn_deg": 15, "axis": (1, 0, 0)}  # pyright: ignore[reportArgumentType]
+    assert isinstance(chosen_prior(PriorOptions(prior="table+own_priors:Slow"), TURNTABLE), ProductPrior)
+
+
+@pytest.mark.usefixtures("own")
+@pytest.mark.parametrize(
+    ("prior", "arguments", "says"),
+    [
+        ("own_priors:Missing", (), "cannot be imported"),
+        ("nowhere_at_all:Slow", (), "cannot be imported"),
+        ("broken_priors:Slow", (), "ZeroDivisionError"),
+        ("own_priors:Thawed", (), "frozen dataclass"),
+        ("own_priors:OWN", (), "cannot be imported"),
+        ("os:path", (), "is no prior"),
+        ("own_priors:Choosy", (), "never"),
+        ("own_priors:Slow", ("speed=3",), "has axis, max_turn_deg"),
+        ("own_priors:Slow", ("axis",), "NAME=VALUE"),
+        ("table", ("axis=1",), "--prior-args"),
+    ],
+)
+def test_what_is_no_prior_is_said_in_one_line(prior: str, arguments: tuple[str, ...], says: str) -> None:
+    with refused("--prior", says):
+        chosen_prior(PriorOptions(prior=prior, prior_args=arguments), TURNTABLE)
+
+
+@pytest.mark.usefixtures("own")
+def test_a_prior_of_the_users_own_registers_from_the_command_line(capfd: pytest.CaptureFixture[str]) -> None:
+    own = ["--prior", "own_priors:Slow", "--prior-args", "max_turn_deg=50", "--method", "icp"]
+    assert main(["register", str(bundled("box")), "1", "0", *own]) == 0
+    edge = json.loads(capfd.readouterr().out)
+    assert main(["register", str(bundled("box")), "1", "0", "--prior", "table", "--method", "icp"]) == 0
+    assert json.loads(capfd.readouterr().out) == edge

@@ -110,7 +110,9 @@ class Build:
         parts = asdict(self.prior) | asdict(self.method) | asdict(self.selection) | asdict(self.where)
         parts["voxel_m"] = self.voxel_m
         parts["sensor"] = None if self.sensor is None else str(self.sensor)
-        return {name: value for name, value in parts.items() if name not in ("prior", "seed") and value is not None}
+        return {
+            name: value for name, value in parts.items() if name not in ("prior", "seed") and value not in (None, ())
+        }
 
 
 def _check(options: Build) -> None:

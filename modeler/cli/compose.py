@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import itertools
 import math
-from collections.abc import Callable, Mapping
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -133,15 +138,18 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
     name = prior_name(options, sequence)
     parts = name.split("+")
     for part in parts:
-        if part not in _GIVEN:
+        if part not in _GIVEN and ":" not in part:
             raise InputError(
                 f"--prior {name}: there is no prior {part!r}; there are {', '.join(map(repr, _GIVEN))}, "
-                "and several joined by +"
+                "your own as module:Class, and several joined by +"
             )
         if parts.count(part) > 1:
             raise InputError(f"--prior {name} names {part} twice; name each once")
     known = [part for part in parts if part not in _GUESSES] or ["general"]
-    accepted = {parameter for part in (*parts, *known) for parameter in _GIVEN[part]}
+    own = sum(part not in _GIVEN for part in known)
+    if own > 1 or (options.prior_args and not own):
+        raise InputError("--prior-args are the fields of one prior of your own; give --prior module:Class once")
+    accepted = {parameter for part in (*parts, *known) for parameter in _GIVEN.get(part, ())}
     given = options.given(name, accepted, _GIVEN)
     of = {part: {key: value for key, value in given.items() if key in _GIVEN[part]} for part in _GIVEN}
     if {"table", "turntable"} <= set(known):  # the axis is the table's normal: to multiply would count the table twice
@@ -151,7 +159,9 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
             )
         known.remove("table")
         of["turntable"]["needs_table"] = True
-    found = [_known(part, of[part], sequence) for part in known]
+    found = [
+        _known(part, of[part], sequence) if part in _GIVEN else _own_prior(part, options.prior_args) for part in known
+    ]
     result = found[0]
     for other in found[1:]:
         result = ProductPrior(result, other)
@@ -208,6 +218,46 @@ def _known(name: str, given: dict[str, Any], sequence: AbstractSequence | None) 
             return _poke(given, sequence)
         case _:
             return GeneralPrior(**given)
+
+
+def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:
+    """Return a prior that a user wrote.
+
+    Args:
+        name: `module:Class`, the module importable from the current folder.
+        arguments: its fields, each as `name=value`.
+
+    Raises:
+        InputError: where it cannot be imported or made, or is no prior.
+    """
+    module_name, _, class_name = name.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        kind = getattr(importlib.import_module(module_name), class_name)
+    except Exception as error:  # whatever a user's module raises
+        raise InputError(f"--prior {name}: cannot be imported ({type(error).__name__}: {error}); correct it") from error
+    frozen = getattr(getattr(kind, "__dataclass_params__", None), "frozen", False)
+    if not (isinstance(kind, type) and issubclass(kind, AbstractPrior) and is_dataclass(kind) and frozen):
+        raise InputError(f"--prior {name}: is no prior; derive a frozen dataclass from modeler.types.AbstractPrior")
+    known = {field.name for field in fields(kind) if field.init}
+    values = {}
+    for argument in arguments:
+        field, equals, text = argument.partition("=")
+        if not equals or field not in known:
+            raise InputError(
+                f"--prior-args {argument}: {class_name} has {', '.join(sorted(known)) or 'no fields'}; give NAME=VALUE"
+            )
+        try:
+            values[field] = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            values[field] = text
+    try:
+        prior = kind(**values)
+    except Exception as error:
+        raise InputError(f"--prior {name}: cannot be made ({error}); see --prior-args") from error
+    assert isinstance(prior, AbstractPrior)
+    return prior
 
 
 def _guess(name: str, given: dict[str, Any], known: AbstractPrior) -> AbstractPrior:

@@ -88,7 +88,10 @@ class PriorOptions:
     held: a robot's hand carries it (robot.txt).
     poke: somebody pushes it along the table.
     Guesses that only tell where to look: velocity (the motion goes on), axes (long objects stay aligned), features.
+    module:Class: your own, an AbstractPrior that is a frozen dataclass, imported from the current folder or PYTHONPATH.
     What is joined by + holds together: held+table, features+table."""
+    prior_args: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE..."), default("the class's own")] = ()
+    """Fields of your own prior, values as Python writes them: step_deg=25 axis=(0,0,1) (module:Class)."""
     max_rotation_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("50")] = None
     """Largest rotation between two frames (general, table)."""
     max_offset_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.04")] = None
@@ -173,7 +176,7 @@ class PriorOptions:
 
     def parameters(self) -> dict[str, Any]:
         """Return all parameters that were given, by field name."""
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "prior"}
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("prior", "prior_args")}
         return {name: value for name, value in values.items() if value is not None}
 
 
