@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rings import covariance, edge, measured, nees, ring, spin, spun
+from rings import OBJECT_M, covariance, edge, measured, nees, ring, spin, spun, turntable
 from scipy.spatial.transform import Rotation
 from turning_box import steps
 
 from modeler import se3
 from modeler.export import RunFolder, RunMeta
 from modeler.graph import PoseGraph, Smoother, dead_reckoning, solve
-from modeler.types import Array, Edge, Mode, PoseGaussian
+from modeler.types import Array, Edge, Mode, PoseGaussian, Solution, loop_opening
 from viz.report.result import Result
 
 COUNT = 8
@@ -92,3 +93,35 @@ def _pose(line: Array) -> Array:
     pose = se3.translation(line[1:4])
     pose[:3, :3] = Rotation.from_quat(line[4:8]).as_matrix()
     return pose
+
+
+def test_the_opening_of_a_loop_is_in_units_of_what_its_edges_state() -> None:
+    """Over many rings whose edges err as they state, the mean square of `sigmas` is 1."""
+    rng = np.random.default_rng(5)
+    squares = []
+    for _ in range(300):
+        graph, _ = ring(COUNT, rng, [(0, COUNT - 1)])
+        opening = loop_opening(graph.edges, Solution(), {})
+        assert opening is not None
+        assert (opening.source, opening.target, opening.edges) == (COUNT - 1, 0, COUNT - 1)
+        squares.append(opening.sigmas**2)
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.15)  # sd of the mean 0.033, and first order
+
+
+def test_the_opening_of_a_loop_is_what_a_closure_was_turned_by() -> None:
+    rng = np.random.default_rng(6)
+    truth = turntable(COUNT)
+    exact = [edge(k, k + 1, PoseGaussian(_true(truth, k, k + 1), covariance(rng))) for k in range(COUNT - 1)]
+    closure = edge(0, 7, PoseGaussian(_true(truth, 0, 7) @ spin([0.0, 0.1, 0.0]), covariance(rng)), "closure")
+    centroid_m = {7: OBJECT_M}
+    opening = loop_opening([*exact, closure], Solution(), centroid_m)
+    assert opening is not None
+    assert opening.rotation_rad == pytest.approx(0.1)
+    assert opening.translation_m == pytest.approx(0.0, abs=1e-9)
+    refused = edge(0, 7, closure.posterior.pose, "closure", accepted=False)
+    assert loop_opening([*exact, refused], Solution(), centroid_m) is None
+    assert loop_opening([*exact[1:], closure], Solution(), centroid_m) is None, "no chain joins its ends"
+
+
+def _true(truth: Mapping[int, Array], target: int, source: int) -> Array:
+    return se3.inverse(truth[target]) @ truth[source]

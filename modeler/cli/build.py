@@ -221,6 +221,11 @@ def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> in
     took = f"{report['seconds'].get('total', 0.0):.0f} s"
     frames = "1 frame" if len(report["frames"]) == 1 else f"{len(report['frames'])} frames"
     say(f"{accepted} of {frames}, {loop}, {took}: {options.out}")
+    if opening := report.get("loop"):
+        say(
+            f"the loop was open by {opening['opening_deg']:.1f}° and {1000.0 * opening['opening_m']:.1f} mm, "
+            f"{opening['sigmas']:.1f} times what its {opening['edges']} edges and the closure state"
+        )
     if report["reasons"]:
         first, *others = sorted(report["reasons"], key=lambda reason: "left out" in reason)  # those were told above
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""

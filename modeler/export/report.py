@@ -26,6 +26,7 @@ from modeler.types import (
     Step,
     explain,
     joined_without,
+    loop_opening,
     loops_closed,
 )
 
@@ -115,6 +116,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "seconds": dict(meta.seconds),
         "complete": step.last and not meta.interrupted,
         "closed": loops_closed(_taking_part(step)) > 0,
+        "loop": _loop(step.edges_so_far, solution, views),
         "trustworthy": not reasons,
         "reasons": reasons,
         "up": _up(solution, views),
@@ -126,6 +128,22 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
     ]
     edges = [edge_record(edge, solution, views.get(edge.source)) for edge in step.edges_so_far]
     return {**_json(report), "edges": edges, "poses": _json(poses)}
+
+
+def _loop(
+    edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage]
+) -> dict[str, float | int | list[int]] | None:
+    """Return by how much the chain of consecutive edges missed the closure that spans most of it; None without one."""
+    opening = loop_opening(edges, solution, {frame: view.centroid_m for frame, view in views.items()})
+    if opening is None:
+        return None
+    return {
+        "frames": [opening.target, opening.source],
+        "edges": opening.edges,
+        "opening_deg": float(np.degrees(opening.rotation_rad)),
+        "opening_m": opening.translation_m,
+        "sigmas": opening.sigmas,
+    }
 
 
 def _up(solution: Solution, views: Mapping[int, RayImage]) -> Array | None:

@@ -119,3 +119,78 @@ def _parts(edges: Sequence[Edge], everything: Sequence[Edge]) -> int:
     ends = np.searchsorted(frames, np.reshape([(edge.source, edge.target) for edge in edges], (-1, 2)))
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(frames), len(frames)))
     return int(connected_components(graph, directed=False)[0])
+
+
+@dataclass(frozen=True)
+class LoopOpening:
+    """By how much a chain of odometry edges misses the closure that joins its ends, before the optimisation."""
+
+    source: int
+    """Frame number of the closure's source."""
+    target: int
+    """Frame number of the closure's target."""
+    edges: int
+    """Number of edges of the chain."""
+    rotation_rad: float
+    """Rotation between the closure and the chain."""
+    translation_m: float
+    """Distance between where they put the object."""
+    sigmas: float
+    """Root of NEES/6 under the stated covariances of chain and closure: about 1 where these are true."""
+
+
+def loop_opening(edges: Sequence[Edge], solution: Solution, centroids_m: Mapping[int, Array]) -> LoopOpening | None:
+    """Compare the accepted closure that spans the longest chain of odometry edges with that chain.
+
+    Needs no ground truth: an opening of many standard deviations shows errors that the covariances do not hold, as
+    those of intrinsics, or a wrong edge. The noise that consecutive edges share is not taken into account.
+
+    Args:
+        edges: of the graph.
+        solution: tells which of them take part, and with which pose.
+        centroids_m: (3,) of the object in camera coordinates by frame number, for the translation; 0 where unknown.
+    """
+    used = [edge for edge in edges if solution.takes_part(edge)]
+    neighbours: dict[int, list[tuple[int, PoseGaussian]]] = {}
+    for edge in used:
+        if edge.kind == "odometry":
+            pose = solution.pose_of(edge)
+            neighbours.setdefault(edge.target, []).append((edge.source, pose))
+            neighbours.setdefault(edge.source, []).append((edge.target, pose.inverse()))
+    openings = [
+        _opening(edge, solution.pose_of(edge), *chain, centroids_m.get(edge.source, np.zeros(3)))
+        for edge in used
+        if edge.kind == "closure" and (chain := _chain(neighbours, edge.target, edge.source)) is not None
+    ]
+    return max(openings, key=lambda opening: (opening.edges, opening.sigmas), default=None)
+
+
+def _chain(
+    neighbours: Mapping[int, Sequence[tuple[int, PoseGaussian]]], target: int, source: int
+) -> tuple[PoseGaussian, int] | None:
+    """Return target_from_source along odometry edges and their number; None where they do not join the frames."""
+    reached = {target: (PoseGaussian(np.eye(4), np.zeros((6, 6))), 0)}
+    waiting = [target]
+    for frame in waiting:
+        before, count = reached[frame]
+        for neighbour, pose in neighbours.get(frame, []):
+            if neighbour not in reached:
+                covariance = se3.composed_covariance(before.covariance, pose.mean, pose.covariance)
+                reached[neighbour] = PoseGaussian(before.mean @ pose.mean, covariance), count + 1
+                waiting.append(neighbour)
+    return reached.get(source)
+
+
+def _opening(edge: Edge, closure: PoseGaussian, chain: PoseGaussian, count: int, centroid_m: Array) -> LoopOpening:
+    """Return how far a closure is from the chain between its frames."""
+    xi = se3.log(se3.inverse(closure.mean) @ chain.mean)
+    squared = xi @ np.linalg.solve(closure.covariance + chain.covariance, xi)
+    moved_m = se3.transform(chain.mean, centroid_m[None]) - se3.transform(closure.mean, centroid_m[None])
+    return LoopOpening(
+        source=edge.source,
+        target=edge.target,
+        edges=count,
+        rotation_rad=float(np.linalg.norm(xi[:3])),
+        translation_m=float(np.linalg.norm(moved_m)),
+        sigmas=float(np.sqrt(squared / 6.0)),
+    )
