@@ -7,9 +7,9 @@ from scipy import stats
 from modeler import se3
 from modeler.evaluation import (
     LEVELS,
-    about,
+    about_point,
+    align_to_model,
     coverage,
-    laid,
     nees,
     rotation_error_deg,
     trajectory_errors,
@@ -99,14 +99,14 @@ def test_about_a_point_turns_about_it_and_keeps_the_nees() -> None:
     rng = np.random.default_rng(8)
     gaussian = _random_gaussian(rng)
     truth = gaussian.mean @ se3.exp(0.05 * rng.normal(size=6))
-    shifted, there = about(gaussian, CENTROID_M), truth @ se3.translation(CENTROID_M)
+    shifted, there = about_point(gaussian, CENTROID_M), truth @ se3.translation(CENTROID_M)
     assert nees(shifted, there) == pytest.approx(nees(gaussian, truth))
     assert nees(shifted, there, slice(0, 3)) == pytest.approx(nees(gaussian, truth, slice(0, 3)))
     # An object that turns about its own centroid stays there; in the camera its translation looks uncertain.
     xi = rng.normal(size=(20000, 6)) * np.repeat([0.02, 1e-4], 3)
     draws = se3.translation(CENTROID_M) @ se3.exp(xi) @ se3.translation(-CENTROID_M)
     _, covariance = se3.mean(draws, np.ones(len(draws)))
-    sigmas = np.sqrt(np.diag(about(PoseGaussian(np.eye(4), covariance), CENTROID_M).covariance))
+    sigmas = np.sqrt(np.diag(about_point(PoseGaussian(np.eye(4), covariance), CENTROID_M).covariance))
     assert np.sqrt(covariance[3, 3]) > 0.01
     np.testing.assert_allclose(sigmas, np.repeat([0.02, 1e-4], 3), rtol=0.05)
 
@@ -165,11 +165,11 @@ def test_an_object_is_laid_on_the_truth_by_all_frames_together() -> None:
     truth = {frame: se3.exp(rng.normal(size=6)) for frame in (2, 3, 5, 9)}
     model_from_object = se3.exp(rng.normal(size=6))
     trajectory = {frame: se3.inverse(pose @ model_from_object) for frame, pose in truth.items()}
-    np.testing.assert_allclose(laid(trajectory, truth), model_from_object, atol=1e-9)
+    np.testing.assert_allclose(align_to_model(trajectory, truth), model_from_object, atol=1e-9)
     # One frame of four a little off moves the whole by a quarter of that; which frame comes first does not matter.
     off = se3.exp(np.array([0.0, 0.0, 0.004, 0.0, 0.0, 0.0]))
     for frame in (2, 9):
-        moved = laid(trajectory | {frame: trajectory[frame] @ off}, truth)
+        moved = align_to_model(trajectory | {frame: trajectory[frame] @ off}, truth)
         assert np.linalg.norm(se3.log(se3.inverse(model_from_object) @ moved)[:3]) == pytest.approx(0.001, rel=1e-3)
     with pytest.raises(ValueError, match="no frame"):
-        laid(trajectory, {7: np.eye(4)})
+        align_to_model(trajectory, {7: np.eye(4)})

@@ -6,7 +6,7 @@ from calibration.specimens import load_specimen
 from calibration.study import Condition, rendered_views, staged
 
 from modeler import se3
-from modeler.evaluation import about, true_motion
+from modeler.evaluation import about_point, true_motion
 from modeler.priors import TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
@@ -57,6 +57,6 @@ def test_thin_legs_are_not_dragged_behind():
             rng = np.random.default_rng([source, target])
             found = VisibilityRegistrar().register(views[source], views[target], density, rng=rng)
             centre_m = views[source].centroid_m
-            error = se3.log(se3.inverse(about(found.pose, centre_m).mean) @ there @ se3.translation(centre_m))
+            error = se3.log(se3.inverse(about_point(found.pose, centre_m).mean) @ there @ se3.translation(centre_m))
             drags_mm.append(1e3 * sign * error[3])
     assert abs(np.mean(drags_mm)) < 0.15

@@ -32,17 +32,17 @@ class Closer:
     away_deg: float = 90.0
     """How far in degrees the object must have turned away from an earlier view before it counts as coming back."""
     max_closures: int = 2
-    """At most so many views besides the previous one are tried for a frame; 0 = never close."""
+    """Most views besides the previous one that are tried for a frame; 0 = never close."""
     min_gain_nats: float = 4.16
     """Least expected information of a closure: 6 log 2 halves all six standard deviations."""
     max_spans: int = 1
-    """Once all frames are in, at most so many more views are tried for each of them; 0 = none."""
+    """Most further views that are tried for each frame once all are in; 0 = none."""
     max_span_deg: float = 55.0
     """Largest rotation in degrees to such a view: two steps of the usual 25°."""
     min_span_gain_nats: float = 0.1
     """Least expected information of such an edge: one over two steps of 25° adds that."""
     max_relocations: int = 4
-    """At most so many earlier views are tried for a frame that the previous view does not place."""
+    """Most earlier views that are tried for a frame that the previous view does not place."""
     thresholds: Thresholds = field(default_factory=Thresholds)
     """What edges other than that to the previous view must fulfil."""
     consistency: ConsistencyModel = field(default_factory=ConsistencyModel)

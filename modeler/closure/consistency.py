@@ -29,7 +29,7 @@ from modeler.types import (
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What edges other than that to the previous view must fulfil; method.md tells where the numbers come from."""
+    """What edges other than that to the previous view must fulfil; method.md has their origins."""
 
     min_overlap: float = 0.4
     """Smallest overlap (0..1), predicted and found."""
@@ -89,7 +89,7 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class EvidenceBound:
-    """The log evidence of a run's edges, and what is too little beside it."""
+    """The log evidence of a run's edges, and the least that others may have."""
 
     median_nats: float = float("nan")
     """Median of the run's edges; NaN: not known yet."""

@@ -68,7 +68,7 @@ class MapView:
         between = (frames > min(target, source)) & (frames < max(target, source))
         rotations = [self.all_poses[between, :3, :3], self.poses(paths.along(target))[:, :3, :3]]
         cosine = 0.5 * (np.tensordot(np.concatenate(rotations), self.solution.trajectory[target][:3, :3], 2) - 1.0)
-        return bool(cosine.min(initial=1.0) <= np.cos(np.radians(away_deg)))
+        return bool(cosine.min(initial=1.0) <= np.cos(np.radians(away_deg)))  # method.md, eq. C7
 
     @cached_property
     def _network(self) -> PathNetwork:

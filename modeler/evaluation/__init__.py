@@ -2,9 +2,9 @@
 
 from modeler.evaluation.poses import LEVELS as LEVELS
 from modeler.evaluation.poses import TrajectoryErrors as TrajectoryErrors
-from modeler.evaluation.poses import about as about
+from modeler.evaluation.poses import about_point as about_point
+from modeler.evaluation.poses import align_to_model as align_to_model
 from modeler.evaluation.poses import coverage as coverage
-from modeler.evaluation.poses import laid as laid
 from modeler.evaluation.poses import nees as nees
 from modeler.evaluation.poses import rotation_error_deg as rotation_error_deg
 from modeler.evaluation.poses import trajectory_errors as trajectory_errors

@@ -62,7 +62,7 @@ def nees(estimate: PoseGaussian, truth: Array, components: slice = slice(0, 6)) 
     return float(xi @ np.linalg.solve(estimate.covariance[components, components], xi))
 
 
-def about(estimate: PoseGaussian, point_m: Array) -> PoseGaussian:
+def about_point(estimate: PoseGaussian, point_m: Array) -> PoseGaussian:
     """Return a motion's Gaussian in source coordinates shifted to a point, along the camera's axes.
 
     Its ξ then turns about that point and moves it, so that rotation and translation hardly mix at the object's
@@ -137,10 +137,10 @@ def trajectory_errors(
     return TrajectoryErrors(rotation_deg, translation_m)
 
 
-def laid(trajectory: Mapping[int, Array], camera_from_model: Mapping[int, Array]) -> Array:
-    """Return model_from_object (4, 4) that lays a trajectory's object on the true model, all frames taken together.
+def align_to_model(trajectory: Mapping[int, Array], camera_from_model: Mapping[int, Array]) -> Array:
+    """Return model_from_object (4, 4) that aligns a trajectory with the true model, as the mean over its frames.
 
-    It is the mean of what the frames say, so that an error of the first frame is not an error of all others.
+    So an error of the first frame is not an error of all others.
 
     Args:
         trajectory: object_from_camera (4, 4) by frame number.
@@ -152,5 +152,5 @@ def laid(trajectory: Mapping[int, Array], camera_from_model: Mapping[int, Array]
     frames = [frame for frame in sorted(trajectory) if frame in camera_from_model]
     if not frames:
         raise ValueError("no frame of the trajectory has a true pose; compare frames of the same sequence")
-    told = [se3.inverse(trajectory[frame] @ camera_from_model[frame]) for frame in frames]
-    return se3.mean(np.stack(told), np.ones(len(told)))[0]
+    relative = [se3.inverse(trajectory[frame] @ camera_from_model[frame]) for frame in frames]
+    return se3.mean(np.stack(relative), np.ones(len(relative)))[0]

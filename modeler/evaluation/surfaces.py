@@ -100,13 +100,13 @@ class TrueSurface:
             columns = np.rint(camera.fx * x / safe + camera.cx).astype(np.int64)
             rows = np.rint(camera.fy * y / safe + camera.cy).astype(np.int64)
             inside = (z > 0.0) & (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
-            asked = np.flatnonzero(inside & ~seen)
-            asked = asked[measured[rows[asked], columns[asked]]]
+            candidates = np.flatnonzero(inside & ~seen)
+            candidates = candidates[measured[rows[candidates], columns[candidates]]]
             centre_m = se3.inverse(camera_from_model)[:3, 3]
-            ways = self.points_m[asked] - centre_m
-            rays = np.concatenate([np.broadcast_to(centre_m, ways.shape), ways], axis=1)
+            directions = self.points_m[candidates] - centre_m
+            rays = np.concatenate([np.broadcast_to(centre_m, directions.shape), directions], axis=1)
             reached = scene.cast_rays(o3d.core.Tensor.from_numpy(rays.astype(np.float32)))["t_hit"].numpy()
-            seen[asked[reached > _REACHED]] = True
+            seen[candidates[reached > _REACHED]] = True
         return seen
 
 

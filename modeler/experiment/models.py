@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.evaluation import SurfaceErrors, TrueSurface, laid, rotation_error_deg, surface_errors
+from modeler.evaluation import SurfaceErrors, TrueSurface, align_to_model, rotation_error_deg, surface_errors
 from modeler.fusion import Fuser
 from modeler.types import Array, InputError, ObjectModel, RayImage
 
@@ -85,7 +85,7 @@ class _Candidate:
     model_from_object: Array
     """(4, 4) lays it on the true model."""
     model_from_camera: Mapping[int, Array]
-    """Its poses (4, 4), so laid, by frame number."""
+    """Its poses (4, 4), so align_to_model, by frame number."""
 
 
 def model_scores(modelled: Modelled, fuser: Fuser, seed: int) -> list[ModelScore]:
@@ -126,7 +126,7 @@ def model_scores(modelled: Modelled, fuser: Fuser, seed: int) -> list[ModelScore
 def _candidates(modelled: Modelled, frames: Sequence[int], fuser: Fuser) -> tuple[_Candidate, _Candidate]:
     """Return the run's own model and the one of true poses."""
     true_poses = {frame: se3.inverse(modelled.camera_from_model[frame]) for frame in frames}
-    model_from_object = laid(modelled.trajectory, modelled.camera_from_model)
+    model_from_object = align_to_model(modelled.trajectory, modelled.camera_from_model)
     own_poses = {frame: model_from_object @ modelled.trajectory[frame] for frame in frames}
     reference = fuser.fuse({frame: modelled.views[frame] for frame in frames}, true_poses)
     return (

@@ -92,7 +92,7 @@ def slip(
     back = np.zeros((len(step), 6))
     back[:, 2] = -angle
     rest = se3.exp(back) @ step
-    xi = se3.log(rest)
+    xi = se3.log(rest)  # method.md, eq. G7
     across = np.eye(6) - se3.adjoint(se3.inverse(rest))[:, :, 2, None] * slope[:, None]
     derivative = (inverse_right_jacobian(xi) @ across)[:, _SLIP]
     of_source = derivative @ se3.adjoint(se3.inverse(camera_from_axis))

@@ -72,7 +72,7 @@ class SquareRoot:
     """Of each clique, where it has any."""
 
     def parent(self, clique: Clique) -> Clique | None:
-        """Return the clique that another hangs on: it holds all variables of that one's separator."""
+        """Return the parent of a clique, which holds all variables of its separator."""
         return self.clique_of[min(clique.separator, key=self.rank.__getitem__)] if clique.separator else None
 
     def path_to_roots(self, variables: Iterable[int]) -> list[Clique]:

@@ -52,7 +52,7 @@ def optimise(
     threshold: float,
     inlier: Sequence[bool] = (),
 ) -> Optimum:
-    """Return the optimum and which loops take part in it: those whose error stays below the threshold.
+    """Return the optimum of method.md, eq. G1, and which loops take part: those whose error stays below the threshold.
 
     Where some do not, graduated non-convexity with a truncated least-squares loss chooses, unless the given choice
     already stands: all that take part agree with the optimum, all that are left out contradict it.

@@ -24,8 +24,8 @@ from modeler.graph.covariance import RelativeCovariance, chi_square_quantile
 from modeler.graph.pose_graph import Factor, PoseGraph
 from modeler.types import Array, Solution
 
-_CAUTION = 0.16  # one standard error to the side on which covariances are larger
-_MOST = 0.9  # of a covariance: registration has noise of its own, from where it looks and how it searches
+_QUANTILE = 0.16  # one standard error towards larger covariances
+_MAX_SHARE = 0.9  # of a covariance: registration has noise of its own, from its samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,13 +33,13 @@ class SharedCovariance:
     """Covariances of target_from_source between solved frames whose edges share the frames' noise."""
 
     independent: RelativeCovariance
-    """Those for edges with nothing in common."""
+    """Those for independent edges."""
     factors: Sequence[Factor]
     """All that take part."""
     share: float
-    """That is the frames' own, 0 to 1."""
+    """Share (0..1) of covariances that is the frames' own noise."""
     common: float = 0.0
-    """B, as a share of an edge's covariance: of those of all edges in their source cameras the harmonic mean."""
+    """B, as a share of the harmonic mean of all edges' covariances."""
 
     def __call__(self, target: int, source: int) -> Array:
         """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
@@ -63,15 +63,15 @@ class SharedCovariance:
             return alone
         source_from_target = se3.inverse(self.independent.trajectory[source]) @ self.independent.trajectory[target]
         of_target = se3.inverse_covariance(source_from_target, self._own.get(target, np.zeros((6, 6))))
-        covariance = (1.0 - self.share) * alone + self._own.get(source, np.zeros((6, 6))) + of_target
+        covariance = (1.0 - self.share) * alone + self._own.get(source, np.zeros((6, 6))) + of_target  # eq. G9
         if self.common:
             left = np.eye(6) - se3.adjoint(source_from_target)
-            covariance = covariance + left @ self._alike @ left.T
+            covariance = covariance + left @ self._alike @ left.T  # eq. G10
         return 0.5 * (covariance + covariance.T)
 
     @cached_property
     def _own(self) -> dict[int, Array]:
-        """Covariances Q (6, 6) of the frames' own noise: as the edges of each say, those that are sure first."""
+        """Covariances Q (6, 6) of the frames' own noise: ρ/2 of the harmonic mean of each frame's edges."""
         informations: dict[int, list[Array]] = {}
         for factor in self.factors:
             information = factor.root_information.T @ factor.root_information
@@ -91,14 +91,14 @@ class SharedCovariance:
 
 
 def shared_noise(graph: PoseGraph, solution: Solution) -> float:
-    """Return the share ρ of edges' covariances that is their images' own, as loops tell: they close better for it.
+    """Estimate the share ρ of edges' covariances that is their images' own from how well loops close (eq. G11).
 
     The images' noise cancels around a loop, so that 6 l conditions of l loops are met with (1 − ρ) of the squared
-    distance that independent edges would have. The estimate errs towards independence by one standard error; without
-    loops, and where they close no better than edges of independent noise, it is 0.
+    distance of independent edges. The estimate errs towards independence by one standard error; without loops, and
+    where they close no better than independent edges, it is 0.
 
     Args:
-        graph: the edges; those of neighbouring frames over one, two … steps tell most.
+        graph: the edges.
         solution: of that graph.
     """
     count, distance = 0, 0.0
@@ -114,4 +114,4 @@ def shared_noise(graph: PoseGraph, solution: Solution) -> float:
     conditions = 6 * (count - len(solution.trajectory) + 1)
     if not count or conditions <= 0:
         return 0.0
-    return float(np.clip(1.0 - distance / chi_square_quantile(_CAUTION, conditions), 0.0, _MOST))
+    return float(np.clip(1.0 - distance / chi_square_quantile(_QUANTILE, conditions), 0.0, _MAX_SHARE))

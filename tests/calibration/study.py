@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.specimens import FRAMES, SPECIMENS, Half, Specimen, Symmetry, load_specimen
 from modeler import se3
-from modeler.evaluation import about, nees, rotation_error_deg, translation_error_m, true_motion
+from modeler.evaluation import about_point, nees, rotation_error_deg, translation_error_m, true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M
 from modeler.rays import Sensor
@@ -192,7 +192,7 @@ def rendered_views(sequence: RenderedSequence) -> dict[int, RayImage]:
 
 def judged(blank: Trial, posterior: Posterior, truth: Array, centroid_m: Array) -> Trial:
     """Return a trial with its errors: in all six, and by axis about the object's centroid."""
-    estimate, there = about(posterior.pose, centroid_m), truth @ se3.translation(centroid_m)
+    estimate, there = about_point(posterior.pose, centroid_m), truth @ se3.translation(centroid_m)
     return replace(
         blank,
         outcome=posterior.outcome.label,

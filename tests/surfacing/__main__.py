@@ -21,7 +21,7 @@ import sequences
 from modeler import se3
 from modeler.cli import main as modeler
 from modeler.cli.inputs import reopened
-from modeler.evaluation import TrueSurface, laid, surface_errors
+from modeler.evaluation import TrueSurface, align_to_model, surface_errors
 from modeler.export import write_atomically
 from modeler.fusion import Fuser
 from modeler.types import Array, RayImage
@@ -78,7 +78,7 @@ def _rows(name: str, folder: Path) -> list[dict[str, object]]:
     mesh = true_mesh(run.parts[0].sequence)
     surface = TrueSurface.of(mesh.vertices_m, mesh.triangles, np.random.default_rng([0, 0]))
     seen = surface.seen((view.frame, truth[frame]) for frame, view in run.views.items())
-    model_from_object = laid(run.solution.trajectory, truth)
+    model_from_object = align_to_model(run.solution.trajectory, truth)
     own = {frame: model_from_object @ pose for frame, pose in run.solution.trajectory.items()}
     rows = []
     for poses, trajectory in (("true", {frame: se3.inverse(truth[frame]) for frame in run.views}), ("own", own)):
