@@ -23,7 +23,7 @@ from modeler.registration.visibility.registrar import ModeSampler
 from modeler.registration.visibility.sampling import AdaptiveSampler
 from modeler.types import Outcome, PoseGaussian, Posterior
 from sequences.rendering.renderer import RenderedSequence
-from viz.calibration import coverage_curves
+from viz.figures import coverage_curves
 
 BLANK = Trial("tuning", "n-fold", "box", "usual", "table", OURS, 1, 0, outcome=OUTSIDE)
 CENTROID_M = np.array([0.05, -0.02, 0.8])

@@ -13,10 +13,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances, surface
+from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances, meshing
+from modeler.fusion.depth_views import depth_views, disagreement, posed_views
 from modeler.fusion.distance_field import DistanceField, VoxelGrid
 from modeler.fusion.support import exposure_gains
-from modeler.fusion.views import depth_views, disagreement, posed_views
 from modeler.kernels import marching_cubes, occupancy, point_clouds, tsdf
 from modeler.rays import Sensor
 from modeler.types import (
@@ -58,7 +58,7 @@ def brick():
 def on_surface(model: ObjectModel, count: int = 20000):
     """Return points drawn evenly on a mesh."""
     rng = np.random.default_rng(1)
-    area = surface.areas_of(model.vertices_m, model.triangles)
+    area = meshing.areas_of(model.vertices_m, model.triangles)
     chosen = model.triangles[rng.choice(len(area), size=count, p=area / area.sum())]
     share = rng.dirichlet(np.ones(3), size=count)
     return np.einsum("nk,nkc->nc", share, model.vertices_m[chosen])
@@ -350,7 +350,7 @@ def disagreement_m(views, trajectory):
 def test_views_asked_in_batches_disagree_by_the_same(rng, monkeypatch):
     trajectory, noisy = tabletop.trajectory(POSES), tabletop.views(BRICK, POSES, rng)
     at_once = disagreement_m(noisy, trajectory)
-    monkeypatch.setattr("modeler.fusion.views.BATCH", 100 * len(POSES))
+    monkeypatch.setattr("modeler.fusion.depth_views.BATCH", 100 * len(POSES))
     assert disagreement_m(noisy, trajectory) == at_once
 
 
@@ -406,19 +406,19 @@ def test_what_nobody_saw_is_trimmed_where_it_curls_at_a_border_and_closes_gaps_h
     corner = np.arange(len(vertices)).reshape(x.shape)
     a, b, c, d = (corner[i : 60 + i, j : 40 + j].ravel() for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)))
     triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    normals = surface.normals_of(vertices, triangles)
+    normals = meshing.normals_of(vertices, triangles)
     x, bump = x.ravel(), bump.ravel()
     seen = (x < 20.0) & (bump == 0.0)
-    loose = surface.folded(vertices, normals, seen, ~seen)
+    loose = meshing.folded(vertices, normals, seen, ~seen)
     assert loose[(bump > 0.5) & (bump < 4.0)].all()
     assert not loose[seen].any()
-    left = surface.without_loose_border(np.ones(len(x), dtype=bool), loose, triangles, 20)
+    left = meshing.without_loose_border(np.ones(len(x), dtype=bool), loose, triangles, 20)
     assert left.all()  # no border of what is marked: the whole mesh is
-    left = surface.without_loose_border(x < 30.0, loose, triangles, 20)
+    left = meshing.without_loose_border(x < 30.0, loose, triangles, 20)
     assert left[x < 22.0].all()
     assert not left[x > 25.0].any()
     assert np.array_equal(
-        surface.without_loose_border(x < 30.0, loose, triangles, 3)[x < 30.0], (left | (x < 27.0))[x < 30.0]
+        meshing.without_loose_border(x < 30.0, loose, triangles, 3)[x < 30.0], (left | (x < 27.0))[x < 30.0]
     )
 
 
@@ -752,7 +752,7 @@ def test_no_edge_of_a_zero_level_has_more_than_two_triangles(seed):
     field = DistanceField(VoxelGrid(np.zeros(3), 1.0, np.array([6, 6, 6])), values, weights, np.argwhere(weights > 0.0))
     _, torn = marching_cubes.extract(values, weights, field.known)
     assert edge_uses(torn).max() > 1
-    _, triangles = surface.extracted_mesh(field)
+    _, triangles = meshing.extracted_mesh(field)
     assert edge_uses(triangles).max() == 1
 
 

@@ -9,7 +9,7 @@ import pytest
 import tabletop
 
 from modeler import se3
-from modeler.fusion.views import Crop, crop, depth_views, free_of, pose_variances
+from modeler.fusion.depth_views import Crop, crop, depth_views, free_of, pose_variances
 from modeler.types import Array, RayImage
 
 WHOLE = slice(0, tabletop.CAMERA.height), slice(0, tabletop.CAMERA.width)

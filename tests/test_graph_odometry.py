@@ -16,7 +16,7 @@ from modeler import se3
 from modeler.export import RunFolder, RunMeta
 from modeler.graph import PoseGraph, Smoother, dead_reckoning, solve
 from modeler.types import Array, Edge, Mode, PoseGaussian, Solution, loop_opening
-from viz.report.result import Result
+from viz.report.run_data import Result
 
 COUNT = 8
 

@@ -19,7 +19,7 @@ from recordings import small_frames
 from modeler.cli import main
 from modeler.export import RunFolder
 from sequences import open_sequence, write_bop
-from viz.ending import ends_whole
+from viz.stream import ends_whole
 
 QUICK = ("--prior", "table", "--method", "icp")
 

@@ -26,7 +26,7 @@ from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.shapes import Capsule, Compound, Cylinder, Part, Sphere
 from sequences.rendering.trajectory import Turntable
 from viz import entities
-from viz.report.recorded import cloud, recorded
+from viz.report.run_data import cloud, recorded
 
 FIGURE = Compound(
     (
@@ -245,7 +245,7 @@ def test_models_are_laid_on_each_other_from_any_side() -> None:
     brick = tabletop.Box((0.07, 0.05, 0.03))
     moved = se3.exp(np.array([2.0, -0.7, 1.1, 0.2, 0.1, -0.3]))
     one, other = volume_of(brick, np.eye(4), lambda pose: pose), volume_of(brick, moved, lambda pose: pose)
-    best, *rest = Matcher(rotations=120, judged=15).matches(one, other, (one.model(), other.model()))
+    best, *rest = Matcher(rotations=120, scored=15).matches(one, other, (one.model(), other.model()))
     laid = se3.transform(best.target_from_source, other.model().points_m)
     assert np.quantile(np.abs(brick.distance(laid)), 0.95) < 2e-3
     assert best.score > 0.85

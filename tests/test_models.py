@@ -223,7 +223,7 @@ def test_a_joined_run_is_judged_where_its_parts_know_one_surface(
 ) -> None:
     joined = tmp_path / "joined"
     shutil.copytree(built, tmp_path / "other")
-    monkeypatch.setattr(fusion, "Matcher", lambda: Matcher(rotations=40, judged=5))
+    monkeypatch.setattr(fusion, "Matcher", lambda: Matcher(rotations=40, scored=5))
     assert _told(capsys, "join", built, tmp_path / "other", "--out", joined, "--pairs", "2")[0] in (0, 3)
     status, out, err = _told(capsys, "evaluate", joined, "--out", tmp_path / "scores")
     assert (status, err) == (0, "")

@@ -22,8 +22,7 @@ from modeler.types import Array, InputError
 from sequences import bundled
 from viz.report import write_page
 from viz.report.mesh import read_mesh, scene
-from viz.report.recorded import recorded, surfaces
-from viz.report.result import Result
+from viz.report.run_data import Result, recorded, surfaces
 from viz.stream import open_stream
 
 TRUTH = {k: se3.inverse(object_from_camera(k)) for k in range(COUNT)}

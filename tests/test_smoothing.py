@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from modeler.fusion import surface, watertight
+from modeler.fusion import meshing, watertight
 from modeler.types import Array
 
 RADIUS_M, NOISE_M = 0.05, 0.0004
@@ -26,24 +26,24 @@ def test_only_vertices_asked_for_are_smoothed_and_nothing_shrinks(rng: np.random
     vertices_m = rough(rng)
     before_m = vertices_m.copy()
     only = vertices_m[:, 2] > 0.0
-    smooth_m = surface.taubin_smoothed(vertices_m, TRIANGLES, surface.WEAK_PASSES, only)
+    smooth_m = meshing.taubin_smoothed(vertices_m, TRIANGLES, meshing.WEAK_PASSES, only)
     np.testing.assert_array_equal(smooth_m[~only], before_m[~only])
     np.testing.assert_array_equal(vertices_m, before_m)
     assert off_m(smooth_m[only]).std() < 0.5 * off_m(before_m[only]).std()
     assert abs(off_m(smooth_m[only]).mean()) < 1e-3 * RADIUS_M
-    everywhere_m = surface.taubin_smoothed(vertices_m, TRIANGLES, 3)
+    everywhere_m = meshing.taubin_smoothed(vertices_m, TRIANGLES, 3)
     np.testing.assert_allclose(
-        surface.taubin_smoothed(vertices_m, TRIANGLES, 3, np.ones_like(only)), everywhere_m, atol=1e-12
+        meshing.taubin_smoothed(vertices_m, TRIANGLES, 3, np.ones_like(only)), everywhere_m, atol=1e-12
     )
 
 
 def test_grown_marks_reach_as_many_rings_as_asked() -> None:
     one = np.zeros(len(BALL.vertices), dtype=bool)
     one[0] = True
-    np.testing.assert_array_equal(surface.dilated(one, TRIANGLES, 0), one)
-    ring = surface.dilated(one, TRIANGLES, 1)
+    np.testing.assert_array_equal(meshing.dilated(one, TRIANGLES, 0), one)
+    ring = meshing.dilated(one, TRIANGLES, 1)
     assert set(np.flatnonzero(ring)) == {0, *BALL.vertex_neighbors[0]}
-    np.testing.assert_array_equal(surface.dilated(one, TRIANGLES, 2), surface.dilated(ring, TRIANGLES, 1))
+    np.testing.assert_array_equal(meshing.dilated(one, TRIANGLES, 2), meshing.dilated(ring, TRIANGLES, 1))
 
 
 @pytest.mark.parametrize("weak_above_m", [np.inf, 0.03])

@@ -16,7 +16,7 @@ from streamed import MERGED, Recording, drawn, read, record
 from turning_box import CENTRE_M, HALF_M, LOST, steps
 
 from modeler.types import Failed, Outcome, Plane, PoseGaussian, Segmentation, Solution, Step
-from viz import blueprint, clouds, entities, images
+from viz import blueprint, entities, images, pair_view
 from viz.stream import open_stream
 
 PAIR_CLOUDS = (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER)
@@ -105,7 +105,7 @@ def test_captions_lie_below_the_object_where_its_support_is_seen(run: list[Step]
     assert view is not None
     normal = np.array([0.0, -np.cos(0.6), -np.sin(0.6)])
     on_table = replace(view, plane=Plane(normal, 0.5, 0.01, 0.001))
-    below_m = clouds.below_m(on_table) - view.centroid_m
+    below_m = pair_view.below_m(on_table) - view.centroid_m
     np.testing.assert_allclose(below_m, -normal * np.linalg.norm(below_m), atol=1e-9)
 
 
@@ -137,11 +137,11 @@ def test_large_images_are_shown_smaller(run: list[Step]) -> None:
     depth_m = np.ones((960, 1280), dtype=np.float32)
     frame = replace(run[0].frame, depth_m=depth_m, colour=None)
     step = replace(run[0], frame=frame, segmentation=replace(run[0].segmentation, mask=depth_m > 0.0))
-    (depth,) = [archetype for path, archetype in images.drawing(step) if path == entities.DEPTH]
+    (depth,) = [archetype for path, archetype in images.draw_frame(step) if path == entities.DEPTH]
     assert isinstance(depth, rr.EncodedDepthImage)
     assert depth.blob is not None
     assert decoded(depth.blob.as_arrow_array().to_pylist()).shape == (240, 320)
-    (mask,) = [archetype for path, archetype in images.drawing(step) if path == entities.MASK]
+    (mask,) = [archetype for path, archetype in images.draw_frame(step) if path == entities.MASK]
     assert isinstance(mask, rr.SegmentationImage)
     assert mask.buffer is not None
     assert len(mask.buffer.as_arrow_array().to_pylist()[0]) == 480 * 640

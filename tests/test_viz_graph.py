@@ -12,7 +12,7 @@ from turning_box import COUNT, COVARIANCE, LOST
 
 from modeler import se3
 from modeler.types import PoseGaussian, Step
-from viz import clouds, entities, uncertainty
+from viz import entities, graph_view, model_view
 from viz.stream import graph_due
 
 
@@ -87,7 +87,7 @@ def test_axis_tips_spread_as_sampled_rotations_do() -> None:
     factor = rng.standard_normal((3, 3)) * 0.02
     omegas = rng.standard_normal((100_000, 3)) @ factor.T
     samples = rotation @ se3.exp(np.concatenate([omegas, np.zeros_like(omegas)], axis=1))[:, :3, :3]
-    got = uncertainty.axis_tip_covariances(rotation, factor @ factor.T)
+    got = graph_view.axis_tip_covariances(rotation, factor @ factor.T)
     for axis in range(3):
         wanted = np.cov(samples[:, :, axis].T)
         np.testing.assert_allclose(got[axis], wanted, atol=0.03 * np.trace(wanted))
@@ -95,15 +95,15 @@ def test_axis_tips_spread_as_sampled_rotations_do() -> None:
 
 def test_magnification_is_round_and_never_grows(run: list[Step]) -> None:
     edges = run[-1].edges_so_far
-    factors = [uncertainty.magnification(edges[:k], 0.8) for k in range(1, len(edges) + 1)]
+    factors = [graph_view.magnification(edges[:k], 0.8) for k in range(1, len(edges) + 1)]
     assert (np.diff(factors) <= 0.0).all()
     for scale in (1e-8, 1e-4, 1.0, 1e6):
         posterior = edges[0].posterior
         sure = replace(posterior, pose=PoseGaussian(posterior.pose.mean, scale * COVARIANCE))
-        factor = uncertainty.magnification([replace(edges[0], posterior=sure)], 0.8)
+        factor = graph_view.magnification([replace(edges[0], posterior=sure)], 0.8)
         assert 0.1 <= factor <= 1000.0
         assert f"{factor:g}".strip("0.") in "125"
-    assert uncertainty.magnification([], 0.8) == 1.0
+    assert graph_view.magnification([], 0.8) == 1.0
 
 
 def test_the_model_grows_and_ends_as_a_mesh(run: list[Step], recording: Recording) -> None:
@@ -141,13 +141,13 @@ def test_a_coarsened_mesh_keeps_its_shape() -> None:
             np.stack([corner + 1, corner + count + 1, corner + count], 1),
         ]
     )
-    coarse, kept = clouds.coarsened(vertices, triangles, 5_000)
+    coarse, kept = model_view.coarsened(vertices, triangles, 5_000)
     assert 500 < len(kept) <= 5_000
     np.testing.assert_allclose(coarse[:, 2], 0.1 * np.sin(3 * coarse[:, 0]), atol=1e-3)
     np.testing.assert_allclose(coarse[:, 3], coarse[:, 0] + coarse[:, 1], atol=1e-9)
     one, other = coarse[kept[:, 1]] - coarse[kept[:, 0]], coarse[kept[:, 2]] - coarse[kept[:, 0]]
     assert (np.cross(one[:, :3], other[:, :3])[:, 2] <= 1e-12).all()  # all still face the same way
-    same, all_of_them = clouds.coarsened(vertices, triangles, len(triangles))
+    same, all_of_them = model_view.coarsened(vertices, triangles, len(triangles))
     assert same is vertices
     assert all_of_them is triangles
 

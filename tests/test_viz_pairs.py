@@ -14,7 +14,7 @@ from turning_box import CENTRE_M, COUNT, COVARIANCE, HALF_M, LOST, object_from_c
 
 from modeler import se3
 from modeler.types import Mode, PoseGaussian, Step
-from viz import entities, ghosts, readings, spread, visibility
+from viz import entities, images, pair_view, readings
 
 
 def test_alignment_brings_the_pair_together(recording: Recording) -> None:
@@ -33,7 +33,7 @@ def test_draws_stand_for_the_posterior(run: list[Step]) -> None:
     rng = np.random.default_rng(0)
     posterior = run[1].posteriors[0]
     mean = posterior.pose.mean
-    sigma_points = se3.log(se3.inverse(mean) @ spread.draws(posterior))
+    sigma_points = se3.log(se3.inverse(mean) @ pair_view.draws(posterior))
     np.testing.assert_allclose(sigma_points.T @ sigma_points / 2.0, posterior.pose.covariance, atol=1e-9)
     # Two modes, the lighter by three to one: the draws keep the proportion, and are the same every time.
     offsets = np.zeros((400, 6))
@@ -41,10 +41,10 @@ def test_draws_stand_for_the_posterior(run: list[Step]) -> None:
     samples = mean @ se3.exp(offsets + 0.01 * rng.standard_normal((400, 6)))
     weights = np.where(offsets[:, 1] > 0, 0.75, 0.25) / 200.0
     modal = replace(posterior, samples=samples, weights=weights)
-    drawn_poses = spread.draws(modal)
+    drawn_poses = pair_view.draws(modal)
     share = np.mean(se3.log(se3.inverse(mean) @ drawn_poses)[:, 1] > 0)
     assert share == pytest.approx(0.75, abs=1 / 80)
-    np.testing.assert_array_equal(drawn_poses, spread.draws(modal))
+    np.testing.assert_array_equal(drawn_poses, pair_view.draws(modal))
 
 
 def test_the_ends_of_the_axes_gather_about_the_mean(recording: Recording, run: list[Step]) -> None:
@@ -62,8 +62,8 @@ def test_the_visibility_picture_has_the_three_areas(run: list[Step], recording: 
     shape = target.frame.depth_m.shape
     areas = np.array(recording[entities.VISIBILITY_AREAS][1]["buffer"][0], dtype=np.uint8).reshape(shape)
     assert target.frame.mask is not None
-    np.testing.assert_array_equal(areas == visibility.OBJECT, target.frame.mask)
-    np.testing.assert_array_equal(areas == visibility.MISSING, np.isnan(target.frame.depth_m))
+    np.testing.assert_array_equal(areas == images.OBJECT, target.frame.mask)
+    np.testing.assert_array_equal(areas == images.MISSING, np.isnan(target.frame.depth_m))
 
 
 def test_points_hang_in_front_only_where_the_motion_is_wrong(run: list[Step]) -> None:
@@ -73,17 +73,17 @@ def test_points_hang_in_front_only_where_the_motion_is_wrong(run: list[Step]) ->
     truth = se3.inverse(object_from_camera(0)) @ object_from_camera(1)
 
     def share(verdict: int, offset_m: list[float]) -> float:
-        verdicts = visibility.projection(source, target, se3.translation(np.array(offset_m)) @ truth).verdicts
-        judged = verdicts[verdicts != visibility.NO_SAY]
+        verdicts = images.projection(source, target, se3.translation(np.array(offset_m)) @ truth).verdicts
+        judged = verdicts[verdicts != images.NO_SAY]
         assert len(judged) > 0.6 * len(verdicts)
         return float(np.mean(judged == verdict))
 
-    assert share(visibility.VIOLATION, [0.0, 0.0, 0.0]) < 0.01
-    assert share(visibility.AGREES, [0.0, 0.0, 0.0]) > 0.6
-    assert share(visibility.VIOLATION, [0.0, 0.0, -0.05]) > 0.9
-    assert share(visibility.HIDDEN, [0.0, 0.0, 0.05]) > 0.9
-    assert share(visibility.VIOLATION, [0.25, 0.0, 0.0]) > 0.9  # before the background
-    beyond = visibility.projection(source, target, se3.translation(np.array([5.0, 0.0, 0.0])) @ truth)
+    assert share(images.VIOLATION, [0.0, 0.0, 0.0]) < 0.01
+    assert share(images.AGREES, [0.0, 0.0, 0.0]) > 0.6
+    assert share(images.VIOLATION, [0.0, 0.0, -0.05]) > 0.9
+    assert share(images.HIDDEN, [0.0, 0.0, 0.05]) > 0.9
+    assert share(images.VIOLATION, [0.25, 0.0, 0.0]) > 0.9  # before the background
+    beyond = images.projection(source, target, se3.translation(np.array([5.0, 0.0, 0.0])) @ truth)
     assert len(beyond.pixels) == 0
 
 
@@ -94,7 +94,7 @@ def test_points_are_drawn_by_what_is_said_of_them(run: list[Step]) -> None:
     def drawn_at(offset_m: list[float]) -> dict[str, Any]:
         mean = se3.translation(np.array(offset_m)) @ posterior.pose.mean
         moved = replace(posterior, pose=replace(posterior.pose, mean=mean))
-        return dict(visibility.drawing(replace(step, posteriors=(moved,))))
+        return dict(images.draw_projected_points(replace(step, posteriors=(moved,))))
 
     for path, offset_m in (
         (entities.VISIBILITY_AGREES, [0.0, 0.0, 0.0]),
@@ -113,9 +113,9 @@ def test_where_nothing_was_measured_no_point_is_judged(run: list[Step]) -> None:
     assert target is not None
     nowhere = np.zeros_like(target.layers["cells"])  # cells of the kind MISSING
     blind = replace(target, layers=dict(target.layers) | {"cells": nowhere})
-    verdicts = visibility.projection(source, blind, np.eye(4)).verdicts
+    verdicts = images.projection(source, blind, np.eye(4)).verdicts
     assert len(verdicts) > 100
-    assert (verdicts == visibility.NO_SAY).all()
+    assert (verdicts == images.NO_SAY).all()
 
 
 def test_ghosts_stay_with_their_mode_and_spread_about_it(run: list[Step]) -> None:
@@ -133,7 +133,7 @@ def test_ghosts_stay_with_their_mode_and_spread_about_it(run: list[Step]) -> Non
         ]
     )
     modal = replace(posterior, modes=modes, samples=draws, weights=np.full(400, 1 / 400))
-    shown = ghosts.magnified(modal, view)
+    shown = pair_view.magnified(modal, view)
     assert np.mean(shown.mode_of == 0) == pytest.approx(0.75, abs=1 / 20)
     assert shown.factor > 1.0
     for number, mode in enumerate(modes):
@@ -142,7 +142,7 @@ def test_ghosts_stay_with_their_mode_and_spread_about_it(run: list[Step]) -> Non
             for pose in shown.poses[shown.mode_of == number]
         ]
         assert 0.0 < max(apart_m) < 0.3 * HALF_M.max()
-    recording_of = dict(ghosts.drawing(replace(step, posteriors=(modal,))))
+    recording_of = dict(pair_view.draw_magnified_posterior(replace(step, posteriors=(modal,))))
     labels = recording_of[entities.GHOST_LABELS]
     assert isinstance(labels, rr.Points3D)
     assert labels.labels is not None
@@ -203,6 +203,6 @@ def test_readings_that_a_method_does_not_give_are_left_out(run: list[Step]) -> N
     assert readings.pair_words(replace(edge, posterior=single), run[1]).endswith(
         "rotation sd <0.01°, translation sd <0.01 mm, overlap 2 %, 1 effective sample, 0.1 s"
     )
-    paths = {path for path, _ in readings.drawing(replace(run[1], edges=(poor,)))}
+    paths = {path for path, _ in readings.draw_readings(replace(run[1], edges=(poor,)))}
     assert f"{entities.OVERLAP}/odometry" in paths
     assert f"{entities.SECONDS}/odometry" not in paths

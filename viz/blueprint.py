@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 
 from modeler.export.standing import upright
 from modeler.types import Array, RayImage
-from viz import entities, images, poses
+from viz import entities, graph_view, images
 
 _BACKGROUND: Final = (24, 26, 30)
 _ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object to the eye; the camera is towards -z, up is -y
@@ -166,7 +166,7 @@ def _far(first: RayImage | None) -> rrb.EyeControls3D | None:
     """Return an eye on the whole graph; None before there is an object."""
     if first is None:
         return None
-    return _eye(first, 2.8 * float(np.linalg.norm(first.centroid_m)), poses.OVER_THE_RING)
+    return _eye(first, 2.8 * float(np.linalg.norm(first.centroid_m)), graph_view.OVER_THE_RING)
 
 
 def _radius_m(view: RayImage) -> float:

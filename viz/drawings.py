@@ -1,14 +1,67 @@
-"""What is sent to a recording: archetypes by the path of their entity."""
+"""What the drawings share: archetypes by the path of their entity, and helpers for clouds, captions and ellipsoids."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Final
 
+import numpy as np
+import numpy.typing as npt
 import rerun as rr
+from scipy.spatial.transform import Rotation
+
+from modeler.types import Array, Posterior, Step
+from viz import entities
 
 Drawing = Iterator[tuple[str, rr.AsComponents]]
 """Entities in the order in which they are logged."""
 
 CLEAR: Final = rr.Clear(recursive=False)
 """Takes away what an entity showed."""
+
+
+POINT_SIZE: Final = rr.Radius.ui_points(1.75)
+
+
+def draw_axes() -> Drawing:
+    """Yield what is said once: which way is up."""
+    for path in (entities.PAIR, entities.WORLD):
+        yield path, rr.ViewCoordinates.RDF
+
+
+def shown_posterior(step: Step) -> Posterior | None:
+    """Return the first registration of the step's frame to a view that is at hand: the odometry pair."""
+    own = (posterior for posterior in step.posteriors if posterior.source == step.frame.index)
+    return next((posterior for posterior in own if posterior.target in step.views), None)
+
+
+def caption(at_m: Array, words: str, rgb: entities.Rgb) -> rr.Points3D:
+    """Return words that stand at a point (3,)."""
+    return rr.Points3D(at_m, labels=words, show_labels=True, radii=rr.Radius.ui_points(0.0), colors=rgb)
+
+
+def shaded(rgb: entities.Rgb, normals: Array) -> npt.NDArray[np.uint8]:
+    """Return a colour (n, 3) that is darker the more steeply a surface with `normals` (n, 3) is seen from frame 0."""
+    light = 0.35 + 0.65 * np.abs(normals @ np.array([-0.36, -0.48, -0.8]))
+    return np.clip(light[:, None] * np.array(rgb), 0, 255).astype(np.uint8)
+
+
+def scale_words(factor: float) -> str:
+    """Say how many times larger than life something is drawn."""
+    return "to scale" if factor == 1.0 else f"drawn \N{MULTIPLICATION SIGN}{factor:g}"
+
+
+def rounded_down(number: float) -> float:
+    """Return the largest of …, 0.5, 1, 2, 5, 10, … that is not above a positive number."""
+    decade = 10.0 ** math.floor(math.log10(number))
+    return max(factor * decade for factor in (1, 2, 5) if factor * decade <= number)
+
+
+def ellipsoids(covariances: Array) -> tuple[Array, Array]:
+    """Return the half axes (n, 3) at one sd and the orientations (n, 4: x, y, z, w) of covariances (n, 3, 3)."""
+    variances, axes = np.linalg.eigh(covariances)
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
+    half_axes = np.sqrt(np.maximum(variances, 0.0))
+    thinnest = np.maximum(0.02 * half_axes.max(axis=1, keepdims=True), 1e-9)  # a disc without thickness is not drawn
+    return np.maximum(half_axes, thinnest), Rotation.from_matrix(axes).as_quat()

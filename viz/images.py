@@ -1,9 +1,10 @@
-"""What the camera saw: colour, depth and the object mask, compressed."""
+"""What the camera saw, and the points of the new view projected into the image it is registered to."""
 
 from __future__ import annotations
 
 import io
 import math
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -11,9 +12,13 @@ import numpy.typing as npt
 import rerun as rr
 from PIL import Image
 
-from modeler.types import BoolArray, Frame, Step
+from modeler import se3
+from modeler.kernels import point_likelihood as kernel
+from modeler.rays import Sensor
+from modeler.registration.visibility import VisibilityLikelihood
+from modeler.types import Array, BoolArray, Frame, RayImage, Step
 from viz import entities
-from viz.drawings import Drawing
+from viz.drawings import CLEAR, Drawing, shown_posterior
 
 _PIXELS: Final = 500_000  # larger images are shown at a whole fraction of their size
 _DEPTH_PIXELS: Final = 100_000
@@ -23,13 +28,13 @@ _RUN_LENGTHS: Final = 3  # zlib's strategy; for filtered depth the quickest, and
 _DIMMED: Final = 0.65  # how dark what is not the object becomes
 
 
-def statics() -> Drawing:
+def draw_mask_colours() -> Drawing:
     """Yield what is said once: the mask leaves the object as it is and dims the rest."""
     background = rr.AnnotationInfo(id=0, label="background", color=(0, 0, 0))
     yield entities.MASK, rr.AnnotationContext([background, rr.AnnotationInfo(1, "object", (0, 0, 0, 0))])
 
 
-def drawing(step: Step) -> Drawing:
+def draw_frame(step: Step) -> Drawing:
     """Yield the colour image, the depth image and the mask of the step's frame."""
     stride, coarse = stride_px(step.frame), depth_stride_px(step.frame)
     mask = step.segmentation.mask
@@ -84,3 +89,106 @@ def _depth_range(pixels: npt.NDArray[np.uint16], mask: BoolArray) -> tuple[float
     near, far = np.percentile(chosen, (1, 99))
     margin = max(0.5 * (far - near), 1.0)
     return float(near - margin), float(far + margin)
+
+
+MISSING, BACKGROUND, OBJECT = 0, 1, 2
+"""Areas of a picture: nothing was measured, something other than the object was, the object was."""
+AGREES, HIDDEN, VIOLATION, NO_SAY = 0, 1, 2, 3
+"""Verdicts on a point: on the measured surface, behind it, in front of it, where nothing is to be told."""
+
+_PROJECTED_POINTS: Final = 1_200
+_VERDICT: Final = np.zeros(6, dtype=np.int8)  # by that of the likelihood
+_VERDICT[[kernel.MATCHED, kernel.UNKNOWN]] = AGREES, NO_SAY
+_VERDICT[[kernel.HIDDEN, kernel.BEHIND]] = HIDDEN
+_VERDICT[[kernel.IN_FRONT, kernel.IN_EMPTY_SPACE]] = VIOLATION
+_PATHS: Final = {
+    AGREES: (entities.VISIBILITY_AGREES, entities.AGREES_RGB, 1.25),
+    HIDDEN: (entities.VISIBILITY_HIDDEN, entities.HIDDEN_RGB, 1.0),
+    NO_SAY: (entities.VISIBILITY_NO_SAY, entities.NO_SAY_RGB, 1.0),
+    VIOLATION: (entities.VISIBILITY_VIOLATIONS, entities.VIOLATION_RGB, 3.0),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedPoints:
+    """The points of one view in the image of another."""
+
+    pixels: Array
+    """(n, 2) column and row in the image, of points inside it."""
+    verdicts: npt.NDArray[np.int8]
+    """(n,) one of the four verdicts each."""
+
+
+def draw_area_colours() -> Drawing:
+    """Yield what is said once: the paper's colours of the areas."""
+    names = {MISSING: "no measurement", BACKGROUND: "background", OBJECT: "object"}
+    colours = zip(names.items(), entities.AREAS_RGB, strict=True)
+    infos = [rr.AnnotationInfo(id=number, label=name, color=rgb) for (number, name), rgb in colours]
+    yield entities.VISIBILITY_AREAS, rr.AnnotationContext(infos)
+
+
+def draw_projected_points(step: Step) -> Drawing:
+    """Yield the areas of the target's image, and the source's points in it under the mean of the step's first pair."""
+    posterior = shown_posterior(step)
+    paths = (entities.VISIBILITY_AREAS, entities.VISIBILITY_CAPTION, *(path for path, _, _ in _PATHS.values()))
+    if posterior is None or step.view is None or not np.isfinite(posterior.pose.mean).all():
+        for path in paths:
+            yield path, CLEAR
+        return
+    target = step.views[posterior.target]
+    stride = depth_stride_px(target.frame)
+    yield entities.VISIBILITY_AREAS, rr.SegmentationImage(areas(target)[::stride, ::stride], draw_order=0.0)
+    shown = projection(step.view, target, posterior.pose.mean)
+    for order, (verdict, (path, rgb, points)) in enumerate(_PATHS.items()):
+        chosen = shown.pixels[shown.verdicts == verdict]
+        if len(chosen) == 0:
+            yield path, CLEAR
+        else:
+            radius = rr.Radius.ui_points(points)
+            yield path, rr.Points2D(chosen / stride, colors=rgb, radii=radius, draw_order=10.0 + order)
+    if len(target.pixels):
+        row, column = target.pixels.max(axis=0)[0], target.pixels.mean(axis=0)[1]
+        below = np.array([column, row + 0.12 * np.ptp(target.pixels, axis=0).max()]) / stride
+        style = {"colors": (200, 200, 200), "radii": rr.Radius.ui_points(0.0), "show_labels": True}
+        yield entities.VISIBILITY_CAPTION, rr.Points2D(below, labels=caption_of(shown), **style)
+
+
+def caption_of(shown: ProjectedPoints) -> str:
+    """Say how many of the points that can be judged are where they may be."""
+    judged = max(int(np.sum(shown.verdicts != NO_SAY)), 1)
+    agree, hidden, front = (round(100 * np.sum(shown.verdicts == v) / judged) for v in (AGREES, HIDDEN, VIOLATION))
+    return f"agree {agree} %, hidden {hidden} %, in front {front} %"
+
+
+def areas(view: RayImage) -> npt.NDArray[np.uint8]:
+    """Return what each pixel (h, w) saw."""
+    measured = np.isfinite(view.frame.depth_m) & (view.frame.depth_m > 0)
+    picture = np.where(measured, BACKGROUND, MISSING).astype(np.uint8)
+    picture[measured if view.frame.mask is None else view.frame.mask] = OBJECT
+    return picture
+
+
+def projection(source: RayImage, target: RayImage, target_from_source: Array) -> ProjectedPoints:
+    """Return where points of the source land in the target's image, and whether they may be there.
+
+    The verdicts are those of `visibility`, from which an edge's overlap is counted, whatever method found the motion.
+    """
+    if min(len(source.points_m), len(target.points_m)) == 0:
+        return ProjectedPoints(np.zeros((0, 2)), np.zeros(0, dtype=np.int8))
+    likelihood, rng = VisibilityLikelihood(points=_PROJECTED_POINTS), np.random.default_rng(0)
+    projected = likelihood.between(_ready(source), _ready(target), rng).forward
+    points_m = se3.transform(target_from_source, projected.points[:, :3])
+    verdicts = _VERDICT[projected.classify(se3.rows(target_from_source))]
+    camera = target.frame.camera
+    ahead = points_m[:, 2] > 1e-6
+    points_m, verdicts = points_m[ahead], verdicts[ahead]
+    scale = np.array([camera.fx, camera.fy])
+    pixels = scale * points_m[:, :2] / points_m[:, 2:] + np.array([camera.cx, camera.cy])
+    columns, rows = np.rint(pixels).T
+    inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
+    return ProjectedPoints(pixels[inside], verdicts[inside])
+
+
+def _ready(view: RayImage) -> RayImage:
+    """Return a view with the images that the likelihood looks up; steps hold earlier views without them."""
+    return view if view.layers else Sensor(view.sigma_wh, view.sigma_r_m).ray_image(view.frame, view.plane)

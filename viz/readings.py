@@ -1,22 +1,77 @@
-"""Readings of each pair over time, and the same in words."""
+"""Standard deviations and other readings of each pair: over time, and in words."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
 
+from modeler import se3
 from modeler.export.report import undetermined
 from modeler.types import ACCEPTED, Array, Edge, PoseGaussian, Posterior, Step, explain
-from viz import certainty, entities, poses
+from viz import entities
 from viz.drawings import Drawing
+
+
+@dataclass(frozen=True)
+class Sd:
+    """Standard deviations of a motion along its worst axes."""
+
+    rotation_deg: float
+    """Of the rotation."""
+    translation_mm: float
+    """Of the object's centre: that of the camera's own origin is mostly the rotation times the object's distance."""
+
+
+def sd_of(pose: PoseGaussian, centre_m: Array) -> Sd:
+    """Return how sure a motion is; NaN where its covariance is not finite.
+
+    Args:
+        pose: with ξ in the coordinates in which `centre_m` is given.
+        centre_m: (3,) the object's centre.
+    """
+    if not np.isfinite(pose.covariance).all():
+        return Sd(math.nan, math.nan)
+    covariance = se3.covariance_about(pose.covariance, centre_m)
+    return Sd(math.degrees(worst_axis_sd(covariance[:3, :3])), 1000.0 * worst_axis_sd(covariance[3:, 3:]))
+
+
+def certainty_words(posterior: Posterior, centre_m: Array) -> list[str]:
+    """Say how sure a registration is, a few words a reading, without those that its method does not give.
+
+    Args:
+        posterior: of target_from_source.
+        centre_m: (3,) the object's centre in the source camera's frame.
+    """
+    sd = sd_of(posterior.pose, centre_m)
+    samples = f"{posterior.effective_samples:.0f}"
+    readings = (
+        (sd.rotation_deg, f"rotation sd {_short(sd.rotation_deg)}°"),
+        (sd.translation_mm, f"translation sd {_short(sd.translation_mm)} mm"),
+        (posterior.overlap, f"overlap {100.0 * posterior.overlap:.0f} %"),
+        (posterior.effective_samples, f"{samples} effective sample" + "s" * (samples != "1")),
+        (posterior.seconds, f"{posterior.seconds:.2g} s"),
+    )
+    return [said for value, said in readings if math.isfinite(value)]
+
+
+def _short(value: float) -> str:
+    """Return a number of two digits, none of which lie beyond what anybody measures."""
+    return "<0.01" if 0.0 < value < 0.01 else f"{value:.2g}"
+
+
+def worst_axis_sd(covariance: Array) -> float:
+    """Return the sd along the least certain axis of a covariance (3, 3)."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
+
 
 _SERIES_RGB = {"odometry": entities.ODOMETRY_RGB, "closure": entities.CLOSURE_RGB, "pose": entities.UNCERTAINTY_RGB}
 
 
-def statics(name: str, facts: Mapping[str, object]) -> Drawing:
+def draw_legend(name: str, facts: Mapping[str, object]) -> Drawing:
     """Yield what is said once: how each series looks, the legend, and what the run was asked to do."""
     for reading in entities.READINGS:
         for series in entities.SERIES:
@@ -45,7 +100,7 @@ def _fact(value: object) -> str:
     return text.replace("|", "\\|")
 
 
-def drawing(step: Step) -> Drawing:
+def draw_readings(step: Step) -> Drawing:
     """Yield the readings of the step's pairs; of several closures the surest."""
     for kind in ("odometry", "closure"):
         judged = [edge for edge in step.edges if edge.kind == kind]
@@ -61,7 +116,7 @@ def drawing(step: Step) -> Drawing:
             yield f"{reading}/pose", rr.Scalars(value)
 
 
-def words(step: Step) -> Drawing:
+def draw_text(step: Step) -> Drawing:
     """Yield what happened to the frame in words, and a line for the log for each pair."""
     level = rr.TextLogLevel.INFO if step.accepted else rr.TextLogLevel.WARN
     if not step.edges and not step.last:
@@ -82,7 +137,7 @@ def pair_words(edge: Edge, step: Step) -> str:
     verdict = edge.kind if edge.accepted else f"{edge.kind} rejected"
     if not edge.accepted and posterior.usable:  # else the outcome is the reason
         verdict += f" ({explain(edge.reason)})"
-    known = ", ".join(certainty.words(posterior, _centre_m(step)))
+    known = ", ".join(certainty_words(posterior, _centre_m(step)))
     return f"{edge.source} → {edge.target} {verdict}: {posterior.outcome.label}; {known}"
 
 
@@ -99,7 +154,7 @@ def now_words(step: Step) -> str:
             lines.append(f"  - all edges together leave to its modes {', '.join(f'{100 * w:.0f}%' for w in left)}")
     if not step.edges and not step.last:
         lines.append("- The first view of the object." if step.accepted else f"- {_outcome(step)}")
-    kinds = [edge.kind for edge in step.edges_so_far if poses.takes_part(edge, step)]
+    kinds = [edge.kind for edge in step.edges_so_far if step.solution.takes_part(edge)]
     for edge in step.solution.outliers:
         lines.append(f"- {edge.source} → {edge.target} {edge.kind} is left out, for all other edges contradict it.")
     rejected = len(step.edges_so_far) - len(kinds)
@@ -123,7 +178,7 @@ def _readings(posterior: Posterior, step: Step) -> dict[str, float]:
 
 def _sds(pose: PoseGaussian, centre_m: Array) -> dict[str, float]:
     """Return how sure a motion is by entity path."""
-    sd = certainty.sd_of(pose, centre_m)
+    sd = sd_of(pose, centre_m)
     return {entities.ROTATION_SD: sd.rotation_deg, entities.TRANSLATION_SD: sd.translation_mm}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
 import threading
 import time
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from modeler.regular_files import create_regular
+from modeler.regular_files import create_regular, open_regular
 from modeler.types import InputError, Step
 from viz import entities, viewer
 
@@ -49,23 +50,30 @@ class RerunStream:
         if not self.recording.is_enabled():
             return
         # Rerun takes half a second to import: only runs that record pay for it.
-        from viz import blueprint, clouds, ghosts, images, merged, poses, readings, spread, uncertainty, visibility
+        from viz import blueprint, graph_view, images, model_view, pair_view, readings
+        from viz.drawings import shown_posterior
 
         # A frame that was lost is tried again when later ones are known: what that brings stands at the latest frame.
         self.recording.set_time(entities.FRAME, sequence=max([step.frame.index, *step.views]))
         self.recording.set_time(entities.ELAPSED, duration=time.monotonic() - self.started_s)
         if step.view is not None and set(step.views) == {step.frame.index}:
             self.recording.send_blueprint(blueprint.layout(step.view))
-        of_pair = (images.drawing, clouds.pair_drawing, spread.drawing, ghosts.drawing, visibility.drawing)
-        repeated = step.last and clouds.shown_posterior(step) is None  # the last frame's pair stays in view
+        of_pair = (
+            images.draw_frame,
+            pair_view.draw_pair,
+            pair_view.draw_posterior,
+            pair_view.draw_magnified_posterior,
+            images.draw_projected_points,
+        )
+        repeated = step.last and shown_posterior(step) is None  # the last frame's pair stays in view
         for path, archetype in itertools.chain(
             *(() if repeated else (drawing(step) for drawing in of_pair)),
-            clouds.model_drawing(step),
-            merged.drawing(step),
-            poses.newest_drawing(step),
-            *((poses.drawing(step), uncertainty.drawing(step)) if graph_due(step) else ()),
-            readings.drawing(step),
-            readings.words(step),
+            model_view.draw_model(step),
+            model_view.draw_merged_clouds(step),
+            graph_view.draw_newest_camera(step),
+            *((graph_view.draw_graph(step), graph_view.draw_uncertainty(step)) if graph_due(step) else ()),
+            readings.draw_readings(step),
+            readings.draw_text(step),
         ):
             self.recording.log(path, archetype)
 
@@ -133,7 +141,7 @@ def open_stream(
     """
     import rerun as rr
 
-    from viz import blueprint, clouds, images, readings, visibility
+    from viz import blueprint, drawings, images, readings
 
     listens = connect is not None and viewer.reachable(connect)
     sinks: list[rr.FileSink | rr.GrpcSink] = [] if save is None else [_file_sink(save)]
@@ -149,7 +157,10 @@ def open_stream(
         recording.send_recording_name(name)
         recording.send_blueprint(blueprint.layout(None))
         for path, archetype in itertools.chain(
-            images.statics(), clouds.statics(), visibility.statics(), readings.statics(name, facts or {})
+            images.draw_mask_colours(),
+            drawings.draw_axes(),
+            images.draw_area_colours(),
+            readings.draw_legend(name, facts or {}),
         ):
             recording.log(path, archetype, static=True)
     return RerunStream(recording, viewers, time.monotonic(), save, watched=listens or bool(viewers))
@@ -180,3 +191,19 @@ def _file_sink(save: Path) -> rr.FileSink:
     except OSError as error:
         raise InputError(f"{save}: cannot write the recording ({error.strerror}); choose another folder") from error
     return rr.FileSink(save)
+
+
+_BEGINS, _ENDS = b"RRF2", b"FOOT"
+_LAST = 64  # bytes that hold the end mark
+
+
+def ends_whole(recording: Path) -> bool:
+    """Return whether a recording has its end, which one lacks that was cut off by a kill or a full disk.
+
+    Of other formats than today's nothing is known: they count as whole.
+    """
+    with open_regular(recording) as file:
+        if file.read(len(_BEGINS)) != _BEGINS:
+            return True
+        file.seek(max(0, os.fstat(file.fileno()).st_size - _LAST))
+        return _ENDS in file.read()

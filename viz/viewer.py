@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
-from modeler.regular_files import check_regular
+from modeler.regular_files import check_regular, open_regular
 from modeler.types import InputError
 
 _HOST: Final = "127.0.0.1"
@@ -175,7 +175,7 @@ class _OneFile(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Send the file."""
-        with suppress(ConnectionError), self._file.open("rb") as content:
+        with suppress(ConnectionError), open_regular(self._file) as content:
             self.send_response(200)
             self.send_header("Access-Control-Allow-Origin", self._origin)
             self.send_header("Content-Type", "application/octet-stream")

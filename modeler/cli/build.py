@@ -66,7 +66,7 @@ class Build:
         from modeler.cli.advice import comes_back
         from modeler.cli.outputs import check_run_folder
         from modeler.export import Remembered, RunFolder, RunMeta, alone
-        from viz.ending import ends_whole
+        from viz.stream import ends_whole
 
         began_s = time.perf_counter()
         _check(self)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from modeler.fusion.views import DepthViews
+from modeler.fusion.depth_views import DepthViews
 from modeler.kernels import marching_cubes, tsdf
 from modeler.types import Array
 

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.fusion import surface, watertight
+from modeler.fusion import meshing, watertight
+from modeler.fusion.depth_views import SMOOTHED, DepthViews, depth_views, disagreement, posed_views
 from modeler.fusion.distance_field import DistanceField, VoxelGrid, filled, grid_around, measured
 from modeler.fusion.support import ViewSupport, exposure_gains, view_support
-from modeler.fusion.views import SMOOTHED, DepthViews, depth_views, disagreement, posed_views
 from modeler.kernels import point_clouds
 from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage
 
@@ -155,7 +155,7 @@ class FusionVolume:
             watertight: close the mesh with surface that no view saw; the standard deviation of its vertices is inf.
         """
         vertices, triangles, seen = self._mesh(watertight=watertight)
-        normals = surface.normals_of(vertices, triangles)
+        normals = meshing.normals_of(vertices, triangles)
         at_vertices = self.support(vertices, normals)
         points, point_normals = downsampled(
             self.views.points_m,
@@ -175,7 +175,7 @@ class FusionVolume:
             vertices_m=vertices,
             triangles=triangles,
             vertex_normals=normals,
-            vertex_colours=surface.filled_colours(at_vertices.colours, known, vertices) if coloured else None,
+            vertex_colours=meshing.filled_colours(at_vertices.colours, known, vertices) if coloured else None,
             vertex_views=np.where(seen, at_vertices.views, 0),
             vertex_sigmas_m=np.where(seen, at_vertices.sigmas_m, np.inf),
         )
@@ -187,7 +187,7 @@ class FusionVolume:
     def texture_colours(self, points_m: Array, normals: Array) -> npt.NDArray[np.uint8]:
         """Return the RGB (n, 3) of surface points (n, 3) from the most frontal and sharpest views."""
         found = self._support(points_m, normals, self._gains, focus=SHARP)
-        return surface.filled_colours(found.colours, found.coloured, points_m)
+        return meshing.filled_colours(found.colours, found.coloured, points_m)
 
     @property
     def texel_m(self) -> float:
@@ -218,48 +218,48 @@ class FusionVolume:
         """Return which points (n,) have more support than views that see them empty."""
         return found.weight > self.fuser.empty_weight * found.empty_views
 
-    def _mesh(self, *, watertight: bool) -> tuple[Array, surface.Triangles, BoolArray]:
+    def _mesh(self, *, watertight: bool) -> tuple[Array, meshing.Triangles, BoolArray]:
         """Return vertices (v, 3) and triangles (t, 3) of the surface, and which vertices the views support."""
         field = measured(self.grid, self.views, tau_m=self.tau_m, empty_weight=self.fuser.empty_weight)
         for _ in range(self.fuser.closing):
             field = filled(field)
-        vertices, triangles = surface.extracted_mesh(field)
+        vertices, triangles = meshing.extracted_mesh(field)
         kept, weak = self._kept(vertices, triangles)
         shown = triangles[np.all(kept[triangles], axis=1)]
-        shown = shown[surface.large_pieces(vertices, shown, self.fuser.min_piece)]
-        used, compact = surface.used_vertices(shown, len(vertices))
+        shown = shown[meshing.large_pieces(vertices, shown, self.fuser.min_piece)]
+        used, compact = meshing.used_vertices(shown, len(vertices))
         if watertight:
             return self._closed_mesh(field, vertices, used, weak)
-        smooth = surface.taubin_smoothed(vertices[used], compact, self.fuser.fairing)
-        smooth = surface.taubin_smoothed(smooth, compact, surface.WEAK_PASSES, weak[used])
+        smooth = meshing.taubin_smoothed(vertices[used], compact, self.fuser.fairing)
+        smooth = meshing.taubin_smoothed(smooth, compact, meshing.WEAK_PASSES, weak[used])
         return smooth, compact, np.ones(len(used), dtype=bool)
 
-    def _kept(self, vertices: Array, triangles: surface.Triangles) -> tuple[BoolArray, BoolArray]:
+    def _kept(self, vertices: Array, triangles: meshing.Triangles) -> tuple[BoolArray, BoolArray]:
         """Return which vertices (v,) of the zero level set are surface, and which (v,) have weak support.
 
         Surface is supported, not seen empty by several views, and does not fold over at a border.
         """
-        normals = surface.normals_of(vertices, triangles)
+        normals = meshing.normals_of(vertices, triangles)
         found = self._support(vertices, normals, np.zeros((len(self.views.index), 4)))
         # Closing gaps in the support must not add what several views see empty.
         empty = found.empty_views * self.fuser.empty_weight > found.weight + self.fuser.empty_weight
         seen = (found.weight > self.fuser.min_support) & self._supported(found)
-        marked = surface.gaps_closed(seen, triangles, self.fuser.closing) & ~empty
+        marked = meshing.gaps_closed(seen, triangles, self.fuser.closing) & ~empty
         # At silhouettes the zero level set folds over: views extrapolate the object one band behind its surface.
-        loose = surface.folded(vertices, normals, seen, marked & ~seen)
-        marked = surface.without_loose_border(marked, loose, triangles, FOLD_RINGS)
+        loose = meshing.folded(vertices, normals, seen, marked & ~seen)
+        marked = meshing.without_loose_border(marked, loose, triangles, FOLD_RINGS)
         usual = float(np.median(found.weight[marked])) if marked.any() else 0.0
-        return surface.spikes_removed(marked, triangles, self.fuser.opening), found.weight < surface.WEAK * usual
+        return meshing.spikes_removed(marked, triangles, self.fuser.opening), found.weight < meshing.WEAK * usual
 
     def _closed_mesh(
         self, field: DistanceField, vertices: Array, used: npt.NDArray[np.int64], weak: BoolArray
-    ) -> tuple[Array, surface.Triangles, BoolArray]:
+    ) -> tuple[Array, meshing.Triangles, BoolArray]:
         """Return the watertight mesh: vertices, triangles, and which vertices the views support."""
         unused = np.ones(len(vertices), dtype=bool)
         unused[used] = False
         field = watertight.without_rejected(field, vertices[unused], vertices[used], self.tau_m)
         return watertight.cleaned(
-            *surface.extracted_mesh(watertight.closed_field(field, self.views, self.tau_m)),
+            *meshing.extracted_mesh(watertight.closed_field(field, self.views, self.tau_m)),
             vertices[used],
             weak[used],
             voxel_m=self.grid.voxel_m,

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import laplace, minimum_filter
 
-from modeler.fusion.views import GREY, DepthViews
+from modeler.fusion.depth_views import GREY, DepthViews
 from modeler.kernels import tsdf
 from modeler.types import Array
 

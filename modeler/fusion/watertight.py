@@ -7,9 +7,9 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 from scipy.spatial import KDTree
 
-from modeler.fusion import surface
+from modeler.fusion import meshing
+from modeler.fusion.depth_views import DepthViews
 from modeler.fusion.distance_field import FAINT, DistanceField, crossed
-from modeler.fusion.views import DepthViews
 from modeler.kernels import occupancy
 from modeler.types import Array, BoolArray
 
@@ -102,8 +102,8 @@ def support_planes(seen: DepthViews, corners_m: Array, tau_m: float) -> Array:
 
 
 def cleaned(
-    vertices_m: Array, triangles: surface.Triangles, shown_m: Array, weak: BoolArray, *, voxel_m: float, passes: int
-) -> tuple[Array, surface.Triangles, BoolArray]:
+    vertices_m: Array, triangles: meshing.Triangles, shown_m: Array, weak: BoolArray, *, voxel_m: float, passes: int
+) -> tuple[Array, meshing.Triangles, BoolArray]:
     """Return vertices (v, 3) and triangles (t, 3) of the largest component, smoothed, and which (v,) views saw.
 
     Args:
@@ -114,18 +114,18 @@ def cleaned(
         voxel_m: side of a voxel.
         passes: of smoothing seen surface; unseen surface is smoothed more.
     """
-    triangles = triangles[surface.solid_pieces(vertices_m, triangles)]
-    used, triangles = surface.used_vertices(triangles, len(vertices_m))
+    triangles = triangles[meshing.solid_pieces(vertices_m, triangles)]
+    used, triangles = meshing.used_vertices(triangles, len(vertices_m))
     vertices_m = vertices_m[used]
     away_m, nearest = KDTree(shown_m).query(vertices_m, distance_upper_bound=voxel_m)
     shown = away_m < voxel_m
-    vertices_m = surface.taubin_smoothed(vertices_m, triangles, passes)
-    vertices_m = surface.laplacian_smoothed(vertices_m, triangles, ~shown, SPANNING_PASSES)
+    vertices_m = meshing.taubin_smoothed(vertices_m, triangles, passes)
+    vertices_m = meshing.laplacian_smoothed(vertices_m, triangles, ~shown, SPANNING_PASSES)
     # Support is weak along the seam.
-    seam = surface.dilated(shown, triangles, 1) & surface.dilated(~shown, triangles, 1)
-    vertices_m = surface.laplacian_smoothed(vertices_m, triangles, seam, SEAM_PASSES)
-    rough = surface.dilated(seam, triangles, SEAM_RINGS) | (shown & np.append(weak, False)[nearest])
-    return surface.taubin_smoothed(vertices_m, triangles, surface.WEAK_PASSES, rough), triangles, shown
+    seam = meshing.dilated(shown, triangles, 1) & meshing.dilated(~shown, triangles, 1)
+    vertices_m = meshing.laplacian_smoothed(vertices_m, triangles, seam, SEAM_PASSES)
+    rough = meshing.dilated(seam, triangles, SEAM_RINGS) | (shown & np.append(weak, False)[nearest])
+    return meshing.taubin_smoothed(vertices_m, triangles, meshing.WEAK_PASSES, rough), triangles, shown
 
 
 def _without_deep_voids(field: DistanceField, deep: BoolArray, stride: int) -> DistanceField:

@@ -21,7 +21,7 @@ from calibration.study import CONTROL, MEASURES, OURS, Study, Trial
 from calibration.tables import degrees, results_csv, results_json, rows, text
 from modeler.export import write_atomically
 from modeler.types import InputError
-from viz.calibration import Curve, Panel, coverage_curves
+from viz.figures import Curve, Panel, coverage_curves
 
 _ORDERS_OF_MAGNITUDE = 100.0  # by which the control's mean squared error must exceed what it states
 

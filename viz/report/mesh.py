@@ -1,4 +1,4 @@
-"""The fused mesh, coarse enough for a page, as the viewer in the page takes it."""
+"""The fused mesh in the page: coarse enough for its viewer, and as a still picture."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from modeler.export import read_model
 from modeler.export.mesh import sigma_rgb
 from modeler.types import Array, InputError
-from viz.clouds import coarsened
+from viz.model_view import coarsened
 
 _TRIANGLES: Final = 60_000
 _STEPS: Final = 32767  # of a coordinate from the centre to the farthest vertex: 16-bit whole numbers
@@ -99,3 +99,81 @@ def scene(mesh: Mesh, strips_m: list[Array], object_from_upright: Array) -> Mapp
 def _packed(array: npt.NDArray[Any]) -> str:
     """Return the bytes of an array as text."""
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
+def shade(
+    vertices_m: Array,
+    triangles: npt.NDArray[np.int64],
+    colours: npt.NDArray[np.uint8] | None,
+    object_from_camera: Array,
+    size: tuple[int, int],
+    *,
+    field_of_view_deg: float = 30.0,
+    samples: int = 2,
+) -> npt.NDArray[np.uint8]:
+    """Return a picture (h, w, 3) of a mesh under a light beside the camera, on white; back sides are drawn red.
+
+    Args:
+        vertices_m: (v, 3).
+        triangles: (t, 3), counter-clockwise from outside.
+        colours: (v, 3) RGB; None = grey.
+        object_from_camera: (4, 4) pose of the camera (x right, y down, z forward) in the mesh's frame.
+        size: height and width in px.
+        field_of_view_deg: vertical.
+        samples: rays along each side of a pixel.
+    """
+    import open3d as o3d  # slow to import, and nothing else of viz needs it
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices_m, dtype=np.float32)),
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, dtype=np.uint32)),
+    )
+    height, width = size[0] * samples, size[1] * samples
+    focal = 0.5 * height / np.tan(np.radians(0.5 * field_of_view_deg))
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    along = np.stack(
+        [(columns - 0.5 * (width - 1)) / focal, (rows - 0.5 * (height - 1)) / focal, np.ones((height, width))], axis=-1
+    )
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    rays = np.empty((height, width, 6), dtype=np.float32)
+    rays[..., :3] = object_from_camera[:3, 3]
+    rays[..., 3:] = along @ object_from_camera[:3, :3].T
+    hits = {name: value.numpy() for name, value in scene.cast_rays(o3d.core.Tensor.from_numpy(rays)).items()}
+    seen = np.isfinite(hits["t_hit"])
+
+    corners = triangles[hits["primitive_ids"][seen].astype(np.int64)]
+    share = hits["primitive_uvs"][seen].astype(np.float64)
+    share = np.stack([1.0 - share.sum(axis=1), share[:, 0], share[:, 1]], axis=1)
+    normals = hits["primitive_normals"][seen].astype(np.float64)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    light = np.array([-0.35, -0.55, -1.0]) / np.linalg.norm([-0.35, -0.55, -1.0])
+    facing = -np.sum(normals * rays[seen][:, 3:], axis=1)
+    lit = np.clip(normals @ object_from_camera[:3, :3] @ light, 0.0, 1.0)
+    base = np.full((len(corners), 3), 190.0)
+    if colours is not None:
+        base = np.einsum("nk,nkc->nc", share, colours[corners].astype(np.float64))
+    base[facing < 0.0] = (200.0, 60.0, 50.0)
+    lit = np.where(facing < 0.0, 0.4 - 0.6 * facing, lit)
+    picture = np.full((height, width, 3), 255.0)
+    picture[seen] = base * (0.25 + 0.75 * lit)[:, None]
+    blocks = picture.reshape(size[0], samples, size[1], samples, 3)
+    return np.clip(np.rint(blocks.mean(axis=(1, 3))), 0, 255).astype(np.uint8)
+
+
+def look_at(centre_m: Array, direction: Array, distance_m: float, up: Array) -> Array:
+    """Return object_from_camera (4, 4) of a camera that looks at a point from a direction.
+
+    Args:
+        centre_m: (3,) what it looks at.
+        direction: (3,) from there to the camera.
+        distance_m: between the two.
+        up: (3,) what is up in the picture.
+    """
+    forward = -np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = centre_m - distance_m * forward
+    return pose

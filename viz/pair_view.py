@@ -1,4 +1,4 @@
-"""The posterior of the newest pair larger than life: the object where samples put it, mode by mode."""
+"""The newest pair of views: its clouds before and after alignment, and how sure the posterior is."""
 
 from __future__ import annotations
 
@@ -14,8 +14,75 @@ import rerun as rr
 from modeler import se3
 from modeler.export.standing import upright
 from modeler.types import Array, Mode, Posterior, RayImage, Step
-from viz import certainty, clouds, entities, spread, uncertainty
-from viz.drawings import CLEAR, Drawing
+from viz import entities
+from viz.drawings import (
+    CLEAR,
+    POINT_SIZE,
+    Drawing,
+    caption,
+    ellipsoids,
+    rounded_down,
+    scale_words,
+    shaded,
+    shown_posterior,
+)
+from viz.readings import worst_axis_sd
+
+_PAIR_POINTS: Final = 6_000
+
+
+_DRAWS: Final = 80
+_LENGTH: Final = 1.1  # of the axes, in distances of the farthest point from the centroid: they stick out of the object
+
+
+def draw_posterior(step: Step) -> Drawing:
+    """Yield the axes of the source at the mean of the pair's posterior, and their ends under draws from it."""
+    posterior = shown_posterior(step)
+    if posterior is None or step.view is None or not np.isfinite(posterior.pose.covariance).all():
+        yield entities.PAIR_AXES, CLEAR
+        yield entities.PAIR_DRAWS, CLEAR
+        return
+    centre = step.view.centroid_m
+    length_m = axes_length_m(step.view)
+    ends = centre + length_m * np.eye(3)
+    mean = posterior.pose.mean
+    colours = np.array(entities.AXIS_RGB, dtype=np.uint8)
+    yield (
+        entities.PAIR_AXES,
+        rr.Arrows3D(
+            origins=np.tile(se3.transform(mean, centre), (3, 1)),
+            vectors=length_m * mean[:3, :3].T,
+            colors=colours,
+            radii=rr.Radius.ui_points(0.75),
+        ),
+    )
+    poses = draws(posterior)
+    points = np.einsum("nij,kj->nki", poses[:, :3, :3], ends) + poses[:, None, :3, 3]
+    yield (
+        entities.PAIR_DRAWS,
+        rr.Points3D(points.reshape(-1, 3), colors=np.tile(colours, (len(poses), 1)), radii=rr.Radius.ui_points(2.0)),
+    )
+
+
+def axes_length_m(view: RayImage) -> float:
+    """Return the length of the object's axes as drawn."""
+    return _LENGTH * float(np.linalg.norm(view.points_m - view.centroid_m, axis=1).max())
+
+
+def draws(posterior: Posterior) -> Array:
+    """Return motions (n, 4, 4) that stand for a posterior, the same at every call.
+
+    They are samples at even steps of the cumulative weight; of a method without samples, the motions one sd along
+    each axis of the covariance to either side.
+    """
+    if len(posterior.samples) > 0:
+        cumulative = np.cumsum(posterior.weights)
+        steps = (np.arange(_DRAWS) + 0.5) / _DRAWS * cumulative[-1]
+        return posterior.samples[np.minimum(np.searchsorted(cumulative, steps), len(cumulative) - 1)]
+    variances, axes = np.linalg.eigh(posterior.pose.covariance)
+    sds = (np.sqrt(np.maximum(variances, 0.0)) * axes).T
+    return posterior.pose.mean @ se3.exp(np.concatenate([sds, -sds]))
+
 
 _GHOSTS: Final = 20
 _GHOST_POINTS: Final = 200
@@ -47,9 +114,9 @@ class Ghosts:
     """(n,) number of the mode that each belongs to."""
 
 
-def drawing(step: Step) -> Drawing:
+def draw_magnified_posterior(step: Step) -> Drawing:
     """Yield the source at every mode, ghosts of it, the ends of its axes and the ellipsoid of its centre."""
-    posterior = clouds.shown_posterior(step)
+    posterior = shown_posterior(step)
     if posterior is None or step.view is None or not np.isfinite(posterior.pose.covariance).all():
         for path in _PATHS:
             yield path, CLEAR
@@ -73,7 +140,7 @@ def magnified(posterior: Posterior, view: RayImage) -> Ghosts:
     """
     modes = posterior.modes or (Mode(1.0, posterior.pose),)
     centre = se3.translation(view.centroid_m)
-    drawn = spread.draws(posterior)
+    drawn = draws(posterior)
     drawn = drawn[np.linspace(0, len(drawn) - 1, min(_GHOSTS, len(drawn))).astype(np.int64)]
     mode_of = np.array([_nearest(modes, pose) for pose in drawn])
     means = np.array([mode.pose.mean for mode in modes])[mode_of] @ centre
@@ -100,12 +167,12 @@ def _factor(modes: Sequence[Mode], view: RayImage) -> float:
     widest_rad, widest_m = 0.0, 0.0
     for mode in modes:
         covariance = se3.covariance_about(mode.pose.covariance, view.centroid_m)
-        turn_rad, shift_m = (certainty.worst_axis_sd(block) for block in (covariance[:3, :3], covariance[3:, 3:]))
+        turn_rad, shift_m = (worst_axis_sd(block) for block in (covariance[:3, :3], covariance[3:, 3:]))
         widest_rad, widest_m = max(widest_rad, turn_rad), max(widest_m, math.hypot(radius_m * turn_rad, shift_m))
     if not widest_m > 0.0:
         return 1.0
     wanted = min(_SHOWN_SD * radius_m / widest_m, _MOST_RAD / max(widest_rad, 1e-9))
-    return min(uncertainty.rounded_down(wanted), 1000.0) if wanted >= 1.0 else 1.0
+    return min(rounded_down(wanted), 1000.0) if wanted >= 1.0 else 1.0
 
 
 def _means(view: RayImage, modes: Sequence[Mode], colours: npt.NDArray[np.int64]) -> rr.Points3D:
@@ -114,14 +181,14 @@ def _means(view: RayImage, modes: Sequence[Mode], colours: npt.NDArray[np.int64]
     points, normals = view.points_m[::stride], view.normals[::stride]
     return rr.Points3D(
         np.concatenate([se3.transform(mode.pose.mean, points) for mode in modes]),
-        colors=np.concatenate([clouds.shaded(tuple(rgb), normals) for rgb in colours.tolist()]),
+        colors=np.concatenate([shaded(tuple(rgb), normals) for rgb in colours.tolist()]),
         radii=rr.Radius.ui_points(1.0),
     )
 
 
 def _tips(view: RayImage, ghosts: Ghosts) -> Drawing:
     """Yield where the ends of the object's axes land."""
-    ends = view.centroid_m + spread.axes_length_m(view) * np.eye(3)
+    ends = view.centroid_m + axes_length_m(view) * np.eye(3)
     points = np.einsum("nij,kj->nki", ghosts.poses[:, :3, :3], ends) + ghosts.poses[:, None, :3, 3]
     colours = np.tile(np.array(entities.AXIS_RGB, dtype=np.uint8), (len(ghosts.poses), 1))
     yield entities.GHOST_TIPS, rr.Points3D(points.reshape(-1, 3), colors=colours, radii=rr.Radius.ui_points(2.5))
@@ -134,7 +201,7 @@ def _centres(view: RayImage, ghosts: Ghosts, colours: npt.NDArray[np.int64]) -> 
     centres = np.array([se3.transform(pose, view.centroid_m) for pose in poses])
     covariances = np.array([mode.pose.covariance for mode in ghosts.modes])
     blocks = se3.covariance_about(covariances, view.centroid_m)[:, 3:, 3:]
-    half_axes, quaternions = uncertainty.ellipsoids(rotations @ blocks @ np.swapaxes(rotations, 1, 2))
+    half_axes, quaternions = ellipsoids(rotations @ blocks @ np.swapaxes(rotations, 1, 2))
     for path, sigmas, style in (
         (entities.GHOST_CENTRE_1_SIGMA, 1.0, rr.components.FillMode.Solid),
         (entities.GHOST_CENTRE_3_SIGMA, 3.0, rr.components.FillMode.DenseWireframe),
@@ -151,12 +218,40 @@ def _centres(view: RayImage, ghosts: Ghosts, colours: npt.NDArray[np.int64]) -> 
             ),
         )
     # The heaviest mode's caption stands below the object, the others' one over another above it.
-    down = 1.1 * spread.axes_length_m(view) * np.array([1.0, *(-1.0 - 0.25 * np.arange(len(centres) - 1))])
+    down = 1.1 * axes_length_m(view) * np.array([1.0, *(-1.0 - 0.25 * np.arange(len(centres) - 1))])
     places = centres[0] + down[:, None] * upright(view)[:, 1]
-    scale = f"spread {uncertainty.scale_words(ghosts.factor)}"
+    scale = f"spread {scale_words(ghosts.factor)}"
     shares = [f"mode {k + 1}: {100.0 * mode.weight:.0f} %" for k, mode in enumerate(ghosts.modes)]
     labels = [scale] if len(shares) == 1 else [f"{shares[0]}, {scale}", *shares[1:]]
     yield (
         entities.GHOST_LABELS,
         rr.Points3D(places, labels=labels, show_labels=True, radii=rr.Radius.ui_points(0.0), colors=colours),
     )
+
+
+def draw_pair(step: Step) -> Drawing:
+    """Yield the source and target clouds of the step's first registration in the target's camera frame."""
+    posterior = shown_posterior(step)
+    if posterior is None or step.view is None:
+        for path in (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER, entities.PAIR_CAPTION):
+            yield path, CLEAR
+        return
+    identity = np.eye(4)
+    yield entities.PAIR_TARGET, _view_points(step.views[posterior.target], identity, entities.TARGET_RGB)
+    yield entities.PAIR_BEFORE, _view_points(step.view, identity, entities.SOURCE_RGB)
+    yield entities.PAIR_AFTER, _view_points(step.view, posterior.pose.mean, entities.SOURCE_RGB)
+    words = f"orange: frame {posterior.source}, teal: frame {posterior.target}"
+    yield entities.PAIR_CAPTION, caption(below_m(step.views[posterior.target]), words, (200, 200, 200))
+
+
+def below_m(view: RayImage) -> Array:
+    """Return a point (3,) below what a view saw of the object, where a caption has room."""
+    centre = view.centroid_m
+    return centre + 1.2 * float(np.linalg.norm(view.points_m - centre, axis=1).max()) * upright(view)[:, 1]
+
+
+def _view_points(view: RayImage, target_from_view: Array, rgb: entities.Rgb) -> rr.Points3D:
+    """Return the surface points of a view, carried to the target's camera frame."""
+    stride = math.ceil(max(len(view.points_m), 1) / _PAIR_POINTS)
+    points = se3.transform(target_from_view, view.points_m[::stride])
+    return rr.Points3D(points, colors=shaded(rgb, view.normals[::stride]), radii=POINT_SIZE)

@@ -1,4 +1,4 @@
-"""How sure each edge and each pose of the graph is, drawn: before loop closure and after."""
+"""The pose graph: cameras and edges, and the uncertainty of each before and after loop closure."""
 
 from __future__ import annotations
 
@@ -8,13 +8,113 @@ from typing import Final
 
 import numpy as np
 import rerun as rr
-from scipy.spatial.transform import Rotation
 
 from modeler import se3
+from modeler.export.standing import upright
 from modeler.graph import PoseGraph, dead_reckoning
-from modeler.types import Array, Edge, Step
-from viz import clouds, entities, poses
-from viz.drawings import CLEAR, Drawing
+from modeler.types import Array, Camera, Edge, Step
+from viz import entities
+from viz.drawings import CLEAR, Drawing, caption, ellipsoids, rounded_down, scale_words
+
+OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
+"""From the object towards the eye that looks at the whole graph."""
+
+_POSES: Final = 150  # of more than so many poses every n-th is drawn
+_CAMERA_SIZE: Final = 0.1  # as a share of the distance to the object
+_CAPTION: Final = 1.0  # of captions below the object, as a share of the distance to it
+
+
+def draw_graph(step: Step) -> Drawing:
+    """Yield all cameras and the edges between them, in the object frame."""
+    trajectory = step.solution.trajectory
+    poses = np.array([trajectory[k] for k in shown(step)]).reshape(-1, 4, 4)
+    size_m = camera_size_m(step)
+    yield entities.CAMERAS, _frusta(poses, step.frame.camera, size_m, (entities.CAMERA_RGB, 1.0))
+    yield entities.AXES, _axes(poses, size_m)
+    chain = [step.solution.odometry[k][:3, 3] for k in sorted(step.solution.odometry)]
+    yield entities.CHAIN, _lines([chain] if len(chain) > 1 else [], entities.CHAIN_RGB, 1.0)
+    before = np.array([step.solution.odometry[k] for k in shown(step) if k in step.solution.odometry]).reshape(-1, 4, 4)
+    yield entities.BEFORE_CAMERAS, _frusta(before, step.frame.camera, size_m, (entities.CHAIN_RGB, 1.0))
+    yield from _edges(step)
+
+
+def draw_newest_camera(step: Step) -> Drawing:
+    """Yield the camera of the step's frame."""
+    current = step.solution.trajectory.get(step.frame.index)
+    if current is None:
+        yield entities.CURRENT, CLEAR
+    else:
+        style = (entities.CURRENT_RGB, 3.0)
+        yield entities.CURRENT, _frusta(current[None], step.frame.camera, 1.3 * camera_size_m(step), style)
+
+
+def shown(step: Step) -> list[int]:
+    """Return the frames whose poses are drawn: all, or of many every n-th."""
+    numbers = sorted(step.solution.trajectory)
+    return numbers[:: math.ceil(max(len(numbers), 1) / _POSES)]
+
+
+def camera_size_m(step: Step) -> float:
+    """Return the length of a drawn camera and of its axes."""
+    return _CAMERA_SIZE * distance_m(step)
+
+
+def distance_m(step: Step) -> float:
+    """Return how far the object was from the camera in the first accepted view; 1 m before there is one."""
+    if not step.views:
+        return 1.0
+    points_m = step.views[min(step.views)].points_m
+    return float(np.linalg.norm(points_m[:: math.ceil(len(points_m) / 500)].mean(axis=0)))
+
+
+def below_ring_m(step: Step) -> Array:
+    """Return a point (3,) that the eye over the whole graph sees below it: where a caption has room."""
+    first = step.views[min(step.views)]
+    towards_eye = OVER_THE_RING / np.linalg.norm(OVER_THE_RING)
+    down = np.array([0.0, 1.0, 0.0]) - towards_eye[1] * towards_eye
+    return first.centroid_m + upright(first) @ down * (_CAPTION * distance_m(step) / np.linalg.norm(down))
+
+
+def _edges(step: Step) -> Drawing:
+    """Yield the edges as lines between camera centres; an edge of a frame without a pose has no place."""
+    trajectory = step.solution.trajectory
+    lines: dict[str, list[list[Array]]] = {entities.ODOMETRY: [], entities.CLOSURE: [], entities.REJECTED: []}
+    for edge in step.edges_so_far:
+        if edge.source in trajectory and edge.target in trajectory:
+            accepted = entities.CLOSURE if edge.kind == "closure" else entities.ODOMETRY
+            path = accepted if step.solution.takes_part(edge) else entities.REJECTED
+            lines[path].append([trajectory[edge.target][:3, 3], trajectory[edge.source][:3, 3]])
+    yield entities.ODOMETRY, _lines(lines[entities.ODOMETRY], entities.ODOMETRY_RGB, 1.5)
+    yield entities.CLOSURE, _lines(lines[entities.CLOSURE], entities.CLOSURE_RGB, 2.5)
+    yield entities.REJECTED, _lines(lines[entities.REJECTED], entities.REJECTED_RGB, 1.5)
+
+
+def _lines(strips: Sequence[Array | list[Array]], rgb: entities.Rgb, points: float) -> rr.AsComponents:
+    """Return line strips `points` wide on the screen, or nothing where there are none."""
+    return rr.LineStrips3D(strips, colors=rgb, radii=rr.Radius.ui_points(points)) if strips else CLEAR
+
+
+def _frusta(poses: Array, camera: Camera, size_m: float, style: tuple[entities.Rgb, float]) -> rr.AsComponents:
+    """Return the cameras at `poses` (n, 4, 4) as pyramids `size_m` long, each one line strip."""
+    across = (np.array([0, camera.width, camera.width, 0]) - camera.cx) / camera.fx
+    down = (np.array([0, 0, camera.height, camera.height]) - camera.cy) / camera.fy
+    corners = size_m * np.stack([across, down, np.ones(4)], axis=1)
+    tip = np.zeros(3)
+    outline = np.array([tip, *corners, corners[0], tip, corners[1], corners[2], tip, corners[3]])
+    return _lines([se3.transform(pose, outline) for pose in poses], *style)
+
+
+def _axes(poses: Array, size_m: float) -> rr.AsComponents:
+    """Return the axes of the poses (n, 4, 4): x red, y green, z blue."""
+    if len(poses) == 0:
+        return CLEAR
+    return rr.Arrows3D(
+        origins=np.repeat(poses[:, :3, 3], 3, axis=0),
+        vectors=size_m * np.swapaxes(poses[:, :3, :3], 1, 2).reshape(-1, 3),
+        colors=np.tile(np.array(entities.AXIS_RGB, dtype=np.uint8), (len(poses), 1)),
+        radii=rr.Radius.ui_points(1.0),
+    )
+
 
 _LARGEST_3_SIGMA: Final = 0.3  # half axis of the largest ellipsoid of a chain, as a share of the object's distance
 _LARGEST_EDGE_SIGMA: Final = 0.12  # half axis of the largest ellipsoid of an edge, as a share of that distance
@@ -32,15 +132,15 @@ _BEFORE: Final = (
 )
 
 
-def drawing(step: Step) -> Drawing:
+def draw_uncertainty(step: Step) -> Drawing:
     """Yield the ellipsoids of the edges, of the poses, and of the poses of the chain before closure, all magnified."""
-    factor = magnification(step.edges_so_far, poses.distance_m(step))
-    shown = poses.shown(step)
-    after = {frame: step.solution.covariances[frame] for frame in shown if frame in step.solution.covariances}
+    factor = magnification(step.edges_so_far, distance_m(step))
+    frames = shown(step)
+    after = {frame: step.solution.covariances[frame] for frame in frames if frame in step.solution.covariances}
     yield from _of_poses(step, _AFTER, step.solution.trajectory, after, factor)
     root = next(iter(step.solution.odometry), None)  # the chain is walked outwards from it
     chain = dead_reckoning(PoseGraph(step.edges_so_far, root))
-    chained = {k: chain[k].covariance for k in shown if k in chain and k in step.solution.odometry}
+    chained = {k: chain[k].covariance for k in frames if k in chain and k in step.solution.odometry}
     yield from _of_poses(step, _BEFORE, step.solution.odometry, chained, factor)
     yield from _of_edges(step)
 
@@ -54,7 +154,7 @@ def _of_poses(
         for path in paths:
             yield path, CLEAR
         return
-    size_m = poses.camera_size_m(step)
+    size_m = camera_size_m(step)
     known_poses = np.array([trajectory[k] for k in covariances])
     rotations, centres = known_poses[:, :3, :3], known_poses[:, :3, 3]
     blocks = np.array(list(covariances.values()))
@@ -90,12 +190,7 @@ def _of_poses(
         ),
     )
     words = f"1 and 3 sd, {scale_words(factor)}"
-    yield label, clouds.caption(poses.below_ring_m(step), words, entities.UNCERTAINTY_RGB)
-
-
-def scale_words(factor: float) -> str:
-    """Say how many times larger than life something is drawn."""
-    return "to scale" if factor == 1.0 else f"drawn \N{MULTIPLICATION SIGN}{factor:g}"
+    yield label, caption(below_ring_m(step), words, entities.UNCERTAINTY_RGB)
 
 
 def _of_edges(step: Step) -> Drawing:
@@ -104,7 +199,7 @@ def _of_edges(step: Step) -> Drawing:
     edges = [
         edge
         for edge in step.edges_so_far
-        if edge.source in trajectory and edge.target in trajectory and poses.takes_part(edge, step)
+        if edge.source in trajectory and edge.target in trajectory and step.solution.takes_part(edge)
     ]
     edges = [edge for edge in edges if np.isfinite(edge.posterior.pose.covariance).all()]
     if not edges or not step.views:
@@ -115,7 +210,7 @@ def _of_edges(step: Step) -> Drawing:
     rotations = np.array([trajectory[edge.source][:3, :3] for edge in edges])
     blocks = np.array([edge.posterior.pose.covariance[3:, 3:] for edge in edges])
     half_axes, quaternions = ellipsoids(rotations @ blocks @ np.swapaxes(rotations, 1, 2))
-    factor = rounded_down(_LARGEST_EDGE_SIGMA * poses.distance_m(step) / max(float(half_axes.max()), 1e-9))
+    factor = rounded_down(_LARGEST_EDGE_SIGMA * distance_m(step) / max(float(half_axes.max()), 1e-9))
     factor = min(max(factor, 0.1), 1000.0)
     yield (
         entities.EDGES_1_SIGMA,
@@ -128,7 +223,7 @@ def _of_edges(step: Step) -> Drawing:
         ),
     )
     words = f"edges: 1 sd, {scale_words(factor)}"
-    yield entities.EDGES_MAGNIFICATION, clouds.caption(poses.below_ring_m(step), words, entities.UNCERTAINTY_RGB)
+    yield entities.EDGES_MAGNIFICATION, caption(below_ring_m(step), words, entities.UNCERTAINTY_RGB)
 
 
 def _edge_rgb(edge: Edge) -> entities.Rgb:
@@ -151,21 +246,6 @@ def magnification(edges: Sequence[Edge], distance_m: float) -> float:
         return 1.0
     sigma_m = math.sqrt(max(9.0 * variances[0], sum(variances)))  # room for nine edges from the start
     return min(max(rounded_down(_LARGEST_3_SIGMA * distance_m / (3.0 * sigma_m)), 0.1), 1000.0)
-
-
-def rounded_down(number: float) -> float:
-    """Return the largest of …, 0.5, 1, 2, 5, 10, … that is not above a positive number."""
-    decade = 10.0 ** math.floor(math.log10(number))
-    return max(factor * decade for factor in (1, 2, 5) if factor * decade <= number)
-
-
-def ellipsoids(covariances: Array) -> tuple[Array, Array]:
-    """Return the half axes (n, 3) at one sd and the orientations (n, 4: x, y, z, w) of covariances (n, 3, 3)."""
-    variances, axes = np.linalg.eigh(covariances)
-    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
-    half_axes = np.sqrt(np.maximum(variances, 0.0))
-    thinnest = np.maximum(0.02 * half_axes.max(axis=1, keepdims=True), 1e-9)  # a disc without thickness is not drawn
-    return np.maximum(half_axes, thinnest), Rotation.from_matrix(axes).as_quat()
 
 
 def axis_tip_covariances(rotation: Array, covariance: Array) -> Array:

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.fusion import surface
+from modeler.fusion import meshing
+from modeler.fusion.depth_views import GREY, free_of, posed_views
 from modeler.fusion.fuser import Fuser
-from modeler.fusion.views import GREY, free_of, posed_views
 from modeler.kernels import marching_cubes, tsdf
 from modeler.types import Array, ObjectModel, RayImage
 
@@ -99,11 +99,11 @@ class IncrementalTsdf:
         known = weights > 0.0
         values = np.where(known, self.sums[..., 1] / np.where(known, weights, 1.0), 0.0).astype(np.float32)
         positions, triangles = marching_cubes.extract(values, weights, np.argwhere(known))
-        shown = triangles[surface.large_pieces(positions, triangles, self.fuser.min_piece)]
-        used, shown = surface.used_vertices(shown, len(positions))
+        shown = triangles[meshing.large_pieces(positions, triangles, self.fuser.min_piece)]
+        used, shown = meshing.used_vertices(shown, len(positions))
         positions = positions[used]
         vertices_m = (np.array(self.low) + positions + 0.5) * self.voxel_m
-        normals = surface.normals_of(vertices_m, shown)
+        normals = meshing.normals_of(vertices_m, shown)
         colours = self._colours(positions)
         return ObjectModel(
             points_m=vertices_m,

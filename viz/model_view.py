@@ -1,0 +1,100 @@
+"""The model: its cloud while it grows, its mesh at the end, and the merged clouds before and after loop closure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from modeler import se3
+from modeler.export.mesh import MADE_UP_RGB
+from modeler.types import Array, ObjectModel, Step
+from viz import entities
+from viz.drawings import CLEAR, POINT_SIZE, Drawing, shaded
+
+_MODEL_POINTS: Final = 15_000
+_TRIANGLES: Final = 60_000
+_PLAIN: Final = 215.0  # grey of surface without colour
+
+
+def draw_model(step: Step) -> Drawing:
+    """Yield the model's cloud while it grows, and its mesh in place of the cloud on the last step."""
+    model = step.model
+    meshed = step.last and model is not None and len(model.triangles) > 0
+    if model is None or meshed:
+        yield entities.CLOUD, CLEAR
+    else:
+        stride = math.ceil(max(len(model.points_m), 1) / _MODEL_POINTS)
+        normals = model.normals[::stride]
+        colours = shaded((215, 215, 215), normals) if model.colours is None else model.colours[::stride]
+        yield entities.CLOUD, rr.Points3D(model.points_m[::stride], colors=colours, radii=POINT_SIZE)
+    yield entities.MESH, _mesh(model) if model is not None and meshed else CLEAR
+
+
+def _mesh(model: ObjectModel) -> rr.Mesh3D:
+    """Return the mesh, coarse enough for the recording to stay small; surface that nobody saw is tinted."""
+    colours = np.full(model.vertices_m.shape, _PLAIN) if model.vertex_colours is None else model.vertex_colours
+    colours = colours.astype(np.float64)
+    if model.vertex_views is not None:
+        made_up = model.vertex_views == 0
+        colours[made_up] = 0.5 * (colours[made_up] + MADE_UP_RGB)
+    attributes = np.concatenate([model.vertices_m, model.vertex_normals, colours], axis=1)
+    vertices, triangles = coarsened(attributes, model.triangles, _TRIANGLES)
+    return rr.Mesh3D(
+        vertex_positions=vertices[:, :3],
+        vertex_normals=vertices[:, 3:6],
+        triangle_indices=triangles,
+        vertex_colors=np.rint(vertices[:, 6:]).astype(np.uint8),
+    )
+
+
+def coarsened(vertices: Array, triangles: npt.NDArray[np.int64], limit: int) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Merge vertices that share a cell of a grid until at most `limit` triangles remain.
+
+    Args:
+        vertices: (v, 3 + k) positions in m, then k attributes that are averaged with them.
+        triangles: (t, 3) vertex numbers.
+        limit: how many triangles may remain.
+    """
+    a, b, c = np.moveaxis(vertices[triangles, :3], 1, 0)
+    area_m2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    cell_m = max(math.sqrt(1.5 * area_m2 / limit), 1e-9)  # cells hold about so much surface, of two triangles
+    merged, kept = vertices, triangles
+    while len(kept) > limit:
+        cells = np.floor((vertices[:, :3] - vertices[:, :3].min(axis=0)) / cell_m).astype(np.int64)
+        _, rows, columns = cells.max(axis=0) + 1
+        numbers = (cells[:, 0] * rows + cells[:, 1]) * columns + cells[:, 2]
+        _, cell_of, count = np.unique(numbers, return_inverse=True, return_counts=True)
+        merged = np.stack([np.bincount(cell_of, column) for column in vertices.T], axis=1) / count[:, None]
+        kept = cell_of[triangles]
+        kept = kept[(kept[:, 0] != kept[:, 1]) & (kept[:, 1] != kept[:, 2]) & (kept[:, 2] != kept[:, 0])]
+        cell_m *= 1.15
+    return merged, kept
+
+
+_MERGED_POINTS: Final = 60_000
+_RAMP_RGB: Final = ((70, 100, 255), (40, 190, 190), (255, 225, 60))  # from the first view to the last
+
+
+def draw_merged_clouds(step: Step) -> Drawing:
+    """Yield the merged points along the chain of edges and after optimisation, on the last step alone."""
+    if step.last and len(step.solution.trajectory) > 1:
+        yield entities.MERGED_BEFORE, _merged_points(step, step.solution.odometry)
+        yield entities.MERGED_AFTER, _merged_points(step, step.solution.trajectory)
+
+
+def _merged_points(step: Step, poses: Mapping[int, Array]) -> rr.Points3D:
+    """Return the points of all views that have a pose, a colour a view from blue to yellow."""
+    frames = [frame for frame in sorted(poses) if frame in step.views]
+    stride = math.ceil(max(sum(len(step.views[frame].points_m) for frame in frames), 1) / _MERGED_POINTS)
+    parts = [se3.transform(poses[frame], step.views[frame].points_m[::stride]) for frame in frames]
+    along = np.linspace(0.0, 2.0, max(len(frames), 2))[: len(frames)]
+    shades = np.stack([np.interp(along, [0.0, 1.0, 2.0], channel) for channel in zip(*_RAMP_RGB, strict=True)], axis=1)
+    colours = np.repeat(np.rint(shades), [len(part) for part in parts], axis=0)
+    return rr.Points3D(
+        np.concatenate([np.zeros((0, 3)), *parts]), colors=colours.astype(np.uint8), radii=rr.Radius.ui_points(1.25)
+    )
