@@ -1,4 +1,4 @@
-"""What every sequence offers, whatever it is read from."""
+"""The interface of sequences, and selections of their frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from modeler.types import Array, Frame, InputError
 
 
 class AbstractSequence(ABC):
-    """Frames of one rigid object in order of time, as often as one asks for them.
+    """Frames of one rigid object in order of time; it can be iterated over repeatedly.
 
     Frame numbers ascend, but need be neither dense nor start at 0. Frames are read when asked for.
     """
@@ -53,11 +53,11 @@ class AbstractSequence(ABC):
     @property
     @abstractmethod
     def motion(self) -> Mapping[str, object] | None:
-        """What is known of the motion, `{"kind": "turntable", "step_deg": 25, …}`; None where nothing is."""
+        """Known motion, `{"kind": "turntable", "step_deg": 25, …}`; None if nothing is known."""
 
     @property
     def robot_path(self) -> Path | None:
-        """The trajectory of the hand that holds the object; None where there is none."""
+        """Trajectory of the robot hand that holds the object; None if there is none."""
         return None
 
     @property
@@ -67,30 +67,30 @@ class AbstractSequence(ABC):
 
     @property
     def layout(self) -> str:
-        """What the sequence is stored as, in words."""
+        """Storage format, for people."""
         return "frames in memory"
 
     @property
     def depth_unit(self) -> str:
-        """What one unit of stored depth is, and who says so, in words."""
+        """Unit of the stored depth and its source, for people."""
         return "m"
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the reader assumed, or left out, that somebody should know; a sentence each."""
+        """What the reader assumed or left out, a sentence each."""
         return ()
 
     @property
     def live(self) -> bool:
-        """Whether more frames come than `indices` tells, so that iterating takes as long as they take to come."""
+        """Whether more frames arrive than `indices` lists; iterating waits for them."""
         return False
 
     def recorded(self) -> AbstractSequence:
-        """Return what is there already, which ends by itself, of a live sequence."""
+        """Return the frames that have already arrived, as a sequence that ends."""
         return self
 
     def until(self, stop: Callable[[], bool]) -> AbstractSequence:
-        """Return the sequence that, where it is live, ends as soon as `stop` says so."""
+        """Return the sequence, which, if live, ends as soon as `stop()` is true."""
         return self
 
     def __len__(self) -> int:
@@ -105,7 +105,7 @@ class AbstractSequence(ABC):
         """Return a part of the sequence.
 
         Args:
-            every: keep the first frame and every so many-th after it.
+            every: stride over the frames.
             frames: keep frame numbers from `start` up to but not including `stop`.
 
         Raises:
@@ -124,10 +124,10 @@ class AbstractSequence(ABC):
 
 @dataclass(frozen=True)
 class AbstractDerived(AbstractSequence):
-    """Another sequence but for what is overridden."""
+    """A view of another sequence; subclasses override what differs."""
 
     whole: AbstractSequence
-    """The other sequence."""
+    """The underlying sequence."""
 
     @property
     def name(self) -> str:
@@ -153,12 +153,12 @@ class AbstractDerived(AbstractSequence):
 
     @property
     def motion(self) -> Mapping[str, object] | None:
-        """What is known of the motion between consecutive frames of the other sequence."""
+        """Known motion between consecutive frames of the underlying sequence."""
         return self.whole.motion
 
     @property
     def robot_path(self) -> Path | None:
-        """The trajectory of the hand that holds the object; None where there is none."""
+        """Trajectory of the robot hand that holds the object; None if there is none."""
         return self.whole.robot_path
 
     @property
@@ -183,15 +183,15 @@ class AbstractDerived(AbstractSequence):
 
     @property
     def live(self) -> bool:
-        """Whether more frames come than `indices` tells."""
+        """Whether more frames arrive than `indices` lists."""
         return self.whole.live
 
     def recorded(self) -> AbstractSequence:
-        """Return what is there already, which ends by itself, of a live sequence."""
+        """Return the frames that have already arrived, as a sequence that ends."""
         return replace(self, whole=self.whole.recorded())
 
     def until(self, stop: Callable[[], bool]) -> AbstractSequence:
-        """Return the sequence that, where it is live, ends as soon as `stop` says so."""
+        """Return the sequence, which, if live, ends as soon as `stop()` is true."""
         return replace(self, whole=self.whole.until(stop))
 
 
@@ -223,10 +223,10 @@ class SelectedSequence(AbstractDerived):
 
 
 def check_every(every: int) -> None:
-    """Refuse to keep every so many-th frame where that is none.
+    """Check a stride.
 
     Raises:
-        InputError: where it keeps nothing.
+        InputError: where it is less than 1.
     """
     if every < 1:
         raise InputError(f"--every {every} keeps no frame; give a whole number of at least 1.")
@@ -246,6 +246,6 @@ def frame_range(text: str) -> slice:
 
 
 def span(indices: tuple[int, ...]) -> str:
-    """Return frame numbers in words, for messages."""
+    """Return a range of frame numbers as text."""
     count = f"{len(indices)} frame" + ("" if len(indices) == 1 else "s")
     return f"{indices[0]} to {indices[-1]}, {count}" if indices else "none"

@@ -61,7 +61,7 @@ def camera_from_model(node: Node) -> Array:
     """Return the pose (4, 4), in m, of one object of `scene_gt.json`.
 
     Raises:
-        InputError: where rotation or translation is missing or the rotation is none.
+        InputError: where rotation or translation is missing or not valid.
     """
     entry = node.need("cam_R_m2c")
     written = entry.numbers(9).reshape(3, 3)
@@ -96,14 +96,14 @@ class BopSequence(AbstractRecording):
     """A BOP scene folder, the onboarding layouts among them.
 
     Of several objects the first (`mask_visib/*_000000.png`, first ground truth) counts.
-    Opening checks the layout, the intrinsics and `sequence.json`; pictures and ground truth are read when asked for.
+    Opening checks the layout, the intrinsics and `sequence.json`; images and ground truth are read on demand.
     """
 
     overrides: Overrides = field(default_factory=Overrides)
-    """What counts more than the folder."""
+    """Values that take precedence over the files."""
 
     def __post_init__(self) -> None:
-        """Check everything that can be checked without decoding a picture.
+        """Check everything that can be checked without decoding an image.
 
         Raises:
             InputError: where the folder is no readable scene.
@@ -254,7 +254,7 @@ class BopSequence(AbstractRecording):
 
 
 def _numbered(root: Path, name: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Return the pictures of a folder of a sequence by the number that is their name."""
+    """Return the images of a folder by the frame number in their name."""
     found: dict[int, Path] = {}
     for path in entries(inside(root / name, root)):
         number = frame_number(path.stem)
@@ -308,7 +308,7 @@ def write_bop(
 
 
 def _tidy(folder: Path) -> None:
-    """Remove what programs that were killed have left of the folder beside it."""
+    """Remove partial folders that killed processes have left."""
     for left in folder.parent.glob(f".{glob.escape(folder.name)}.*.partial"):
         process = left.name.split(".")[-2]
         try:
@@ -335,11 +335,11 @@ def _fill(
         matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
         cameras[str(frame.index)] = camera_entry(matrix, depth_scale_mm)
         times_s[str(frame.index)] = frame.time_s
-        _picture(folder / "depth" / f"{stem}.png", _raw_depth(frame, depth_scale_mm))
+        _image(folder / "depth" / f"{stem}.png", _raw_depth(frame, depth_scale_mm))
         if frame.mask is not None:
-            _picture(folder / "mask_visib" / f"{stem}_000000.png", frame.mask.astype(np.uint8) * np.uint8(255))
+            _image(folder / "mask_visib" / f"{stem}_000000.png", frame.mask.astype(np.uint8) * np.uint8(255))
         if frame.colour is not None:
-            _picture(folder / "rgb" / f"{stem}{colour_suffix}", frame.colour)
+            _image(folder / "rgb" / f"{stem}{colour_suffix}", frame.colour)
     _json(folder / "scene_camera.json", cameras)
     if truth is not None:
         _json(folder / "scene_gt.json", {str(index): [pose_entry(pose)] for index, pose in truth.items()})
@@ -358,7 +358,7 @@ def _raw_depth(frame: Frame, depth_scale_mm: float) -> npt.NDArray[np.uint16]:
     return np.where(measured, np.maximum(units, 1.0), 0.0).astype(np.uint16)
 
 
-def _picture(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
+def _image(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
     path.parent.mkdir(exist_ok=True)
     write_image(path, pixels)
 
@@ -391,13 +391,13 @@ def true_mesh(sequence: AbstractSequence) -> Mesh:
         if found is not None:
             return read_mesh(found, _MM)
     raise InputError(
-        f"{sequence.name}: has no true surface to compare with; put model.ply (m) beside its frames, or BOP's models "
-        "folder (mm) beside its split"
+        f"{sequence.name}: has no true surface to compare with; put model.ply (m) next to its frames, or BOP's models "
+        "folder (mm) next to its split"
     )
 
 
 def _of_dataset(scene: Path) -> Path | None:
-    """Return the model of a scene's first object, beside the scene or its split."""
+    """Return the model of a scene's first object, next to the scene or its split."""
     truth = scene / "scene_gt.json"
     if not is_there(truth):
         return None

@@ -40,7 +40,7 @@ class CloudSequence(AbstractRecording):
     unit_mm: float
     """Millimetres per unit of the coordinates."""
     given: Intrinsics | None
-    """Intrinsics where somebody says them."""
+    """Intrinsics that take precedence over fitted ones."""
 
     def __post_init__(self) -> None:
         """Check the first cloud's header and `sequence.json`.
@@ -83,7 +83,7 @@ class CloudSequence(AbstractRecording):
         return Frame(index, float(index), depth, camera, None, colour)
 
     def truth(self) -> dict[int, Array] | None:
-        """Return None: clouds do not tell the object's pose."""
+        """Return None: clouds have no ground truth."""
         return None
 
     @property
@@ -148,7 +148,7 @@ def organised(path: Path) -> tuple[int, int]:
     columns, rows, points = (int(found[1]) if found else 0 for found in sizes)
     if columns < 2 or rows < 2 or columns * rows != points:
         raise InputError(
-            f"{path}: is not organised as an image, of so many columns and rows; save the camera's cloud as it comes "
+            f"{path}: is not organised as an image of columns and rows; save the camera's cloud as it comes "
             "(PCD with WIDTH and HEIGHT, PLY with obj_info num_cols and num_rows), or its depth image."
         )
     if points > MAX_PIXELS:

@@ -48,12 +48,12 @@ def _open(path: Path | EmbeddedImage, formats: tuple[str, ...]) -> Image.Image:
         with _stream(path) as stream, warnings.catch_warnings(), _unlogged():
             warnings.simplefilter("ignore")  # what is wrong is reported below, in one line
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(stream, formats=formats) as picture:
-                if picture.width * picture.height > MAX_PIXELS:
+            with Image.open(stream, formats=formats) as image:
+                if image.width * image.height > MAX_PIXELS:
                     raise Image.DecompressionBombError
-                with _quiet() if picture.format == "TIFF" else contextlib.nullcontext():
-                    picture.load()
-                return picture
+                with _quiet() if image.format == "TIFF" else contextlib.nullcontext():
+                    image.load()
+                return image
     except InputError:
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
@@ -115,8 +115,8 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with _stream(path) as stream, warnings.catch_warnings(), _unlogged():
             warnings.simplefilter("ignore")
-            with Image.open(stream, formats=("PNG", "TIFF", "JPEG")) as picture:
-                return picture.size
+            with Image.open(stream, formats=("PNG", "TIFF", "JPEG")) as image:
+                return image.size
     except InputError:
         raise
     except Exception as error:
@@ -140,12 +140,12 @@ def read_depth(path: Path | EmbeddedImage) -> npt.NDArray[np.uint16]:
     Raises:
         InputError: where the file is missing, broken, too large or not 16-bit greyscale.
     """
-    picture = _open(path, ("PNG", "TIFF"))
-    if picture.mode not in ("I;16", "I;16B", "I"):
-        kind = _KINDS.get(picture.mode, f"of mode {picture.mode}")
+    image = _open(path, ("PNG", "TIFF"))
+    if image.mode not in ("I;16", "I;16B", "I"):
+        kind = _KINDS.get(image.mode, f"of mode {image.mode}")
         raise InputError(f"{path}: is {kind}; depth must be a 16-bit greyscale PNG or TIFF image.")
-    pixels = np.asarray(picture)
-    if picture.mode == "I" and (pixels.min(initial=0) < 0 or pixels.max(initial=0) > np.iinfo(np.uint16).max):
+    pixels = np.asarray(image)
+    if image.mode == "I" and (pixels.min(initial=0) < 0 or pixels.max(initial=0) > np.iinfo(np.uint16).max):
         raise InputError(f"{path}: holds values beyond 16 bits; depth must be a 16-bit greyscale PNG or TIFF image.")
     return pixels.astype(np.uint16)
 
@@ -156,8 +156,8 @@ def read_mask(path: Path) -> BoolArray:
     Raises:
         InputError: where the file is missing, broken or too large.
     """
-    picture = _open(path, ("PNG",))
-    pixels = np.asarray(picture if picture.mode in ("1", "L", "I;16", "I") else picture.convert("L"))
+    image = _open(path, ("PNG",))
+    pixels = np.asarray(image if image.mode in ("1", "L", "I;16", "I") else image.convert("L"))
     return pixels != 0
 
 
@@ -167,20 +167,20 @@ def read_colour(path: Path | EmbeddedImage) -> npt.NDArray[np.uint8]:
     Raises:
         InputError: where the file is missing, broken or too large.
     """
-    picture = _open(path, ("PNG", "JPEG", "TIFF"))
-    if picture.mode.startswith("I"):  # 16-bit grey, which Pillow would clip rather than scale
-        grey = (np.asarray(picture).astype(np.uint32) >> 8).astype(np.uint8)
+    image = _open(path, ("PNG", "JPEG", "TIFF"))
+    if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip rather than scale
+        grey = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
         return np.repeat(grey[:, :, None], 3, axis=2)
-    return np.array(picture.convert("RGB"))
+    return np.array(image.convert("RGB"))
 
 
 def write_image(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
     """Write pixels as the suffix says: PNG as small as it gets, or JPEG at quality 85."""
-    picture = Image.fromarray(np.ascontiguousarray(pixels))
+    image = Image.fromarray(np.ascontiguousarray(pixels))
     if path.suffix == ".jpg":
-        picture.save(path, quality=85, optimize=True)
+        image.save(path, quality=85, optimize=True)
     else:
-        picture.save(path, compress_level=9, optimize=True)
+        image.save(path, compress_level=9, optimize=True)
 
 
 def metres(raw: npt.NDArray[np.uint16], scale_mm: float) -> npt.NDArray[np.float32]:

@@ -34,22 +34,22 @@ from sequences.recording import AbstractRecording, paired
 @final
 @dataclass(frozen=True)
 class FrameFiles:
-    """The pictures of one frame."""
+    """Files of one frame."""
 
     time_s: float
     """Time of capture in s."""
     depth: Path
-    """16-bit picture."""
+    """16-bit image."""
     colour: Path | None = None
     """Colour aligned to depth, in its size or finer."""
     mask: Path | None = None
-    """Not black = object."""
+    """Non-zero = object."""
 
 
 @final
 @dataclass(frozen=True)
 class ImageFolderSequence(AbstractRecording):
-    """Pictures in folders with one camera for all of them."""
+    """Image files of one camera."""
 
     files: Mapping[int, FrameFiles]
     """By frame number, ascending."""
@@ -58,9 +58,9 @@ class ImageFolderSequence(AbstractRecording):
     depth_scale_mm: float
     """Millimetres per unit of depth."""
     what: str
-    """The layout in words."""
+    """Storage format, for people."""
     unit_source: str
-    """Who says what the unit is."""
+    """Source of the unit."""
     read_truth: Callable[[], dict[int, Array] | None] = lambda: None
     """Reads the true camera_from_model (4, 4) in m by frame number, when it is asked for."""
     remarks: tuple[str, ...] = ()
@@ -128,7 +128,7 @@ UNIT_MM = 0.2
 CALIBRATION = (525.0, 525.0, 319.5, 239.5)
 """What the benchmark recommends for its images of 640 x 480, which come without intrinsics."""
 FARTHEST_M = 1e6
-"""No camera moves so far."""
+"""Largest plausible coordinate of a camera in m."""
 MAX_GAP_S = 0.2
 """Ground truth is not interpolated over longer gaps."""
 
@@ -148,10 +148,10 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
     pairs, remarks = paired(depth, colour)
     files: dict[int, FrameFiles] = {}
     for index, pair in pairs.items():
-        picture = _listed(path, "depth.txt", pair.depth[0])
-        shot_colour = None if pair.colour is None else _listed(path, "rgb.txt", pair.colour[0])
-        mask = masks.get(picture.stem) or (None if shot_colour is None else masks.get(shot_colour.stem))
-        files[index] = FrameFiles(pair.time_s, picture, shot_colour, mask)
+        image = _listed(path, "depth.txt", pair.depth[0])
+        colour_path = None if pair.colour is None else _listed(path, "rgb.txt", pair.colour[0])
+        mask = masks.get(image.stem) or (None if colour_path is None else masks.get(colour_path.stem))
+        files[index] = FrameFiles(pair.time_s, image, colour_path, mask)
     used = {one.mask for one in files.values()}
     strange = [mask.name for mask in masks.values() if mask not in used]
     if strange:
@@ -249,17 +249,17 @@ def _list(path: Path, words: int) -> list[tuple[float, list[str]]]:
 
 
 def _listed(root: Path, by: str, name: str) -> Path:
-    """Return a picture that a list names.
+    """Return an image file named in a list.
 
     Raises:
         InputError: where there is none, or it lies elsewhere.
     """
     name = name.strip()
     if not name.isprintable():
-        raise InputError(f"{root / by}: names a picture with control characters; correct it there.")
+        raise InputError(f"{root / by}: names an image with control characters; correct it there.")
     path = inside(root / name, root)
     if not is_there(path):
-        raise InputError(f"{root / by}: names {name}, which is not there; add the picture or remove the line.")
+        raise InputError(f"{root / by}: names {name}, which is not there; add the image or remove the line.")
     return path
 
 
@@ -271,7 +271,7 @@ POSES = "annotated_poses"
 def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
     """Open a folder with `depth/` and intrinsics, and where they are there `color/` or `rgb/`, and `masks/`.
 
-    Depth is in mm unless the file of intrinsics or somebody says otherwise, as both programs have it.
+    Depth is in mm unless the file of intrinsics or the user gives another unit, as in both programs.
 
     Raises:
         InputError: where it is not readable as such.
@@ -296,10 +296,10 @@ def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
         if others:
             remarks.append(f"{len(others)} {what}s belong to no depth image and are left out ({others[0]})")
     files = {
-        numbers[stem]: FrameFiles(_time_s(stem, numbers[stem]), picture, colour.get(stem), masks.get(stem))
-        for stem, picture in depth.items()
+        numbers[stem]: FrameFiles(_time_s(stem, numbers[stem]), image, colour.get(stem), masks.get(stem))
+        for stem, image in depth.items()
     }
-    unit_mm, who = found.unit(overrides, (1.0, "nothing says otherwise"))
+    unit_mm, who = found.unit(overrides, (1.0, "the default"))
     return ImageFolderSequence(
         path,
         files=dict(sorted(files.items())),
@@ -313,14 +313,14 @@ def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
 
 
 def _layout(path: Path) -> str:
-    """Return whose layout a folder has, in words."""
+    """Return the name of a folder's layout."""
     if (path / "cam_K.txt").exists() and first_folder(path, (*MASK_FOLDERS, POSES)) is not None:
         return "BundleSDF folder"
     return "Open3D folder" if (path / "camera_intrinsic.json").exists() else "folder of pictures"
 
 
 def frame_numbers(stems: list[str]) -> dict[str, int] | None:
-    """Return the frame numbers that names are, begin with, or differ by alone; None where they do not tell."""
+    """Parse frame numbers: whole names, leading digits, or the only digits that differ; None if ambiguous."""
     for numbered in (stems, [re.split(r"[^0-9]", stem)[0] for stem in stems], _differences(stems)):
         numbers = [frame_number(stem) for stem in numbered]
         known = [number for number in numbers if number is not None]
@@ -330,7 +330,7 @@ def frame_numbers(stems: list[str]) -> dict[str, int] | None:
 
 
 def _differences(stems: list[str]) -> list[str]:
-    """Return the digits by which names such as `depth_9` and `depth_10` differ, where that is all; else nothing."""
+    """Return the digits in which names such as `depth_9` and `depth_10` differ, if nothing else does."""
     rows = [re.split(r"([0-9]+)", stem) for stem in stems]
     if len({len(row) for row in rows}) != 1:
         return []
@@ -340,7 +340,7 @@ def _differences(stems: list[str]) -> list[str]:
 
 
 def _time_s(stem: str, number: int) -> float:
-    """Return the time that a long number in a name tells in ns; else the frame number."""
+    """Return the time in s of a name that is a time stamp in ns; else the frame number."""
     return int(stem) * 1e-9 if stem.isascii() and stem.isdigit() and 16 <= len(stem) <= 19 else float(number)
 
 
@@ -350,7 +350,7 @@ def _partners(
     """Return the images of a folder by the name of the depth image to which they belong, and the names of the others.
 
     Raises:
-        InputError: where neither names nor numbers nor order tell.
+        InputError: where neither names nor numbers nor order match them.
     """
     folder = first_folder(root, names)
     if folder is None:
@@ -373,7 +373,7 @@ def _partners(
 
 
 def _posed_truth(root: Path, numbers: Mapping[str, int]) -> dict[int, Array] | None:
-    """Return camera_from_model by frame number as BundleSDF's or Open3D's files tell it; None without."""
+    """Return camera_from_model by frame number from BundleSDF's or Open3D's pose files; None without."""
     posed = {path.stem: path for path in entries(root / POSES) if path.suffix == ".txt"}
     if posed:
         found = {number: _pose(inside(posed[stem], root)) for stem, number in numbers.items() if stem in posed}

@@ -27,7 +27,7 @@ def input_errors(path: Path, what: str, advice: str) -> Iterator[None]:
     Args:
         path: the file.
         what: what it should be, as in "bag".
-        advice: what to do where it is none.
+        advice: what to do about it.
 
     Raises:
         InputError: in place of anything else.
@@ -71,15 +71,15 @@ def is_there(path: Path) -> bool:
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...], root: Path) -> dict[str, Path]:
-    """Return the pictures of a folder by name without ending; hidden files are none.
+    """Return the images of a folder by stem, without hidden files.
 
     Args:
-        folder: where; a folder that is not there has none.
-        suffixes: endings in small letters, such as `.png`.
+        folder: may be missing.
+        suffixes: in lower case, such as `.png`.
         root: the sequence that the folder belongs to.
 
     Raises:
-        InputError: where the folder may not be read, two pictures share a name, or a link leads out of the sequence.
+        InputError: where the folder may not be read, two images share a name, or a link leads out of the sequence.
     """
     found: dict[str, Path] = {}
     for path in entries(inside(folder, root)):
@@ -109,7 +109,7 @@ def inside(path: Path, root: Path) -> Path:
 
 
 def frame_number(stem: str) -> int | None:
-    """Return the frame number that a name is; None where it is none, or too long to be one."""
+    """Parse a frame number of at most nine digits; None if it is none."""
     return int(stem) if stem.isascii() and stem.isdigit() and len(stem) <= 9 else None
 
 
@@ -145,7 +145,7 @@ class Node:
         return InputError(f"{self.path}: {self.where} is {shown}; it must be {expected}.")
 
     def unknown(self, known: Sequence[str]) -> InputError:
-        """Return the error for an entry whose key is none of the known ones."""
+        """Return the error for an entry with an unknown key."""
         near = difflib.get_close_matches(self.keys[-1], known, n=1)
         hint = f"did you mean {near[0]}?" if near else f"it takes {', '.join(known)}."
         return InputError(f"{self.path}: {self.where} is not known; {hint}")
@@ -243,7 +243,7 @@ def read_text(path: Path, kind: str = "text") -> str:
 
     Args:
         path: the file.
-        kind: what it should be, for messages.
+        kind: what it should be, for error messages.
 
     Raises:
         InputError: where it is no regular file, missing, larger, or not UTF-8.

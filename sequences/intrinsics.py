@@ -1,4 +1,4 @@
-"""Intrinsics: as the user overrides them, and as programs write them beside their images."""
+"""Intrinsics: overrides by the user, and the files that programs write next to their images."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from sequences.input_files import Node, inside, is_there, read_text, read_tree
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy in px."""
 RANGE = "fx and fy from 1 to 1e6, cx and cy from -1e6 to 1e6"
-"""What intrinsics can be, in words."""
+"""Range of intrinsics, for messages."""
 
 
 @dataclass(frozen=True)
 class Overrides:
-    """Facts that take precedence over what the reader would find or assume."""
+    """Values that take precedence over what the files say or the reader assumes."""
 
     intrinsics: Intrinsics | None = None
     """fx, fy, cx, cy of the depth camera in px."""
@@ -72,30 +72,30 @@ NAMES = (
 @final
 @dataclass(frozen=True)
 class CameraFacts:
-    """What is told of the camera of a folder of pictures."""
+    """What is known of the camera of a folder of images."""
 
     intrinsics: Intrinsics
     """fx, fy, cx, cy in px."""
     by: str
-    """The file, or the option, that tells it."""
+    """The file, or the option, that it comes from."""
     unit_mm: float | None = None
     """Millimetres per unit of depth, where the file says so."""
     size: tuple[int, int] | None = None
     """Width and height in px of the images that the file is of, where it says so."""
 
     def unit(self, overrides: Overrides, usual: tuple[float, str]) -> tuple[float, str]:
-        """Return the millimetres per unit of depth, and who says so.
+        """Return the millimetres per unit of depth, and its source.
 
         Args:
-            overrides: what counts more.
-            usual: what holds where nobody says anything.
+            overrides: values that take precedence.
+            usual: the default and its source.
         """
         if overrides.depth_scale_mm is not None:
             return overrides.depth_scale_mm, "--depth-scale-mm"
         return usual if self.unit_mm is None else (self.unit_mm, self.by)
 
     def doubts(self, size: tuple[int, int]) -> list[str]:
-        """Return in words why it may not be the camera of images of some width and height; none where it may."""
+        """Return remarks where the intrinsics are of images of another (width, height)."""
         if self.size in (None, size):
             return []
         return [
@@ -105,11 +105,11 @@ class CameraFacts:
 
 
 def find_intrinsics(folder: Path, overrides: Overrides) -> CameraFacts | None:
-    """Return what is told of the camera of a folder of pictures; None where nobody tells its intrinsics.
+    """Return what is known of the camera of a folder of images; None without intrinsics.
 
     Args:
         folder: where to look.
-        overrides: what counts more.
+        overrides: values that take precedence.
 
     Raises:
         InputError: where a file of intrinsics cannot be read.

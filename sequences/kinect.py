@@ -127,18 +127,18 @@ class KinectSequence(AbstractStreams[int]):
             raise InputError(f"{self.path}: depth image {index} is cut off; record it anew.")
         return metres(np.frombuffer(data, ">u2").reshape(camera.height, camera.width).astype(np.uint16), self.unit_mm)
 
-    def aligned(self, index: int, stamp: int, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
+    def colour_at(self, index: int, stamp: int, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
         """Return colour (h, w, 3) as RGB at the pixels of depth; None without a colour camera."""
         if self.alignment is None:
             return None
-        picture = self.file.picture("COLOR", stamp, f"{self.path}: colour image {index}")
+        image = self.file.image("COLOR", stamp, f"{self.path}: colour image {index}")
         camera = self.alignment.colour.camera
-        if picture.shape[:2] != (camera.height, camera.width):
+        if image.shape[:2] != (camera.height, camera.width):
             raise InputError(
-                f"{self.path}: colour image {index} is {picture.shape[1]} x {picture.shape[0]} pixels where the track "
+                f"{self.path}: colour image {index} is {image.shape[1]} x {image.shape[0]} pixels where the track "
                 f"says {camera.width} x {camera.height}; record it anew."
             )
-        return self.alignment.aligned(depth_m, picture)
+        return self.alignment.align(depth_m, image)
 
     @property
     def layout(self) -> str:
@@ -187,7 +187,7 @@ class Matroska:
         """Return what `calibration.json`, which is attached to the recording, says.
 
         Raises:
-            InputError: where nothing of the kind is attached.
+            InputError: where it is not attached.
         """
         with input_errors(self.path, "recording", _AGAIN):
             for attached in self._container.streams.attachments:
@@ -216,8 +216,8 @@ class Matroska:
         with input_errors(self.path, "recording", _AGAIN):
             return bytes(self._find(title, stamp))
 
-    def picture(self, title: str, stamp: int, where: str) -> npt.NDArray[np.uint8]:
-        """Return one image as RGB (h, w, 3); `where` names it for messages.
+    def image(self, title: str, stamp: int, where: str) -> npt.NDArray[np.uint8]:
+        """Return one image as RGB (h, w, 3); `where` is for error messages.
 
         Raises:
             InputError: where it cannot be decoded.

@@ -20,16 +20,16 @@ Pixel = TypeVar("Pixel", np.uint8, np.uint16, np.float32)
 @final
 @dataclass(frozen=True)
 class Lens:
-    """A camera whose lens bends lines: radial and tangential coefficients as ROS, OpenCV and the Kinect have them."""
+    """A camera with radial and tangential distortion, with the coefficients of ROS, OpenCV and the Kinect."""
 
     camera: Camera
-    """The camera, of the bent and of the straight picture alike."""
+    """Intrinsics, of the distorted and the undistorted image alike."""
     coefficients: tuple[float, ...]
     """k1 k2 p1 p2 k3 (`plumb_bob`), and k4 k5 k6 for `rational_polynomial`."""
 
     @property
-    def bends(self) -> bool:
-        """Whether there is anything to take out."""
+    def is_distorted(self) -> bool:
+        """Whether any coefficient is not zero."""
         return any(abs(value) > 1e-9 for value in self.coefficients)
 
     def distort(self, w: Array, h: Array) -> tuple[Array, Array]:
@@ -43,19 +43,19 @@ class Lens:
             h * radial + p1 * (square + 2.0 * h**2) + 2.0 * p2 * w * h,
         )
 
-    def straight(self, picture: npt.NDArray[Pixel], outside: float = 0.0) -> npt.NDArray[Pixel]:
-        """Return a picture (h, w) or (h, w, c) without distortion: each pixel from the nearest bent one.
+    def undistort(self, image: npt.NDArray[Pixel], outside: float = 0.0) -> npt.NDArray[Pixel]:
+        """Undistort an image (h, w) or (h, w, c): each pixel is the nearest distorted one.
 
         Depth must not be mixed from several pixels, so nothing is.
 
         Args:
-            picture: as the camera took it.
+            image: as the camera took it.
             outside: what pixels get that the camera did not see.
         """
-        if not self.bends:
-            return picture
+        if not self.is_distorted:
+            return image
         rows, columns, inside = self._sources
-        result = picture[rows, columns]
+        result = image[rows, columns]
         result[~inside] = outside
         return result
 
@@ -73,20 +73,20 @@ _BROWN = ("plumb_bob", "rational_polynomial", "Brown Conrady", "Modified Brown C
 """RealSense's library projects by one formula in all three models of that name, to 0.02 px."""
 
 
-def known(camera: Camera, bend: Sequence[float], model: str, where: str) -> Lens:
+def lens_of_model(camera: Camera, distortion: Sequence[float], model: str, where: str) -> Lens:
     """Return the lens that a file describes.
 
     Args:
         camera: the camera.
-        bend: coefficients in the model's order.
+        distortion: coefficients in the model's order.
         model: what the file calls the model of distortion.
-        where: the file, for messages.
+        where: the file, for error messages.
 
     Raises:
-        InputError: where the lens bends lines and the model is not known.
+        InputError: where there is distortion by an unknown model.
     """
-    found = Lens(camera, coefficients(bend))
-    if found.bends and model not in _NO_NAME + _BROWN:
+    found = Lens(camera, coefficients(distortion))
+    if found.is_distorted and model not in _NO_NAME + _BROWN:
         raise InputError(f"{where}: its distortion model {model!r} is not known; record the rectified topic.")
     return found
 
@@ -100,12 +100,12 @@ def coefficients(values: Sequence[float]) -> tuple[float, ...]:
 
 
 OCCLUSION_SHARE = 0.02
-"""What lies farther than this share behind something in the colour camera's view is hidden from it."""
+"""Relative depth behind the nearest surface from which on a point counts as occluded."""
 
 NEIGHBOUR_M = 0.02
-"""What the colour camera does not see takes the colour of what it sees at most so far away."""
+"""Occluded pixels take the colour of the nearest visible surface within this distance."""
 STRIDE = 3
-"""One in so many points may lend its colour."""
+"""Stride over the visible points in that search."""
 
 
 @final
@@ -120,14 +120,14 @@ class Alignment:
     colour_from_depth: Array
     """(4, 4) in m."""
 
-    def aligned(self, depth_m: npt.NDArray[np.float32], picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    def align(self, depth_m: npt.NDArray[np.float32], image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
         """Return the colour (h, w, 3) of each depth pixel; black where there is no depth.
 
         What the colour camera does not see takes the colour of the nearest surface that it sees, if that is near.
 
         Args:
             depth_m: (h, w) of the depth camera, NaN where nothing was measured.
-            picture: (h', w', 3) as the colour camera took it.
+            image: (h', w', 3) as the colour camera took it.
         """
         rays = self.depth.rays()
         rows, columns = np.nonzero(np.isfinite(depth_m) & (depth_m > 0.0))
@@ -144,7 +144,7 @@ class Alignment:
         seen = inside.copy()
         seen[inside] = self._visible(columns_there[inside], rows_there[inside], there[inside, 2])
         found = np.zeros((len(rows), 3), np.uint8)
-        found[seen] = picture[rows_there[seen], columns_there[seen]]
+        found[seen] = image[rows_there[seen], columns_there[seen]]
         found[~seen] = _nearest_colours(there, seen, found)
         result = np.zeros((*depth_m.shape, 3), np.uint8)
         result[rows, columns] = found

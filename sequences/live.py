@@ -20,11 +20,11 @@ from sequences.intrinsics import Overrides
 from sequences.lens import Lens, coefficients
 
 FIRST = 10
-"""So many frames are taken before anything is said of the sequence."""
+"""Number of frames taken before the sequence is described."""
 
 
-PATIENCE = 100
-"""So often may a camera give the same image."""
+MAX_REPEATS = 100
+"""Largest number of repetitions of one image."""
 
 
 class AbstractCamera(ABC):
@@ -57,18 +57,18 @@ class AbstractCamera(ABC):
 @final
 @dataclass(frozen=True)
 class LiveSequence(AbstractSequence):
-    """What a camera sees from now on, an image whenever one is asked for, until it is told to stop."""
+    """Images of a running camera, taken on demand until `stop()` is true."""
 
     camera: AbstractCamera
     """The running camera."""
     seen: tuple[Frame, ...]
     """What it saw first."""
     every: int = 1
-    """Keep the first image and every so many-th after it."""
+    """Stride over the images."""
     kept: slice = field(default_factory=lambda: slice(None, None))
     """Keep these frame numbers."""
     stop: Callable[[], bool] = lambda: False
-    """Asked before each image: whether to come to an end."""
+    """Polled before each image; true ends the sequence."""
 
     @property
     def name(self) -> str:
@@ -155,12 +155,12 @@ def begin(camera: AbstractCamera, first: int | None = None) -> LiveSequence:
 
 def _next(camera: AbstractCamera, number: int, after_s: float | None) -> Frame:
     """Return the first image that is not the one of `after_s` again, as it may come with another colour image."""
-    for _ in range(PATIENCE):
+    for _ in range(MAX_REPEATS):
         time_s, raw, colour = camera.take()
         if time_s != after_s:
             lens = camera.lens
-            depth_m = lens.straight(metres(raw, camera.unit_mm), float("nan"))
-            return Frame(number, time_s, depth_m, lens.camera, None, None if colour is None else lens.straight(colour))
+            depth_m = lens.undistort(metres(raw, camera.unit_mm), float("nan"))
+            return Frame(number, time_s, depth_m, lens.camera, None, None if colour is None else lens.undistort(colour))
     raise InputError(f"{camera.name}: gives the same image again and again; plug it in anew.")
 
 
@@ -169,7 +169,7 @@ SCHEME = "realsense:"
 ADVICE = "a RealSense camera is read by its maker's library; pip install 'modeler[realsense]'"
 WARM_UP = 30
 """Images after which exposure has settled."""
-PATIENCE_MS = 5000
+TIMEOUT_MS = 5000
 
 
 def open_camera(serial: str, overrides: Overrides, context: Any = None) -> LiveSequence:
@@ -177,7 +177,7 @@ def open_camera(serial: str, overrides: Overrides, context: Any = None) -> LiveS
 
     Args:
         serial: its serial number; empty for the only one.
-        overrides: what counts more than what the camera says.
+        overrides: values that take precedence over the camera's.
         context: where to look for cameras; everywhere without it.
 
     Raises:
@@ -227,7 +227,7 @@ class RealsenseCamera(AbstractCamera):
         Args:
             rs: the library.
             serial: may be empty.
-            overrides: what counts more than what the camera says.
+            overrides: values that take precedence over the camera's.
             context: where to look for cameras; None for everywhere.
 
         Raises:
@@ -255,9 +255,9 @@ class RealsenseCamera(AbstractCamera):
             raise InputError(f"{where}: cannot be started ({' '.join(str(error).split())}); plug it in anew.") from None
         found = (intrinsics.fx, intrinsics.fy, intrinsics.ppx, intrinsics.ppy)
         camera = Camera(intrinsics.width, intrinsics.height, *(overrides.intrinsics or found))
-        bend = () if overrides.intrinsics else coefficients(intrinsics.coeffs)
+        distortion = () if overrides.intrinsics else coefficients(intrinsics.coeffs)
         scale_mm = unit_mm if overrides.depth_scale_mm is None else overrides.depth_scale_mm
-        running = cls(pipeline, rs.align(rs.stream.depth), model, Lens(camera, bend), scale_mm)
+        running = cls(pipeline, rs.align(rs.stream.depth), model, Lens(camera, distortion), scale_mm)
         weakref.finalize(running, pipeline.stop)
         return running
 
@@ -277,13 +277,13 @@ class RealsenseCamera(AbstractCamera):
         return self.scale_mm
 
     def take(self) -> tuple[float, npt.NDArray[np.uint16], npt.NDArray[np.uint8] | None]:
-        """Return the newest image; older ones that nobody asked for are lost."""
+        """Return the newest image; older ones are dropped."""
         try:
-            frames = self.align.process(self.pipeline.wait_for_frames(PATIENCE_MS))
+            frames = self.align.process(self.pipeline.wait_for_frames(TIMEOUT_MS))
             depth, colour = frames.get_depth_frame(), frames.get_color_frame()
             raw = np.asanyarray(depth.get_data()).astype(np.uint16)
-            picture = np.array(colour.get_data(), dtype=np.uint8) if colour else None
-            return float(depth.get_timestamp()) / 1000.0, raw, picture
+            image = np.array(colour.get_data(), dtype=np.uint8) if colour else None
+            return float(depth.get_timestamp()) / 1000.0, raw, image
         except RuntimeError as error:
             raise InputError(
                 f"{self.model}: gives no image ({' '.join(str(error).split())}); plug it in anew."

@@ -20,7 +20,7 @@ REACH = 4
 MIN_JUMP = 0.03
 """Least step of depth at a border, as a share of the depth."""
 LARGEST_STEP_PX = 1.5
-"""A border goes on in the next row within so many pixels."""
+"""Largest step of an edge from row to row in px."""
 WIDEST_SHADOW_PX = 60
 """A near thing that is followed by nothing for longer is not known to have a border there."""
 STEEPEST = 1.5
@@ -31,8 +31,8 @@ WINDOW = 9
 
 @final
 @dataclass(frozen=True)
-class Border:
-    """A border across a number of rows (or columns)."""
+class DepthEdge:
+    """A depth discontinuity across a number of rows (or columns)."""
 
     variance_px2: float
     """Variance of its position at right angles to itself: over time, and about a smooth curve."""
@@ -42,12 +42,12 @@ class Border:
     """Number of rows."""
 
 
-def borders(depth_m: Array, middle_m: Array) -> list[Border]:
+def borders(depth_m: Array, middle_m: Array) -> list[DepthEdge]:
     """Find the borders in frames of a still scene and measure how unsteady they are.
 
     In each row the position of a border is the number of pixels around it that belong to the near thing: pixel by pixel
-    a frame either sees the near thing or does not. Its variance over time tells of what changes from frame to frame,
-    its distance from a curve through its neighbours of what stays.
+    a frame either sees the near thing or does not. Its variance over time measures the temporal noise,
+    its distance from a curve through its neighbours the fixed-pattern noise.
 
     Args:
         depth_m: (n, h, w), NaN where nothing was measured.
@@ -63,7 +63,7 @@ def borders(depth_m: Array, middle_m: Array) -> list[Border]:
     return found
 
 
-def pooled_px(found: list[Border]) -> float | None:
+def pooled_px(found: list[DepthEdge]) -> float | None:
     """Return the standard deviation in px that half of the borders, by length, do not exceed; None without any."""
     if not found:
         return None
@@ -124,7 +124,7 @@ def _chains(positions: Array, rows: int) -> list[Array]:
     return [np.stack(chain) for chain in closed + open_chains if len(chain) >= WINDOW + 3]
 
 
-def _measured(chain: Array, frames: int) -> list[Border]:
+def _measured(chain: Array, frames: int) -> list[DepthEdge]:
     """Return what a chain says, unless it runs too nearly along the rows."""
     smooth, slope = savgol_coeffs(WINDOW, 2), savgol_coeffs(WINDOW, 2, deriv=1)
     where = chain[:, 1]
@@ -138,11 +138,11 @@ def _measured(chain: Array, frames: int) -> list[Border]:
     over_time = chain[half:-half, 2][straight]
     about_curve = residual[straight] ** 2 / (1.0 - smooth[half]) - over_time / frames
     variance = float(np.mean(squeeze * over_time) + max(np.mean(squeeze * about_curve), 0.0))
-    return [Border(variance, float(np.median(chain[:, 3])), int(np.count_nonzero(straight)))]
+    return [DepthEdge(variance, float(np.median(chain[:, 3])), int(np.count_nonzero(straight)))]
 
 
 HALF = 3
-"""Surfaces are compared with a quadric over so many pixels to either side."""
+"""Half width of the window of the quadric fit in px."""
 MAX_BEND = 0.05
 """Where neighbours differ by more than this share of the depth, there is no surface."""
 DISTANCE_STEP = 1.15
@@ -270,16 +270,16 @@ MAX_MOVING = 0.02
 @final
 @dataclass(frozen=True)
 class Calibration:
-    """What a still scene says of its camera."""
+    """Noise of a camera measured in a static scene."""
 
     model: NoiseModel
     """The noise."""
     bins: tuple[NoiseBin, ...]
-    """What was measured along the ray, by distance and angle."""
-    borders: tuple[Border, ...]
-    """What was measured across it."""
+    """Variance along the ray by distance and angle."""
+    borders: tuple[DepthEdge, ...]
+    """Variance across the ray at depth discontinuities."""
     frames: int
-    """From how many frames."""
+    """Number of frames."""
 
 
 def calibrate(sequence: AbstractSequence) -> Calibration:

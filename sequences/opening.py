@@ -25,11 +25,11 @@ BAGS = (".bag", ".mcap", ".db3")
 
 
 def open_sequence(path: str | Path, overrides: Overrides | None = None) -> AbstractSequence:
-    """Open the sequence at a path; what it is stored as is told from the path.
+    """Open the sequence at a path in whichever supported format.
 
     Args:
         path: a folder or a file, or `realsense:` for a live camera.
-        overrides: what a person says of it.
+        overrides: values that take precedence over the files.
 
     Raises:
         InputError: where it does not hold a readable sequence.
@@ -46,10 +46,10 @@ def open_sequence(path: str | Path, overrides: Overrides | None = None) -> Abstr
 
 
 def _meant(path: Path) -> str:
-    """Return a question after what lies there under nearly that name, "" where nothing does."""
-    with contextlib.suppress(OSError):  # whatever is wrong with the folder is told of the path
-        beside = [other.name for other in path.parent.iterdir()]
-        if near := difflib.get_close_matches(path.name, beside, n=1, cutoff=0.75):
+    """Return a suggestion of a similar name in the same folder, "" if there is none."""
+    with contextlib.suppress(OSError):  # the error about the path itself follows
+        siblings = [other.name for other in path.parent.iterdir()]
+        if near := difflib.get_close_matches(path.name, siblings, n=1, cutoff=0.75):
             return f"did you mean {path.parent / near[0]}? Else "
     return ""
 
@@ -125,6 +125,6 @@ def _advice(path: Path) -> str:
         return f"is the folder of the images alone; give the one it lies in, {path.absolute().parent}."
     if any(entry.suffix.lower() == ".png" for folder in ("", *inner) for entry in entries(path / folder)):
         return (
-            "holds pictures but no folder depth; put the depth images into one, and camera.json or cam_K.txt beside it."
+            "holds images but no folder depth; put the depth images into one, and camera.json or cam_K.txt next to it."
         )
     return f"holds no depth images where they are looked for; give {FORMATS}."

@@ -22,7 +22,7 @@ from sequences.lens import Lens
 class AbstractRecording(AbstractSequence):
     """A sequence in a folder or a file, of whatever format.
 
-    What the format cannot say stands in `sequence.json` of the folder, or in `NAME.json` beside a file `NAME.bag`.
+    Facts outside the format are read from `sequence.json` in the folder, or from `NAME.json` next to a file `NAME.bag`.
     """
 
     path: Path
@@ -121,7 +121,7 @@ def _poke(node: Node) -> dict[str, object]:
 
 
 Stamp = TypeVar("Stamp")
-"""By what a stream finds one of its images again."""
+"""Key of an image in its stream."""
 MAX_APART_S = 0.02
 """Depth and colour farther apart in time than this are no pair (the TUM benchmark's own tool has the same)."""
 
@@ -141,7 +141,7 @@ class ImagePair(Generic[Stamp]):
 
 @dataclass(frozen=True)
 class AbstractStreams(AbstractRecording, Generic[Stamp]):
-    """A stream of depth images, one of colour images beside it, and a lens to be straightened."""
+    """Streams of depth and colour images, with lens distortion."""
 
     lens: Lens
     """The depth camera."""
@@ -155,7 +155,7 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
         """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured.
 
         Args:
-            index: frame number, for messages.
+            index: frame number, for error messages.
             stamp: which image of the stream.
 
         Raises:
@@ -163,11 +163,11 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
         """
 
     @abstractmethod
-    def aligned(self, index: int, stamp: Stamp, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
+    def colour_at(self, index: int, stamp: Stamp, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
         """Return colour (h, w, 3) as RGB at the pixels of a depth image (h, w) without distortion; None without.
 
         Args:
-            index: frame number, for messages.
+            index: frame number, for error messages.
             stamp: which image of the stream.
             depth_m: the depth image.
 
@@ -185,12 +185,12 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
         pair = self.pairs.get(index)
         if pair is None:
             raise self.absent(index)
-        depth_m = self.lens.straight(self.seen_m(index, pair.depth), float("nan"))
-        colour = None if pair.colour is None else self.aligned(index, pair.colour, depth_m)
+        depth_m = self.lens.undistort(self.seen_m(index, pair.depth), float("nan"))
+        colour = None if pair.colour is None else self.colour_at(index, pair.colour, depth_m)
         return Frame(index, pair.time_s, depth_m, self.lens.camera, None, colour)
 
     def truth(self) -> dict[int, Array] | None:
-        """Return None: cameras do not tell the object's pose."""
+        """Return None: recordings of cameras have no ground truth."""
         return None
 
     @property
@@ -202,24 +202,24 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
 def paired(
     depth: Sequence[tuple[float, Stamp]], colour: Sequence[tuple[float, Stamp]]
 ) -> tuple[dict[int, ImagePair[Stamp]], list[str]]:
-    """Return depth images, each with the colour image nearest in time, and in words how many have none.
+    """Pair each depth image with the colour image nearest in time; also return remarks.
 
     Args:
         depth: times in s, ascending, and images; their places become the frame numbers.
-        colour: likewise; empty where there is none, of which nothing is said.
+        colour: likewise; may be empty.
     """
     partners = nearest([time_s for time_s, _ in depth], [time_s for time_s, _ in colour], MAX_APART_S)
     pairs = {
         index: ImagePair(time_s, image, None if partner is None else colour[partner][1])
         for index, ((time_s, image), partner) in enumerate(zip(depth, partners, strict=True))
     }
-    alone = partners.count(None)
-    said = f"{alone} depth images have no colour image within {MAX_APART_S * 1000:g} ms"
-    return pairs, [said] if colour and alone else []
+    unpaired = partners.count(None)
+    remark = f"{unpaired} depth images have no colour image within {MAX_APART_S * 1000:g} ms"
+    return pairs, [remark] if colour and unpaired else []
 
 
 def nearest(times_s: Sequence[float], others_s: Sequence[float], limit_s: float) -> list[int | None]:
-    """Return for each time the place of the nearest other time within a limit; None where there is none."""
+    """Return the index of the nearest other time within a limit for each time; None if there is none."""
     if not others_s:
         return [None] * len(times_s)
     all_s = np.asarray(others_s, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""A look at every frame before it is used: what a sequence holds, what is missing, and what cannot be true."""
+"""Inspection of all frames: what a sequence holds, what is missing, and what is implausible."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sequences.base import AbstractSequence, span
 
 NEAREST_M = 0.01
 FARTHEST_M = 100.0
-"""No depth camera for objects measures nearer or farther; a median beyond tells of a wrong unit."""
+"""Range of the median depth; beyond, the unit is wrong."""
 
 
 LIKELY_M = (0.25, 5.0)
@@ -62,11 +62,11 @@ class Survey:
     colours: int
     """Number of frames with colour."""
     truths: int | None
-    """Number of frames with a true pose; None where nobody looked."""
+    """Number of frames with a true pose; None if not checked."""
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What is not there, in words, and what follows."""
+        """What is missing and the consequences, for people."""
         total, lacks = len(self.indices), []
         if self.masks < total:
             what = "no masks" if self.masks == 0 else f"no mask in {total - self.masks} frames"
@@ -84,7 +84,7 @@ class Survey:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What may be meant otherwise than it is said, in words."""
+        """What is likely to be wrong, for people."""
         middle_m, doubts = self.range_m[1], []
         if not LIKELY_M[0] <= middle_m <= LIKELY_M[1]:
             what = "near" if middle_m < LIKELY_M[0] else "far"
@@ -116,7 +116,7 @@ class Survey:
                 )
         if self.joined < LEAST_JOINED:
             doubts.append(
-                f"{1.0 - self.joined:.0%} of the measured pixels have none beside them: single points show no "
+                f"{1.0 - self.joined:.0%} of the measured pixels have no measured neighbours: single points show no "
                 "surface to register; fill the gaps, or scale the images down until they close"
             )
         if self.repeated:
@@ -132,7 +132,7 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
 
     Args:
         sequence: what to look at.
-        truth: whether to look at the ground truth too, which whoever estimates must not.
+        truth: whether to read the ground truth too; estimation must not.
 
     Raises:
         InputError: where a frame or the ground truth cannot be read, none measures anything, all masks are empty, or

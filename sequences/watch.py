@@ -24,7 +24,7 @@ POLL_S = 0.05
 @final
 @dataclass(frozen=True)
 class WatchLimits:
-    """How long to wait for what."""
+    """Time limits of watching a folder."""
 
     idle_s: float = 10.0
     """When nothing has come for so long, the sequence is over."""
@@ -39,25 +39,25 @@ class WatchLimits:
 class WatchedSequence(AbstractDerived):
     """The frames in a folder, and those that will come, each once it is complete.
 
-    What is not iterated over, such as `indices` and `name`, is as it was when the sequence was opened.
+    `indices`, `name` and the rest keep their values from when the sequence was opened.
     """
 
     path: Path
     """The folder, in any layout of pictures."""
     overrides: Overrides = field(default_factory=Overrides)
-    """What a person says of it."""
+    """Values that take precedence over the files."""
     patience: WatchLimits = field(default_factory=WatchLimits)
     """How long to wait."""
     every: int = 1
-    """Keep the first frame and every so many-th after it."""
+    """Stride over the frames."""
     kept: slice = field(default_factory=lambda: slice(None, None))
     """Keep these frame numbers."""
     stop: Callable[[], bool] = lambda: False
-    """Asked while waiting: whether to come to an end."""
+    """Polled while waiting; true ends the sequence."""
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Frame numbers so far."""
+        """Numbers of the frames that have arrived."""
         wanted = [index for index in self.whole.indices if self._wants(index)]
         return tuple(wanted[:: self.every])
 

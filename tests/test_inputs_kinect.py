@@ -77,7 +77,7 @@ def test_depth_comes_out_straight_and_colour_aligned(tmp_path: Path) -> None:
     lens = depth_lens(Node(calibration(), path), (WIDTH, HEIGHT), None)
     for raw, frame in zip(images, sequence, strict=True):
         assert frame.time_s == pytest.approx(frame.index / 30.0, abs=2e-3)
-        expected = lens.straight(np.where(raw == 0, np.nan, raw * 0.001).astype(np.float32), float("nan"))
+        expected = lens.undistort(np.where(raw == 0, np.nan, raw * 0.001).astype(np.float32), float("nan"))
         np.testing.assert_allclose(frame.depth_m, expected, rtol=1e-6)
         assert np.isfinite(frame.depth_m).mean() > 0.9
         assert frame.colour is not None
@@ -107,7 +107,7 @@ def test_a_recording_of_the_makers_library_is_read(tmp_path: Path) -> None:
     for number, frame in enumerate(sequence):
         raw = scene.depth(number, *recording.DEPTH)
         wanted = np.where(raw == 0, np.nan, raw * 0.001).astype(np.float32)
-        np.testing.assert_allclose(frame.depth_m, sequence.lens.straight(wanted, float("nan")), rtol=1e-6)
+        np.testing.assert_allclose(frame.depth_m, sequence.lens.undistort(wanted, float("nan")), rtol=1e-6)
         assert frame.time_s == pytest.approx(number * recording.STEP_US * 1e-6, abs=1e-6)
         assert frame.colour is not None
         coloured = np.argwhere(frame.colour.any(axis=2))
@@ -227,10 +227,10 @@ def test_images_larger_than_their_track_are_bounded(tmp_path: Path, monkeypatch:
         container.mux(packet)
     container.close()
     stamp = Matroska(tmp_path / "s.mkv").stamps("COLOR")[1][1]
-    assert Matroska(tmp_path / "s.mkv").picture("COLOR", stamp, "image 1").shape == (240, 320, 3)
+    assert Matroska(tmp_path / "s.mkv").image("COLOR", stamp, "image 1").shape == (240, 320, 3)
     monkeypatch.setattr("sequences.kinect.MAX_PIXELS", 64 * 48)
     with pytest.raises(InputError, match=r"s\.mkv: is not a readable recording"):
-        Matroska(tmp_path / "s.mkv").picture("COLOR", stamp, "image 1")
+        Matroska(tmp_path / "s.mkv").image("COLOR", stamp, "image 1")
 
 
 def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,7 +248,7 @@ def test_what_is_hidden_from_the_colour_camera_does_not_get_the_colour_before_it
     depth_m[0, 0] = np.nan
     picture = np.zeros((60, 80, 3), np.uint8)
     picture[..., 0] = np.arange(80, dtype=np.uint8) + 1
-    colour = beside.aligned(depth_m, picture)
+    colour = beside.align(depth_m, picture)
     assert colour[0, 0].sum() == 0
     near, far = 70.0 * 0.1 / 0.5, 70.0 * 0.1 / 2.0
     assert colour[30, 40, 0] == 40 + 1 - near
@@ -266,7 +266,7 @@ def test_what_is_hidden_takes_the_colour_of_the_same_surface_close_by() -> None:
     far_px, near_px = 300 * 0.05 / 0.5, 300 * 0.05 / 0.4
     picture = np.full((120, 160, 3), (0, 0, 200), np.uint8)
     picture[40:80, int(100 - near_px) : int(120 - near_px) + 1] = (200, 0, 0)
-    colour = beside.aligned(depth_m, picture)
+    colour = beside.align(depth_m, picture)
     assert (colour[60, 100:120, 0] == 200).all()
     assert (colour[60, int(far_px) + 1 : 99, 2] == 200).all()
     assert (colour[60, 122:, 2] == 200).all()

@@ -137,7 +137,7 @@ def test_depth_of_lines_or_single_points_is_asked_about(
     write_open3d(tmp_path / "s", list(map(thinned, frames)))
     doubts = survey(open_sequence(tmp_path / "s")).doubts
     assert [doubt.partition(":")[0] for doubt in doubts] == [
-        "100% of the measured pixels have none beside them"
+        "100% of the measured pixels have no measured neighbours"
     ] * sparse
 
 

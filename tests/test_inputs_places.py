@@ -31,7 +31,7 @@ def test_pictures_that_lie_elsewhere_are_seen(
         shutil.copytree(written / "bop" / "depth", place)
     for name in ("flat", "deeper"):
         assert main(["info", str(tmp_path / name)]) == 2
-        assert "holds pictures but no folder depth; put the depth images into one" in capsys.readouterr().err
+        assert "holds images but no folder depth; put the depth images into one" in capsys.readouterr().err
     (tmp_path / "deeper" / "images").rename(tmp_path / "deeper" / "Depth_16bit")
     assert main(["info", str(tmp_path / "deeper")]) == 2
     assert "if its depth images are those in Depth_16bit, rename that to depth" in capsys.readouterr().err

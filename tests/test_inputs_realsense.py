@@ -22,7 +22,7 @@ from modeler.cli import main
 from modeler.export import RunFolder
 from modeler.types import Camera, Frame, InputError
 from sequences import CalibratedSequence, NoiseModel, Overrides, open_sequence, survey
-from sequences.lens import Lens, known
+from sequences.lens import Lens, lens_of_model
 from sequences.live import AbstractCamera, begin, open_camera
 from sequences.ros.sequence import RosSequence
 
@@ -179,7 +179,7 @@ def test_the_makers_library_sees_points_where_our_lens_does(rs: Any, model: str)
     intrinsics.ppx, intrinsics.ppy, intrinsics.coeffs = 320.0, 240.0, list(recording.BEND)
     intrinsics.model = getattr(rs.distortion, model)
     camera = Camera(640, 480, 385.0, 384.0, 320.0, 240.0)
-    ours = known(camera, recording.BEND, model.replace("_", " ").title(), "here")
+    ours = lens_of_model(camera, recording.BEND, model.replace("_", " ").title(), "here")
     for x, y in itertools.product(np.linspace(-0.8, 0.8, 9), np.linspace(-0.6, 0.6, 7)):
         w, h = ours.distort(np.array(x), np.array(y))
         theirs = rs.rs2_project_point_to_pixel(intrinsics, [x, y, 1.0])
@@ -336,7 +336,7 @@ def test_a_camera_that_is_unplugged_leaves_what_it_gave(
 def test_a_camera_is_straightened() -> None:
     camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
     lens = Lens(camera, (-0.3, 0.1))
-    assert lens.bends
-    straight = lens.straight(np.arange(64 * 48, dtype=np.uint16).reshape(48, 64))
+    assert lens.is_distorted
+    straight = lens.undistort(np.arange(64 * 48, dtype=np.uint16).reshape(48, 64))
     assert straight[0, 0] > 0  # from further in
     assert straight[24, 32] == 24 * 64 + 32

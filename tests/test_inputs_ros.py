@@ -349,7 +349,7 @@ def test_mcap_of_other_systems_says_so(tmp_path: Path, capfd: pytest.CaptureFixt
     path.write_bytes(content[:21] + b"ros3" + content[25:])
     assert main(["info", str(path)]) == 2
     assert capfd.readouterr().err == (
-        f"modeler: {path}: holds messages of 'ros3' where those of ROS are read from MCAP; record it with ROS\n"
+        f"modeler: {path}: holds messages of profile 'ros3' where those of ROS are read from MCAP; record it with ROS\n"
     )
 
 

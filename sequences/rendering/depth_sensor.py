@@ -20,7 +20,7 @@ from modeler.types import Array, BoolArray
 @final
 @dataclass(frozen=True)
 class LateralJitter:
-    """Pixels look a little beside where they should, their neighbours with them."""
+    """Correlated lateral jitter of the pixels' rays."""
 
     sigma_px: float = 0.4
     """Standard deviation along rows and columns."""
@@ -32,7 +32,7 @@ class LateralJitter:
         _not_negative(sigma_px=self.sigma_px, correlation_px=self.correlation_px)
 
     def offsets_px(self, shape: tuple[int, int], rng: np.random.Generator) -> tuple[Array, Array]:
-        """Draw how far beside each pixel looks, along columns and rows, each (h, w)."""
+        """Draw the lateral offsets of the pixels in px, along columns and rows, each (h, w)."""
         along_w, along_h = (self.sigma_px * gaussian_field(shape, self.correlation_px, rng) for _ in range(2))
         return along_w, along_h
 
@@ -40,7 +40,7 @@ class LateralJitter:
 @final
 @dataclass(frozen=True)
 class DisparityNoise:
-    """Disparity is noisy and comes in steps."""
+    """Noise and quantisation of the disparity."""
 
     sigma_px: float = 0.07
     """Standard deviation of the disparity of a surface that faces the camera."""
@@ -74,7 +74,7 @@ class DisparityNoise:
 @final
 @dataclass(frozen=True)
 class GrazingLoss:
-    """Surfaces seen at a grazing angle are lost in patches."""
+    """Drop-out at grazing incidence, in patches."""
 
     start_deg: float = 70.0
     """Incidence from which on pixels are lost."""
@@ -95,7 +95,7 @@ class GrazingLoss:
 @final
 @dataclass(frozen=True)
 class MixedPixels:
-    """At the border of two surfaces a pixel may measure something between them."""
+    """Mixed pixels: at depth discontinuities a pixel may measure a depth between the two surfaces."""
 
     probability: float = 0.05
     """Share of border pixels that do."""
@@ -119,7 +119,7 @@ class MixedPixels:
 @final
 @dataclass(frozen=True)
 class RandomLoss:
-    """A few pixels are lost in small patches anywhere."""
+    """Drop-out of small patches anywhere."""
 
     probability: float = 0.002
     """Share of pixels that are lost."""
@@ -167,7 +167,7 @@ def _share(**values: float) -> None:
 @final
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """What the rays of one image met."""
+    """Ray hits of one image."""
 
     depth_m: Array
     """(h, w) distance along the optical axis; NaN where they met nothing."""
@@ -191,11 +191,11 @@ class DepthSensor:
     shadow: bool = True
     """Whether what the projector does not light is lost."""
     jitter: LateralJitter | None = field(default_factory=LateralJitter)
-    """Pixels look a little aside."""
+    """Lateral jitter."""
     mixed: MixedPixels | None = field(default_factory=MixedPixels)
-    """Borders mix."""
+    """Mixed pixels."""
     disparity: DisparityNoise | None = field(default_factory=DisparityNoise)
-    """Noise and steps of disparity."""
+    """Disparity noise."""
     grazing: GrazingLoss | None = field(default_factory=GrazingLoss)
     """Loss of grazing surfaces."""
     loss: RandomLoss | None = field(default_factory=RandomLoss)

@@ -27,7 +27,7 @@ def build(annotation: object, node: Node) -> typing.Any:
         node: what the file says.
 
     Raises:
-        InputError: where the file says something else; keys that nobody asked for are refused.
+        InputError: where a value has the wrong type or a key is unknown.
     """
     origin, choices = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
@@ -210,7 +210,7 @@ class Recipe:
     trajectory: AnyTrajectory = field(default_factory=Tabletop)
     """How the object moves."""
     sensor: DepthSensor | None = field(default_factory=DepthSensor)
-    """How the camera errs; null for exact depth."""
+    """Errors of the depth camera; null for exact depth."""
     colour: Literal["none", "png", "jpg"] = "none"
     """Whether and how colour images are written."""
     pattern: Mosaic | None = None

@@ -22,7 +22,7 @@ from sequences.rendering.shapes import placement
 @final
 @dataclass(frozen=True)
 class Tabletop:
-    """Somebody pushes the object about the table: it turns by about a step and shifts a little at random."""
+    """The object is pushed over the table by hand: each step turns it by about `step_deg` and shifts it a little."""
 
     frames: int = 14
     """Number of frames."""
@@ -142,7 +142,7 @@ class Hand:
     height_m: float = 0.1
     """Height of the object's centre above the table's plane in m."""
     robot: RobotReadings | None = None
-    """Who holds the object: a robot that writes `robot.txt`, or a person."""
+    """The robot that holds the object and writes `robot.txt`; null for a person."""
 
     def __post_init__(self) -> None:
         """Check the sizes."""

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 MAX_BYTES = 1 << 30
 """Chunks and messages that would unpack to more are refused."""
 MAX_RATIO = 100
-"""So are larger files that would unpack to more than so many times their size: depth images are not so dull."""
+"""Largest compression ratio of larger files: depth images never reach it."""
 _PIECE = 1 << 20
 _ZSTD = b"\x28\xb5\x2f\xfd"  # what its files begin with
 
@@ -92,7 +92,7 @@ def is_zstd(data: bytes) -> bool:
 
 
 def of_size(unpack: Callable[[bytes, int], bytes]) -> Callable[[bytes, int], bytes]:
-    """Return what unpacks to a size that is told beforehand, if it is one that may be."""
+    """Return a decompressor that checks the size announced for the result."""
 
     def bounded(data: bytes, size: int) -> bytes:
         if size > MAX_BYTES:
@@ -103,7 +103,7 @@ def of_size(unpack: Callable[[bytes, int], bytes]) -> Callable[[bytes, int], byt
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file packed by zstd that would unpack to something enormous; other files may be what they are.
+    """Refuse a file packed by zstd that would unpack to something enormous; other files are not checked.
 
     Raises:
         ValueError: where it would.
@@ -122,7 +122,7 @@ def check_file(path: Path) -> None:
 
 def _whole(unpacked: bytes, *, ended: bool, most: int) -> bytes:
     if len(unpacked) > most:
-        raise ValueError(f"a chunk would unpack to more than it says, or than {MAX_BYTES >> 20} MB")
+        raise ValueError(f"a chunk would unpack to more than announced, or than {MAX_BYTES >> 20} MB")
     if not ended:
         raise ValueError("a chunk is cut off")
     return unpacked
@@ -183,7 +183,7 @@ class Bag:
 
         Args:
             topic: one of `types`.
-            most: stop after so many.
+            most: largest number of messages.
 
         Raises:
             InputError: where the bag is broken.
@@ -256,7 +256,7 @@ def _kind(connection: Connection) -> str:
 def _image_alone(data: bytes) -> bytes:
     """Return a ROS 1 image message without the bytes that RealSense's recorder leaves behind it."""
     at = 12  # behind number and time
-    for fixed in (8, 5, 0):  # texts and pixels tell their lengths; between them: size, order and step
+    for fixed in (8, 5, 0):  # strings and pixels are preceded by their lengths; between them: size, byte order and step
         (length,) = struct.unpack_from("<I", data, at)
         at += 4 + length + fixed
     return data[:at]
@@ -333,7 +333,7 @@ class _Renamed(io.FileIO):
 
 
 def _profile(path: Path) -> str | None:
-    """Return whose messages an MCAP file says to hold, as in `ros2`; None where it is none."""
+    """Return the profile of an MCAP file, such as `ros2`; None if it is no MCAP file."""
     with open_regular(path) as file:
         start = file.read(_PROFILE_AT + 64)
     if not start.startswith(_MCAP) or len(start) < _PROFILE_AT:
@@ -345,10 +345,9 @@ def _profile(path: Path) -> str | None:
 def _check_profile(path: Path) -> None:
     """Refuse an MCAP file of messages that are not ROS's, as far as its header says so."""
     profile = _profile(path)
-    if profile not in ("ros1", "ros2", None):  # what is no MCAP file at all the library tells
+    if profile not in ("ros1", "ros2", None):  # the library refuses what is no MCAP file
         raise InputError(
-            f"{path}: holds messages of {repr(profile) if profile else 'nobody knows what'} where those of ROS are "
-            "read from MCAP; record it with ROS."
+            f"{path}: holds messages of profile {profile!r} where those of ROS are read from MCAP; record it with ROS."
         )
 
 

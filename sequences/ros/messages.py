@@ -12,7 +12,7 @@ import numpy.typing as npt
 from modeler.types import Camera, InputError
 from sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour, read_depth
 from sequences.intrinsics import sane
-from sequences.lens import Lens, known
+from sequences.lens import Lens, lens_of_model
 from sequences.ros.bag import MAX_BYTES, from_zstd
 
 IMAGE, PACKED, CAMERA = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
@@ -48,7 +48,7 @@ def depth_m(message: Any, unit_mm: float, where: str) -> npt.NDArray[np.float32]
     Args:
         message: an image for which `is_depth`.
         unit_mm: what one unit of 16-bit depth is.
-        where: the bag and the topic, for messages.
+        where: the bag and the topic, for error messages.
 
     Raises:
         InputError: where the message contradicts itself.
@@ -103,14 +103,14 @@ class _Raw:
     __msgtype__: str = IMAGE
 
 
-def _unpacked(message: Any, told: re.Match[str], where: str) -> _Raw:
-    """Return an image whose pixels are packed by zstd, as `told` by its format, without that."""
-    width, height, step = (int(number) for number in told.groups()[1:])
+def _unpacked(message: Any, packing: re.Match[str], where: str) -> _Raw:
+    """Return an image with its zstd-compressed pixels decompressed; `packing` is the match of its format."""
+    width, height, step = (int(number) for number in packing.groups()[1:])
     try:
         data = from_zstd(bytes(message.data), min(step * height, MAX_BYTES))
     except ValueError as error:
         raise InputError(f"{where}: cannot be unpacked ({error}); record it anew.") from None
-    return _Raw(told[1], width, height, step, np.frombuffer(data, np.uint8))
+    return _Raw(packing[1], width, height, step, np.frombuffer(data, np.uint8))
 
 
 def lens(message: Any, where: str, *, ros1: bool) -> Lens:
@@ -120,12 +120,12 @@ def lens(message: Any, where: str, *, ros1: bool) -> Lens:
         InputError: where it is not calibrated, or is no pinhole camera with common distortion.
     """
     matrix = np.asarray(message.K if ros1 else message.k, dtype=np.float64)
-    bend = np.asarray(message.D if ros1 else message.d, dtype=np.float64)
+    distortion = np.asarray(message.D if ros1 else message.d, dtype=np.float64)
     fx, _, cx, _, fy, cy = (float(value) for value in matrix[:6])
-    if not sane((fx, fy, cx, cy)) or not np.isfinite(bend).all():
+    if not sane((fx, fy, cx, cy)) or not np.isfinite(distortion).all():
         raise InputError(f"{where}: camera_info has no usable K; calibrate the camera, or convert with --intrinsics.")
     camera = Camera(int(message.width), int(message.height), fx, fy, cx, cy)
-    return known(camera, bend.tolist(), str(message.distortion_model), where)
+    return lens_of_model(camera, distortion.tolist(), str(message.distortion_model), where)
 
 
 def _from_yuv(rows: npt.NDArray[np.uint8], places: tuple[int, int, int]) -> npt.NDArray[np.uint8]:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.types import Array, Camera, InputError
 from sequences.intrinsics import sane
-from sequences.lens import Lens, known
+from sequences.lens import Lens, lens_of_model
 from sequences.ros.bag import Bag
 
 STATIC = "tf2_msgs/msg/TFMessage"
@@ -51,7 +51,7 @@ def static_transform(bag: Bag, target: str, source: str) -> Array | None:
 
 
 def transform_pose(transform: Any) -> Array | None:
-    """Return the motion (4, 4), in m, that a `geometry_msgs/Transform` is; None where it is none."""
+    """Return the motion (4, 4), in m, of a `geometry_msgs/Transform`; None if it is not rigid."""
     turn, shift = transform.rotation, transform.translation
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64)
     offset_m = np.array([shift.x, shift.y, shift.z], dtype=np.float64)
@@ -68,7 +68,7 @@ def _name(frame_id: str) -> str:
 
 
 FARTHEST_CAMERA_M = 10.0
-"""No two cameras of one device are so far apart."""
+"""Largest distance of two cameras of one device."""
 TEXT = "std_msgs/msg/String"
 _STREAM = r"(/device_\d+/sensor_\d+)/\w+"
 
@@ -88,32 +88,33 @@ def realsense_unit_mm(bag: Bag, topic: str) -> tuple[float, str] | None:
 
 
 def realsense_lens(bag: Bag, topic: str) -> Lens | None:
-    """Return the camera of a topic where a text tells it, as versions 2.58 write it; None where none does.
+    """Return the camera of a topic from a text message, as version 2.58 writes it; None without.
 
     Raises:
-        InputError: where the text tells no camera.
+        InputError: where the text describes no camera.
     """
     stream = re.match(_STREAM, topic)
     name = None if stream is None else f"{stream[0]}/camera_info"
     if name is None or bag.types.get(name) != TEXT:
         return None
     for _, message in bag.messages(name, most=1):
-        said = _said(message)
-        width, height, *pixels = (_number(said.get(key, "")) for key in ("width", "height", "fx", "fy", "ppx", "ppy"))
-        bend = _numbers(said.get("coeffs", ""), 5)
-        sound = sane((pixels[0], pixels[1], pixels[2], pixels[3])) and bool(np.isfinite(bend).all())
+        entries = _entries(message)
+        names = ("width", "height", "fx", "fy", "ppx", "ppy")
+        width, height, *pixels = (_number(entries.get(key, "")) for key in names)
+        distortion = _numbers(entries.get("coeffs", ""), 5)
+        sound = sane((pixels[0], pixels[1], pixels[2], pixels[3])) and bool(np.isfinite(distortion).all())
         if not sound or not (1.0 <= width <= 1e5 and 1.0 <= height <= 1e5):
-            raise InputError(f"{bag.path}: {name}: tells no camera; record it anew, or convert with --intrinsics.")
+            raise InputError(f"{bag.path}: {name}: describes no camera; record it anew, or convert with --intrinsics.")
         camera = Camera(int(width), int(height), pixels[0], pixels[1], pixels[2], pixels[3])
-        return known(camera, bend.tolist(), said.get("model", ""), f"{bag.path}: {name}")
+        return lens_of_model(camera, distortion.tolist(), entries.get("model", ""), f"{bag.path}: {name}")
     return None
 
 
 def realsense_colour_from_depth(bag: Bag, colour_topic: str, depth_topic: str) -> Array | None:
-    """Return the motion (4, 4), in m, from the depth to the colour camera; None where nothing tells it.
+    """Return the motion (4, 4), in m, from the depth to the colour camera; None if unknown.
 
     Raises:
-        InputError: where what tells it is no motion.
+        InputError: where it is not rigid.
     """
     poses = [_from_reference(bag, topic) for topic in (colour_topic, depth_topic)]
     colour, depth = poses
@@ -137,16 +138,16 @@ def _pose(message: Any, where: str) -> Array:
         found = transform_pose(message)
         pose = np.full((4, 4), np.nan) if found is None else found
     else:
-        said = _said(message)
+        entries = _entries(message)
         # Matrices of the camera's library stand column by column.
-        pose = se3.translation(_numbers(said.get("translation", ""), 3))
-        pose[:3, :3] = _numbers(said.get("rotation", ""), 9).reshape(3, 3).T
+        pose = se3.translation(_numbers(entries.get("translation", ""), 3))
+        pose[:3, :3] = _numbers(entries.get("rotation", ""), 9).reshape(3, 3).T
     if not se3.is_rigid(pose, tolerance=1e-3, farthest_m=FARTHEST_CAMERA_M):
         raise InputError(f"{where}: is no rigid motion; record it anew.")
     return pose
 
 
-def _said(message: Any) -> dict[str, str]:
+def _entries(message: Any) -> dict[str, str]:
     """Return what a text message `key=value;key=value` says."""
     return dict(part.split("=", 1) for part in str(getattr(message, "data", "")).split(";") if "=" in part)
 

@@ -34,7 +34,7 @@ def choose_depth_topic(bag: Bag, first: Mapping[str, Any], overrides: Overrides)
     """Return the topic of depth images.
 
     Raises:
-        InputError: where there is none or nothing tells which.
+        InputError: where there is none, or several.
     """
     found = [topic for topic, message in first.items() if messages.is_depth(message)]
     if overrides.depth_topic is not None:
@@ -58,7 +58,7 @@ def depth_lens(bag: Bag, topic: str, image: Any, overrides: Overrides) -> Lens:
     """Return the camera of a topic.
 
     Raises:
-        InputError: where nothing tells it.
+        InputError: where it is unknown.
     """
     if overrides.intrinsics is not None:
         if image.__msgtype__ == messages.IMAGE:
@@ -74,7 +74,7 @@ def depth_lens(bag: Bag, topic: str, image: Any, overrides: Overrides) -> Lens:
 
 
 def _camera(bag: Bag, topic: str) -> Lens | None:
-    """Return what the first camera_info message beside a topic of images says; None where there is none."""
+    """Return the camera of the first camera_info message that belongs to a topic; None without."""
     infos = [other for other, kind in bag.types.items() if kind == messages.CAMERA]
     bare = re.sub(r"/(compressedDepth|compressed|theora)$", "", topic)
     parent = bare.rsplit("/", 1)[0]
@@ -106,7 +106,7 @@ def colour_source(
         bag: the bag.
         first: the first image of each topic.
         depth: topic and camera of the depth images.
-        overrides: what a person says.
+        overrides: values that take precedence over the bag.
 
     Raises:
         InputError: where the topic asked for holds none.
@@ -138,7 +138,7 @@ def colour_source(
 
 
 def _beside(bag: Bag, first: Mapping[str, Any], topic: str, depth: tuple[str, Lens]) -> Alignment | None:
-    """Return where the camera of a colour topic is; None where nothing tells it."""
+    """Return the alignment of a colour topic with depth; None if unknown."""
     camera, motion = _camera(bag, topic), realsense_colour_from_depth(bag, topic, depth[0])
     if motion is None:
         motion = static_transform(bag, first[topic].header.frame_id, first[depth[0]].header.frame_id)
@@ -155,7 +155,7 @@ def _same(one: Lens | None, other: Lens) -> bool:
 
 
 def choose_unit(bag: Bag, topic: str, image: Any, overrides: Overrides) -> tuple[float, str]:
-    """Return the millimetres in one unit of 16-bit depth, and the unit in words."""
+    """Return the millimetres per unit of 16-bit depth, and the unit for people."""
     if overrides.depth_scale_mm is not None:
         return overrides.depth_scale_mm, f"{overrides.depth_scale_mm:g} mm (--depth-scale-mm)"
     if image.__msgtype__ == messages.IMAGE and image.encoding in messages.METRES:
@@ -188,7 +188,7 @@ class RosSequence(AbstractStreams[Stamp]):
     unit_mm: float
     """Millimetres per unit of 16-bit depth."""
     unit: str
-    """The unit in words."""
+    """The unit, for people."""
 
     def seen_m(self, index: int, stamp: Stamp) -> npt.NDArray[np.float32]:
         """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured."""
@@ -197,15 +197,15 @@ class RosSequence(AbstractStreams[Stamp]):
         self._check_size(where, depth_m.shape, self.lens)
         return depth_m
 
-    def aligned(self, index: int, stamp: Stamp, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
+    def colour_at(self, index: int, stamp: Stamp, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
         """Return colour (h, w, 3) as RGB at the pixels of depth; None without a topic of colour."""
         if self.colour is None:
             return None
         where = f"{self.path}: {self.colour.topic}, for image {index}"
-        picture = messages.colour(self.bag.message(self.colour.topic, stamp), where)
+        image = messages.colour(self.bag.message(self.colour.topic, stamp), where)
         alignment = self.colour.alignment
-        self._check_size(where, picture.shape[:2], self.lens if alignment is None else alignment.colour)
-        return self.lens.straight(picture) if alignment is None else alignment.aligned(depth_m, picture)
+        self._check_size(where, image.shape[:2], self.lens if alignment is None else alignment.colour)
+        return self.lens.undistort(image) if alignment is None else alignment.align(depth_m, image)
 
     @property
     def layout(self) -> str:
@@ -229,7 +229,7 @@ class RosSequence(AbstractStreams[Stamp]):
 
 
 def open_ros(path: Path, overrides: Overrides) -> RosSequence:
-    """Open a bag. Which topics hold depth and aligned colour is told from their messages.
+    """Open a bag; topics of depth and colour are recognised from their messages.
 
     Raises:
         InputError: where it is no bag, or lacks depth images or their camera.
@@ -243,8 +243,8 @@ def open_ros(path: Path, overrides: Overrides) -> RosSequence:
     times = _times(bag, depth_topic)
     if not times:
         raise InputError(f"{path}: holds no message of {depth_topic}; record it anew.")
-    pairs, alone = paired(times, [] if colour is None else _times(bag, colour.topic))
-    return RosSequence(path, lens, pairs, (*left, *alone), bag, depth_topic, colour, unit_mm, unit)
+    pairs, unpaired = paired(times, [] if colour is None else _times(bag, colour.topic))
+    return RosSequence(path, lens, pairs, (*left, *unpaired), bag, depth_topic, colour, unit_mm, unit)
 
 
 def _times(bag: Bag, topic: str) -> list[tuple[float, Stamp]]:

@@ -1,1 +1,1 @@
-"""Kills `modeler build` and resumes it; `python -m kills` does so at many moments."""
+"""Kills commands and gives them again; `python -m kills` does so at many moments."""

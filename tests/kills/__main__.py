@@ -1,6 +1,7 @@
 """Kill `modeler build` with SIGKILL at random moments, resume it, and compare with a run that nobody disturbed.
 
     PYTHONPATH=tests python -m kills --count 50 --seed 0
+    PYTHONPATH=tests python -m kills --commands --count 10      every other command that writes, 10 times each
 
 Trajectory, graph, mesh and cloud must be the same to the byte, and each kill may cost one pair at most. What fails is
 kept in the folder of --out, and the status is 1.
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kills.commands import COMMANDS, CommandTrials, write_inputs
 from kills.trials import KINDS, Trials
 from sequences import bundled
 
@@ -29,9 +31,12 @@ def main() -> int:
     parser.add_argument("--sequence", default=str(bundled("tube")))
     parser.add_argument("--options", default="--prior table", help="further options of modeler build, as one word")
     parser.add_argument("--out", type=Path, default=Path("runs/kills"), help="folder of the runs, which is emptied")
+    parser.add_argument("--commands", nargs="*", choices=COMMANDS, help="kill these other commands; all without a name")
     options = parser.parse_args()
     shutil.rmtree(options.out, ignore_errors=True)
     options.out.mkdir(parents=True)
+    if options.commands is not None:
+        return _commands(options.commands or list(COMMANDS), options.count, options.out)
     trials = Trials((options.sequence, *shlex.split(options.options)), options.out)
     whole = trials.undisturbed()
     print(f"undisturbed: {whole.pairs} pairs, {whole.changes} changes of the folder, {whole.seconds:.1f} s", flush=True)
@@ -44,6 +49,21 @@ def main() -> int:
         survived, failed = survived + (not fault), failed + bool(fault)
         print(f"{survived + failed:3d} {kind:9} {when:30} {fault or 'the same'}", flush=True)
     print(f"{survived} of {options.count} kills survived in {time.monotonic() - began:.0f} s")
+    return 1 if failed else 0
+
+
+def _commands(names: list[str], count: int, out: Path) -> int:
+    """Kill commands at changes of the disk spread over each, and return the exit status."""
+    write_inputs(out)
+    failed = 0
+    for name in names:
+        trials = CommandTrials(out, name)
+        whole, changes = trials.undisturbed()
+        for change in sorted({round(place) for place in np.linspace(1, changes, count)}):
+            fault = trials.fault(change, whole)
+            failed += bool(fault)
+            print(f"{name:16} before change {change:3d} of {changes:3d}   {fault or 'the same'}", flush=True)
+    print(f"{failed} faults")
     return 1 if failed else 0
 
 

@@ -21,12 +21,14 @@ def run(log: Path, change: int, arguments: list[str]) -> int:
     """Run a command of `modeler` and return its status.
 
     Args:
-        log: a line is added to it for every registration that begins, and for every change of the run folder.
+        log: a line is added to it for every registration that begins, and for every change of the run folder,
+            or of the folder that what a command writes lies in.
         change: kill the process before this one, counted from 1; 0: none.
         arguments: what follows `modeler`.
     """
     notes = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-    folder = os.path.abspath(arguments[arguments.index("--out") + 1])
+    out = os.path.abspath(arguments[arguments.index("--out") + 1])
+    folder = out if arguments[0] == "build" else os.path.dirname(out)  # where others write what replaces it
     changes = 0
 
     def heard(event: str, values: tuple[Any, ...]) -> None:

@@ -136,14 +136,18 @@ class Trials:
     def _started(self, folder: Path, log: Path, change: int, *flags: str) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "kills.child", str(log), str(change), "build", *self.arguments]
         log.touch()
-        path = os.pathsep.join(place for place in sys.path if place)
         return subprocess.Popen(
             [*command, "--out", str(folder), *flags],
-            env=os.environ | {"PYTHONPATH": path},
+            env=environment(),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
         )
+
+
+def environment() -> dict[str, str]:
+    """Return the environment in which a child finds the modules of this process."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)}
 
 
 def _pairs(log: Path) -> int:
