@@ -83,9 +83,9 @@ def test_the_page_is_whole_and_needs_no_network(page: str) -> None:
 def test_every_section_is_there(page: str) -> None:
     headings = Elements(page).headings
     assert ODD_NAME in headings
-    wanted = ["Model", "Camera around the object", "Uncertainty", "Merged points", "Errors against ground truth"]
+    wanted = ["Model", "Camera poses", "Uncertainty", "Merged points", "Errors against ground truth"]
     assert [heading for heading in headings if heading in wanted] == wanted
-    assert {"Are the covariances true?", "Pairs", "Settings"} <= set(headings)
+    assert {"Calibration of the covariances", "Pairs", "Settings"} <= set(headings)
 
 
 def test_every_pair_is_told_with_its_pictures(page: str, run: Path) -> None:

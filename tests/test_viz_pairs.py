@@ -185,7 +185,7 @@ def test_what_the_graph_leaves_to_the_modes_of_a_pair_is_told(run: list[Step]) -
     step = run[1]
     pair = (step.edges[0].source, step.edges[0].target)
     wary = replace(step, solution=replace(step.solution, mode_weights={pair: np.array([0.9, 0.1])}))
-    assert "leave to its modes 90%, 10%" in readings.now_words(wary)
+    assert "its modes in the pose graph: 90%, 10%" in readings.now_words(wary)
     assert "modes" not in readings.now_words(step)
 
 

@@ -47,7 +47,7 @@ def _images(first: RayImage | None) -> rrb.Container:
     seen = rrb.Spatial2DView(
         origin=entities.VISIBILITY,
         contents=[f"{entities.VISIBILITY}/**"],
-        name="New points in last view",
+        name="New points in previous view",
         visual_bounds=near,
     )
     if first is not None and first.frame.colour is None:
@@ -84,7 +84,7 @@ def _closure(first: RayImage | None) -> tuple[rrb.View, rrb.View]:
 
 
 def _pair(first: RayImage | None) -> rrb.Container:
-    """Return the newest pair before and after alignment, and the posterior larger than life."""
+    """Return the newest pair before and after alignment, and the magnified posterior."""
     eye = _near(first, FROM_THE_SIDE, 4.2)
     before = [entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_CAPTION]
     after = [entities.PAIR_TARGET, entities.PAIR_AFTER, entities.PAIR_AXES, entities.PAIR_DRAWS]

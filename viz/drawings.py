@@ -18,14 +18,14 @@ Drawing = Iterator[tuple[str, rr.AsComponents]]
 """Entities in the order in which they are logged."""
 
 CLEAR: Final = rr.Clear(recursive=False)
-"""Takes away what an entity showed."""
+"""Removes what an entity showed."""
 
 
 POINT_SIZE: Final = rr.Radius.ui_points(1.75)
 
 
 def draw_axes() -> Drawing:
-    """Yield what is said once: which way is up."""
+    """Yield the axes of the 3D views: x right, y down, z forward."""
     for path in (entities.PAIR, entities.WORLD):
         yield path, rr.ViewCoordinates.RDF
 
@@ -37,18 +37,18 @@ def shown_posterior(step: Step) -> Posterior | None:
 
 
 def caption(at_m: Array, words: str, rgb: entities.Rgb) -> rr.Points3D:
-    """Return words that stand at a point (3,)."""
+    """Return a caption at a point (3,)."""
     return rr.Points3D(at_m, labels=words, show_labels=True, radii=rr.Radius.ui_points(0.0), colors=rgb)
 
 
 def shaded(rgb: entities.Rgb, normals: Array) -> npt.NDArray[np.uint8]:
-    """Return a colour (n, 3) that is darker the more steeply a surface with `normals` (n, 3) is seen from frame 0."""
+    """Return RGB (n, 3) of a surface with `normals` (n, 3), lit from above left in the camera frame."""
     light = 0.35 + 0.65 * np.abs(normals @ np.array([-0.36, -0.48, -0.8]))
     return np.clip(light[:, None] * np.array(rgb), 0, 255).astype(np.uint8)
 
 
 def scale_words(factor: float) -> str:
-    """Say how many times larger than life something is drawn."""
+    """Return the magnification in words."""
     return "to scale" if factor == 1.0 else f"drawn \N{MULTIPLICATION SIGN}{factor:g}"
 
 

@@ -1,4 +1,4 @@
-"""Where everything lives in a recording: entity paths, timelines and colours, in one place."""
+"""Entity paths, timelines and colours of a recording."""
 
 from typing import Final
 
@@ -98,23 +98,25 @@ UNCERTAINTY_RGB: Final[Rgb] = (255, 225, 90)
 AXIS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((230, 70, 70), (80, 200, 80), (90, 130, 255))
 
 LEGEND_TEXT: Final = """\
-**Image column.** The frame as the camera saw it, all but the object dimmed; its depth; and, lowest, what the last view
-saw (blue: object, grey: background, black: no measurement) with the new view's points in it: orange they agree with the
-surface measured there, brown they are hidden behind it, **pink they hang in front of what was measured**, as few do
-under the true motion.
+**Images** (left). Top: the frame, with everything but the object dimmed. Middle: its depth. Bottom: the image of
+the view to which the frame is registered (blue: object, grey: background, black: no measurement) with the points of
+the new view projected into it: orange points agree with the surface measured there, brown ones are hidden behind
+it, **pink ones lie in front of what was measured**, which few points do at the true pose.
 
-**Pair column.** New view orange, the view it is aligned to teal, in the latter's camera frame. Lowest, the posterior
-spread by the factor written there: the object at its mean, ghosts of it at samples, the ends of its axes as dots, its
-centre within 1 and 3 sd as yellow ellipsoids; other modes in other colours, with their share of the probability.
+**Pair** (right). New view orange, the view it is registered to teal, in the camera frame of the latter. Bottom: the
+posterior, magnified by the factor written there. The object is drawn at the mean and, dimmed, at samples; dots are
+the ends of its axes, yellow ellipsoids its centre within 1 and 3 standard deviations (sd). Further modes have other
+colours and are labelled with their probabilities.
 
-**Model.** Pink surface is made up: nobody saw it, and it closes the mesh. The tabs beside it have, at the last frame,
-the points of all views laid together without closure and with it, a colour a frame from blue to yellow: where a loop
-was open, yellow points lie beside blue ones.
+**Model.** Pink surface was not seen by any view; it closes the mesh. After the last frame, two more tabs show the
+points of all views before and after loop closure, coloured by frame from blue to yellow. Where the loop was open
+before closure, yellow points lie apart from blue ones.
 
-**Graph.** A pyramid is the camera as the object saw it, the newest orange. Edges: odometry and spans white, closure
-green, rejected red, each with an ellipsoid of the shift it allows within 1 sd. Yellow: position of a camera within
-1 sd (solid) and 3 sd (wire); discs at the tips of its axes: rotation within 1 sd. All magnified as written below.
+**Pose graph.** Pyramids are camera poses in the object frame, the newest orange. Edges: odometry and spans white,
+closures green, rejected red; the ellipsoid on an edge is the 1 sd region of its translation. Yellow: 1 sd (solid)
+and 3 sd (wire) regions of camera positions; discs at the tips of the axes: 1 sd of rotation. All are magnified by
+the factor written below the graph.
 
-**Readings.** White odometry, green closure, yellow the newest pose after optimisation. Sd along the worst axis;
-translation is that of the object's centre.
+**Plots** (bottom). White: odometry; green: closure; yellow: the newest pose after optimisation. The sd is that
+along the least certain axis; translation is that of the object's centre.
 """

@@ -49,7 +49,7 @@ def draw_newest_camera(step: Step) -> Drawing:
 
 
 def shown(step: Step) -> list[int]:
-    """Return the frames whose poses are drawn: all, or of many every n-th."""
+    """Return the frames whose poses are drawn: all, or every n-th of many."""
     numbers = sorted(step.solution.trajectory)
     return numbers[:: math.ceil(max(len(numbers), 1) / _POSES)]
 
@@ -60,7 +60,7 @@ def camera_size_m(step: Step) -> float:
 
 
 def distance_m(step: Step) -> float:
-    """Return how far the object was from the camera in the first accepted view; 1 m before there is one."""
+    """Return the distance of the object from the camera in the first accepted view; 1 m before there is one."""
     if not step.views:
         return 1.0
     points_m = step.views[min(step.views)].points_m
@@ -68,7 +68,7 @@ def distance_m(step: Step) -> float:
 
 
 def below_ring_m(step: Step) -> Array:
-    """Return a point (3,) that the eye over the whole graph sees below it: where a caption has room."""
+    """Return a point (3,) below the graph as seen by the initial eye, for a caption."""
     first = step.views[min(step.views)]
     towards_eye = OVER_THE_RING / np.linalg.norm(OVER_THE_RING)
     down = np.array([0.0, 1.0, 0.0]) - towards_eye[1] * towards_eye
@@ -231,7 +231,7 @@ def _edge_rgb(edge: Edge) -> entities.Rgb:
 
 
 def magnification(edges: Sequence[Edge], distance_m: float) -> float:
-    """Return the factor 0.1, 0.2, 0.5, 1, 2 … 1000 by which uncertainty is drawn larger than life.
+    """Return the factor 0.1, 0.2, 0.5, 1, 2 … 1000 by which uncertainty is magnified.
 
     It follows from the accepted odometry edges alone and never grows with more of them, so that the ellipsoids that
     loop closure makes smaller also look smaller.

@@ -29,7 +29,7 @@ _DIMMED: Final = 0.65  # how dark what is not the object becomes
 
 
 def draw_mask_colours() -> Drawing:
-    """Yield what is said once: the mask leaves the object as it is and dims the rest."""
+    """Yield the colours of the mask: it dims all but the object."""
     background = rr.AnnotationInfo(id=0, label="background", color=(0, 0, 0))
     yield entities.MASK, rr.AnnotationContext([background, rr.AnnotationInfo(1, "object", (0, 0, 0, 0))])
 
@@ -48,12 +48,12 @@ def draw_frame(step: Step) -> Drawing:
 
 
 def stride_px(frame: Frame) -> int:
-    """Return how many pixels of the frame one pixel of its pictures stands for, along either axis."""
+    """Return the stride at which images of the frame are drawn."""
     return math.ceil(math.sqrt(frame.depth_m.size / _PIXELS))
 
 
 def depth_stride_px(frame: Frame) -> int:
-    """Return the same for pictures made of depth, which are costly to pack and show no more when they are finer."""
+    """Return the stride of images made of depth: larger, for they compress slowly and show no more when finer."""
     return math.ceil(math.sqrt(frame.depth_m.size / _DEPTH_PIXELS))
 
 
@@ -120,7 +120,7 @@ class ProjectedPoints:
 
 
 def draw_area_colours() -> Drawing:
-    """Yield what is said once: the paper's colours of the areas."""
+    """Yield the colours of the areas, as in the paper."""
     names = {MISSING: "no measurement", BACKGROUND: "background", OBJECT: "object"}
     colours = zip(names.items(), entities.AREAS_RGB, strict=True)
     infos = [rr.AnnotationInfo(id=number, label=name, color=rgb) for (number, name), rgb in colours]
@@ -154,7 +154,7 @@ def draw_projected_points(step: Step) -> Drawing:
 
 
 def caption_of(shown: ProjectedPoints) -> str:
-    """Say how many of the points that can be judged are where they may be."""
+    """Return the shares of the points with a measurement that agree, are hidden, and lie in front."""
     judged = max(int(np.sum(shown.verdicts != NO_SAY)), 1)
     agree, hidden, front = (round(100 * np.sum(shown.verdicts == v) / judged) for v in (AGREES, HIDDEN, VIOLATION))
     return f"agree {agree} %, hidden {hidden} %, in front {front} %"

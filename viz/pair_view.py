@@ -70,10 +70,10 @@ def axes_length_m(view: RayImage) -> float:
 
 
 def draws(posterior: Posterior) -> Array:
-    """Return motions (n, 4, 4) that stand for a posterior, the same at every call.
+    """Return samples (n, 4, 4) of a posterior, the same at every call.
 
-    They are samples at even steps of the cumulative weight; of a method without samples, the motions one sd along
-    each axis of the covariance to either side.
+    They are taken at even steps of the cumulative weight; without samples, they are the sigma points of the
+    covariance.
     """
     if len(posterior.samples) > 0:
         cumulative = np.cumsum(posterior.weights)
@@ -102,20 +102,20 @@ _PATHS: Final = (
 
 @dataclass(frozen=True, eq=False)
 class Ghosts:
-    """Motions drawn from a posterior, spread wider about the modes they belong to."""
+    """Samples of a posterior, magnified about the modes they belong to."""
 
     modes: tuple[Mode, ...]
-    """Heaviest first; one where the posterior tells of none."""
+    """Heaviest first; the posterior's Gaussian if it has none."""
     factor: float
-    """How many times wider; never less than 1."""
+    """Magnification; never less than 1."""
     poses: Array
     """(n, 4, 4) target_from_source as drawn."""
     mode_of: npt.NDArray[np.int64]
-    """(n,) number of the mode that each belongs to."""
+    """(n,) the mode of each sample."""
 
 
 def draw_magnified_posterior(step: Step) -> Drawing:
-    """Yield the source at every mode, ghosts of it, the ends of its axes and the ellipsoid of its centre."""
+    """Yield the source at every mode and at samples, the ends of its axes, and the ellipsoid of its centre."""
     posterior = shown_posterior(step)
     if posterior is None or step.view is None or not np.isfinite(posterior.pose.covariance).all():
         for path in _PATHS:
@@ -133,10 +133,9 @@ def draw_magnified_posterior(step: Step) -> Drawing:
 
 
 def magnified(posterior: Posterior, view: RayImage) -> Ghosts:
-    """Return ghosts of a posterior, spread by a round factor that makes them easy to tell apart.
+    """Return samples of a posterior, magnified by a round factor that makes them easy to tell apart.
 
-    Each motion moves away from the mean of its own mode, turning about the object's centre, so that separate modes
-    stay where they are.
+    Each sample moves away from the mean of its own mode, about the object's centre; modes stay in place.
     """
     modes = posterior.modes or (Mode(1.0, posterior.pose),)
     centre = se3.translation(view.centroid_m)
@@ -150,7 +149,7 @@ def magnified(posterior: Posterior, view: RayImage) -> Ghosts:
 
 
 def _nearest(modes: Sequence[Mode], pose: Array) -> int:
-    """Return the number of the mode under which a motion (4, 4) is most likely."""
+    """Return the number of the most probable mode of a sample (4, 4)."""
     if len(modes) == 1:
         return 0
     costs = []
@@ -162,7 +161,7 @@ def _nearest(modes: Sequence[Mode], pose: Array) -> int:
 
 
 def _factor(modes: Sequence[Mode], view: RayImage) -> float:
-    """Return by how much to spread the draws."""
+    """Return the magnification of the samples."""
     radius_m = float(np.linalg.norm(view.points_m - view.centroid_m, axis=1).max())
     widest_rad, widest_m = 0.0, 0.0
     for mode in modes:
@@ -187,7 +186,7 @@ def _means(view: RayImage, modes: Sequence[Mode], colours: npt.NDArray[np.int64]
 
 
 def _tips(view: RayImage, ghosts: Ghosts) -> Drawing:
-    """Yield where the ends of the object's axes land."""
+    """Yield the ends of the object's axes at the samples."""
     ends = view.centroid_m + axes_length_m(view) * np.eye(3)
     points = np.einsum("nij,kj->nki", ghosts.poses[:, :3, :3], ends) + ghosts.poses[:, None, :3, 3]
     colours = np.tile(np.array(entities.AXIS_RGB, dtype=np.uint8), (len(ghosts.poses), 1))
@@ -195,7 +194,7 @@ def _tips(view: RayImage, ghosts: Ghosts) -> Drawing:
 
 
 def _centres(view: RayImage, ghosts: Ghosts, colours: npt.NDArray[np.int64]) -> Drawing:
-    """Yield the ellipsoids of the object's centre under every mode, and what they are in words."""
+    """Yield the covariance ellipsoids of the object's centre under every mode, and their captions."""
     poses = np.array([mode.pose.mean for mode in ghosts.modes])
     rotations = poses[:, :3, :3]
     centres = np.array([se3.transform(pose, view.centroid_m) for pose in poses])
@@ -245,7 +244,7 @@ def draw_pair(step: Step) -> Drawing:
 
 
 def below_m(view: RayImage) -> Array:
-    """Return a point (3,) below what a view saw of the object, where a caption has room."""
+    """Return a point (3,) below the object of a view, for a caption."""
     centre = view.centroid_m
     return centre + 1.2 * float(np.linalg.norm(view.points_m - centre, axis=1).max()) * upright(view)[:, 1]
 

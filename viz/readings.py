@@ -18,7 +18,7 @@ from viz.drawings import Drawing
 
 @dataclass(frozen=True)
 class Sd:
-    """Standard deviations of a motion along its worst axes."""
+    """Standard deviations of a relative pose along its least certain axes."""
 
     rotation_deg: float
     """Of the rotation."""
@@ -27,7 +27,7 @@ class Sd:
 
 
 def sd_of(pose: PoseGaussian, centre_m: Array) -> Sd:
-    """Return how sure a motion is; NaN where its covariance is not finite.
+    """Return the standard deviations of a relative pose; NaN if its covariance is not finite.
 
     Args:
         pose: with ξ in the coordinates in which `centre_m` is given.
@@ -40,7 +40,7 @@ def sd_of(pose: PoseGaussian, centre_m: Array) -> Sd:
 
 
 def certainty_words(posterior: Posterior, centre_m: Array) -> list[str]:
-    """Say how sure a registration is, a few words a reading, without those that its method does not give.
+    """Return the readings of a registration in words, without those that its method does not give.
 
     Args:
         posterior: of target_from_source.
@@ -72,7 +72,7 @@ _SERIES_RGB = {"odometry": entities.ODOMETRY_RGB, "closure": entities.CLOSURE_RG
 
 
 def draw_legend(name: str, facts: Mapping[str, object]) -> Drawing:
-    """Yield what is said once: how each series looks, the legend, and what the run was asked to do."""
+    """Yield what does not change: the style of each series, the legend, and the settings of the run."""
     for reading in entities.READINGS:
         for series in entities.SERIES:
             if series != "pose" or reading in entities.POSE_READINGS:
@@ -84,11 +84,11 @@ def draw_legend(name: str, facts: Mapping[str, object]) -> Drawing:
 
 
 def run_words(name: str, facts: Mapping[str, object]) -> str:
-    """Say in Markdown what the run is and what it was asked to do.
+    """Return name and settings of the run in Markdown.
 
     Args:
         name: of the sequence.
-        facts: whatever else is known before the run, by name.
+        facts: settings, by name.
     """
     rows = [f"| {key.replace('_', ' ')} | {_fact(value)} |" for key, value in facts.items()]
     return "\n".join([f"### {name}", "", "| | |", "|---|---|", *rows] if rows else [f"### {name}"])
@@ -101,7 +101,7 @@ def _fact(value: object) -> str:
 
 
 def draw_readings(step: Step) -> Drawing:
-    """Yield the readings of the step's pairs; of several closures the surest."""
+    """Yield the readings of the step's pairs; of several closures the one with the least rotation variance."""
     for kind in ("odometry", "closure"):
         judged = [edge for edge in step.edges if edge.kind == kind]
         if judged:
@@ -117,7 +117,7 @@ def draw_readings(step: Step) -> Drawing:
 
 
 def draw_text(step: Step) -> Drawing:
-    """Yield what happened to the frame in words, and a line for the log for each pair."""
+    """Yield what happened to the frame in words, and a log line for each pair."""
     level = rr.TextLogLevel.INFO if step.accepted else rr.TextLogLevel.WARN
     if not step.edges and not step.last:
         yield entities.LOG, rr.TextLog(f"frame {step.frame.index}: {_outcome(step)}", level=level)
@@ -132,7 +132,7 @@ def _outcome(step: Step) -> str:
 
 
 def pair_words(edge: Edge, step: Step) -> str:
-    """Say in one line how the registration of a pair ended and how sure it is."""
+    """Return the outcome and the readings of a pair in one line."""
     posterior = edge.posterior
     verdict = edge.kind if edge.accepted else f"{edge.kind} rejected"
     if not edge.accepted and posterior.usable:  # else the outcome is the reason
@@ -142,7 +142,7 @@ def pair_words(edge: Edge, step: Step) -> str:
 
 
 def now_words(step: Step) -> str:
-    """Say in Markdown what the frame brought, pair by pair, and where the model stands."""
+    """Return in Markdown the outcome of the frame and of its pairs, and the state of the model."""
     frame = f"Frame {step.frame.index}: {'accepted' if step.accepted else 'left out'}"
     lines = [f"### {frame}{', the last' if step.last else ''}"]
     for edge in step.edges:
@@ -151,12 +151,12 @@ def now_words(step: Step) -> str:
             lines += [f"  - {words}" for words in undetermined(edge.posterior, step.view)]
         left = step.solution.mode_weights.get((edge.source, edge.target))
         if left is not None and len(left) > 1:
-            lines.append(f"  - all edges together leave to its modes {', '.join(f'{100 * w:.0f}%' for w in left)}")
+            lines.append(f"  - its modes in the pose graph: {', '.join(f'{100 * w:.0f}%' for w in left)}")
     if not step.edges and not step.last:
         lines.append("- The first view of the object." if step.accepted else f"- {_outcome(step)}")
     kinds = [edge.kind for edge in step.edges_so_far if step.solution.takes_part(edge)]
     for edge in step.solution.outliers:
-        lines.append(f"- {edge.source} → {edge.target} {edge.kind} is left out, for all other edges contradict it.")
+        lines.append(f"- {edge.source} → {edge.target} {edge.kind} is left out: the other edges contradict it.")
     rejected = len(step.edges_so_far) - len(kinds)
     points = 0 if step.model is None else len(step.model.points_m)
     lines.append(

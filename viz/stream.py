@@ -1,4 +1,4 @@
-"""A sink of steps: what a run does, as it does it, in a recording and in the viewer."""
+"""A sink of steps that streams a run to a recording and to viewers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _GRAPH_DRAWN: Final = 50  # times at most while the number of views doubles: dra
 
 @dataclass(frozen=True, eq=False)
 class RerunStream:
-    """A recording that grows with every step. Nothing that happens to a viewer reaches the run."""
+    """A recording that grows with every step. No viewer can stop or delay the run."""
 
     recording: rr.RecordingStream
     """Where steps are drawn."""
@@ -42,7 +42,7 @@ class RerunStream:
 
     @property
     def address(self) -> str | None:
-        """What a person opens to watch: the page in the browser, or else where the window listens; None without."""
+        """The address to open: the page in the browser, else the port of the window; None without a viewer."""
         return self.viewers[-1].address if self.viewers else None
 
     def __call__(self, step: Step) -> None:
@@ -167,7 +167,7 @@ def open_stream(
 
 
 def _own_viewers(*, spawn: bool, web: bool) -> tuple[viewer.Viewer, ...]:
-    """Start the viewers that were asked for, as far as they start."""
+    """Start the requested viewers; those that fail are logged and left out."""
     viewers: list[viewer.Viewer] = []
     for wanted, start in ((spawn, viewer.start_window), (web, viewer.start_web)):
         if wanted:
@@ -198,9 +198,9 @@ _LAST = 64  # bytes that hold the end mark
 
 
 def ends_whole(recording: Path) -> bool:
-    """Return whether a recording has its end, which one lacks that was cut off by a kill or a full disk.
+    """Return whether a recording is complete: one cut off by a kill or a full disk has no footer.
 
-    Of other formats than today's nothing is known: they count as whole.
+    Recordings of other formats count as complete.
     """
     with open_regular(recording) as file:
         if file.read(len(_BEGINS)) != _BEGINS:

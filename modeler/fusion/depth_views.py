@@ -305,6 +305,7 @@ def disagreement(views: DepthViews, limit_m: float) -> tuple[float, float] | Non
         off_m = np.abs(distance_m[found])
         found_m.append((off_m, off_m / np.sqrt(1.0 / mine + 1.0 / theirs)))
     off_m, share_m = (np.concatenate(some) for some in zip(*found_m, strict=True))
+    # (F4)
     return (1.4826 * float(np.median(off_m)), 1.4826 * float(np.median(share_m))) if len(off_m) else None
 
 

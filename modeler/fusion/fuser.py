@@ -243,7 +243,7 @@ class FusionVolume:
         found = self._support(vertices, normals, np.zeros((len(self.views.index), 4)))
         # Closing gaps in the support must not add what several views see empty.
         empty = found.empty_views * self.fuser.empty_weight > found.weight + self.fuser.empty_weight
-        seen = (found.weight > self.fuser.min_support) & self._supported(found)
+        seen = (found.weight > self.fuser.min_support) & self._supported(found)  # (F7)
         marked = meshing.gaps_closed(seen, triangles, self.fuser.closing) & ~empty
         # At silhouettes the zero level set folds over: views extrapolate the object one band behind its surface.
         loose = meshing.folded(vertices, normals, seen, marked & ~seen)

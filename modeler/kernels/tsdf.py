@@ -221,7 +221,7 @@ def observe(
             left, top = math.floor(u), math.floor(v)
             if gains[f, 3] == 0.0 or left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
                 continue
-            share = gains[f, 3] * weights[n] ** focus
+            share = gains[f, 3] * weights[n] ** focus  # (F9)
             colours[q, 3] += share
             for c in range(3):
                 colours[q, c] += share * gains[f, c] * between(colour[f], u, v, c)
@@ -354,7 +354,7 @@ def dominant_vote(seen, distance, weight, number, normals, tau_m):
     """
     best, best_score = -1, 0.0
     for k in range(seen):
-        score = weight[k] * (1.01 - abs(distance[k]) / tau_m)
+        score = weight[k] * (1.01 - abs(distance[k]) / tau_m)  # (F6)
         if score > best_score:
             best, best_score = k, score
     if best < 0 or distance[best] >= 0.0:

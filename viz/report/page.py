@@ -35,7 +35,7 @@ _ABOVE_LEFT: Final = np.array([-0.5, -0.5, -0.75])
 
 
 def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -> None:
-    """Write a page about a run that needs nothing but itself.
+    """Write a self-contained page about a run.
 
     Args:
         run: the run folder.
@@ -59,13 +59,13 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
 
 
 def _head(result: Result, mesh: Mesh | None) -> str:
-    """Return name, verdict and the figures that matter most."""
+    """Return name, verdict and key figures."""
     report = result.report
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in report["reasons"])
     verdict = (
-        '<p class="verdict">Nothing speaks against this model: every frame was placed and every check passed.</p>'
+        '<p class="verdict">All frames were placed and all checks passed.</p>'
         if report["trustworthy"]
-        else f'<div class="verdict no">This model is not to be trusted:<ul>{reasons}</ul></div>'
+        else f'<div class="verdict no">Do not trust this model:<ul>{reasons}</ul></div>'
     )
     closed = loops_closed([edge for edge in result.edges if edge.accepted])
     total_s = report["seconds"].get("total")
@@ -73,7 +73,7 @@ def _head(result: Result, mesh: Mesh | None) -> str:
         (f"{len(result.poses)} of {len(report['frames'])}", "frames placed"),
         (str(closed), "loop closed" if closed == 1 else "loops closed"),
         ("none" if mesh is None else f"{mesh.total:,}", "triangles"),
-        ("unknown" if total_s is None else f"{total_s:.0f} s", "to build"),
+        ("unknown" if total_s is None else f"{total_s:.0f} s", "build time"),
     ]
     if result.true_pose(result.first) is not None:
         poses = {k: pose.mean for k, pose in result.poses.items() if result.true_pose(k) is not None}
@@ -90,11 +90,11 @@ def _head(result: Result, mesh: Mesh | None) -> str:
 def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
     """Return the mesh in its viewer, over a picture of it for browsers that draw no surfaces."""
     if mesh is None:
-        return ["<h2>Model</h2><p>The run left no mesh.</p>"]
+        return ["<h2>Model</h2><p>This run has no mesh.</p>"]
     cameras = [_pyramid(pose.mean) for pose in result.poses.values()]
     object_from_upright = model_upright(result.report)
     data = json.dumps(scene(mesh, cameras, object_from_upright))
-    paints = {"colours": "colour", "certainty": "certainty", "plain": "plain"}
+    paints = {"colours": "colour", "certainty": "standard deviation", "plain": "plain"}
     known = [name for name in paints if name == "plain" or getattr(mesh, name) is not None]
     options = "".join(f"<option value='{name}'>{paints[name]}</option>" for name in known)
     made_coarser = "" if len(mesh.triangles) == mesh.total else f", shown with {len(mesh.triangles):,}"
@@ -102,10 +102,10 @@ def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
         "<h2>Model</h2><figure><div class='stage'>"
         f"<canvas id='mesh' style='background-image:url({_poster(mesh, object_from_upright)})'></canvas>"
         f"<div class='switches'><span id='scale' hidden>sd {_scale()} {1000.0 * MOST_SIGMA_M:g} mm, "
-        f"<span class='pink'>pink: made up</span></span><select id='paint'>{options}</select>"
+        f"<span class='pink'>pink: not seen</span></span><select id='paint'>{options}</select>"
         "<label><input type='checkbox' id='cameras'> cameras</label></div></div>"
-        f"<figcaption id='mesh-note'>The fused mesh, {mesh.total:,} triangles{made_coarser}. Drag to turn, wheel to "
-        "zoom, Shift and drag to move, double click to start over. Insides of open surfaces are reddish.</figcaption>"
+        f"<figcaption id='mesh-note'>The fused mesh, {mesh.total:,} triangles{made_coarser}. Drag to rotate, scroll to "
+        "zoom, Shift and drag to pan, double-click to reset. Back faces of open surfaces are reddish.</figcaption>"
         "</figure>",
         f"<script type='application/json' id='scene'>{data}</script>",
         f"<script>{_asset('mesh_viewer.js')}</script>",
@@ -113,27 +113,28 @@ def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
 
 
 def _trajectory(result: Result, mesh: Mesh | None, centre_m: Array) -> Sequence[str]:
-    """Return where the camera was and how sure that is."""
+    """Return the camera poses and their uncertainty."""
     shape_m = np.zeros((0, 3)) if mesh is None else mesh.vertices_m
     shape_m = shape_m[:: max(len(shape_m) // _SHAPE_POINTS, 1)]
     return [
-        "<h2>Camera around the object</h2>",
+        "<h2>Camera poses</h2>",
         figure(
             plots.trajectory(result, shape_m),
-            "Positions of the camera in the object frame; the black dot is the first frame. Ellipses hold three "
-            "standard deviations of the position, to scale.",
+            "Camera positions in the object frame; the black dot is the first frame. Ellipses are 3 sd regions of the "
+            "positions, to scale. Grey: the object.",
         ),
         "<h2>Uncertainty</h2>",
         figure(
             plots.uncertainty(result, centre_m),
-            "Standard deviation along the worst axis: of each edge, and of each pose relative to the first along the "
-            "chain of edges and after optimisation. What loop closure is worth is the gap between the two lines.",
+            "Standard deviation (sd) along the least certain axis: of each edge, and of each pose relative to the "
+            "first frame, before loop closure (chain of consecutive edges) and after optimisation. The gap between the "
+            "two lines is the effect of loop closure.",
         ),
     ]
 
 
 def _closure(result: Result, rows: Mapping[str, Mapping[int, Row]]) -> Sequence[str]:
-    """Return what loop closure did to the merged points, where there was one and the recording has the points."""
+    """Return the merged points before and after loop closure, if there was one and the recording has the points."""
     surfaces_m = surfaces(rows)
     seen = sum(frame in surfaces_m for frame in result.poses)  # of joined runs the recording has one pair alone
     if 2 * seen < len(result.poses) or not any(edge.kind == "closure" and edge.accepted for edge in result.edges):
@@ -142,8 +143,9 @@ def _closure(result: Result, rows: Mapping[str, Mapping[int, Row]]) -> Sequence[
         "<h2>Merged points</h2>",
         figure(
             plots.merged_clouds(result, surfaces_m),
-            "What all frames saw, laid together along the chain of edges and after optimisation, a colour a frame from "
-            "dark to bright. Where a loop was open, bright points lie beside dark ones.",
+            "Points of all frames, merged by the poses before loop closure (left) and after optimisation (right), "
+            "coloured by frame from dark to bright. Where the loop was open before closure, bright points lie "
+            "apart from dark ones.",
             kind="png",
         ),
     ]
@@ -153,8 +155,8 @@ def _accuracy(result: Result, centre_m: Array) -> Sequence[str]:
     """Return errors and coverage where the truth is known."""
     if result.true_pose(result.first) is None or not plots.edge_estimates(result):
         return [
-            "<h2>Errors</h2><p>The true motion is not known here (no scene_gt.json beside the sequence, or the "
-            "sequence has moved): there are no errors to show.</p>"
+            "<h2>Errors</h2><p>There is no ground truth (no scene_gt.json in the sequence, or the sequence has moved), "
+            "so errors cannot be shown.</p>"
         ]
     nees = [evaluation.nees(pose, truth) for pose, truth in plots.edge_estimates(result)]
     inside = evaluation.coverage(nees)[0.95]
@@ -162,16 +164,15 @@ def _accuracy(result: Result, centre_m: Array) -> Sequence[str]:
         "<h2>Errors against ground truth</h2>",
         figure(
             plots.errors(result, centre_m),
-            "Lines are errors relative to the first frame, bands the standard deviation that the result states along "
-            "its worst axis. Errors well above their band mean a result too sure of itself, or a truth that is "
-            "itself not so true.",
+            "Lines: errors relative to the first frame. Bands: the estimated sd along the least certain axis. Errors "
+            "far above their band mean that the covariances are too small, or that the ground truth is inaccurate.",
         ),
-        "<h2>Are the covariances true?</h2>",
+        "<h2>Calibration of the covariances</h2>",
         figure(
             plots.coverage(result),
-            "Share of truths inside the region of a given probability. On the diagonal: calibrated; below: too sure; "
-            f"above: too modest; grey: what chance allows. Of {len(nees)} edges {100.0 * inside:.0f} % have the truth "
-            "inside their 95 % region.",
+            "Share of true poses inside the region of a given probability. On the diagonal: calibrated; below: "
+            "overconfident; above: conservative; grey: expected scatter. The 95 % regions of "
+            f"{100.0 * inside:.0f} % of the {len(nees)} edges contain the truth.",
             style="half",
             kind="png",
         ),
@@ -179,7 +180,7 @@ def _accuracy(result: Result, centre_m: Array) -> Sequence[str]:
 
 
 def _settings(result: Result) -> str:
-    """Return what the run was asked to do, with what, and what became of its frames."""
+    """Return the settings, versions and times of the run, and the frames left out."""
     report = result.report
     rows = {"sequence": report["sequence"], "seed": report["seed"], "prior": report["prior"], **report["settings"]}
     if rows.get("frames") == ":":
@@ -196,7 +197,7 @@ def _settings(result: Result) -> str:
 
 
 def _name(result: Result) -> str:
-    """Return what the sequence is called, of joined runs what each is."""
+    """Return the name of the sequence, of joined runs the names of all."""
     where = str(result.report["sequence"])
     parts = where.split(" + ") if "joined" in result.report["settings"] else [where]
     return " + ".join(Path(part).name for part in parts) or "model"
@@ -212,7 +213,7 @@ def _pyramid(object_from_camera: Array) -> Array:
 
 
 def _poster(mesh: Mesh, object_from_upright: Array) -> str:
-    """Return a picture of the mesh that stands still, as a data address."""
+    """Return a still picture of the mesh as a data address."""
     away = object_from_upright @ _ABOVE_LEFT
     camera = look_at(mesh.centre_m, away, 4.2 * mesh.radius_m, -object_from_upright[:, 1])
     picture = shade(mesh.vertices_m, mesh.triangles, mesh.colours, camera, (460, 1048))
@@ -222,7 +223,7 @@ def _poster(mesh: Mesh, object_from_upright: Array) -> str:
 
 
 def _scale() -> str:
-    """Return the colours of certainty, from sure to unsure."""
+    """Return the colour scale of standard deviations."""
     from matplotlib import colormaps
 
     stops = ",".join(
@@ -247,7 +248,7 @@ def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Arr
         "From left: the frame; its surface (<span class='orange'>orange</span>) and that of the view it is registered "
         "to (<span class='teal'>teal</span>) before and after alignment."
         if pictures
-        else "There are no pictures, for recording.rrd is missing."
+        else "There are no pictures because recording.rrd is missing."
     )
     cards = [
         _pair_card(result, edge, record, pictures.get(edge.source), centre_m)
@@ -262,7 +263,7 @@ def _mode_words(modes: Sequence[Mapping[str, Any]]) -> str:
         return ""
     shares = [f"{100.0 * mode['weight']:.0f} %" for mode in modes]
     left = [f"{100.0 * mode['weight_in_graph']:.0f} %" for mode in modes if mode.get("weight_in_graph") is not None]
-    graph = f"; all edges together leave {', '.join(left)}" if left else ""
+    graph = f"; in the pose graph {', '.join(left)}" if left else ""
     return f"<p>{len(modes)} modes: {', '.join(shares)}{graph}.</p>"
 
 
@@ -282,8 +283,8 @@ def _pair_card(
     truth = result.true_motion(edge)
     if truth is not None:
         facts += [
-            f"rotation off by {evaluation.rotation_error_deg(posterior.pose.mean, truth):.2f}°",
-            f"translation by {1000.0 * evaluation.translation_error_m(posterior.pose.mean, truth, seen_m):.1f} mm",
+            f"rotation error {evaluation.rotation_error_deg(posterior.pose.mean, truth):.2f}°",
+            f"translation error {1000.0 * evaluation.translation_error_m(posterior.pose.mean, truth, seen_m):.1f} mm",
         ]
     words = escape(", ".join(facts))
     open_words = _mode_words(record.get("modes", [])) + "".join(
