@@ -40,13 +40,13 @@ def test_a_turn_that_is_told_by_hand_counts_more(frames: slice, given_deg: float
 
 
 def test_a_table_that_turns_the_other_way_is_asked_about() -> None:
-    lost = [f"frame 2 was left out: {Outcome.NO_OVERLAP.label}: {Outcome.NO_OVERLAP.advice}"]
+    lost = {"frames": [{"cause": ""}, {"cause": Outcome.NO_OVERLAP.label}], "reason_codes": ["left_out"]}
     known, unknown = (priors.TurntablePrior(-25.0, 3.0, step_sign=sign) for sign in ("known", "unknown"))
     assert sense_in_doubt(lost, known)
-    assert sense_in_doubt(["frames 6 and 5 share little surface (overlap 0.47), and no other edge ..."], known)
+    assert sense_in_doubt({"frames": [], "reason_codes": ["little_overlap"]}, known)
     assert not sense_in_doubt(lost, unknown)
     assert not sense_in_doubt(lost, priors.TablePrior())
-    assert not sense_in_doubt(["the run was interrupted after frame 3"], known)
+    assert not sense_in_doubt({"frames": [], "reason_codes": ["interrupted"]}, known)
 
 
 def test_a_step_that_the_views_contradict_is_told() -> None:
@@ -70,10 +70,10 @@ def test_a_step_that_the_views_contradict_is_told() -> None:
 
 
 def test_frames_before_the_object_came_are_told() -> None:
-    few, lost = f"{Outcome.TOO_FEW_POINTS.label}: {Outcome.TOO_FEW_POINTS.advice}", Outcome.NO_OVERLAP.label
+    few, lost = Outcome.TOO_FEW_POINTS.label, Outcome.NO_OVERLAP.label
 
     def said(*outcomes: str) -> str:
-        return ends_without([{"id": 2 * place, "outcome": outcome} for place, outcome in enumerate(outcomes)])
+        return ends_without([{"id": 2 * place, "cause": cause} for place, cause in enumerate(outcomes)])
 
     assert said(few, few, ACCEPTED, lost, ACCEPTED) == (
         "the object is seen from frame 4 on; --frames 4: takes those frames alone"

@@ -50,14 +50,15 @@ def comes_back(frames: AbstractSequence, given_deg: float | None, reach_deg: flo
     return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
 
 
-def sense_in_doubt(reasons: Sequence[str], prior: AbstractPrior) -> bool:
+def sense_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
     """Return whether views overlap so little that a table may turn the other way round than its prior takes for known.
 
     Args:
-        reasons: not to trust the model, as the report has them.
+        report: of the run.
         prior: of the run.
     """
-    little = any(words in reason for reason in reasons for words in ("no overlap", "little surface"))
+    little = "little_overlap" in (report.get("reason_codes") or ())
+    little = little or any(frame.get("cause") == Outcome.NO_OVERLAP.label for frame in report["frames"])
     return little and isinstance(prior, TurntablePrior) and prior.step_sign == "known"
 
 
@@ -94,7 +95,7 @@ def ends_without(frames: Sequence[Mapping[str, Any]]) -> str:
         frames: of the report.
     """
     ids = sorted(frame["id"] for frame in frames)
-    seen = sorted(frame["id"] for frame in frames if not frame["outcome"].startswith(Outcome.TOO_FEW_POINTS.label))
+    seen = sorted(frame["id"] for frame in frames if frame.get("cause") != Outcome.TOO_FEW_POINTS.label)
     if len(seen) < 2 or (seen[0], seen[-1]) == (ids[0], ids[-1]):
         return ""
     late, early = seen[0] > ids[0], seen[-1] < ids[-1]

@@ -227,10 +227,11 @@ def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> in
             f"{opening['sigmas']:.1f} times what its {opening['edges']} edges and the closure state"
         )
     if report["reasons"]:
-        first, *others = sorted(report["reasons"], key=lambda reason: "left out" in reason)  # those were told above
+        coded = list(zip(report.get("reason_codes") or report["reasons"], report["reasons"], strict=False))
+        first, *others = [words for _, words in sorted(coded, key=lambda reason: reason[0] == "left_out")]  # said above
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
         say(f"not to be trusted: {first}{more}")
-        if sense_in_doubt(report["reasons"], prior):
+        if sense_in_doubt(report, prior):
             say("that the table turns the way round that was told is taken for granted; else give --step-sign unknown")
     for remark in (other_step(report["edges"], prior), ends_without(report["frames"])):
         if remark:

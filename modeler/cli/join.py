@@ -264,8 +264,9 @@ def _written(
 
     views = dict(parts[0].views) | dict(parts[1].views)
     model = Fuser().fuse(views, solution.trajectory, conditional_covariances(solution, graph.edges))
+    names = [field.name for field in fields(FrameRecord)]
     for record in (record for part in parts for record in part.report["frames"]):
-        folder.frames[record["id"]] = FrameRecord(**{field.name: record[field.name] for field in fields(FrameRecord)})
+        folder.frames[record["id"]] = FrameRecord(**{name: record[name] for name in names if name in record})
     joining = tuple(edge for edge in graph.edges if edge.source in parts[1].views and edge.target in parts[0].views)
     best = max((edge.posterior for edge in joining if edge.accepted), key=lambda posterior: posterior.overlap)
     first, root = min(views), {min(views): np.eye(4)}

@@ -207,10 +207,17 @@ _WHOLE: dict[str, Test] = {
     "closed": _is(bool),
     "trustworthy": _is(bool),
     "reasons": lambda value: isinstance(value, list) and all(map(_is(str), value)),
+    "reason_codes": _null_or(lambda value: isinstance(value, list) and all(map(_is(str), value))),
     "seconds": lambda value: isinstance(value, dict) and all(map(_is_number, value.values())),
     "up": _null_or(_is_direction),
 }
-_FRAME: dict[str, Test] = {"id": _is_whole, "timestamp": _is_number, "points": _is_whole, "outcome": _is(str)}
+_FRAME: dict[str, Test] = {
+    "id": _is_whole,
+    "timestamp": _is_number,
+    "points": _is_whole,
+    "outcome": _is(str),
+    "cause": _null_or(_is(str)),  # reports of earlier versions have none
+}
 _POSE: dict[str, Test] = {"id": _is_whole, "object_from_camera": _numbers(16), "covariance": _numbers(36)}
 _MODE: dict[str, Test] = {"weight": _is_number_or_null, "target_from_source": _numbers(16), "covariance": _numbers(36)}
 _EDGE: dict[str, Test] = {

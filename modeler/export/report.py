@@ -24,6 +24,7 @@ from modeler.types import (
     RayImage,
     Solution,
     Step,
+    code,
     explain,
     joined_without,
     loop_opening,
@@ -79,7 +80,9 @@ class FrameRecord:
     points: int
     """Number of surface points on the object."""
     outcome: str
-    """`ACCEPTED`, or why the frame was left out."""
+    """`ACCEPTED`, or in words why the frame was left out."""
+    cause: str = ""
+    """The same for programs, as `types.code` has it; "" for frames that were accepted."""
 
     @property
     def accepted(self) -> bool:
@@ -90,8 +93,21 @@ class FrameRecord:
 def frame_record(step: Step) -> FrameRecord:
     """Return what became of the frame of a step."""
     points = 0 if step.view is None else len(step.view.points_m)
-    outcome = ACCEPTED if step.left_out is None else explain(step.left_out)
-    return FrameRecord(step.frame.index, float(step.frame.time_s), points, outcome)
+    if step.left_out is None:
+        return FrameRecord(step.frame.index, float(step.frame.time_s), points, ACCEPTED)
+    outcome, cause = explain(step.left_out), code(step.left_out)
+    return FrameRecord(step.frame.index, float(step.frame.time_s), points, outcome, cause)
+
+
+@dataclass(frozen=True)
+class Shortcoming:
+    """Why a model is not to be trusted."""
+
+    code: str
+    """For programs: `doubt`, `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `closures_refused`,
+    `unconfirmed`, `never_came_back`, `little_overlap` or `unsure_rotation`."""
+    words: str
+    """For people."""
 
 
 def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[str, Any]:
@@ -118,7 +134,8 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "closed": loops_closed(_taking_part(step)) > 0,
         "loop": _loop(step.edges_so_far, solution, views),
         "trustworthy": not reasons,
-        "reasons": reasons,
+        "reasons": [reason.words for reason in reasons],
+        "reason_codes": [reason.code for reason in reasons],
         "up": _up(solution, views),
         "frames": [vars(frame) for frame in frames],
     }
@@ -152,16 +169,17 @@ def _up(solution: Solution, views: Mapping[int, RayImage]) -> Array | None:
     return None if first is None or first.plane is None else first.plane.normal
 
 
-def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> list[str]:
-    """Return in words why the model is not to be trusted; empty where it is."""
-    reasons = list(meta.doubts)
+def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> list[Shortcoming]:
+    """Return why the model is not to be trusted; empty where it is."""
+    reasons = [Shortcoming("doubt", words) for words in meta.doubts]
     if meta.interrupted:
-        reasons.append(f"the run was interrupted after frame {step.frame.index}")
+        reasons.append(Shortcoming("interrupted", f"the run was interrupted after frame {step.frame.index}"))
     elif not step.last:
-        reasons.append("the run has not finished")
-    reasons += _left_out(frames)
+        reasons.append(Shortcoming("unfinished", "the run has not finished"))
+    reasons += [Shortcoming("left_out", words) for words in _left_out(frames)]
     if sum(frame.accepted for frame in frames) < 2:
-        reasons.append("fewer than two frames were accepted: there is nothing to align")
+        words = "fewer than two frames were accepted: there is nothing to align"
+        reasons.append(Shortcoming("too_few_frames", words))
     edges = _taking_part(step)
     if not loops_closed(edges):
         closures = [edge for edge in step.edges_so_far if edge.kind == "closure"]
@@ -169,20 +187,24 @@ def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> l
         if refused:
             last = refused[-1]
             pair = f"frame {last.source} on frame {last.target}"
-            reasons.append(
-                f"none of {len(closures)} closures closed a loop; the last refused, {pair}: {_reason(last, step)}"
-            )
+            words = f"none of {len(closures)} closures closed a loop; the last refused, {pair}: {_reason(last, step)}"
+            reasons.append(Shortcoming("closures_refused", words))
         elif closures:
-            reasons.append("what joins the first frames to the last is confirmed by nothing: no loop was closed")
+            words = "what joins the first frames to the last is confirmed by nothing: no loop was closed"
+            reasons.append(Shortcoming("unconfirmed", words))
         elif meta.closure_expected:
-            reasons.append("the object never came back to an earlier view, so that no loop was closed")
+            words = "the object never came back to an earlier view, so that no loop was closed"
+            reasons.append(Shortcoming("never_came_back", words))
     reasons += [
-        f"frames {edge.source} and {edge.target} share little surface (overlap {edge.posterior.overlap:.2f}), and no "
-        "other edge confirms how they were joined"
+        Shortcoming(
+            "little_overlap",
+            f"frames {edge.source} and {edge.target} share little surface (overlap {edge.posterior.overlap:.2f}), and "
+            "no other edge confirms how they were joined",
+        )
         for edge in edges
         if edge.posterior.overlap < _LITTLE_OVERLAP and not joined_without(edge, edges)
     ]
-    return reasons + _unsure(step.solution)
+    return reasons + [Shortcoming("unsure_rotation", words) for words in _unsure(step.solution)]
 
 
 def _left_out(frames: Sequence[FrameRecord]) -> list[str]:

@@ -41,6 +41,7 @@ from modeler.types.reasons import Reason as Reason
 from modeler.types.reasons import Relocalised as Relocalised
 from modeler.types.reasons import Stated as Stated
 from modeler.types.reasons import advice as advice
+from modeler.types.reasons import code as code
 from modeler.types.reasons import explain as explain
 from modeler.types.reasons import summary as summary
 from modeler.types.solution import Edge as Edge

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -141,6 +142,13 @@ Reason: TypeAlias = (
     | Stated
 )
 """Why an edge was accepted or rejected, or a frame left out."""
+
+
+def code(reason: Reason) -> str:
+    """Return the kind of a reason for programs that read reports: an outcome's label, or the class in snake case."""
+    if isinstance(reason, Failed):
+        return reason.outcome.label
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(reason).__name__).lower()
 
 
 def explain(reason: Reason) -> str:
