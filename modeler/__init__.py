@@ -1,1 +1,137 @@
-"""Models of objects from depth-camera sequences, with registration uncertainty that is tested to be true."""
+"""Models of objects from depth-camera sequences, with registration uncertainty that is tested to be true.
+
+A fixed depth camera watches a rigid object that is turned or moved. Pairs of depth images are registered by a
+probabilistic method, whose posteriors become the factors of a pose graph; its optimised poses fuse the images into a
+mesh. The method is that of M. Wüthrich et al., "Probabilistic Depth Image Registration incorporating Nonvisual
+Information", ICRA 2012, and its extensions; `docs/method.md` states it.
+
+Two depth images to a relative pose and its covariance:
+
+    import modeler
+
+    posterior = modeler.register(source_depth_m, target_depth_m, (fx, fy, cx, cy))
+    posterior.outcome, posterior.pose.mean, posterior.pose.covariance
+
+A sequence to a model, in a run folder as `modeler build` makes it:
+
+    result = modeler.build("sequences/bundled/box", "runs/box", prior="table")
+    result.trustworthy, result.model.vertices_m, result.solution.trajectory
+
+Frames and units
+    Lengths are in m, angles in rad unless a name ends with `_deg`; depth is the distance along the optical axis, with 0
+    or NaN where nothing was measured. Camera frames have x right, y down, z forward. `target_from_source` is the (4, 4)
+    transform that carries points of the source's camera frame to the target's. The object frame is the camera frame of
+    the first accepted view; a trajectory holds `object_from_camera` by frame number. A covariance (6, 6) is that of
+    the tangent vector (rotation, translation) of `mean @ exp(xi)`, in the frame on the right.
+
+Components are frozen dataclasses, whose fields are their parameters: a `Modeler` is made of a segmenter, a sensor, a
+prior, a registrar, a closer and a fuser, each replaceable. `modeler.types` has the abstract interfaces.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from modeler.api import Result, build, register
+    from modeler.pipeline import Modeler
+    from modeler.priors import (
+        AxesPrior,
+        FeaturesPrior,
+        GeneralPrior,
+        HeldPrior,
+        PokePrior,
+        ProductPrior,
+        TablePrior,
+        TurntablePrior,
+        VelocityPrior,
+    )
+    from modeler.rays import Sensor
+    from modeler.registration import VisibilityRegistrar
+    from modeler.segmentation import Segmenter
+    from modeler.types import (
+        Camera,
+        Frame,
+        InputError,
+        ObjectModel,
+        Outcome,
+        PoseGaussian,
+        Posterior,
+        Solution,
+        Step,
+    )
+    from sequences import open_sequence
+
+_MODULES = {
+    "modeler.api": ("Result", "build", "register"),
+    "modeler.pipeline": ("Modeler",),
+    "modeler.priors": (
+        "AxesPrior",
+        "FeaturesPrior",
+        "GeneralPrior",
+        "HeldPrior",
+        "PokePrior",
+        "ProductPrior",
+        "TablePrior",
+        "TurntablePrior",
+        "VelocityPrior",
+    ),
+    "modeler.rays": ("Sensor",),
+    "modeler.registration": ("VisibilityRegistrar",),
+    "modeler.segmentation": ("Segmenter",),
+    "modeler.types": (
+        "Camera",
+        "Frame",
+        "InputError",
+        "ObjectModel",
+        "Outcome",
+        "PoseGaussian",
+        "Posterior",
+        "Solution",
+        "Step",
+    ),
+    "sequences": ("open_sequence",),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+__all__ = [
+    "AxesPrior",
+    "Camera",
+    "FeaturesPrior",
+    "Frame",
+    "GeneralPrior",
+    "HeldPrior",
+    "InputError",
+    "Modeler",
+    "ObjectModel",
+    "Outcome",
+    "PokePrior",
+    "PoseGaussian",
+    "Posterior",
+    "ProductPrior",
+    "Result",
+    "Segmenter",
+    "Sensor",
+    "Solution",
+    "Step",
+    "TablePrior",
+    "TurntablePrior",
+    "VelocityPrior",
+    "VisibilityRegistrar",
+    "build",
+    "open_sequence",
+    "register",
+]
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name when it is first used (PEP 562), so that `import modeler` costs nothing."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(importlib.import_module(_MODULE_OF[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

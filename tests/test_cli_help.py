@@ -107,16 +107,6 @@ def test_commands_of_the_readme_are_understood(line: str) -> None:
     assert parsed(line.split()).run.__doc__
 
 
-def test_python_of_the_readme_runs(capfd: pytest.CaptureFixture[str]) -> None:
-    pair, tour = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    exec(pair, {})
-    assert capfd.readouterr().out.startswith("Outcome.CONVERGED")
-    quick = tour.replace('open_sequence(bundled("box"))', 'open_sequence(bundled("box")).select(frames=slice(0, 2))')
-    assert quick != tour
-    exec(quick, {})
-    assert capfd.readouterr().out == "0 accepted 1\n1 accepted 2\n"
-
-
 def test_the_readme_names_every_file_of_a_run_folder() -> None:
     assert {name for name in re.findall(r"`(\w+\.\w+)`", README) if name in FILES} == FILES
 

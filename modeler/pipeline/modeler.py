@@ -16,7 +16,9 @@ from modeler.graph import CommonAxis, shared_noise
 from modeler.pipeline.pairs import Prepared, prepare, register
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
+from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
+from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
 from modeler.types import (
     AbstractPrior,
@@ -44,17 +46,17 @@ class Modeler:
     have come back (paper, section VI-D); the posteriors become edges of a pose graph, the solved poses fuse the views.
     """
 
-    segmenter: Segmenter
+    segmenter: Segmenter = field(default_factory=Segmenter)
     """Finds the object."""
-    sensor: Sensor
+    sensor: Sensor = field(default_factory=Sensor)
     """Noise of the camera."""
-    prior: AbstractPrior
+    prior: AbstractPrior = field(default_factory=GeneralPrior)
     """What is known of motions before the images are compared."""
-    registrar: AbstractRegistrar
+    registrar: AbstractRegistrar = field(default_factory=VisibilityRegistrar)
     """Registers two views."""
-    closer: Closer
+    closer: Closer = field(default_factory=Closer)
     """Chooses the pairs and judges the results."""
-    fuser: Fuser
+    fuser: Fuser = field(default_factory=Fuser)
     """Makes the model."""
     common_noise: float = 0.1
     """Covariance of the error that all views of a run share, as a share of an edge's. No loop observes it: over many

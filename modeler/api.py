@@ -1,0 +1,165 @@
+"""What a script needs most: two depth images to a posterior, a sequence to a model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.cli import compose
+from modeler.cli.advice import comes_back
+from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.export import RunFolder, RunMeta, alone
+from modeler.pipeline import Modeler
+from modeler.rays import Sensor
+from modeler.types import AbstractPrior, Camera, Frame, InputError, ObjectModel, Posterior, Solution, Step
+from sequences import AbstractSequence
+from sequences import open_sequence as opened
+from viz.stream import open_stream
+
+Intrinsics = Camera | npt.ArrayLike
+"""A camera, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a run came to."""
+
+    model: ObjectModel | None
+    """The fused object; None where no frame shows it."""
+    solution: Solution
+    """object_from_camera (4, 4) by frame number, with covariances."""
+    report: Mapping[str, Any]
+    """As in report.json: every frame, every edge, and whether and why not to trust the model."""
+    folder: Path
+    """The run folder."""
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether the model can be trusted; `report["reasons"]` says why not."""
+        return bool(self.report["trustworthy"])
+
+
+def register(
+    source_depth_m: npt.ArrayLike,
+    target_depth_m: npt.ArrayLike,
+    intrinsics: Intrinsics,
+    *,
+    prior: AbstractPrior | None = None,
+    masks: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+    sensor: Sensor | None = None,
+    seed: int = 0,
+) -> Posterior:
+    """Return the posterior of target_from_source, the motion of the object between two depth images.
+
+    Args:
+        source_depth_m: (h, w) depth in m; 0 or NaN where nothing was measured.
+        target_depth_m: (h, w), of the same camera.
+        intrinsics: a `Camera`, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix.
+        prior: what is known of the motion; None: rotations up to 50° and shifts of up to 4 cm, as `GeneralPrior`.
+        masks: (h, w) of source and target, true on the object; None: the object is segmented.
+        sensor: noise of the camera; None: the first Kinect's.
+        seed: of the samples; the same seed gives the same posterior.
+
+    Raises:
+        InputError: where an image cannot be used, shows no object, or lacks what the prior needs.
+    """
+    pictures = [np.array(depth, dtype=np.float32) for depth in (source_depth_m, target_depth_m)]
+    if pictures[0].ndim != 2 or pictures[0].shape != pictures[1].shape:
+        shapes = " and ".join(str(picture.shape) for picture in pictures)
+        raise InputError(f"the depth images have shapes {shapes}; give two arrays (h, w) of the same camera")
+    given = [None, None] if masks is None else [np.asarray(mask, dtype=bool) for mask in masks]
+    if any(mask is not None and mask.shape != pictures[0].shape for mask in given):
+        raise InputError(f"the masks have another shape than the depth images, {pictures[0].shape}; give the same")
+    camera = _camera(intrinsics, pictures[0].shape)
+    frames = []
+    for index, (depth_m, mask) in enumerate(zip(pictures, given, strict=True)):
+        depth_m[~(depth_m > 0.0) | np.isinf(depth_m)] = np.nan
+        frames.append(Frame(index, float(index), depth_m, camera, mask=mask))
+    modeler = Modeler(sensor=sensor or Sensor(), seed=seed)
+    scene = modeler.segmenter.scene(frames)
+    views = []
+    for name, frame in zip(("source", "target"), frames, strict=True):
+        prepared = modeler.prepare(frame, scene)
+        if prepared.view is None:
+            raise InputError(f"the {name} image has {prepared.flaw.label}: {prepared.flaw.advice}")
+        views.append(prepared.view)
+    return modeler.register(*views, prior=prior)
+
+
+def build(
+    sequence: str | Path | AbstractSequence,
+    out: str | Path,
+    *,
+    prior: AbstractPrior | str | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> Result:
+    """Build the model of an object from a sequence into a run folder, as `modeler build` does.
+
+    Args:
+        sequence: a path in any format that `modeler build` reads, or an open sequence, with frames selected or not.
+        out: the run folder to make: mesh, cloud, trajectory, graph, report and recording.
+        prior: what is known of the motion between frames, or the name of such a prior as of `--prior`; None: what the
+            sequence says of itself, else that of `general`.
+        seed: of every random number; the same seed gives the same model.
+        overwrite: replace the results of an earlier run in the folder.
+
+    Raises:
+        InputError: where the sequence cannot be read, or the folder cannot be used.
+    """
+    began_s = time.perf_counter()
+    frames = sequence if isinstance(sequence, AbstractSequence) else opened(Path(sequence))
+    options = PriorOptions(prior=prior if isinstance(prior, str) else None)
+    modeler = compose.modeler(frames, options, MethodOptions(seed=seed), ObjectOptions())
+    if isinstance(prior, AbstractPrior):
+        modeler = replace(modeler, prior=prior)
+    meta = RunMeta(
+        sequence=frames.name if isinstance(sequence, AbstractSequence) else str(sequence),
+        seed=seed,
+        prior=type(prior).__name__ if isinstance(prior, AbstractPrior) else compose.told(options, frames)[0],
+        closure_expected=comes_back(frames, None, modeler.closer.max_angle_deg),
+    )
+    scene = compose.scene(modeler, frames)
+    report: Mapping[str, Any] = {}
+    last: Step | None = None
+    with alone(Path(out)):
+        folder = RunFolder.open(Path(out), overwrite=overwrite)
+        facts = {"sequence": meta.sequence, "seed": seed, "prior": meta.prior}
+        stream = open_stream(frames.name, save=folder.path / "recording.rrd", facts=facts)
+        try:
+            for event in modeler.run(frames, scene):
+                if isinstance(event, Step):
+                    seconds = {"total": time.perf_counter() - began_s}
+                    report = folder.write(event, replace(meta, seconds=seconds))
+                    stream(event)
+                    last = event
+        finally:
+            stream.close()
+        folder.finish()
+    if last is None:
+        raise InputError(f"{frames.name}: holds no frame; select others")
+    return Result(last.model, last.solution, report, folder.path)
+
+
+def _camera(intrinsics: Intrinsics, shape: tuple[int, ...]) -> Camera:
+    """Return the camera of images of a shape (h, w).
+
+    Raises:
+        InputError: where the intrinsics are none.
+    """
+    height, width = shape
+    if isinstance(intrinsics, Camera):
+        return intrinsics
+    numbers = np.asarray(intrinsics, dtype=np.float64)
+    if numbers.shape == (3, 3):
+        numbers = numbers[[0, 1, 0, 1], [0, 1, 2, 2]]
+    if numbers.shape != (4,) or not np.isfinite(numbers).all() or not (numbers[:2] > 0.0).all():
+        raise InputError("the intrinsics are no camera; give (fx, fy, cx, cy) in px, or the (3, 3) camera matrix")
+    return Camera(width, height, *(float(number) for number in numbers))

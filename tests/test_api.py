@@ -1,0 +1,105 @@
+"""What `import modeler` offers, and the Python of the README."""
+
+from __future__ import annotations
+
+import pydoc
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tabletop
+
+import modeler
+from modeler import se3
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+PAIR, BUILD, LOOP = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+POSES = tabletop.turntable(15)
+SOURCE, TARGET = (tabletop.view(tabletop.Box((0.06, 0.045, 0.08)), POSES[index], index).frame for index in (1, 0))
+CAMERA = SOURCE.camera
+NUMBERS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
+
+
+def test_the_package_is_imported_without_what_it_is_made_of() -> None:
+    code = "import sys, modeler; print('numpy' in sys.modules, modeler.TablePrior.__name__, 'numpy' in sys.modules)"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout.split() == ["False", "TablePrior", "True"]
+
+
+def test_every_public_name_is_there_and_documented() -> None:
+    assert set(modeler.__all__) <= set(dir(modeler))
+    assert all(getattr(modeler, name).__doc__ for name in modeler.__all__)
+    with pytest.raises(AttributeError, match="nothing_such"):
+        _ = modeler.nothing_such  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_help_tells_frames_units_and_functions() -> None:
+    text = pydoc.plain(pydoc.render_doc(modeler))
+    for words in (
+        "target_from_source",
+        "Lengths are in m",
+        "register(source_depth_m",
+        "build(sequence",
+        "class Modeler",
+    ):
+        assert words in text
+
+
+def test_a_pair_of_the_readme_runs(capfd: pytest.CaptureFixture[str]) -> None:
+    exec(PAIR, {})
+    assert capfd.readouterr().out.startswith("Outcome.CONVERGED")
+
+
+def test_the_sequence_of_the_readme_is_built(
+    capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    exec(_of_two_frames(BUILD), {})
+    assert capfd.readouterr().out.startswith("True 2 ")
+    assert (tmp_path / "runs" / "box-python" / "model.ply").exists()
+    assert (tmp_path / "runs" / "box-python" / "recording.rrd").exists()
+
+
+def test_the_loop_of_the_readme_runs(capfd: pytest.CaptureFixture[str]) -> None:
+    exec(_of_two_frames(LOOP), {})
+    assert capfd.readouterr().out == "0 True 1\n1 True 2\n1 True 2\n"
+
+
+def _of_two_frames(code: str) -> str:
+    quick = code.replace('open_sequence(bundled("box"))', 'open_sequence(bundled("box")).select(frames=slice(0, 2))')
+    assert quick != code
+    return quick
+
+
+def test_two_depth_images_give_a_pose_and_its_covariance() -> None:
+    depths, masks = (SOURCE.depth_m, TARGET.depth_m), (SOURCE.mask, TARGET.mask)
+    assert masks[0] is not None
+    assert masks[1] is not None
+    zeros = np.nan_to_num(depths[0])
+    matrix = [[CAMERA.fx, 0.0, CAMERA.cx], [0.0, CAMERA.fy, CAMERA.cy], [0.0, 0.0, 1.0]]
+    one = modeler.register(zeros, depths[1], NUMBERS, masks=(masks[0], masks[1]))
+    other = modeler.register(depths[0].tolist(), depths[1], matrix, masks=(masks[0], masks[1]))
+    truth = POSES[0] @ se3.inverse(POSES[1])
+    assert one.outcome is modeler.Outcome.CONVERGED
+    assert np.degrees(se3.rotation_angle(se3.inverse(truth) @ one.pose.mean)) < 1.0
+    assert np.linalg.eigvalsh(one.pose.covariance)[0] > 0.0
+    np.testing.assert_array_equal(one.pose.mean, other.pose.mean)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"source_depth_m": np.ones((3, 4))}, "have shapes"),
+        ({"intrinsics": (1.0, 2.0)}, "intrinsics"),
+        ({"intrinsics": (0.0, 500.0, 10.0, 10.0)}, "intrinsics"),
+        ({"masks": (np.ones((3, 4)), np.ones((3, 4)))}, "masks"),
+        ({"source_depth_m": np.zeros_like(SOURCE.depth_m)}, "source image"),
+    ],
+)
+def test_what_cannot_be_registered_is_refused(change: dict[str, object], words: str) -> None:
+    arguments = {"source_depth_m": SOURCE.depth_m, "target_depth_m": TARGET.depth_m, "intrinsics": NUMBERS} | change
+    with pytest.raises(modeler.InputError, match=words):
+        modeler.register(**arguments)  # pyright: ignore[reportArgumentType]
