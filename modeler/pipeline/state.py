@@ -10,6 +10,7 @@ from modeler.closure import MapView
 from modeler.fusion import IncrementalTsdf
 from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.pipeline.pairs import Prepared
+from modeler.pipeline.view_store import ViewStore
 from modeler.types import Edge, InputError, ObjectModel, RayImage, Solution
 
 _READY = 8  # views kept ready for registration; of others the images that a likelihood looks up are made again
@@ -38,6 +39,8 @@ class State:
     """How many frames were searched for in vain since a search last found one."""
     spans: tuple[Edge, ...] = ()
     """Edges of the refinement, which the graph does not hold yet."""
+    store: ViewStore = field(default_factory=ViewStore)
+    """What keeps the views and the lost frames."""
     model: ObjectModel | None = None
     """The newest model."""
     growing: IncrementalTsdf | None = None
@@ -76,7 +79,7 @@ class State:
     def joined(self, prepared: Prepared, edges: Sequence[Edge]) -> State:
         """Return the state once a frame is judged."""
         number, graph = prepared.frame.index, self.graph.plus(edges)
-        light = prepared if prepared.view is None else replace(prepared, view=_light(prepared.view))
+        light = self._stored(prepared)
         newest = self.newest if number in self.lost else light
         if light.view is None:
             return replace(self, graph=graph, newest=newest)
@@ -116,7 +119,15 @@ class State:
             if after:
                 yield frame, min(after, key=lambda view: self.places[view])
 
-
-def _light(view: RayImage) -> RayImage:
-    """Return a view without the images that a likelihood looks up, which are ten times as large as the frame."""
-    return replace(view, layers={})
+    def _stored(self, prepared: Prepared) -> Prepared:
+        """Return a frame whose images are in the store."""
+        if prepared.frame.index in self.lost:
+            return replace(self.lost[prepared.frame.index], left_out=prepared.left_out)
+        if prepared.view is None:
+            return prepared
+        view = self.store.keep(prepared.view)
+        frame = replace(prepared.frame, depth_m=view.frame.depth_m, colour=view.frame.colour)
+        assert view.frame.mask is not None
+        return replace(
+            prepared, frame=frame, segmentation=replace(prepared.segmentation, mask=view.frame.mask), view=view
+        )
