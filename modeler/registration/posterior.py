@@ -1,4 +1,4 @@
-"""What the sampling methods share: from samples to a Gaussian, and whether they lean on their limits."""
+"""What the sampling methods share: statistics of weighted samples, and posteriors of failed registrations."""
 
 import numpy as np
 
@@ -6,15 +6,15 @@ from modeler import se3
 from modeler.types import AbstractPoseDensity, Array, Outcome, PoseGaussian, Posterior, RayImage
 
 FLOOR = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
-"""Added to covariances (6, 6) of ξ (rad, m) that few samples tell, which would not be positive definite."""
-_SAMPLES = 500  # of a prior, enough for its mean and covariance
+"""Added to sample covariances (6, 6) of ξ (rad, m), so that they are positive definite."""
+_SAMPLES = 500  # of a prior, for its mean and covariance
 
 
 def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaussian:
-    """Return the mean and covariance of weighted motions (paper, E[f(T)] ≈ Σ w_l f(T_l)).
+    """Return the mean and covariance of weighted poses (paper, E[f(T)] ≈ Σ w_l f(T_l)).
 
-    The mean is taken of motions about the object's centre: about the camera, rotation and translation would be strongly
-    coupled, and the mean of a wide posterior would leave the object.
+    The mean is taken about the object's centre: about the camera, rotation and translation would be strongly coupled,
+    and the mean of a wide posterior would leave the object.
 
     Args:
         poses: (n, 4, 4) target_from_source.
@@ -26,7 +26,7 @@ def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaus
 
 
 def normalised(log_weights: Array) -> Array:
-    """Return weights (n,) of sum 1; even ones where all are 0."""
+    """Return weights (n,) of sum 1; uniform ones where all are 0."""
     top = np.max(log_weights)
     weights = np.exp(log_weights - top) if np.isfinite(top) else np.ones(len(log_weights))
     return weights / np.sum(weights)
@@ -59,10 +59,10 @@ def pareto_tail(log_weights: Array) -> float:
 def share_at_limit(
     density: AbstractPoseDensity, poses: Array, weights: Array, centre_m: Array, rng: np.random.Generator
 ) -> float:
-    """Return the share of motions (n, 4, 4) that a small step, about 1° and 1 mm, takes out of the prior's support.
+    """Return the share of weighted poses (n, 4, 4) that a random step of about 1° and 1 mm takes out of the support.
 
-    A posterior that leans on the end of its prior is cut off there, and what it would have found beyond is not known.
-    The steps turn about `centre_m` (3,), a point of the source.
+    A posterior at the limit of its prior is truncated. Rotations of the steps are about `centre_m` (3,), a point of the
+    source.
     """
     nudges = rng.normal(size=(len(poses), 6)) * np.repeat([np.radians(1.0), 0.001], 3)
     nudged = se3.moved(poses, nudges, centre_m)
@@ -76,14 +76,13 @@ def failed(
     density: AbstractPoseDensity | None = None,
     rng: np.random.Generator | None = None,
 ) -> Posterior:
-    """Return the posterior of a registration that could not be made: what was known before, or nothing.
+    """Return the posterior of a registration that could not be made: the prior, or next to no knowledge.
 
     Args:
         source: first view.
         target: second view.
         outcome: why it could not be made.
-        density: what was known of the motion, whose mean and covariance are handed on; without it every rotation within
-            10 m is within one standard deviation.
+        density: the prior, whose mean and covariance are returned; without it the standard deviations are π and 10 m.
         rng: source of all randomness, with a density.
     """
     if density is None or rng is None:

@@ -45,40 +45,22 @@ class VisibilityLikelihood:
     def between(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> PairLikelihood:
         """Return the likelihood of target_from_source, at surface points drawn with `rng`."""
         size_m = 0.5 * (source.size_m + target.size_m)
-        return PairLikelihood(
-            self._directed(source, target, size_m, rng),
-            self._directed(target, source, size_m, rng),
-            size_m=size_m,
-        )
-
-    def _directed(self, view: RayImage, image: RayImage, size_m: float, rng: np.random.Generator) -> DirectedLikelihood:
-        return DirectedLikelihood(
-            spread_points(view, self.points, rng),
-            image,
-            min_blur_m=float(np.hypot(self.surface_detail * size_m, self.surface_noise * image.sigma_r_m)),
-            hidden_share=self.hidden_share,
-            max_point_cost=self.max_point_cost,
-            normal_cost=self.normal_cost,
-            measured_share=measured_share(image),
-        )
+        forward = DirectedLikelihood(self, spread_points(source, self.points, rng), target, size_m)
+        backward = DirectedLikelihood(self, spread_points(target, self.points, rng), source, size_m)
+        return PairLikelihood(forward, backward, size_m)
 
 
 @dataclass(frozen=True, eq=False)
 class DirectedLikelihood:
     """One direction: p(points of one view | image of the other, pose)."""
 
+    model: VisibilityLikelihood
     points: Array
     """(n, 7) position in m, unit normal, variance along the normal in m²."""
     image: RayImage
     """The view in which the points are looked up."""
-    min_blur_m: float
-    """Least noise of matching surfaces."""
-    hidden_share: float
-    """See `VisibilityLikelihood`, as are the next two."""
-    max_point_cost: float
-    normal_cost: float
-    measured_share: float
-    """Share of pixels around the surface that carry a measurement."""
+    size_m: float
+    """Size of the object, see `PairLikelihood`."""
 
     def classify(self, pose: Array) -> np.ndarray:
         """Return the class (n,) of each point under one pose (12,): `point_likelihood.classify`."""
@@ -86,15 +68,15 @@ class DirectedLikelihood:
 
     def residual_excess(self, pose: Array, blur_m: float) -> tuple[float, int]:
         """Return Σ (r² - s² - v) in m² over the matches under a pose (12,), and their number (method.md, eq. 8)."""
-        return point_likelihood.residual_excess(pose, self.projection(), float(np.hypot(blur_m, self.min_blur_m)))
+        return point_likelihood.residual_excess(pose, self.projection(), float(np.hypot(blur_m, self._min_blur_m)))
 
     def misfits(self, pose: Array, blur_m: float) -> Array:
         """Return the loss (k,) in nats of each match under one pose (12,) to its distance and normals."""
-        found = self.matches(pose, float(np.hypot(blur_m, self.min_blur_m)))
+        found = self.matches(pose, float(np.hypot(blur_m, self._min_blur_m)))
         found = found[found[:, point_to_plane.WEIGHT] > 0.0]
         variance = found[:, point_to_plane.FACING_WEIGHT] / found[:, point_to_plane.WEIGHT]
         agreement = np.sum(found[:, point_to_plane.OWN] * found[:, point_to_plane.OTHER], axis=1)
-        return 0.5 * found[:, point_to_plane.RESIDUAL] ** 2 / variance + self.normal_cost * (1.0 - agreement)
+        return 0.5 * found[:, point_to_plane.RESIDUAL] ** 2 / variance + self.model.normal_cost * (1.0 - agreement)
 
     def matches(self, pose: Array, blur_m: float) -> Array:
         """Return the match of each point under one pose (12,): `point_to_plane.matches`."""
@@ -112,13 +94,13 @@ class DirectedLikelihood:
         fx = self.image.frame.camera.fx
         lateral_px = max(self.image.sigma_wh * fx, 1.0)
         return LikelihoodParameters(
-            blur_m=np.float32(np.hypot(blur_m, self.min_blur_m)),
+            blur_m=np.float32(np.hypot(blur_m, self._min_blur_m)),
             silhouette_px=np.float32(_SILHOUETTE_NOISE * lateral_px + blur_m * fx / self._distance_m),
             dead_band_px=np.float32(_DEAD_BAND * lateral_px),
             clearance_m=np.float32(3.0 * self.image.sigma_r_m),
-            max_point_cost=np.float32(self.max_point_cost),
-            normal_cost=np.float32(self.normal_cost),
-            unmeasured_gain=np.float32(np.log(max(self.hidden_share, 1.0 - self.measured_share))),
+            max_point_cost=np.float32(self.model.max_point_cost),
+            normal_cost=np.float32(self.model.normal_cost),
+            unmeasured_gain=np.float32(np.log(max(self.model.hidden_share, 1.0 - self._measured_share))),
             typical_misfit=np.float32(typical_misfit),
             table=self._table,
         )
@@ -143,12 +125,28 @@ class DirectedLikelihood:
         return np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float32)
 
     @cached_property
+    def _min_blur_m(self) -> float:
+        """Least noise of matching surfaces."""
+        detail_m = self.model.surface_detail * self.size_m
+        return float(np.hypot(detail_m, self.model.surface_noise * self.image.sigma_r_m))
+
+    @cached_property
+    def _measured_share(self) -> float:
+        """Share of the pixels around the surface that carry a measurement: low for very sparse images."""
+        rows_, columns = self.image.pixels[:: max(len(self.image.pixels) // 500, 1)].T
+        height, width = self.image.frame.depth_m.shape
+        steps = np.arange(-2, 3)
+        near_rows = np.clip(rows_[:, None, None] + steps[:, None], 0, height - 1)
+        near_columns = np.clip(columns[:, None, None] + steps, 0, width - 1)
+        return float(np.mean(self.image.frame.depth_m[near_rows, near_columns] > 0))
+
+    @cached_property
     def _distance_m(self) -> float:
         return max(float(np.median(self.points[:, 2])), 1e-3)
 
     @cached_property
     def _table(self) -> np.ndarray:
-        return point_likelihood.match_table(self.hidden_share)
+        return point_likelihood.match_table(self.model.hidden_share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +242,7 @@ class PairLikelihood:
         )
         if len(misfits) <= _MIN_MATCHES:
             return 0.5
-        hidden = self.forward.hidden_share
+        hidden = self.forward.model.hidden_share
         low, high = 0.0, 2.0
         for _ in range(16):  # bisection: the mean grows with μ
             middle = 0.5 * (low + high)
@@ -342,16 +340,6 @@ class PairLikelihood:
 def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:
     """Return the regulariser for equations of every `stride`-th point, which are left at their own scale."""
     return regulariser._replace(precision=regulariser.precision / stride, damping=regulariser.damping / stride)
-
-
-def measured_share(view: RayImage) -> float:
-    """Return the share of pixels around the surface points that carry a measurement: low for very sparse images."""
-    rows_, columns = view.pixels[:: max(len(view.pixels) // 500, 1)].T
-    height, width = view.frame.depth_m.shape
-    steps = np.arange(-2, 3)
-    near_rows = np.clip(rows_[:, None, None] + steps[:, None], 0, height - 1)
-    near_columns = np.clip(columns[:, None, None] + steps, 0, width - 1)
-    return float(np.mean(view.frame.depth_m[near_rows, near_columns] > 0))
 
 
 def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> Array:

@@ -47,19 +47,20 @@ class ModeSamples:
     max_compared: float
     """Independent measurements in all points, for the comparison with other modes."""
 
-    def log_evidence(self, pair: PairLikelihood, reference: ModeSamples) -> float:
-        """Return the log evidence of the mode under the nuisance parameters of another (method.md, eq. 13).
+    def compared(self, pair: PairLikelihood, reference: ModeSamples) -> WeightedSamples:
+        """Return the samples with their evidence under the nuisance parameters of another mode (method.md, eq. 13).
 
         Under its own noise a mode that matches badly is forgiven.
         """
-        best = int(np.argmax(self.samples.log_likelihoods))
-        compared = pair.tempered(
-            self.samples.poses[best : best + 1],
+        samples, best = self.samples, int(np.argmax(self.samples.log_likelihoods))
+        under_reference = pair.tempered(
+            samples.poses[best : best + 1],
             reference.noise_m,
             max_independent=self.max_compared,
             typical_misfit=reference.typical_misfit,
         )
-        return self.samples.log_evidence + float(compared[0] - self.samples.log_likelihoods[best])
+        gain = float(under_reference[0] - samples.log_likelihoods[best])
+        return replace(samples, log_evidence=samples.log_evidence + gain)
 
 
 @dataclass(frozen=True)
@@ -183,45 +184,17 @@ class VisibilityRegistrar(AbstractRegistrar):
         rng: np.random.Generator,
         started: float,
     ) -> Posterior:
-        """Return the posterior that one search leads to."""
-        centre_m, fine_m = pair.centre_m, search.fine_m(pair)
+        """Search modes, sample each, refine the samples, weigh the modes, and judge the outcome."""
         found = search.run(pair, density, rng)
         sampled = [
-            self.sampler.run(pair, density, search, mode, rng) for mode in found.modes(centre_m)[: self.max_modes]
+            self.sampler.run(pair, density, search, mode, rng) for mode in found.modes(pair.centre_m)[: self.max_modes]
         ]
         reference = min(sampled, key=lambda mode: mode.noise_m)
-        refined = [
-            replace(
-                self._refined(pair, density, mode.samples, fine_m, rng),
-                log_evidence=mode.log_evidence(pair, reference),
-            )
-            for mode in sampled
-        ]
-        weighed = weigh_modes(refined)
-        samples = np.concatenate([mode.poses for _, mode in weighed])
-        weights = np.concatenate([share * mode.weights for share, mode in weighed])
-        modes = tuple(Mode(share, weighted_gaussian(mode.poses, mode.weights, centre_m)) for share, mode in weighed)
-        collapse = len(modes) == 1 or are_separate(modes)
-        pose = pooled(modes) if collapse else weighted_gaussian(samples, weights, centre_m)
-        overlap = pair.overlap(modes[0].pose.mean)
-        effective = 1.0 / sum(share**2 / mode.effective_samples for share, mode in weighed)
-        beyond = found.beyond_gain > self.max_beyond_gain
-        at_limit = 1.0 if beyond else share_at_limit(density, weighed[0][1].poses, weighed[0][1].weights, centre_m, rng)
-        return Posterior(
-            source=pair.backward.image.index,
-            target=pair.forward.image.index,
-            pose=pose,
-            outcome=self._outcome(effective, pose, overlap, at_limit=at_limit),
-            overlap=overlap,
-            least_overlap=self.min_overlap,
-            samples=samples,
-            weights=weights,
-            modes=modes if len(modes) > 1 else (),
-            effective_samples=effective,
-            pareto_k=max(mode.pareto_k for _, mode in weighed),
-            log_evidence=float(np.logaddexp.reduce([mode.log_evidence for _, mode in weighed])),
-            seconds=time.perf_counter() - started,
-        )
+        compared = [mode.compared(pair, reference) for mode in sampled]
+        refined = [self._refined(pair, density, samples, search.fine_m(pair), rng) for samples in compared]
+        modes = weigh_modes(refined)
+        at_limit = self._share_at_limit(pair, density, found, modes[0][1], rng)
+        return self._judged(pair, modes, at_limit=at_limit, seconds=time.perf_counter() - started)
 
     def _refined(
         self,
@@ -235,6 +208,48 @@ class VisibilityRegistrar(AbstractRegistrar):
         refined = self.refiner.refine(pair, samples.poses, samples.weights, rng, fine_m=fine_m)
         inside = np.isfinite(density.log_evidence(refined))
         return replace(samples, poses=np.where(inside[:, None, None], refined, samples.poses))
+
+    def _share_at_limit(
+        self,
+        pair: PairLikelihood,
+        density: AbstractPoseDensity,
+        found: Candidates,
+        heaviest: WeightedSamples,
+        rng: np.random.Generator,
+    ) -> float:
+        """Return the share of the heaviest mode at the limit of the prior; 1 where surface leads beyond it."""
+        if found.beyond_gain > self.max_beyond_gain:
+            return 1.0
+        return share_at_limit(density, heaviest.poses, heaviest.weights, pair.centre_m, rng)
+
+    def _judged(
+        self, pair: PairLikelihood, weighed: list[tuple[float, WeightedSamples]], *, at_limit: float, seconds: float
+    ) -> Posterior:
+        """Return the posterior of weighted modes, and its outcome (method.md, "Result")."""
+        samples = np.concatenate([mode.poses for _, mode in weighed])
+        weights = np.concatenate([share * mode.weights for share, mode in weighed])
+        modes = tuple(
+            Mode(share, weighted_gaussian(mode.poses, mode.weights, pair.centre_m)) for share, mode in weighed
+        )
+        separate = len(modes) == 1 or are_separate(modes)
+        pose = pooled(modes) if separate else weighted_gaussian(samples, weights, pair.centre_m)
+        overlap = pair.overlap(modes[0].pose.mean)
+        effective = 1.0 / sum(share**2 / mode.effective_samples for share, mode in weighed)
+        return Posterior(
+            source=pair.backward.image.index,
+            target=pair.forward.image.index,
+            pose=pose,
+            outcome=self._outcome(effective, pose, overlap, at_limit=at_limit),
+            overlap=overlap,
+            least_overlap=self.min_overlap,
+            samples=samples,
+            weights=weights,
+            modes=modes if len(modes) > 1 else (),
+            effective_samples=effective,
+            pareto_k=max(mode.pareto_k for _, mode in weighed),
+            log_evidence=float(np.logaddexp.reduce([mode.log_evidence for _, mode in weighed])),
+            seconds=seconds,
+        )
 
     def _outcome(self, effective_samples: float, pose: PoseGaussian, overlap: float, *, at_limit: float) -> Outcome:
         if at_limit > self.max_at_limit:

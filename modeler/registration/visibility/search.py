@@ -215,22 +215,24 @@ class Rescue:
     valley: float = 5.0
     """Least depth (nats) of the valley that separates a basin from the best: without one it is on the same ridge."""
 
-    def dropped(self, problem: Problem, poses: Array, scores: Array, negligible: float) -> Array:
-        """Return those of ordered poses (n, 4, 4) with scores (n,) that are the best of a basin, but negligible."""
-        heads = problem.best_of_basins(poses, 1, self.basins)
-        return poses[heads[scores[heads] < scores[:1] - negligible]]
-
-    def separated(
-        self, problem: Problem, best: Array, poses: Array, score: Callable[[Array], Array], negligible: float
+    def select(
+        self, problem: Problem, poses: Array, scores: Array, blurred: Callable[[Array], Array], negligible: float
     ) -> Array:
-        """Return those of poses (n, 4, 4) that a valley separates from the best, and a blurred score hardly does."""
+        """Return the poses to improve, of ordered poses (n, 4, 4) with scores (n,).
+
+        They are the best of a basin, negligible, not so by a blurred score, and separated from the best by a valley.
+        """
         centre_m = problem.pair.centre_m
-        xi = se3.difference(best, poses, centre_m)
+        heads = problem.best_of_basins(poses, 1, self.basins)
+        dropped = poses[heads[scores[heads] < scores[:1] - negligible]]
+        if not len(dropped):
+            return dropped
+        xi = se3.difference(poses[0], dropped, centre_m)
         shares = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
-        along = se3.moved(best, (shares[:, None, None] * xi).reshape(-1, 6), centre_m)
-        blurred = score(along).reshape(len(shares), -1)
-        apart = blurred[1:-1].min(axis=0) < np.minimum(blurred[0], blurred[-1]) - self.valley
-        return poses[apart & (blurred[-1] > blurred[0] - 2.0 * negligible)]
+        along = se3.moved(poses[0], (shares[:, None, None] * xi).reshape(-1, 6), centre_m)
+        profile = blurred(along).reshape(len(shares), -1)
+        apart = profile[1:-1].min(axis=0) < np.minimum(profile[0], profile[-1]) - self.valley
+        return dropped[apart & (profile[-1] > profile[0] - 2.0 * negligible)]
 
 
 @dataclass(frozen=True)
@@ -405,11 +407,8 @@ class Search:
         self, problem: Problem, poses: Array, scores: Array, middle_m: float, rng: np.random.Generator
     ) -> Array:
         """Return improved poses (m, 4, 4) for basins of ordered poses (n, 4, 4) that are about to be dropped."""
-        dropped = self.rescue.dropped(problem, poses, scores, self.negligible)
-        if not len(dropped):
-            return dropped
         blurred = partial(self.scores, problem.pair, blur_m=middle_m)
-        chosen = self.rescue.separated(problem, poses[0], dropped, blurred, self.negligible)
+        chosen = self.rescue.select(problem, poses, scores, blurred, self.negligible)
         if not len(chosen):
             return chosen
         return self.low_overlap.climb.improve(problem, chosen, rng, max_independent=self.max_independent)
