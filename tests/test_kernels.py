@@ -104,7 +104,7 @@ def parameters(blur_m=0.004):
 
 
 def random_projection(rng, count=40):
-    """Points with normals beside cells that they have nothing to do with."""
+    """Points with normals, and cells independent of them."""
     normals = rng.normal(size=(count, 3)) - [0, 0, 1.5]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = np.hstack([random_points(rng, count), normals, rng.uniform(1e-7, 1e-4, (count, 1))])
@@ -272,7 +272,7 @@ def test_silhouette_distance_is_euclidean_within_the_chamfer_error(rng):
 
 
 def test_compiled_kernels_older_than_any_source_are_dropped(tmp_path):
-    """A kernel holds a copy of what it calls in other files, and those may have changed."""
+    """A kernel contains copies of functions from other files, which may have changed."""
     cache = tmp_path / "__pycache__"
     cache.mkdir()
     for path, modified_s in (

@@ -47,7 +47,7 @@ def test_normal_equations_are_those_of_the_matching_points(rng):
     for pose, gradient, matrix in zip(poses, gradients, matrices, strict=True):
         want = np.zeros(6), np.zeros((6, 6))
         for directed, carried, sign in ((pair.forward, pose, 1.0), (pair.backward, se3.inverse(pose), -1.0)):
-            # ξ moves what is carried forward about the carried centre, turned with it; carried back, by -ξ.
+            # In the target, ξ moves points about the transformed centre, rotated; in the source by -ξ.
             turned = np.kron(np.eye(2), pose[:3, :3] if sign > 0.0 else -np.eye(3))
             about = se3.transform(pose, centre_m[None])[0] if sign > 0.0 else centre_m
             equations = point_to_plane_equations(directed.matches(rows(carried), 0.001), about)
@@ -73,7 +73,7 @@ def test_matches_are_near_and_face_alike(rng):
     ).all()
 
 
-def test_what_the_surface_determines_is_sharpened(rng):
+def test_directions_that_the_surface_determines_are_refined(rng):
     pair, truth, centre_m = bundled_pair("box")
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
     mean, turn_rad, shift_m = sigmas_about(
@@ -110,7 +110,7 @@ def test_too_few_matches_leave_the_samples_alone(rng):
 
 @pytest.mark.parametrize("width", [3, 5, 10, 20])
 def test_the_scatter_of_patches_leaves_out_what_neighbours_share(width, rng):
-    """Squares of noise that a square of 5 × 5 has smoothed: their own scatter beside that of all together."""
+    """Squares of noise smoothed by a square of 5 × 5: their scatter relative to the variance of the sum."""
     ball, side = 5, 20 * width
     noise = rng.normal(size=(60, side, side))
     smooth = ndimage.uniform_filter(noise, ball, mode="wrap", axes=(1, 2))
@@ -121,7 +121,7 @@ def test_the_scatter_of_patches_leaves_out_what_neighbours_share(width, rng):
 
 
 @pytest.mark.parametrize("departs", [False, True])
-def test_variability_of_few_scores_is_told_better_with_the_shape_it_should_have(departs, rng):
+def test_shrinking_to_the_expected_shape_improves_the_variability_of_few_scores(departs, rng):
     """Errors that are alike everywhere, and such as are far larger in one direction than they should be."""
     root = rng.normal(size=(6, 6))
     shape = root @ root.T

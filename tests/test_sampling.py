@@ -70,7 +70,7 @@ def test_samples_are_those_of_prior_times_likelihood(narrower: float) -> None:
     assert found.pareto_k < 0.5
 
 
-def test_two_heaps_and_a_bent_ridge_keep_their_shares() -> None:
+def test_two_modes_and_a_curved_ridge_keep_their_shares() -> None:
     """What one Gaussian cannot draw well, several do; and the weights are right with either."""
     apart = np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
     heaps = gaussian(away(apart), 0.8 * SIGMAS).times(3.0).plus(gaussian(away(-apart), 0.8 * SIGMAS))
@@ -93,7 +93,7 @@ def test_two_heaps_and_a_bent_ridge_keep_their_shares() -> None:
     assert np.mean(slopes) == pytest.approx(0.2, abs=0.02)
 
 
-def test_a_proposal_that_is_off_costs_samples_and_not_truth() -> None:
+def test_a_poor_proposal_costs_samples_and_not_correctness() -> None:
     """What only proposes is divided out: the result is the likelihood's own Gaussian."""
     images = gaussian(away(3.0 * SIGMAS), SIGMAS)
     found = AdaptiveSampler(enough=2000.0, kept=4000).run(
@@ -104,7 +104,7 @@ def test_a_proposal_that_is_off_costs_samples_and_not_truth() -> None:
     np.testing.assert_allclose(np.diag(covariance) / SIGMAS**2, 1.0, atol=0.15)
 
 
-def test_it_draws_no_more_than_it_may_and_says_what_that_is_worth() -> None:
+def test_it_draws_no_more_than_it_may_and_states_its_effective_size() -> None:
     narrow = gaussian(away(4.0 * SIGMAS), 0.01 * SIGMAS)
     found = AdaptiveSampler(initial=200, max_draws=400).run(
         Around(SIGMAS), narrow.log_density, CENTRE_M, np.random.default_rng(0)
@@ -113,13 +113,13 @@ def test_it_draws_no_more_than_it_may_and_says_what_that_is_worth() -> None:
     assert found.effective_samples < 100.0
 
 
-def test_a_likelihood_is_asked_only_where_a_pose_is_possible_and_nothing_possible_is_no_evidence() -> None:
+def test_the_likelihood_is_called_only_inside_the_support_and_an_empty_support_is_no_evidence() -> None:
     class Nowhere(Around):
         def log_evidence(self, target_from_source: Array) -> Array:
             return np.full(len(target_from_source), -np.inf)
 
     def never(poses: Array) -> Array:
-        raise AssertionError(f"asked of {len(poses)} impossible poses")
+        raise AssertionError(f"called with {len(poses)} impossible poses")
 
     found = AdaptiveSampler(max_draws=600).run(
         Nowhere(SIGMAS, evidence=False), never, CENTRE_M, np.random.default_rng(0)
@@ -149,7 +149,7 @@ def test_thinning_leaves_the_few_as_they_are() -> None:
     assert kept.tolist() == [0.5, 0.3, 0.2]
 
 
-def test_the_tail_of_weights_that_fall_steeply_is_told_without_a_warning() -> None:
+def test_the_tail_of_steeply_falling_weights_raises_no_warning() -> None:
     log_weights = -np.random.default_rng(0).exponential(400.0, size=2000)
     assert np.isfinite(pareto_tail(log_weights)) or pareto_tail(log_weights) == -np.inf
     assert pareto_tail(3.0 * np.random.default_rng(1).exponential(1.0, size=4000)) > 0.7

@@ -170,8 +170,8 @@ def test_a_turn_is_found_where_surface_leads_astray(box):
     assert not found.low_overlap
 
 
-def test_an_even_prior_does_not_drag(box):
-    """Where little surface holds a motion on its way down, the middle of what is possible is no better than its end."""
+def test_a_uniform_prior_does_not_pull_to_its_mean(box):
+    """Where little surface matches, the mean of the prior is no better than its limits."""
     pair, density, truth = box
     found = Search(low_overlap=NO_CLIMB).run(pair, density, np.random.default_rng(1))
     assert rotation_error_deg(found.poses[0], truth) < 5.0

@@ -8,14 +8,14 @@ from numba.core import config
 
 # OpenMP is thread-safe (pairs may be registered from several threads) and Open3D needs libgomp anyway.
 config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore[reportAttributeAccessIssue]
-# Threads that spin at the end of each short loop hold up one another wherever anything else runs beside them.
+# Threads that spin at the end of each short loop delay each other on a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def drop_stale(folder: Path) -> None:
     """Delete the compiled kernels of a folder that are older than any source file there.
 
-    Numba keeps a kernel as long as its own file stays as it is, though it holds a copy of what it calls in others.
+    Numba keeps a kernel while its own file is unchanged, though it contains copies of functions from other files.
     """
     newest = max(path.stat().st_mtime for path in folder.glob("*.py"))
     for index in (folder / "__pycache__").glob("*.nbi"):

@@ -26,7 +26,7 @@ _ASIN_5, _ASIN_6, _ASIN_7 = 63.0 / 2816.0, 231.0 / 13312.0, 143.0 / 10240.0
 def quaternion(r00, r01, r02, r10, r11, r12, r20, r21, r22):
     """Return x, y, z and the real part of a rotation matrix's quaternion (Shepperd 1978), and a / sin(a / 2).
 
-    a is the angle of the rotation; of its two quaternions the one with the shorter way.
+    a is the angle of the rotation; of the two quaternions, the one of the smaller angle.
     """
     trace = r00 + r11 + r22
     if trace > 0.0:
@@ -216,8 +216,8 @@ def mean(poses, weights, start, about, iterations, tolerance):
         weights: (n,), their sum 1.
         start: (12,) where the fixed-point iteration begins.
         about: (3,) point in m, C the shift to it.
-        iterations: at most so many steps.
-        tolerance: a shorter step (rad, m) is the last.
+        iterations: largest number of steps.
+        tolerance: the iteration ends at a shorter step (rad, m).
     """
     centre, moved, r = np.empty(12), np.empty(12), np.empty((3, 3))
     first, second = np.empty(6), np.empty((6, 6))

@@ -19,7 +19,7 @@ def log_densities(poses, means, roots, widths, log_weights, centre):
 
     Args:
         poses: (n, 12) upper three rows of their matrices.
-        means: (k, 12) of the components, likewise.
+        means: (k, 12) of the components.
         roots: (k, 6, 6) upper triangular R with RᵀR the precision of ξ = log(mean⁻¹ pose) about the centre.
         widths: (k, 2) largest variances of a rotation and of a translation.
         log_weights: (k,) of any sum of exponentials.

@@ -46,7 +46,7 @@ def solve_symmetric_3(a00, a01, a02, a11, a12, a22, b0, b1, b2):
 
 @numba.njit(cache=True)
 def bounds(mask):
-    """Return the first row, the row after the last, and likewise the columns, of what a mask (h, w) holds."""
+    """Return the bounding box of a mask (h, w): first row, row after the last, and the same of the columns."""
     top, bottom, left, right = mask.shape[0], 0, mask.shape[1], 0
     for row in range(mask.shape[0]):
         for column in range(mask.shape[1]):

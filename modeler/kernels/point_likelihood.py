@@ -45,16 +45,16 @@ _PER_STEP = np.float32(TABLE_STEPS / (TABLE_HIGH - TABLE_LOW))
 
 _OF_SURFACE, _OF_BACKGROUND, _OF_NOTHING = np.float32(SURFACE), np.float32(BACKGROUND), np.float32(MISSING)
 
-# No flag lets the compiler assume away NaN or infinity; these let it use multiply-add and one reciprocal, and add up
-# in any order. So whatever is called from a kernel is made part of it (`forceinline`): a call may end in another copy,
-# compiled by itself, that adds up in another order, and a kernel just compiled would not answer as one from the cache.
+# The flags allow fused multiply-add, one reciprocal and any order of summation; NaN and infinity stay valid. Functions
+# that a kernel calls are inlined (`forceinline`): separately compiled copies could sum in another order, and a kernel
+# just compiled would not return the same bits as one from the cache.
 VECTOR_MATHS = {"contract", "arcp", "nsz", "reassoc"}
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)  # a plain 0.5 would make double precision of all
 
 # Rows of the points, and of `transform_points`.
 VARIANCE_M2 = 6
 X, Y, Z, POINT_NORMAL_X, POINT_NORMAL_Y, POINT_NORMAL_Z, FACING, COVERAGE = 0, 1, 2, 3, 4, 5, 6, 7
-CARRIED_ROWS = 8
+TRANSFORMED_ROWS = 8
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -83,13 +83,13 @@ def invert(pose, inverse):
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
-def transform_points(pose, projection, carried, pixels):
+def transform_points(pose, projection, transformed, pixels):
     """Transform points into the other camera (method.md, eq. 4): straight-line code, which compilers vectorise.
 
     Args:
         pose: (12,) rows of the 3×4 matrix.
         projection: the points and the other camera.
-        carried: (8, n) out: position, normal, how much the point faces the camera (f, 0..1), and how reliably the
+        transformed: (8, n) out: position, normal, how much the point faces the camera (f, 0..1), and how reliably the
             camera measures it (g, 0..1).
         pixels: (n,) out: number of the pixel it falls on, row by row; -1 outside the image or behind the camera.
     """
@@ -113,41 +113,41 @@ def transform_points(pose, projection, carried, pixels):
         inside = (z > ZERO) & (column >= ZERO) & (column < width) & (row >= ZERO) & (row < height)
         safe_column, safe_row = min(max(column, ZERO), width - ONE), min(max(row, ZERO), height - ONE)
         pixel = np.int32(safe_row) * np.int32(width) + np.int32(safe_column)
-        carried[X, j], carried[Y, j], carried[Z, j] = x, y, z
-        carried[POINT_NORMAL_X, j], carried[POINT_NORMAL_Y, j], carried[POINT_NORMAL_Z, j] = (
+        transformed[X, j], transformed[Y, j], transformed[Z, j] = x, y, z
+        transformed[POINT_NORMAL_X, j], transformed[POINT_NORMAL_Y, j], transformed[POINT_NORMAL_Z, j] = (
             normal_x,
             normal_y,
             normal_z,
         )
-        carried[FACING, j] = min(max((cosine - low) * per_range, ZERO), ONE)
-        carried[COVERAGE, j] = min(max((cosine - flat) * per_turn, ZERO), ONE)
+        transformed[FACING, j] = min(max((cosine - low) * per_range, ZERO), ONE)
+        transformed[COVERAGE, j] = min(max((cosine - flat) * per_turn, ZERO), ONE)
         pixels[j] = pixel if inside else np.int32(-1)
 
 
 @numba.njit(cache=True, forceinline=True)
-def fetch_cells(pixels, cells, found):
-    """Copy the cells at `pixels` (n,) into the columns of `found` (8, n); outside the image they are `MISSING`."""
+def fetch_cells(pixels, cells, looked_up):
+    """Copy the cells at `pixels` (n,) into the columns of `looked_up` (8, n); outside the image they are `MISSING`."""
     for j in range(pixels.shape[0]):
         cell = np.uint32(max(pixels[j], np.int32(0)))
         for k in range(CELL_SIZE):
-            found[k, j] = cells[cell, k]
+            looked_up[k, j] = cells[cell, k]
         if pixels[j] < 0:
-            found[KIND, j] = MISSING
+            looked_up[KIND, j] = MISSING
 
 
 @numba.njit(cache=True, forceinline=True)
-def project(pose, projection, carried, pixels, found):
+def project(pose, projection, transformed, pixels, looked_up):
     """Transform points by a pose (12,) and look up their cells: `transform_points`, then `fetch_cells`."""
-    transform_points(pose, projection, carried, pixels)
-    fetch_cells(pixels, projection.cells, found)
+    transform_points(pose, projection, transformed, pixels)
+    fetch_cells(pixels, projection.cells, looked_up)
 
 
 @numba.njit(cache=True, forceinline=True)
 def buffers(projection):
     """Return buffers for `project`: transformed points (8, n), pixels (n,), cells (8, n)."""
     count = projection.points.shape[1]
-    carried, pixels = np.empty((CARRIED_ROWS, count), dtype=np.float32), np.empty(count, dtype=np.int32)
-    return carried, pixels, np.empty((CELL_SIZE, count), dtype=np.float32)
+    transformed, pixels = np.empty((TRANSFORMED_ROWS, count), dtype=np.float32), np.empty(count, dtype=np.int32)
+    return transformed, pixels, np.empty((CELL_SIZE, count), dtype=np.float32)
 
 
 class LikelihoodParameters(NamedTuple):
@@ -158,7 +158,7 @@ class LikelihoodParameters(NamedTuple):
     silhouette_px: np.float32
     """Standard deviation of the silhouette."""
     dead_band_px: np.float32
-    """Dead band beside the silhouette."""
+    """Width of the dead band around the silhouette."""
     clearance_m: np.float32
     """A point this far in front of the background contradicts it."""
     max_point_cost: np.float32
@@ -184,62 +184,62 @@ def match_table(hidden):
 
 
 @numba.njit(cache=True, inline="always")
-def plane_distance(carried, found, j):
+def plane_distance(transformed, looked_up, j):
     """Return the signed distance r in m of a transformed point from the plane of its cell, positive in front."""
     return (
-        found[DISTANCE, j]
-        + found[NORMAL_X, j] * carried[X, j]
-        + found[NORMAL_Y, j] * carried[Y, j]
-        + found[NORMAL_Z, j] * carried[Z, j]
+        looked_up[DISTANCE, j]
+        + looked_up[NORMAL_X, j] * transformed[X, j]
+        + looked_up[NORMAL_Y, j] * transformed[Y, j]
+        + looked_up[NORMAL_Z, j] * transformed[Z, j]
     )
 
 
 @numba.njit(cache=True, inline="always")
-def normal_agreement(carried, found, j):
+def normal_agreement(transformed, looked_up, j):
     """Return the cosine between the normals of a transformed point and of the plane of its cell."""
     return (
-        found[NORMAL_X, j] * carried[POINT_NORMAL_X, j]
-        + found[NORMAL_Y, j] * carried[POINT_NORMAL_Y, j]
-        + found[NORMAL_Z, j] * carried[POINT_NORMAL_Z, j]
+        looked_up[NORMAL_X, j] * transformed[POINT_NORMAL_X, j]
+        + looked_up[NORMAL_Y, j] * transformed[POINT_NORMAL_Y, j]
+        + looked_up[NORMAL_Z, j] * transformed[POINT_NORMAL_Z, j]
     )
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
-def sum_over_points(points, carried, found, parameters):
+def sum_over_points(points, transformed, looked_up, parameters):
     """Return the log-likelihood of transformed points, and the number explained (method.md, eq. 5 and 6).
 
     All cases are evaluated for every point, and one selected: code without branches is vectorised.
 
     Args:
         points: (7, n), see `Projection`.
-        carried: (8, n) and
-        found: (8, n), see `project`.
+        transformed: (8, n) and
+        looked_up: (8, n), see `project`.
         parameters: see `LikelihoodParameters`.
     """
     table, max_point_cost = parameters.table, parameters.max_point_cost
     log_hidden, last = table[0], np.int32(TABLE_STEPS - 1)
     total, explained = ZERO, ZERO
     for j in range(points.shape[1]):
-        faces, kind = carried[FACING, j], found[KIND, j]
-        in_front = plane_distance(carried, found, j)
-        agreement = normal_agreement(carried, found, j)
-        variance = points[VARIANCE_M2, j] + found[VARIANCE, j] + parameters.blur_m * parameters.blur_m
+        faces, kind = transformed[FACING, j], looked_up[KIND, j]
+        in_front = plane_distance(transformed, looked_up, j)
+        agreement = normal_agreement(transformed, looked_up, j)
+        variance = points[VARIANCE_M2, j] + looked_up[VARIANCE, j] + parameters.blur_m * parameters.blur_m
         half_square = HALF * in_front * in_front / variance
         match = parameters.typical_misfit - half_square - parameters.normal_cost * (ONE - agreement)
         matches = (half_square < HALF * MAX_SIGMAS * MAX_SIGMAS) & (agreement > MIN_AGREEMENT)
-        place = (min(max(match, TABLE_LOW), TABLE_HIGH) - TABLE_LOW) * _PER_STEP
-        node = min(np.int32(place), last)
+        position = (min(max(match, TABLE_LOW), TABLE_HIGH) - TABLE_LOW) * _PER_STEP
+        node = min(np.int32(position), last)
         low, high = table[np.uint32(node)], table[np.uint32(node + np.int32(1))]
-        seen = low + (place - np.float32(node)) * (high - low)
-        # In front of what was measured nothing can hide it.
+        seen = low + (position - np.float32(node)) * (high - low)
+        # Nothing hides a point in front of the measured surface.
         seen = max(match, -max_point_cost) if (in_front > ZERO) & (match < log_hidden) else seen
         on_surface = faces * seen - ((ONE - faces) * min(half_square, max_point_cost) if in_front > ZERO else ZERO)
-        beyond = max((found[SILHOUETTE, j] - parameters.dead_band_px) / parameters.silhouette_px, ZERO)
-        in_the_way = carried[Z, j] < found[DEPTH, j] - parameters.clearance_m
-        in_the_open = -min(HALF * beyond * beyond, max_point_cost) if in_the_way else ZERO
+        beyond = max((looked_up[SILHOUETTE, j] - parameters.dead_band_px) / parameters.silhouette_px, ZERO)
+        contradicts = transformed[Z, j] < looked_up[DEPTH, j] - parameters.clearance_m
+        on_background = -min(HALF * beyond * beyond, max_point_cost) if contradicts else ZERO
         gain = on_surface if kind == _OF_SURFACE else ZERO
-        gain = in_the_open if kind == _OF_BACKGROUND else gain
-        gain = parameters.unmeasured_gain * carried[COVERAGE, j] if kind == _OF_NOTHING else gain
+        gain = on_background if kind == _OF_BACKGROUND else gain
+        gain = parameters.unmeasured_gain * transformed[COVERAGE, j] if kind == _OF_NOTHING else gain
         total += gain
         explained += faces if (kind == _OF_SURFACE) & matches else ZERO
     return total, explained
@@ -290,22 +290,24 @@ def log_likelihoods(poses, forward, backward, forward_parameters, backward_param
 @numba.njit(cache=True)
 def classify(pose, projection, parameters):
     """Return the class (n,) of each point of a `Projection` under one pose (12,)."""
-    carried, pixels, found = buffers(projection)
-    project(pose, projection, carried, pixels, found)
+    transformed, pixels, looked_up = buffers(projection)
+    project(pose, projection, transformed, pixels, looked_up)
     classes = np.zeros(pixels.shape[0], dtype=np.int8)
     for j in range(pixels.shape[0]):
-        if found[KIND, j] == BACKGROUND:
+        if looked_up[KIND, j] == BACKGROUND:
             if (
-                found[SILHOUETTE, j] > parameters.dead_band_px
-                and carried[Z, j] < found[DEPTH, j] - parameters.clearance_m
+                looked_up[SILHOUETTE, j] > parameters.dead_band_px
+                and transformed[Z, j] < looked_up[DEPTH, j] - parameters.clearance_m
             ):
                 classes[j] = IN_EMPTY_SPACE
-        elif found[KIND, j] == SURFACE:
-            in_front = plane_distance(carried, found, j)
-            variance = projection.points[VARIANCE_M2, j] + found[VARIANCE, j] + parameters.blur_m * parameters.blur_m
+        elif looked_up[KIND, j] == SURFACE:
+            in_front = plane_distance(transformed, looked_up, j)
+            variance = (
+                projection.points[VARIANCE_M2, j] + looked_up[VARIANCE, j] + parameters.blur_m * parameters.blur_m
+            )
             if in_front > LOOSE_SIGMAS * math.sqrt(variance):
                 classes[j] = IN_FRONT
-            elif carried[FACING, j] > 0.5:
+            elif transformed[FACING, j] > 0.5:
                 classes[j] = MATCHED if in_front > -LOOSE_SIGMAS * math.sqrt(variance) else BEHIND
             else:
                 classes[j] = HIDDEN
@@ -320,14 +322,14 @@ def residual_excess(pose, projection, blur_m):
         Sum in m² of the squared distances less the variances of point and plane, over the points that face the camera
         and are within `LOOSE_SIGMAS` standard deviations, `blur_m` included; and their number.
     """
-    carried, pixels, found = buffers(projection)
-    project(pose, projection, carried, pixels, found)
+    transformed, pixels, looked_up = buffers(projection)
+    project(pose, projection, transformed, pixels, looked_up)
     total, count = 0.0, 0
     for j in range(pixels.shape[0]):
-        if found[KIND, j] != SURFACE or carried[FACING, j] < 0.5:
+        if looked_up[KIND, j] != SURFACE or transformed[FACING, j] < 0.5:
             continue
-        square = np.float64(plane_distance(carried, found, j)) ** 2
-        known = np.float64(projection.points[VARIANCE_M2, j]) + np.float64(found[VARIANCE, j])
+        square = np.float64(plane_distance(transformed, looked_up, j)) ** 2
+        known = np.float64(projection.points[VARIANCE_M2, j]) + np.float64(looked_up[VARIANCE, j])
         if square < LOOSE_SIGMAS * LOOSE_SIGMAS * (known + blur_m * blur_m):
             total += square - known
             count += 1

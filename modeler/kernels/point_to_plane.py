@@ -54,12 +54,12 @@ class Regulariser(NamedTuple):
 
 
 @numba.njit(cache=True, inline="always")
-def match_weight(points, carried, found, residual, surface_m2, j):
+def match_weight(points, transformed, found, residual, surface_m2, j):
     """Return the weight ω in 1/m² of a transformed point at a distance in m from the surface: 0 for no match."""
     variance = points[VARIANCE_M2, j] + found[VARIANCE, j] + surface_m2
     near = residual * residual <= MAX_SIGMAS * MAX_SIGMAS * variance
-    alike = normal_agreement(carried, found, j) >= MIN_AGREEMENT
-    weight = carried[FACING, j] / variance
+    alike = normal_agreement(transformed, found, j) >= MIN_AGREEMENT
+    weight = transformed[FACING, j] / variance
     return weight if (found[KIND, j] == _OF_SURFACE) & near & alike else ZERO
 
 
@@ -76,35 +76,35 @@ def matches(pose, projection, surface_m):
         (n, 12): position in m, own normal and normal of the surface there, all in the other camera's frame; distance
         in m in front of that surface; weight in 1/m², 0 where nothing matches; f (0..1).
     """
-    carried, pixels, cells = buffers(projection)
-    project(pose, projection, carried, pixels, cells)
+    transformed, pixels, cells = buffers(projection)
+    project(pose, projection, transformed, pixels, cells)
     found = np.zeros((pixels.shape[0], 12))
     for j in range(pixels.shape[0]):
-        residual = plane_distance(carried, cells, j)
-        weight = match_weight(projection.points, carried, cells, residual, np.float32(surface_m * surface_m), j)
+        residual = plane_distance(transformed, cells, j)
+        weight = match_weight(projection.points, transformed, cells, residual, np.float32(surface_m * surface_m), j)
         for k in range(3):
-            found[j, k], found[j, 3 + k] = carried[X + k, j], carried[POINT_NORMAL_X + k, j]
+            found[j, k], found[j, 3 + k] = transformed[X + k, j], transformed[POINT_NORMAL_X + k, j]
         if weight > ZERO:
             for k in range(3):
                 found[j, 6 + k] = cells[NORMAL_X + k, j]
-            found[j, RESIDUAL], found[j, WEIGHT], found[j, FACING_WEIGHT] = residual, weight, carried[FACING, j]
+            found[j, RESIDUAL], found[j, WEIGHT], found[j, FACING_WEIGHT] = residual, weight, transformed[FACING, j]
     return found
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
-def linearise(points, carried, found, centre, surface_m2, rows):
+def linearise(points, transformed, found, centre, surface_m2, rows):
     """Write the equations of matches into `rows` (9, n): derivatives by ζ, residual and weight; see `equations`."""
     cx, cy, cz = np.float32(centre[0]), np.float32(centre[1]), np.float32(centre[2])
     for j in range(points.shape[1]):
-        residual = plane_distance(carried, found, j)
+        residual = plane_distance(transformed, found, j)
         rows[6, j] = residual
-        rows[7, j] = match_weight(points, carried, found, residual, surface_m2, j)
+        rows[7, j] = match_weight(points, transformed, found, residual, surface_m2, j)
     for j in range(points.shape[1]):  # a separate loop: compilers prove that no more rows than these do not alias
-        x, y, z = carried[X, j] - cx, carried[Y, j] - cy, carried[Z, j] - cz
+        x, y, z = transformed[X, j] - cx, transformed[Y, j] - cy, transformed[Z, j] - cz
         # The mean of both surfaces' normals, so that neither's noise counts in full.
-        normal_x = HALF * (found[NORMAL_X, j] + carried[POINT_NORMAL_X, j])
-        normal_y = HALF * (found[NORMAL_Y, j] + carried[POINT_NORMAL_Y, j])
-        normal_z = HALF * (found[NORMAL_Z, j] + carried[POINT_NORMAL_Z, j])
+        normal_x = HALF * (found[NORMAL_X, j] + transformed[POINT_NORMAL_X, j])
+        normal_y = HALF * (found[NORMAL_Y, j] + transformed[POINT_NORMAL_Y, j])
+        normal_z = HALF * (found[NORMAL_Z, j] + transformed[POINT_NORMAL_Z, j])
         rows[0, j] = y * normal_z - z * normal_y
         rows[1, j] = z * normal_x - x * normal_z
         rows[2, j] = x * normal_y - y * normal_x
@@ -137,21 +137,19 @@ def new_workspace(forward, backward):
 
 
 @numba.njit(cache=True)
-def rotate_to_source(pose, part, block, retract_all, gradient, matrix):
+def rotate_to_source(pose, part, block, rotated, gradient, matrix):
     """Write Rᵀ g and Rᵀ M R, by halves and blocks of three, of a gradient (6,) and a symmetric matrix (6, 6)."""
     for half in range(0, 6, 3):
         for k in range(3):
             a, b, c = pose[k], pose[4 + k], pose[8 + k]
             gradient[half + k] = a * part[half] + b * part[half + 1] + c * part[half + 2]
             for m in range(6):
-                retract_all[half + k, m] = a * block[half, m] + b * block[half + 1, m] + c * block[half + 2, m]
+                rotated[half + k, m] = a * block[half, m] + b * block[half + 1, m] + c * block[half + 2, m]
     for half in range(0, 6, 3):
         for k in range(3):
             a, b, c = pose[k], pose[4 + k], pose[8 + k]
             for m in range(6):
-                matrix[m, half + k] = (
-                    a * retract_all[m, half] + b * retract_all[m, half + 1] + c * retract_all[m, half + 2]
-                )
+                matrix[m, half + k] = a * rotated[m, half] + b * rotated[m, half + 1] + c * rotated[m, half + 2]
 
 
 @numba.njit(cache=True, error_model="numpy", forceinline=True)
@@ -172,16 +170,16 @@ def equations(pose, forward, backward, centre, surface_m, workspace, gradient, m
         gradient: (6,) out.
         matrix: (6, 6) out.
     """
-    there, back, rows, (inverse, carried_centre, part, block, retract_all) = workspace
+    there, back, rows, (inverse, transformed_centre, part, block, rotated) = workspace
     surface_m2 = np.float32(surface_m * surface_m)
     for k in range(3):
-        carried_centre[k] = pose[4 * k + 3]
+        transformed_centre[k] = pose[4 * k + 3]
         for m in range(3):
-            carried_centre[k] += pose[4 * k + m] * centre[m]
+            transformed_centre[k] += pose[4 * k + m] * centre[m]
     project(pose, forward, there[0], there[1], there[2])
-    linearise(forward.points, there[0], there[2], carried_centre, surface_m2, rows)
+    linearise(forward.points, there[0], there[2], transformed_centre, surface_m2, rows)
     accumulate(rows, forward.points.shape[1], part, block)
-    rotate_to_source(pose, part, block, retract_all, gradient, matrix)
+    rotate_to_source(pose, part, block, rotated, gradient, matrix)
     invert(pose, inverse)
     project(inverse, backward, back[0], back[1], back[2])
     linearise(backward.points, back[0], back[2], centre, surface_m2, rows)
@@ -322,7 +320,7 @@ def trace_ridges(poses, spreads, axes, step_length, ridge, centre, surface_m, re
     """
     visited, counts = np.empty((len(poses), max_steps, 12)), np.zeros(len(poses), dtype=np.int64)
     workspace, gradient, matrix = new_workspace(ridge.forward, ridge.backward), np.empty(6), np.empty((6, 6))
-    looked = buffers(ridge.scoring_forward), buffers(ridge.scoring_backward), np.empty(12)
+    scoring = buffers(ridge.scoring_forward), buffers(ridge.scoring_backward), np.empty(12)
     step, z, rotation = np.empty(6), np.empty(6), np.empty((3, 3))
     pose, moved = np.empty(12), np.empty(12)
     for i in range(len(poses)):
@@ -348,7 +346,7 @@ def trace_ridges(poses, spreads, axes, step_length, ridge, centre, surface_m, re
                 multiply_lower(spreads[i], z, step)
                 retract(pose, step, centre, rotation, moved)
                 pose[:] = moved
-            if not tempered_log_likelihood(pose, ridge, looked) > ridge.floor:
+            if not tempered_log_likelihood(pose, ridge, scoring) > ridge.floor:
                 break
             visited[i, number] = pose
             counts[i] = number + 1

@@ -16,7 +16,7 @@ from modeler.types import Array, RayImage
 
 _MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
 _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a share of its pixels' lateral noise: they err independently
-_DEAD_BAND = 0.25  # likewise, beside the silhouette: points lie a pixel or more inside, since the rim has no plane
+_DEAD_BAND = 0.25  # around the silhouette, relative to the same noise: points lie inside, as the rim has no plane
 _COSINES = np.array([0.1, 0.35, 0.35, 0.6], dtype=np.float32)  # see `Projection`
 _DESCENT_STRIDE, _SCORE_STRIDE = 4, 2  # every fourth point is used for descent, every second for scores
 
@@ -305,7 +305,7 @@ class PairLikelihood:
         step: float,
         max_steps: int,
     ) -> Array:
-        """Return the poses (n, 4, 4) on the way from starts along their axes, while `tempered` is above a floor.
+        """Return the poses (n, 4, 4) on ridges from starts along their axes, while `tempered` is above a floor.
 
         Args:
             poses: (k, 4, 4) target_from_source.

@@ -70,8 +70,7 @@ class ModeSampler:
     max_independent: float = 70.0
     """Independent measurements in the points of both views, see `PairLikelihood.independent_points`."""
     max_compared: float = 40.0
-    """Likewise between modes: sides that are alike differ by what all points of a side err by, which averages out in
-    none."""
+    """The same between modes: the errors that all points of a side share decide between similar sides."""
     widening: float = 1.3
     """Standard deviations of the first proposal relative to those of the candidates."""
     coarse_share: float = 0.4

@@ -66,8 +66,8 @@ class Descent:
     max_step_rad: float = 0.2
     """Largest rotation of a step."""
     max_independent: float = 400.0
-    """Independent measurements in all points: so many that the Gaussian which stands for a uniform prior hardly draws
-    what matching surface leaves open to its mean."""
+    """Independent measurements in all points: large, so that the Gaussian approximation of a uniform prior hardly pulls
+    directions that matching surface leaves open towards its mean."""
     survivors: float = 0.25
     """Largest share of the starts that goes on after the first blur."""
     per_basin: int = 3
@@ -320,7 +320,7 @@ class Search:
     max_independent: float = 120.0
     """Independent measurements in all points, for scores; see `PairLikelihood.independent_points`."""
     local_independent: float = 40.0
-    """Likewise for the spread of a candidate."""
+    """Independent measurements in all points, for the spread of a candidate."""
     negligible: float = 20.0
     """A candidate this many nats below the best is dropped."""
     reach: float = 0.5
@@ -333,7 +333,7 @@ class Search:
     beyond: Beyond = field(default_factory=Beyond)
 
     def scaled(self, effort: float) -> Search:
-        """Return a search with so many times the starts."""
+        """Return a search with `effort` times the starts."""
         starts = replace(
             self.starts,
             max_starts=int(effort * self.starts.max_starts),
