@@ -3,13 +3,14 @@
 # make test       the whole gate: format, lint, types, layers, tests
 # make test-slow  the tests that take long, which make test leaves out
 # make calibrate  whether stated uncertainties are true, on rendered pairs (many minutes)
+# make ablation   what each stage and each constant of the default registration is worth (many hours)
 # make bench      speed, against Open3D and the committed baseline
 # make same       COMMIT=…: whether the results are those of another commit, byte by byte
 # make audit      locked packages against published advisories, where these can be reached
 
 BIN := .venv/bin
 
-.PHONY: setup demo test test-slow calibrate bench same audit
+.PHONY: setup demo test test-slow calibrate ablation bench same audit
 
 setup: .venv/.installed
 
@@ -38,6 +39,9 @@ test-slow: setup
 
 calibrate: setup
 	PYTHONPATH=tests $(BIN)/python -m calibration
+
+ablation: setup
+	PYTHONPATH=tests $(BIN)/python -m ablation
 
 bench: setup
 	$(BIN)/python tests/bench

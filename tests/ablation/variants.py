@@ -1,0 +1,264 @@
+"""The variants of the study: the default registration without one stage, or with one group of constants scaled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal, final
+from unittest import mock
+
+import numpy as np
+
+from modeler.registration import VisibilityRegistrar
+from modeler.registration.visibility import candidates, likelihood, sampling
+from modeler.registration.visibility.candidates import Candidates
+from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
+from modeler.registration.visibility.search import Search, Stage
+from modeler.types import AbstractPoseDensity, Array, Posterior, RayImage
+
+Kind = Literal["default", "removed", "halved", "doubled"]
+Patch = Callable[[], AbstractContextManager[Any]]
+
+_DEFAULT: Final = VisibilityRegistrar()
+_NEVER: Final = 1_000_000
+_SEEDS: Final = 3
+
+
+@final
+@dataclass(frozen=True)
+class Variant:
+    """One registration that differs from the default in one thing."""
+
+    name: str
+    kind: Kind
+    method: VisibilityRegistrar = _DEFAULT
+    patched: Patch = nullcontext
+    """What is replaced in modules while it runs."""
+    seed: int = 0
+
+
+class _OneSearch(VisibilityRegistrar):
+    """Without the second, harder search."""
+
+    def register(
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+    ) -> Posterior:
+        return self._posterior(self.likelihood.between(source, target, rng), density, self.search, rng, 0.0)
+
+
+class _FineOnly(Search):
+    """Without coarse candidates."""
+
+    def run(self, pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator) -> Candidates:
+        found = super().run(pair, density, rng)
+        return found.select(~found.coarse)
+
+
+@dataclass(frozen=True)
+class _Other(VisibilityLikelihood):
+    """With another likelihood of pairs."""
+
+    change: Callable[[PairLikelihood], PairLikelihood] = lambda pair: pair
+
+    def between(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> PairLikelihood:
+        return self.change(super().between(source, target, rng))
+
+
+class _StatedMisfit(PairLikelihood):
+    """With the misfit of a typical match that stated noise implies: half a nat."""
+
+    def typical_misfit(self, pose: Array, blur_m: float) -> float:
+        return 0.5
+
+
+class _StatedNoise(PairLikelihood):
+    """With the finest blur for the noise of matching surfaces."""
+
+    def surface_noise_m(self, pose: Array, blur_m: float) -> float:
+        return blur_m
+
+
+class _NoPatches(PairLikelihood):
+    """With as many independent measurements on small objects as on large ones."""
+
+    def independent_points(self, most: float) -> float:
+        return most
+
+
+def _of(kind: type[PairLikelihood]) -> VisibilityRegistrar:
+    return replace(_DEFAULT, likelihood=_Other(change=lambda pair: kind(pair.forward, pair.backward, pair.size_m)))
+
+
+def _pair(**constants: float) -> VisibilityRegistrar:
+    return replace(_DEFAULT, likelihood=_Other(change=lambda pair: replace(pair, **constants)))
+
+
+def _module(module: object, **values: Any) -> Patch:
+    return lambda: mock.patch.multiple(module, **values)
+
+
+def _changed(component: Any, constants: Mapping[str, object]) -> Any:
+    """Return a component with other values of constants, named by their path: `search.starts.basin`."""
+    for path, value in constants.items():
+        name, _, rest = path.partition(".")
+        component = replace(component, **{name: _changed(getattr(component, name), {rest: value}) if rest else value})
+    return component
+
+
+def _with(**constants: object) -> VisibilityRegistrar:
+    return _changed(_DEFAULT, {path.replace("__", "."): value for path, value in constants.items()})
+
+
+def _scaled(factor: float, *paths: str) -> VisibilityRegistrar:
+    """Return the default with constants times a factor; whole numbers stay whole."""
+    constants = {}
+    for path in paths:
+        value: Any = _DEFAULT
+        for name in path.split("."):
+            value = getattr(value, name)
+        constants[path] = _times(value, factor)
+    return _changed(_DEFAULT, constants)
+
+
+def _times(value: Any, factor: float) -> Any:
+    match value:
+        case tuple():
+            return tuple(_times(one, factor) for one in value)
+        case Stage():
+            return replace(value, climbers=_times(value.climbers, factor))
+        case int():
+            return max(round(factor * value), 1)
+        case _:
+            return factor * value
+
+
+REMOVED: Final = (
+    Variant("rescue of dropped basins", "removed", _with(search__rescue__basins=1)),
+    Variant("climb where little surface matches", "removed", _with(search__low_overlap__score=-np.inf)),
+    Variant("ridge tracing", "removed", _with(search__ridges__max_steps=0)),
+    Variant("coarse candidates", "removed", _with(search=_FineOnly())),
+    Variant("search from better samples (rounds)", "removed", _with(sampler__max_rounds=1)),
+    Variant("second, harder search", "removed", _OneSearch()),
+    Variant("limit of survivors per basin", "removed", _with(search__descent__per_basin=_NEVER)),
+    Variant(
+        "survivors: all starts descend to the end",
+        "removed",
+        _with(search__descent__survivors=1.0, search__descent__per_basin=_NEVER),
+    ),
+    Variant("choice of starts among samples", "removed", _with(search__starts__proposals_per_start=1)),
+    Variant("refinement", "removed", _with(refiner__min_patches=_NEVER)),
+    Variant("estimated misfit μ", "removed", _of(_StatedMisfit)),
+    Variant("estimated noise b", "removed", _of(_StatedNoise)),
+    Variant("patches (fewer independent points when small)", "removed", _of(_NoPatches)),
+    Variant("cost of no overlap", "removed", _pair(no_overlap_cost=0.0)),
+    Variant("cost of normals", "removed", _with(likelihood__normal_cost=0.0)),
+    Variant(
+        "independent points between modes (as within)",
+        "removed",
+        _with(sampler__max_compared=_DEFAULT.sampler.max_independent),
+    ),
+    Variant(
+        "independent points at low overlap (as elsewhere)",
+        "removed",
+        _with(search__low_overlap__max_independent=_DEFAULT.search.max_independent),
+    ),
+    Variant("all modes but the best", "removed", _with(max_modes=1)),
+    Variant("splits of the sampler's Gaussians", "removed", patched=_module(sampling, _PARAMETERS=np.inf)),
+    Variant("widening of the first proposal", "removed", _with(sampler__widening=1.0)),
+    Variant("dead band beside silhouettes", "removed", patched=_module(likelihood, _DEAD_BAND=0.0)),
+    Variant("removal of near candidates (reach)", "removed", _with(search__reach=0.0)),
+    Variant("test of valleys before a rescue", "removed", _with(search__rescue__valley=-np.inf)),
+)
+
+
+def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
+    """Return registrations with groups of constants times a factor, the most telling first."""
+    hidden = 0.25 if factor < 1.0 else 0.75
+    silhouette = _module(likelihood, _SILHOUETTE_NOISE=0.5 * factor, _DEAD_BAND=0.25 * factor)
+    cosines = _module(likelihood, _COSINES=(factor * np.array([0.1, 0.35, 0.35, 0.6])).astype(np.float32))
+    plain = {
+        "independent points within a mode (70)": _scaled(factor, "sampler.max_independent"),
+        "independent points between modes (40)": _scaled(factor, "sampler.max_compared"),
+        "independent points of the search (120)": _scaled(factor, "search.max_independent"),
+        "independent points at low overlap (150)": _scaled(factor, "search.low_overlap.max_independent"),
+        "independent points of the descent (400)": _scaled(factor, "search.descent.max_independent"),
+        "independent points of spreads and climb (40, 40)": _scaled(
+            factor, "search.local_independent", "search.low_overlap.climb.max_independent"
+        ),
+        "cost of no overlap (50 nats)": _pair(no_overlap_cost=50.0 * factor),
+        "scale of overlap (0.1)": _pair(overlap_scale=0.1 * factor),
+        "blurs (0.25 to 0.015)": _scaled(factor, "search.blurs"),
+        "starts (400, 60, 3 a basin)": _scaled(
+            factor, "search.starts.max_starts", "search.starts.min_starts", "search.starts.per_basin"
+        ),
+        "hidden share η (0.5; 0.25 and 0.75)": _with(likelihood__hidden_share=hidden),
+        "cost of one point K (10 nats)": _scaled(factor, "likelihood.max_point_cost"),
+        "cost of normals κ (2 nats)": _scaled(factor, "likelihood.normal_cost"),
+        "silhouette noise and dead band (0.5, 0.25)": silhouette,
+        "surface noise (0.1)": _scaled(factor, "likelihood.surface_noise"),
+        "surface detail (0.003)": _scaled(factor, "likelihood.surface_detail"),
+        "sampler's sizes (400, 200, 580, 750)": _scaled(
+            factor, *(f"sampler.adaptive.{name}" for name in ("initial", "draws", "enough", "kept"))
+        ),
+        "patches of the refinement (2⁵)": _with(refiner__halvings=4 if factor < 1.0 else 6),
+        "least patches (16)": _scaled(factor, "refiner.min_patches"),
+        "points (600)": _scaled(factor, "likelihood.points"),
+        "size of a basin (10°, 0.15)": _scaled(factor, "search.starts.basin_deg", "search.starts.basin"),
+        "samples for each start (15)": _scaled(factor, "search.starts.proposals_per_start"),
+        "survivors (0.25)": _scaled(factor, "search.descent.survivors"),
+        "survivors per basin (3)": _scaled(factor, "search.descent.per_basin"),
+        "iterations of the descent (4)": _scaled(factor, "search.descent.iterations"),
+        "longest step (0.2 rad)": _scaled(factor, "search.descent.max_step_rad"),
+        "negligible (20 nats)": _scaled(factor, "search.negligible"),
+        "rescue: basins, valley (6, 5 nats)": _scaled(factor, "search.rescue.basins", "search.rescue.valley"),
+        "reach (0.5)": _scaled(factor, "search.reach"),
+        "ridges: starts, steps (3, 10)": _scaled(factor, "search.ridges.starts", "search.ridges.max_steps"),
+        "ridges: step (2)": _scaled(factor, "search.ridges.step"),
+        "near the support (1.5 basins)": _scaled(factor, "search.beyond.near"),
+        "score of low overlap (-20 nats)": _scaled(factor, "search.low_overlap.score"),
+        "climb: samples, climbers": _scaled(
+            factor, *(f"search.low_overlap.climb.{name}" for name in ("samples", "first", "stages"))
+        ),
+        "climb: rounds, trials (10, 6)": _scaled(
+            factor, "search.low_overlap.climb.rounds", "search.low_overlap.climb.trials"
+        ),
+        "climb: apart (0.4)": _scaled(factor, "search.low_overlap.climb.apart"),
+        "climb: first step (0.7)": _scaled(factor, "search.low_overlap.climb.step"),
+        "widening of the first proposal (1.3)": _with(sampler__widening=1.0 + 0.3 * factor),
+        "widening of later proposals (1.1)": _with(sampler__adaptive__widening=1.0 + 0.1 * factor),
+        "coarse share (0.4)": _scaled(factor, "sampler.coarse_share"),
+        "gain for a restart, restarts (3 nats, 20)": _scaled(factor, "sampler.restart_gain", "sampler.restarts"),
+        "modes (4)": _scaled(factor, "max_modes"),
+        "sampler: effective size for a fit (80)": _scaled(factor, "sampler.adaptive.min_fitted"),
+        "sampler: draws at most (8000)": _scaled(factor, "sampler.adaptive.max_draws"),
+        "refinement: matches of a patch (6)": _scaled(factor, "refiner.min_matches"),
+        "distance between modes (3.5)": _module(candidates, _MODE_DISTANCE=3.5 * factor),
+        "cosines of visibility (0.1 to 0.6)": cosines,
+    }
+    return {
+        name: (way, nullcontext) if isinstance(way, VisibilityRegistrar) else (_DEFAULT, way)
+        for name, way in plain.items()
+        if not (way is cosines and factor > 1.0)  # cosines beyond 1
+    }
+
+
+def _groups() -> list[Variant]:
+    tables: dict[Kind, Mapping[str, tuple[VisibilityRegistrar, Patch]]] = {
+        "halved": _scalings(0.5),
+        "doubled": _scalings(2.0),
+    }
+    return [
+        Variant(name, kind, *table[name])
+        for name in tables["halved"]
+        for kind, table in tables.items()
+        if name in table
+    ]
+
+
+VARIANTS: Final = (
+    *(Variant(f"seed {seed}", "default", seed=seed) for seed in range(_SEEDS)),
+    *REMOVED,
+    *_groups(),
+)
+"""All of them, the most telling first."""
