@@ -11,11 +11,15 @@ from modeler import se3
 from modeler.closure import Closer, MapView
 from modeler.types import (
     Array,
+    ConfirmedBy,
     Consistency,
     Degenerate,
     Failed,
+    JoinsPrevious,
     LowEvidence,
+    Mode,
     NotPlaced,
+    OpenRotation,
     Outcome,
     PoseGaussian,
     Posterior,
@@ -281,3 +285,147 @@ def test_wrong_closure_cannot_take_the_place_of_failed_odometry() -> None:
     assert not any(edge.accepted for edge in run.judged[13])
     assert 13 not in run.solution.trajectory
     assert all(explain(edge.reason) for edge in run.judged[13])
+
+
+# Registrations that leave a turn open place frames, and close no loop.
+
+
+def _turn_open(posterior: Posterior, sigma_deg: float) -> Posterior:
+    """The same registration of a bottle: all but the turn about its axis, of which only limits tell."""
+    spread = se3.adjoint(ABOUT_OBJECT)
+    wide = spread @ np.diag([0.0, np.radians(sigma_deg) ** 2, 0.0, 0.0, 0.0, 0.0]) @ spread.T
+    return replace(posterior, pose=PoseGaussian(posterior.pose.mean, posterior.pose.covariance + wide))
+
+
+@pytest.mark.parametrize(("sigma_deg", "takes_part"), [(1.0, True), (20.0, False)])
+def test_what_leaves_a_turn_open_places_frames_and_tells_nothing_more(sigma_deg: float, *, takes_part: bool) -> None:
+    """The limits of a turn count once, in the edges that place the frames."""
+    run, closer = Run(list(REGULAR_DEG)), Closer()
+    run.run(closer, lambda posterior: _turn_open(posterior, sigma_deg))
+    assert all(run.judged[frame][0].accepted for frame in run.numbers[1:])
+    assert run.closures()
+    assert all(edge.accepted == takes_part for edge in run.closures())
+    span = closer.judge_span(_turn_open(posterior_of(3, 1, run.truth_between(1, 3)), sigma_deg), _map_view(run))
+    assert (span.kind, span.accepted) == ("span", takes_part)
+    if not takes_part:
+        assert isinstance(span.reason, OpenRotation)
+        assert span.reason.sigma_deg == pytest.approx(20.0, abs=0.5)
+
+
+def test_vaguest_of_several_modes_tells_whether_a_turn_is_open() -> None:
+    run, closer = Run(list(REGULAR_DEG)), Closer()
+    run.run(closer, lambda posterior: _turn_open(posterior, 20.0))
+    sure = posterior_of(3, 1, run.truth_between(1, 3))
+    vague = replace(sure, modes=(Mode(0.6, sure.pose), Mode(0.4, _turn_open(sure, 20.0).pose)))
+    assert closer.judge_span(sure, _map_view(run)).accepted
+    assert isinstance(closer.judge_span(vague, _map_view(run)).reason, OpenRotation)
+
+
+@pytest.mark.parametrize(("sigma_deg", "takes_part"), [(3.0, True), (12.0, False)])
+def test_an_open_turn_does_no_harm_where_the_graph_knows_it_better(sigma_deg: float, *, takes_part: bool) -> None:
+    """A bottle on a turntable, whose step is known: what else the edge tells is welcome."""
+    run, closer = Run(list(REGULAR_DEG)), Closer()
+    run.run(closer, lambda posterior: _turn_open(posterior, sigma_deg))
+    span = closer.judge_span(_turn_open(posterior_of(3, 1, run.truth_between(1, 3)), 20.0), _map_view(run))
+    assert span.accepted == takes_part
+
+
+def _map_view(run: Run) -> MapView:
+    return MapView(run.views, run.solution, run.graph.edges)
+
+
+# Frames that nothing places, and the first one after them: what is believed of its registrations.
+
+
+def test_previous_view_is_not_believed_after_lost_frames_where_the_images_contradict_it() -> None:
+    run = Run(list(REGULAR_DEG[:9]))
+    run.run(Closer(), told(-1))
+    truth, solution = run.measured(4, 8, np.random.default_rng(0), np.zeros(6)), run.solution  # as far as four steps
+    doubtful = witnessed(replace(truth, source=12, target=8), -90.0)
+    map_view = MapView(run.views, solution, run.graph.edges)
+    assert Closer().placement([doubtful], map_view, steps=1)[0] is doubtful
+    assert Closer().placement([doubtful], map_view, steps=4)[0] is None
+    assert isinstance(Closer().judge([doubtful], map_view, steps=4)[0].reason, LowEvidence)
+    assert Closer().placement([witnessed(doubtful, -30.0)], map_view, steps=4)[0] is not None
+
+
+@pytest.mark.parametrize("lost", [1, 16])
+def test_lost_frames_are_found_again_from_any_earlier_view(lost: int) -> None:
+    """The object comes back to a view of long ago; nothing connects it with the newest one."""
+    run = Run([*(20.0 * np.arange(9)), *[0.0] * lost, 42.0])
+    gone = range(9, 9 + lost)
+
+    def spoil(posterior: Posterior) -> Posterior:
+        apart_deg = np.degrees(se3.rotation_angle(posterior.pose.mean))
+        failed = posterior.source in gone or apart_deg > 50.0
+        return replace(posterior, outcome=Outcome.NO_OVERLAP) if failed else posterior
+
+    run.run(Closer(), spoil)
+    back = 9 + lost
+    assert not any(edge.accepted for frame in gone for edge in run.judged[frame])
+    assert len(run.tried[back]) <= 1 + Closer().max_relocations
+    if lost == 1:  # so far from where it was, so soon, is not believed
+        assert not any(edge.accepted for edge in run.judged[back])
+    else:
+        np.testing.assert_allclose(run.solution.trajectory[back], run.truth[back], atol=0.02)
+        assert sum(edge.accepted for edge in run.judged[back]) >= 2  # a witness
+        assert run.judged[back][0].kind == "odometry"  # that failed, though the object had turned away
+
+
+def test_lost_frame_is_bridged_from_the_last_accepted_one() -> None:
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(), lambda p: replace(p, outcome=Outcome.TOO_FEW_POINTS) if p.source == 5 else p)
+    assert run.tried[6][0] == 4
+    assert 5 not in run.solution.trajectory
+    assert 0 in run.tried[13]
+
+
+def test_after_lost_frames_the_previous_view_is_believed_only_near_where_the_motion_led() -> None:
+    """A box looks the same from behind: after a gap its other side matches the last view."""
+    run = Run([*(23.0 * np.arange(7)), *[0.0] * 4, 253.0])
+
+    def spoil(posterior: Posterior) -> Posterior:
+        if posterior.source != 11:
+            return replace(posterior, outcome=Outcome.TOO_FEW_POINTS) if posterior.source > 6 else posterior
+        behind = ABOUT_OBJECT @ se3.exp(np.array([*np.radians([0.0, 180.0, 0.0]), 0, 0, 0])) @ se3.inverse(ABOUT_OBJECT)
+        return replace(posterior, pose=PoseGaussian(posterior.pose.mean @ behind, COVARIANCE))
+
+    run.run(Closer(), spoil)
+    assert run.tried[11][0] == 6
+    assert not any(edge.accepted for edge in run.judged[11])
+
+
+@pytest.mark.parametrize(("outcome", "witnesses"), [("converged", ()), ("converged", (5,)), ("ambiguous", (5,))])
+def test_far_from_where_the_motion_led_the_previous_view_is_believed_only_with_a_witness(
+    outcome: str, witnesses: tuple[int, ...]
+) -> None:
+    """A box's broad side matches its narrow one, a quarter turn away: by itself such a match says nothing."""
+    run = Run([*(20.0 * np.arange(7)), *[0.0] * 4, 140.0])
+
+    def spoil(posterior: Posterior) -> Posterior:
+        gone = 6 < posterior.source < 11
+        if gone or (posterior.source == 11 and posterior.target not in (6, *witnesses)):
+            return replace(posterior, outcome=Outcome.NO_OVERLAP)
+        vague = posterior.source == 11 and posterior.target == 6 and outcome == "ambiguous"
+        return replace(posterior, outcome=Outcome.AMBIGUOUS) if vague else posterior
+
+    run.run(Closer(), spoil)
+    believed = outcome == "converged" and bool(witnesses)  # what is vague agrees with anything
+    assert [edge.accepted for edge in run.judged[11]].count(True) == (2 if believed else 0)
+    if believed:
+        assert run.tried[11][:2] == (6, 5)  # the nearest to where the previous view puts it
+        assert run.judged[11][0].reason == JoinsPrevious(Outcome.CONVERGED, 0.8, ConfirmedBy(5))
+
+
+def test_a_view_seen_from_far_round_places_a_frame_only_with_a_witness() -> None:
+    run = Run([*(20.0 * np.arange(9)), *[0.0] * 6, 300.0, 320.0])
+
+    def spoil(posterior: Posterior) -> Posterior:
+        apart_deg = np.degrees(se3.rotation_angle(posterior.pose.mean))
+        failed = posterior.source in range(9, 15) or apart_deg > 65.0
+        return replace(posterior, outcome=Outcome.NO_OVERLAP) if failed else posterior
+
+    run.run(Closer(), spoil)
+    assert not any(edge.accepted for edge in run.judged[15])  # 60° from the first view, and no other in reach
+    assert any(edge.accepted for edge in run.judged[16])
+    np.testing.assert_allclose(run.solution.trajectory[16], run.truth[16], atol=0.02)

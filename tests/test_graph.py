@@ -1,13 +1,16 @@
 """Laws of the pose graph: calibrated poses, closure that helps, and independence of labels, direction and gauge."""
 
+from __future__ import annotations
+
 import dataclasses
 import itertools
 from collections.abc import Mapping
+from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
-from rings import OBJECT_M, spin, spun
+from rings import OBJECT_M, edge, ring, spin, spun
 from rings import covariance as _covariance
 from rings import edge as _edge
 from rings import measured as _measured
@@ -17,8 +20,9 @@ from rings import turntable as _truth
 from scipy import stats
 
 from modeler import se3
+from modeler.export import g2o_text, tum_text
 from modeler.graph import PoseGraph, solve
-from modeler.types import Array, PoseGaussian
+from modeler.types import Array, Mode, PoseGaussian
 
 
 def _assert_same(actual: Mapping[int, Array], expected: Mapping[int, Array], atol: float = 1e-8) -> None:
@@ -55,11 +59,11 @@ def test_chain_is_dead_reckoning_with_first_order_covariances() -> None:
     graph, _ = _ring(5, np.random.default_rng(1), [])
     solution = solve(graph, {})
     pose, covariance = np.eye(4), np.zeros((6, 6))
-    for edge in graph.edges:
-        pose = pose @ edge.posterior.pose.mean
-        covariance = se3.composed_covariance(covariance, edge.posterior.pose.mean, edge.posterior.pose.covariance)
-        np.testing.assert_allclose(solution.trajectory[edge.source], pose, atol=1e-14)
-        _assert_same_covariance(solution.covariances[edge.source], covariance)
+    for factor in graph.edges:
+        pose = pose @ factor.posterior.pose.mean
+        covariance = se3.composed_covariance(covariance, factor.posterior.pose.mean, factor.posterior.pose.covariance)
+        np.testing.assert_allclose(solution.trajectory[factor.source], pose, atol=1e-14)
+        _assert_same_covariance(solution.covariances[factor.source], covariance)
     _assert_same(solution.odometry, solution.trajectory, atol=0.0)
 
 
@@ -114,9 +118,11 @@ def test_relative_covariance_is_that_of_the_joint_marginal() -> None:
     solution = solve(graph, {})
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
-    for edge in graph.edges:
-        noise = gtsam.noiseModel.Gaussian.Covariance(edge.posterior.pose.covariance)
-        factors.add(gtsam.BetweenFactorPose3(edge.target, edge.source, gtsam.Pose3(edge.posterior.pose.mean), noise))
+    for factor in graph.edges:
+        noise = gtsam.noiseModel.Gaussian.Covariance(factor.posterior.pose.covariance)
+        factors.add(
+            gtsam.BetweenFactorPose3(factor.target, factor.source, gtsam.Pose3(factor.posterior.pose.mean), noise)
+        )
     for frame, pose in solution.trajectory.items():
         values.insert(frame, gtsam.Pose3(pose))
     marginals = gtsam.Marginals(factors, values)
@@ -249,3 +255,54 @@ def test_a_closure_that_comes_before_odometry_of_the_same_frames_does_not_bear_i
     assert solution.outliers == (lie,)
     chain = solve(PoseGraph(tuple(odometry)), {}).trajectory
     assert all(np.allclose(solution.trajectory[frame], pose) for frame, pose in chain.items())
+
+
+# What a solved graph writes is read by others as it was meant: GTSAM takes graph.g2o, evo takes trajectory.txt.
+
+
+def _graph() -> PoseGraph:
+    """A loop with an edge of two modes, whose wrong one is the heavier, and a closure that lies."""
+    graph, truth = ring(12, np.random.default_rng(1), [(0, 11), (0, 6), (3, 9)])
+    quarter = spin([0.0, np.pi / 2, 0.0])
+    several, right = graph.edges[4], graph.edges[4].posterior.pose
+    wrong = PoseGaussian(right.mean @ quarter, right.covariance)
+    modes = [Mode(0.6, wrong), Mode(0.4, right)]
+    lie = PoseGaussian(se3.inverse(truth[1]) @ truth[8] @ quarter, right.covariance)
+    edges = [*graph.edges, edge(1, 8, lie, "closure")]
+    edges[4] = edge(several.target, several.source, wrong, modes=modes)
+    return PoseGraph(tuple(edges))
+
+
+def test_solved_graph_is_the_optimum_of_its_own_file(tmp_path: Path) -> None:
+    """GTSAM, given the file alone, finds the error that the solution has, and nothing to improve."""
+    graph = _graph()
+    solution = solve(graph, {})
+    (tmp_path / "graph.g2o").write_text(g2o_text(graph.edges, solution))
+    factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
+    assert factors.size() == len(graph.edges) - len(solution.outliers) == 14
+    error = 0.0
+    for taken in graph.edges:
+        if taken in solution.outliers:
+            continue
+        pose = solution.edge_poses.get((taken.source, taken.target), taken.posterior.pose)
+        xi = se3.log(se3.inverse(pose.mean) @ solution.relative(taken.target, taken.source))
+        error += 0.5 * float(xi @ np.linalg.solve(pose.covariance, xi))
+    assert factors.error(values) == pytest.approx(error, rel=1e-6)
+    factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    best = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
+    assert factors.error(best) == pytest.approx(error, rel=1e-4)
+    for frame, pose in solution.trajectory.items():
+        np.testing.assert_allclose(best.atPose3(frame).matrix(), pose, atol=1e-4)
+
+
+def test_trajectory_passes_the_checks_of_evo() -> None:
+    """`evo_traj tum FILE --full_check` (1.38): eight columns, rising times, unit quaternions, rigid matrices."""
+    solution = solve(_graph(), {})
+    times_s = {frame: 1305031102.0 + frame / 30.0 for frame in solution.trajectory}
+    columns = np.array([line.split(" ") for line in tum_text(solution.trajectory, times_s).splitlines()], dtype=float)
+    assert columns.shape == (12, 8)
+    assert np.all(np.diff(columns[:, 0]) > 0.0)
+    np.testing.assert_allclose(np.linalg.norm(columns[:, 4:], axis=1), 1.0, atol=1e-12)
+    for pose in solution.trajectory.values():
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)

@@ -6,11 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from rings import edge, measured, nees, rotation_error, spun, turntable
+from hypothesis import given
+from hypothesis import strategies as st
+from rings import OBJECT_M, edge, measured, nees, ring, rotation_error, spin, spun, turntable
 from scipy import stats
+from slow import sampled
 
-from modeler.graph import PoseGraph, Smoother, solve
-from modeler.types import Edge, PoseGaussian, Solution
+from modeler import se3
+from modeler.graph import PoseGraph, Smoother, shared_noise, solve
+from modeler.graph.covariance import chi_square_quantile
+from modeler.types import Array, Edge, PoseGaussian, Solution
 
 SEEDS = 120
 
@@ -91,3 +96,135 @@ def test_lies_among_closures_are_found_out_as_they_come() -> None:
     assert set(false) <= set(growing.solution.outliers)
     assert max(error.values()) < 0.1
     assert error[35] <= 1.2 * rotation_error(solve(graph, {}).trajectory, truth)
+
+
+# Edges that share noise: covariances stay true where edges use the same image, and where all views err alike.
+
+
+COUNT = 14
+SIGMAS = np.repeat([0.01, 0.002], 3)
+ABOUT = se3.adjoint(se3.translation(OBJECT_M))
+WHOLE = ABOUT @ np.diag(SIGMAS**2) @ ABOUT.T  # an edge's covariance, the same from every side of the object
+
+
+TRUTH = {k: se3.inverse(spin([0.0, 2.0 * np.pi * k / COUNT, 0.0])) for k in range(COUNT)}
+PAIRS = [(k - step, k) for step in (1, 2, 3) for k in range(step, COUNT)] + [(0, COUNT - 1), (0, COUNT - 2)]
+
+
+def _graph(rng: np.random.Generator, share: float, common: float = 0.0) -> PoseGraph:
+    """Every frame has a noise of its own, in all its edges, and every edge another; shares of WHOLE, ends counted.
+
+    Beside that all frames err alike, by a share of WHOLE.
+    """
+
+    def noise(variance: float) -> Array:
+        return np.sqrt(variance) * ABOUT @ (SIGMAS * rng.normal(size=6))
+
+    seen = {k: pose @ se3.exp(noise(0.5 * share)) for k, pose in TRUTH.items()}
+    rest = [se3.exp(noise(1.0 - share)) for _ in PAIRS]
+    alike = se3.exp(noise(common))
+    edges = []
+    for (target, source), own in zip(PAIRS, rest, strict=True):
+        mean = se3.inverse(seen[target] @ alike) @ seen[source] @ alike @ own
+        edges.append(edge(target, source, PoseGaussian(mean, WHOLE), "odometry" if source - target == 1 else "closure"))
+    return PoseGraph(tuple(edges))
+
+
+def _mean_nees(
+    share: float, solved: Callable[[PoseGraph], Solution], seeds: int = 100, common: float = 0.0
+) -> tuple[float, float, float]:
+    """Mean NEES of poses, and of motions between neighbours and between far frames."""
+    poses, near, far = [], [], []
+    for seed in range(seeds):
+        solution = solved(_graph(np.random.default_rng(seed), share, common))
+        k = 1 + seed % (COUNT - 1)
+        poses.append(nees(PoseGaussian(solution.trajectory[k], solution.covariances[k]), TRUTH[k]))
+        for pair, values in (((k - 1, k), near), ((k, (k + 6) % COUNT), far)):
+            values.append(nees(solution.relative_gaussian(*pair), se3.inverse(TRUTH[pair[0]]) @ TRUTH[pair[1]]))
+    return float(np.mean(poses)), float(np.mean(near)), float(np.mean(far))
+
+
+TOLERANCE = 4.0 * np.sqrt(12.0 / 100)
+
+
+@pytest.mark.parametrize("share", sampled([0.0, 0.4, 0.8], every=3, fast=1))
+def test_poses_and_motions_are_calibrated_where_the_share_is_known(share: float) -> None:
+    for mean in _mean_nees(share, lambda graph: solve(graph, {}, shared=share)):
+        assert mean == pytest.approx(6.0, abs=TOLERANCE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("share", "common"), [(0.0, 0.5), (0.6, 0.5)])
+def test_poses_and_motions_are_calibrated_where_all_views_err_alike(share: float, common: float) -> None:
+    for mean in _mean_nees(share, lambda graph: solve(graph, {}, shared=share, common=common), common=common):
+        assert mean == pytest.approx(6.0, abs=TOLERANCE)
+    poses, _, far = _mean_nees(share, lambda graph: solve(graph, {}, shared=share), common=common)
+    assert min(poses, far) > 6.0 + 2.0 * TOLERANCE
+
+
+def test_no_loop_tells_what_all_views_err_by() -> None:
+    alone, alike = (_graph(np.random.default_rng(2), 0.5, common) for common in (0.0, 4.0))
+    assert shared_noise(alike, solve(alike, {})) == pytest.approx(shared_noise(alone, solve(alone, {})), abs=0.01)
+
+
+def test_edges_taken_for_independent_are_too_sure() -> None:
+    poses, near, far = _mean_nees(0.8, lambda graph: solve(graph, {}))
+    assert min(poses, near, far) > 6.0 + 2.0 * TOLERANCE
+
+
+@pytest.mark.parametrize("share", sampled([0.0, 0.4, 0.8], every=3, fast=1))
+def test_loops_tell_the_share(share: float) -> None:
+    """Found from the graph alone it errs to the side of independence by about a standard error of 0.1 (1 - share)."""
+    shares = [shared_noise(graph := _graph(np.random.default_rng(seed), share), solve(graph, {})) for seed in range(40)]
+    assert share - 0.2 < np.mean(shares) < share + 0.04
+
+    def solved(graph: PoseGraph) -> Solution:
+        return solve(graph, {}, shared=shared_noise(graph, solve(graph, {})))
+
+    for mean in _mean_nees(share, solved, seeds=60):
+        assert 5.0 - TOLERANCE < mean < 6.0 + 1.3 * TOLERANCE
+
+
+def test_one_edge_alone_keeps_its_covariance() -> None:
+    alone = edge(0, 1, PoseGaussian(se3.inverse(TRUTH[0]) @ TRUTH[1], WHOLE))
+    solution = solve(PoseGraph((alone,)), {}, shared=0.7)
+    np.testing.assert_allclose(solution.covariances[1], WHOLE, atol=1e-12)
+    np.testing.assert_allclose(solution.relative_covariance(0, 1), WHOLE, atol=1e-12)
+    apart = np.eye(6) - se3.adjoint(se3.inverse(TRUTH[1]) @ TRUTH[0])
+    alike = solve(PoseGraph((alone,)), {}, shared=0.7, common=0.5).covariances[1]
+    np.testing.assert_allclose(alike, WHOLE + 0.5 * apart @ WHOLE @ apart.T, atol=1e-12)
+
+
+def test_share_moves_no_pose_and_none_changes_nothing() -> None:
+    graph = _graph(np.random.default_rng(3), 0.5)
+    plain, shared = solve(graph, {}), solve(graph, {}, shared=0.5)
+    zero = Smoother(shared=0.0).to(graph).solution
+    for frame, pose in plain.trajectory.items():
+        np.testing.assert_array_equal(shared.trajectory[frame], pose)
+        np.testing.assert_array_equal(zero.covariances[frame], plain.covariances[frame])
+        np.linalg.cholesky(shared.covariances[frame])
+    np.testing.assert_array_equal(shared.relative_covariance(3, 3), plain.relative_covariance(3, 3))
+    with pytest.raises(KeyError):
+        shared.relative_covariance(0, 99)
+
+
+def test_graph_without_loops_tells_nothing() -> None:
+    graph, _ = ring(6, np.random.default_rng(0), [])
+    assert shared_noise(graph, solve(graph, {})) == 0.0
+    assert shared_noise(PoseGraph(), Solution()) == 0.0
+
+
+@given(probability=st.floats(1e-6, 1.0 - 1e-6), degrees=st.integers(1, 3000))
+def test_quantiles_are_those_of_scipy(probability: float, degrees: int) -> None:
+    assert chi_square_quantile(probability, degrees) == pytest.approx(stats.chi2(degrees).ppf(probability), rel=1e-12)
+
+
+def test_it_does_not_matter_which_way_round_edges_are_written() -> None:
+    rng = np.random.default_rng(4)
+    graph, _ = ring(COUNT, rng, [(0, COUNT - 1), (2, 6), (3, 9)])
+    back = [edge(one.source, one.target, one.posterior.pose.inverse(), one.kind) for one in graph.edges]
+    forth, written_back = (solve(PoseGraph(tuple(edges), first=0), {}, shared=0.6) for edges in (graph.edges, back))
+    for frame in range(1, COUNT):
+        sigmas = np.sqrt(np.diag(forth.covariances[frame]))
+        off = (written_back.covariances[frame] - forth.covariances[frame]) / np.outer(sigmas, sigmas)
+        assert np.abs(off).max() < 1e-4

@@ -16,7 +16,7 @@ import pytest
 from modeler.cli.advice import outcome_advice
 from modeler.cli.console import Console
 from modeler.cli.inputs import reading
-from modeler.types import Failed, Outcome, PriorRefused, Segmentation, Solution, Stated, Step
+from modeler.types import Failed, Outcome, PriorRefused, Searching, Segmentation, Solution, Stated, Step
 from sequences import bundled, open_sequence
 
 COMMAND = [sys.executable, "-m", "modeler", "info", str(bundled("tube"))]
@@ -154,3 +154,39 @@ def test_a_terminal_sees_how_far_it_is_and_how_long_it_takes() -> None:
     assert "14/14" in said
     assert "0:00:0" in said  # gone by, and to go
     assert Path(COMMAND[-1]).name not in said  # data goes to stdout
+
+
+# The bar tells of a frame that is being tried again; without a bar nothing is said of it.
+
+
+_SEARCHING = """
+from modeler.cli.console import Console
+from modeler.types import Searching
+with Console(25, None) as console: console(Searching(12))
+"""
+
+
+def test_somebody_who_watches_sees_which_frame_is_tried_again() -> None:
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120"}
+    with subprocess.Popen([sys.executable, "-c", _SEARCHING], stderr=theirs, env=environment) as process:
+        os.close(theirs)
+        said = b""
+        while select.select([ours], [], [], 60.0)[0]:
+            try:
+                piece = os.read(ours, 4096)
+            except OSError:  # the other end is closed
+                break
+            if not piece:
+                break
+            said += piece
+    os.close(ours)
+    assert process.returncode == 0
+    assert b"trying frame 12 again" in said
+
+
+def test_nobody_is_told_where_there_is_no_bar(capfd: pytest.CaptureFixture[str]) -> None:
+    with Console(25, None) as console:
+        console(Searching(12))
+    said = capfd.readouterr()
+    assert (said.out, said.err) == ("", "")
