@@ -23,7 +23,7 @@ from ablation.pairs import BLOCKS, Case, cases
 from ablation.tables import table
 from ablation.variants import VARIANTS, Variant
 from modeler import se3
-from modeler.evaluation import about, nees, rotation_error_deg
+from modeler.evaluation import about_point, nees, rotation_error_deg
 
 _TIMED = 6  # every sixth case is registered by the default too, so that times compare
 
@@ -88,7 +88,7 @@ def registered(variant: Variant, case: Case) -> dict[str, object]:
         return {**record, "outcome": f"{type(error).__name__}: {error}", "seconds": time.process_time() - began}
     seconds = time.process_time() - began
     centroid_m = case.source.centroid_m
-    estimate, there = about(posterior.pose, centroid_m), case.truth @ se3.translation(centroid_m)
+    estimate, there = about_point(posterior.pose, centroid_m), case.truth @ se3.translation(centroid_m)
     return {
         **record,
         "outcome": posterior.outcome.label,
