@@ -94,7 +94,7 @@ def _depth_range(pixels: npt.NDArray[np.uint16], mask: BoolArray) -> tuple[float
 MISSING, BACKGROUND, OBJECT = 0, 1, 2
 """Areas of a picture: nothing was measured, something other than the object was, the object was."""
 AGREES, HIDDEN, VIOLATION, NO_SAY = 0, 1, 2, 3
-"""Verdicts on a point: on the measured surface, behind it, in front of it, where nothing is to be told."""
+"""Verdicts on a point: on the measured surface, behind it, in front of it, or without a measurement."""
 
 _PROJECTED_POINTS: Final = 1_200
 _VERDICT: Final = np.zeros(6, dtype=np.int8)  # by that of the likelihood

@@ -129,12 +129,12 @@ def open_stream(
     A viewer that does not start or cannot be reached is reported to the log and left out.
 
     Args:
-        name: what the viewer calls the recording, say the sequence's name.
+        name: of the recording in the viewer.
         save: file to record to; None records nowhere.
         spawn: open the viewer in a window.
         web: serve the viewer in the browser on 127.0.0.1; `address` names the page.
         connect: `rerun+http://HOST:PORT/proxy` of a viewer that is already open.
-        facts: what the run was asked to do, by name: shown beside what happens.
+        facts: settings of the run, by name, which the viewer shows.
 
     Raises:
         InputError: where `save` cannot be written, or `connect` is not an address.

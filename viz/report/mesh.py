@@ -33,7 +33,7 @@ class Mesh:
     colours: npt.NDArray[np.uint8] | None
     """(v, 3) RGB, where the input had colour."""
     certainty: npt.NDArray[np.uint8] | None
-    """(v, 3) RGB that stands for the sd of each vertex, pink where it is made up; None where that is not known."""
+    """(v, 3) RGB of the sd of each vertex, pink where no view saw it; None where it is unknown."""
     total: int
     """Number of triangles before the mesh was made coarser."""
 
