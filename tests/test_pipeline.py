@@ -17,8 +17,7 @@ from modeler.fusion import Fuser
 from modeler.graph import CommonAxis, PoseGraph, shared_noise, solve
 from modeler.pipeline import Modeler, Prepared
 from modeler.pipeline.state import State
-from modeler.priors.bumps import KernelMixture
-from modeler.priors.proposal import DefensiveMixture
+from modeler.priors.mixtures import DefensiveMixture, KernelMixture
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import (

@@ -11,7 +11,7 @@ from prior_cases import CASES, held, solution, truth, turned, views
 from scipy import stats
 
 from modeler import priors, se3
-from modeler.priors.gaussian import Gaussian
+from modeler.priors.mixtures import Gaussian
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Plane
 
 every_prior = pytest.mark.parametrize("name", CASES)

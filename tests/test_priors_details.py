@@ -10,12 +10,9 @@ from prior_cases import NORMAL, edges, solution, told, turned, turntable, view, 
 
 from modeler import se3
 from modeler.priors import Poke, PokePrior, PredictedProposal, TablePrior, VelocityPrior
-from modeler.priors.about_axis import Axis
-from modeler.priors.bumps import KernelMixture
-from modeler.priors.common_axis import common_axis
-from modeler.priors.directions import directions_about
-from modeler.priors.on_plane import on_plane
-from modeler.priors.proposal import DefensiveMixture
+from modeler.priors.common_axis import Axis, common_axis
+from modeler.priors.mixtures import DefensiveMixture, KernelMixture, directions_about
+from modeler.priors.table import on_plane
 from modeler.types import Array, Plane, PoseGaussian, RayImage
 
 HERE = np.eye(4)
@@ -53,7 +50,8 @@ def test_the_axis_is_that_of_the_newest_pairs() -> None:
 
 def test_a_learnt_axis_is_a_line_without_an_upper_end() -> None:
     told_up, told_down = (
-        turntable(HERE, learnt=Axis(side * NORMAL, 0.01, np.array([0.02, 0.03, 0.82]), 0.001)) for side in (1.0, -1.0)
+        turntable(HERE, learned_axis=Axis(side * NORMAL, 0.01, np.array([0.02, 0.03, 0.82]), 0.001))
+        for side in (1.0, -1.0)
     )
     samples = told_up.between(SOURCE, TARGET).sample(200, np.random.default_rng(0))
     np.testing.assert_allclose(

@@ -37,10 +37,10 @@ from modeler.priors import (
     TurntablePrior,
     VelocityPrior,
 )
-from modeler.priors.axis_turn import AxisTurn, angles_and_axes
 from modeler.priors.common_axis import common_axis
+from modeler.priors.mixtures import DefensiveMixture
 from modeler.priors.poke import pushed
-from modeler.priors.proposal import DefensiveMixture
+from modeler.priors.turntable import AxisTurn, angles_and_axes
 from modeler.types import Array, Edge, InputError, Mode, Plane, RayImage, SharedAxis
 
 HERE = np.eye(4)
@@ -127,9 +127,9 @@ def test_a_step_is_a_density_however_often_the_table_comes_round() -> None:
 
 
 def test_views_without_their_table_are_refused_where_it_is_asked_for() -> None:
-    with pytest.raises(InputError, match=r"no support plane.*--prior general"):
+    with pytest.raises(InputError, match=r"no support plane.*general prior"):
         TurntablePrior(24.0, needs_table=True).between(BARE_SOURCE, BARE_TARGET)
-    with pytest.raises(InputError, match=r"no support plane.*--prior general"):
+    with pytest.raises(InputError, match=r"no support plane.*general prior"):
         TablePrior().between(BARE_SOURCE, BARE_TARGET)
 
 

@@ -69,8 +69,8 @@ def test_spans_do_not_count_for_the_median_evidence_between_neighbours() -> None
 def test_a_turntable_learns_nothing_from_edges_that_were_left_out() -> None:
     taught, poses = edges(HERE), solution(HERE)
     prior = TurntablePrior(24.0, 2.0)
-    assert prior.learned(poses, taught).learnt is not None
-    assert prior.learned(replace(poses, outliers=taught), taught).learnt is None
+    assert prior.learned(poses, taught).learned_axis is not None
+    assert prior.learned(replace(poses, outliers=taught), taught).learned_axis is None
 
 
 @pytest.mark.parametrize(("kind", "told"), [("odometry", "odometry"), ("span", "odometry"), ("closure", "closure")])

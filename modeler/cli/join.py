@@ -160,7 +160,7 @@ def _edges(first: Reopened, second: Reopened, match: Match, options: Join) -> tu
 
     from modeler import se3
     from modeler.pipeline import register
-    from modeler.priors.bumps import KernelMixture
+    from modeler.priors.mixtures import KernelMixture
     from modeler.registration import VisibilityRegistrar
 
     edges = []

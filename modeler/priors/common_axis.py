@@ -1,57 +1,71 @@
-"""The axis that several motions turn about, with its uncertainty: weighted least squares on SE(3)."""
+"""The axis about which several steps turn, with its uncertainty, and the sense of rotation."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import logsumexp
 
 from modeler import se3
-from modeler.priors.about_axis import Axis
-from modeler.priors.directions import across_axis
+from modeler.priors.mixtures import across_axis
 from modeler.types import Array, PoseGaussian, Posterior
 
-_LEAST_PAIRS, _MOST_PAIRS = 3, 60  # the latest of many say enough
+_LEAST_PAIRS, _MOST_PAIRS = 3, 60  # the latest of many suffice
 _LEAST_TURN_RAD = np.radians(5.0)
-_STUDENT = 5.0  # degrees of freedom of the weights: few, so that motions that do not fit count little
+_STUDENT = 5.0  # degrees of freedom of Student's t: few, so that outliers count little
 _ITERATIONS = 30
-_DECISIVE = np.log(500.0)  # odds at which the sense of turning is taken for known: three sure pairs tell 9³
-_MOST_TOLD = np.log(9.0)  # by one pair: it may be all wrong, for one mode may have been missed
+_DECISIVE_LOG_ODDS = np.log(500.0)  # log odds from which the sense counts as known: three certain pairs yield 9³
+_MAX_LOG_ODDS = np.log(9.0)  # bound on the log odds of one pair, which may have missed the true mode
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """A line in camera coordinates, with its uncertainty."""
+
+    direction: Array
+    """(3,) unit."""
+    sigma_direction_rad: float
+    """Standard deviation of the direction, about each axis orthogonal to it; infinite: any direction."""
+    point_m: Array | None = None
+    """(3,) a point of the line; None where its position is unknown."""
+    sigma_point_m: float = 0.0
+    """Standard deviation of the point, along each axis orthogonal to the line."""
 
 
 def common_axis(motions: Sequence[PoseGaussian], wobble_rad: float, wobble_m: float) -> Axis | None:
-    """Return the axis that motions have in common; None where fewer than three turn far enough to show one.
+    """Fit the common axis of several motions by robust least squares on SE(3); None with fewer than three large turns.
 
     Each motion is exp(θ S) about the unit twist S = (d, -d × p) of the axis through p along d, its own angle θ free,
     and errs by its covariance and the wobble. Moving the axis by a twist ε moves the motion by (Ad(T⁻¹) - 1) ε.
-    Motions that do not fit count less, as under a Student distribution; where the rest scatters more than its
-    covariances say, the axis is the less sure for it.
+    Outliers are downweighted by Student's t; where the inliers scatter more than their covariances say, the axis'
+    covariance is scaled up accordingly.
 
     Args:
-        motions: target_from_source, all before one and the same camera.
-        wobble_rad: standard deviation of each motion's rotation that is no turn about the axis.
-        wobble_m: standard deviation of its shift that no turn makes, at the axis' point.
+        motions: target_from_source, all in the frame of one static camera.
+        wobble_rad: standard deviation of each motion's rotation out of the axis.
+        wobble_m: standard deviation of its shift, at the axis' point.
     """
     turning = [motion for motion in motions if np.linalg.norm(se3.log(motion.mean)[:3]) >= _LEAST_TURN_RAD]
     turning = turning[-_MOST_PAIRS:]
     if len(turning) < _LEAST_PAIRS:
         return None
-    direction, point_m = _begin(turning)
+    direction, point_m = _initial_axis(turning)
     wobble = np.repeat([wobble_rad, wobble_m], 3) ** 2
     information, scale = np.eye(4), 1.0
     for _ in range(_ITERATIONS):
-        information, pull, misfit, weights = np.zeros((4, 4)), np.zeros(4), 0.0, 0.0
+        information, gradient, misfit, weights = np.zeros((4, 4)), np.zeros(4), 0.0, 0.0
         for pose in turning:
-            gap, slope = _gap(pose, direction, point_m, wobble)
-            square = float(gap @ gap)
+            residual, jacobian = _residual(pose, direction, point_m, wobble)
+            square = float(residual @ residual)
             weight = (_STUDENT + 5.0) / (_STUDENT + square)  # an axis fixes five of a motion's six numbers
-            information += weight * slope.T @ slope
-            pull += weight * slope.T @ gap
+            information += weight * jacobian.T @ jacobian
+            gradient += weight * jacobian.T @ residual
             misfit += weight * square
             weights += weight
         scale = max(misfit / max(5.0 * weights - 4.0, 1.0), 1.0)
-        step = np.linalg.solve(information, pull)
+        step = np.linalg.solve(information, gradient)
         tilt, shift = np.split(step, 2)
         across = across_axis(direction)
         direction = se3.exp(np.concatenate([tilt @ across, np.zeros(3)]))[:3, :3] @ direction
@@ -64,12 +78,12 @@ def common_axis(motions: Sequence[PoseGaussian], wobble_rad: float, wobble_m: fl
     return Axis(direction, sigmas[0], point_m, sigmas[1])
 
 
-def _gap(pose: PoseGaussian, direction: Array, point_m: Array, wobble: Array) -> tuple[Array, Array]:
-    """Return how far a motion is from a turn about an axis (6,), and its slope (6, 4) with the axis, both whitened.
+def _residual(pose: PoseGaussian, direction: Array, point_m: Array, wobble: Array) -> tuple[Array, Array]:
+    """Return the residual (6,) of a motion from a pure turn about an axis, and its Jacobian (6, 4), both whitened.
 
-    The angle is whatever fits best. The four numbers are tilts about, and shifts along, two directions across the axis.
+    The angle is eliminated. The four parameters are tilts about, and shifts along, two normals of the axis.
     """
-    # All about the axis' point, which lies near the object: there rotation and shift are told apart best.
+    # About the axis' point, near the object, rotation and shift are least correlated.
     motion = se3.translation(-point_m) @ pose.mean @ se3.translation(point_m)
     covariance = se3.covariance_about(pose.covariance, point_m) + np.diag(wobble)
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -85,13 +99,13 @@ def _gap(pose: PoseGaussian, direction: Array, point_m: Array, wobble: Array) ->
 
 
 def turn_sense(posteriors: Sequence[Posterior], up: Array, step_rad: float, sigma_step_rad: float) -> int:
-    """Return +1 where from frame to frame the object turns right-handed about `up`, -1 the other way, 0 not yet known.
+    """Return the sense of rotation from frame to frame about `up`: +1 right-handed, -1 left-handed, 0 not yet known.
 
-    How sure a pair can be is bounded, so that it takes three of one mind. Turns by about half a circle tell nothing.
+    The odds that one pair contributes are bounded, so that at least three must agree. Half turns are uninformative.
 
     Args:
-        posteriors: of motions before one and the same camera.
-        up: (3,) unit, the side to which the axis points.
+        posteriors: in the frame of one static camera.
+        up: (3,) unit, the axis' direction.
         step_rad: turn from one frame number to the next, of either sign.
         sigma_step_rad: standard deviation of one step.
     """
@@ -100,34 +114,34 @@ def turn_sense(posteriors: Sequence[Posterior], up: Array, step_rad: float, sigm
         steps = posterior.target - posterior.source
         turn_rad, variance = steps * step_rad, abs(steps) * sigma_step_rad**2
         forth, back = (_log_likelihood(posterior, up, turn, variance) for turn in (turn_rad, -turn_rad))
-        odds += float(np.clip(forth - back, -_MOST_TOLD, _MOST_TOLD))
-    return int(np.sign(odds)) if abs(odds) > _DECISIVE else 0
+        odds += float(np.clip(forth - back, -_MAX_LOG_ODDS, _MAX_LOG_ODDS))
+    return int(np.sign(odds)) if abs(odds) > _DECISIVE_LOG_ODDS else 0
 
 
 def _log_likelihood(posterior: Posterior, up: Array, turn_rad: float, variance: float) -> float:
-    """Return the log likelihood, up to a constant, of a turn about `up` that is known with a variance in rad²."""
+    """Return the log likelihood, up to a constant, of a turn about `up` with a variance in rad²."""
     parts = [(mode.weight, mode.pose) for mode in posterior.modes] or [(1.0, posterior.pose)]
-    told, shares = [], []
+    exponents, weights = [], []
     for weight, pose in parts:
         off_rad = np.remainder(se3.log(pose.mean)[:3] @ up - turn_rad + np.pi, 2.0 * np.pi) - np.pi
         whole = variance + up @ pose.covariance[:3, :3] @ up
-        told.append(-0.5 * off_rad**2 / whole)
-        shares.append(weight / np.sqrt(whole))
-    return float(logsumexp(told, b=shares))
+        exponents.append(-0.5 * off_rad**2 / whole)
+        weights.append(weight / np.sqrt(whole))
+    return float(logsumexp(exponents, b=weights))
 
 
-def _begin(motions: Sequence[PoseGaussian]) -> tuple[Array, Array]:
-    """Return a first direction (3,), and the point (3,) of a first axis where the motions' shifts are surest."""
+def _initial_axis(motions: Sequence[PoseGaussian]) -> tuple[Array, Array]:
+    """Return an initial direction (3,), and the point (3,) of the initial axis at which the shifts are most certain."""
     vectors = np.array([se3.log(pose.mean)[:3] for pose in motions])
     direction = np.linalg.svd(vectors)[2][0]
     stay = np.vstack([np.eye(3) - pose.mean[:3, :3] for pose in motions])
     shifts = np.concatenate([pose.mean[:3, 3] for pose in motions])
     point_m = np.linalg.lstsq(stay, shifts, rcond=1e-2)[0]
-    # A point x shifts by υ + ω × x; that varies least where hat(x) undoes what υ varies with ω.
+    # A point x shifts by υ + ω × x, whose variance is least where hat(x) cancels the correlation of υ with ω.
     levers = [pose.covariance[3:, :3] @ np.linalg.inv(pose.covariance[:3, :3]) for pose in motions]
     lever = np.mean(levers, axis=0)
-    surest_m = 0.5 * np.array([lever[2, 1] - lever[1, 2], lever[0, 2] - lever[2, 0], lever[1, 0] - lever[0, 1]])
-    return direction, point_m + direction * (direction @ (surest_m - point_m))
+    certain_m = 0.5 * np.array([lever[2, 1] - lever[1, 2], lever[0, 2] - lever[2, 0], lever[1, 0] - lever[0, 1]])
+    return direction, point_m + direction * (direction @ (certain_m - point_m))
 
 
 def _turn(motion: Array, direction: Array) -> float:

@@ -1,4 +1,4 @@
-"""Nothing known but that the views are neighbours (paper, section IV: the general prior)."""
+"""The general prior: nothing known but that the views are neighbours (paper, section IV)."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.priors.directions import directions
+from modeler.priors.mixtures import directions
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage
 
-_SMALL_DEG = 30.0  # up to this turn limits of the centroids' offset are what they say
+_SMALL_DEG = 30.0  # up to this turn, limits of the centroids' offset hold as given
 _WIDEST_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of what was seen of it
+_ROOM_DEG = 5.0  # for a confident proposal: limits bound the search, and must not cut the posterior off
 
 
 @dataclass(frozen=True)
 class GeneralPrior(AbstractPrior):
-    """Any rotation up to a limit, the centroids of the two surfaces close to each other."""
+    """Any rotation up to a limit, with the centroids of the two surfaces close to each other."""
 
     max_rotation_deg: float = 50.0
     """Largest rotation between the two views."""
     max_offset_m: float = 0.04
-    """Largest distance between the target's centroid and the source's, carried over."""
+    """Largest distance between the target's centroid and the source's, transformed."""
 
     def between(self, source: RayImage, target: RayImage) -> GeneralDensity:
         """Return the density of target_from_source."""
@@ -30,7 +31,7 @@ class GeneralPrior(AbstractPrior):
         )
 
     def relaxed(self, steps: float) -> GeneralPrior:
-        """Return the prior whose limits hold for several steps."""
+        """Return the prior with limits for several steps."""
         rotation_deg, offset_m = relaxed_limits(self.max_rotation_deg, self.max_offset_m, steps)
         return replace(self, max_rotation_deg=rotation_deg, max_offset_m=offset_m)
 
@@ -44,15 +45,15 @@ class GeneralDensity(AbstractPoseDensity):
     target_centroid_m: Array
     """(3,)."""
     max_rotation_rad: float
-    """Largest angle of the rotation from the middle."""
+    """Largest angle of the rotation from `middle`."""
     max_offset_m: float
-    """Radius of the ball of where the target's centroid lies from the source's, carried over."""
+    """Largest distance between the target's centroid and the source's, transformed."""
     middle: Array = field(default_factory=lambda: np.eye(3))
-    """(3, 3) rotation from which the limit counts."""
+    """(3, 3) central rotation."""
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw motions (count, 4, 4)."""
+        """Draw poses (count, 4, 4)."""
         angle = sample_angles(self.max_rotation_rad, count, rng)
         offset_m = directions(count, rng) * self.max_offset_m * rng.random((count, 1)) ** (1 / 3)
         motion = se3.exp(np.concatenate([angle[:, None] * directions(count, rng), np.zeros((count, 3))], axis=1))
@@ -61,7 +62,7 @@ class GeneralDensity(AbstractPoseDensity):
         return motion
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of motions (n, 4, 4); -inf outside."""
+        """Return the log density (n,) of poses (n, 4, 4); -inf outside."""
         trace = np.einsum("nij,ij->n", target_from_source[:, :3, :3], self.middle)  # of the rotation from the middle
         offset_m = centroid_offset(target_from_source, self.source_centroid_m, self.target_centroid_m)
         inside = (trace >= 1.0 + 2.0 * np.cos(self.max_rotation_rad) - 1e-9) & (
@@ -74,11 +75,11 @@ class GeneralDensity(AbstractPoseDensity):
 
 
 def relaxed_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -> tuple[float, float]:
-    """Return the limits of rotation in degrees and of the centroids' offset in m for so many steps (at least 1).
+    """Return the limits of rotation in degrees and of the centroids' offset in m for a number of steps (at least 1).
 
-    Rotation grows up to what two views can be registered across: beyond, they share so little surface that none at all
-    explains them as well. The centroid of what is seen lies before the middle of the object, so that a turn by θ parts
-    two of them by a chord of 2 sin(θ/2), and the offset grows as that does.
+    The rotation is capped at what two views can be registered across: beyond, they share too little surface. The
+    centroid of the visible surface lies in front of the object's centre, so that a turn by θ separates two of them by
+    a chord proportional to 2 sin(θ/2); the offset grows with it.
     """
     rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, _WIDEST_DEG))
     chord = np.sin(np.radians(rotation_deg) / 2.0) / np.sin(np.radians(max_rotation_deg) / 2.0)
@@ -86,17 +87,22 @@ def relaxed_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -
 
 
 def turned_offset_m(max_offset_m: float, turn_rad: float) -> float:
-    """Return the limit of the centroids' offset in m for a turn of any size: up to 30 degrees what it says itself."""
+    """Return the limit of the centroids' offset in m for a turn of any size; up to 30 degrees the limit as given."""
     share = max(abs(np.remainder(turn_rad + np.pi, 2.0 * np.pi) - np.pi) / np.radians(_SMALL_DEG), 1.0)
     return relaxed_limits(_SMALL_DEG, max_offset_m, float(share))[1]
 
 
 def sample_angles(limit_rad: float, count: int, rng: np.random.Generator) -> Array:
-    """Draw the angles (count,) of rotations that are uniform on SO(3) up to a limit: density ∝ 1 - cos(angle)."""
+    """Draw angles (count,) of rotations that are uniform on SO(3) up to a limit: density ∝ 1 - cos(angle)."""
     angle = np.linspace(0.0, limit_rad, 4096)
     return np.interp(rng.random(count), (angle - np.sin(angle)) / (limit_rad - np.sin(limit_rad)), angle)
 
 
 def centroid_offset(target_from_source: Array, source_centroid_m: Array, target_centroid_m: Array) -> Array:
-    """Return the offsets (n, 3) in m of the source's centroid, carried over, from the target's."""
+    """Return the offsets (n, 3) in m of the source's centroid, transformed, from the target's."""
     return target_from_source[:, :3, :3] @ source_centroid_m + target_from_source[:, :3, 3] - target_centroid_m
+
+
+def reach_deg(sigma_deg: float) -> float:
+    """Return the half-width of limits around a proposal with a standard deviation, in degrees."""
+    return min(4.0 * sigma_deg + _ROOM_DEG, 180.0)

@@ -1,4 +1,4 @@
-"""Somebody pokes the object along the table: where, which way and how far tells how it turns and shifts."""
+"""The poke prior: the object is pushed along the table, and the push predicts its turn and shift."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from modeler import se3
-from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M, OnPlane, on_plane
-from modeler.priors.table import TablePrior
+from modeler.priors.table import WOBBLE_DEG, WOBBLE_M, OnPlane, TablePrior, on_plane
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, RayImage
 
-_STEPS = 20  # into which a push is cut
-_PUSHES = 512  # of which the spread of outcomes is told
+_STEPS = 20  # integration steps of a push
+_PUSHES = 512  # samples of a push
 _DIMENSIONS = 7
-_LEAST_WAY = 0.1  # along the table, of a direction: six degrees off its normal nobody means
+_LEAST_WAY = 0.1  # share of a direction in the plane: within six degrees of the normal it is an error
 
 
 @dataclass(frozen=True)
@@ -25,30 +24,30 @@ class Poke:
     point_m: tuple[float, float, float]
     """Where the finger touches the object at the start, in camera coordinates."""
     direction: tuple[float, float, float]
-    """Which way it moves, in camera coordinates, of any length; what of it is off the plane does not count."""
+    """Direction of its motion in camera coordinates, of any length, projected onto the plane."""
     length_m: float
-    """How far it moves."""
+    """Length of its motion."""
 
 
 @dataclass(frozen=True)
 class PokePrior(AbstractPrior):
-    """Slow pushing on a plane with friction: how far the object turns depends on how far off its centre it is pushed.
+    """Quasi-static pushing on a plane with friction.
 
-    The motion follows from where the contact lies from the centre of friction, and from c, the ratio of the friction's
-    greatest moment to its greatest force (Lynch, Maekawa and Tanie 1992), integrated over the push. What is not known
-    for sure (centre, c, contact, direction, length) is drawn many times.
+    The motion follows from the position of the contact relative to the centre of friction, and from c, the ratio of the
+    friction's greatest moment to its greatest force (Lynch, Maekawa and Tanie 1992), integrated over the push. The
+    uncertain quantities (centre, c, contact, direction, length) are sampled.
     """
 
     poke: Poke | None = None
-    """The push between any two frames that are asked for."""
+    """The push between any two frames."""
     pokes: Mapping[int, Poke] = field(default_factory=dict)
-    """Pushes of a sequence, by the number of the first frame after each; it counts more than `poke`."""
+    """Pushes of a sequence, by the number of the first frame after each; they take precedence over `poke`."""
     poke_sigma_m: float = 0.005
     """Standard deviation of the contact and of the push's length."""
     poke_sigma_deg: float = 5.0
     """Standard deviation of the push's direction."""
     centre_sigma_m: float = 0.015
-    """Standard deviation of the centre of friction about the centroid of what is seen, in each direction."""
+    """Standard deviation of the centre of friction about the centroid of the visible surface, in each direction."""
     friction_sigma: float = 0.25
     """Standard deviation of the log of c about the surface's root mean square distance from its centroid."""
     sigma_tilt_deg: float = WOBBLE_DEG
@@ -57,10 +56,10 @@ class PokePrior(AbstractPrior):
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source; after several pushes only that the object is on its table still.
+        """Return the density of target_from_source; after several pushes that of the table prior.
 
         Raises:
-            InputError: where neither view shows a plane, no push is told between them, or it presses on the plane.
+            InputError: where neither view shows a plane, no push is given, or it is directed into the plane.
         """
         earlier, later = sorted((source, target), key=lambda view: view.index)
         pokes = self._between(earlier.index, later.index)
@@ -78,7 +77,7 @@ class PokePrior(AbstractPrior):
         )
         if np.linalg.norm(plane.axes[:2] @ pokes[0].direction) <= _LEAST_WAY * np.linalg.norm(pokes[0].direction):
             raise InputError(
-                f"the poke between frames {earlier.index} and {later.index} presses on the table instead of along it; "
+                f"the poke between frames {earlier.index} and {later.index} is directed into the table, not along it; "
                 "give its direction in camera coordinates"
             )
         outcomes = self._outcomes(pokes[0], earlier, plane)
@@ -97,19 +96,19 @@ class PokePrior(AbstractPrior):
         found = [poke for frame, poke in self.pokes.items() if earlier < frame <= later]
         if not found:
             raise InputError(
-                f"no poke is told between frames {earlier} and {later}; tell each poke by the first frame after it, "
+                f"no poke is given between frames {earlier} and {later}; give each poke with the first frame after it, "
                 "or use --prior table"
             )
         return found
 
     def _outcomes(self, poke: Poke, before: RayImage, plane: OnPlane) -> Array:
-        """Draw outcomes (n, 3) of a push: turn in rad, and where the centroid goes from the later one, in the plane."""
-        rng = np.random.default_rng(0)  # the same push has the same outcomes, whoever asks
+        """Draw outcomes (n, 3) of a push: turn in rad, and the centroid's position relative to the later one's in m."""
+        rng = np.random.default_rng(0)  # equal pushes give equal outcomes
         noise = rng.normal(size=(_PUSHES, _DIMENSIONS))
         in_plane = plane.axes[:2]
         way = in_plane @ np.array(poke.direction)
         way = way / np.linalg.norm(way)
-        along_way = np.array([way, [-way[1], way[0]]])  # all is reckoned along the push and across it
+        along_way = np.array([way, [-way[1], way[0]]])  # coordinates along the push and orthogonal to it
         seen = before.points_m @ in_plane.T @ along_way.T
         centre = seen.mean(axis=0) + self.centre_sigma_m * noise[:, :2]
         radius_m = np.sqrt(np.sum(np.var(seen, axis=0))) * np.exp(self.friction_sigma * noise[:, 2])
@@ -118,7 +117,7 @@ class PokePrior(AbstractPrior):
         length_m = np.maximum(poke.length_m + self.poke_sigma_m * noise[:, 6], 0.0)
         step = (length_m / _STEPS)[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
         turn, shift = pushed(contact - centre, step, radius_m)
-        # The centre of friction was carried by `shift`, the centroid turned about it as well.
+        # The centre of friction moves by `shift`; the centroid also turns about it.
         lever = seen.mean(axis=0) - centre
         cos, sin = np.cos(turn), np.sin(turn)
         carried = np.stack([cos * lever[:, 0] - sin * lever[:, 1], sin * lever[:, 0] + cos * lever[:, 1]], axis=1)
@@ -137,17 +136,17 @@ class PokeDensity(AbstractPoseDensity):
     covariance: Array
     """(3, 3)."""
     backwards: bool
-    """Whether the motion asked for leads back in time."""
+    """Whether the pair leads back in time."""
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw motions (count, 4, 4)."""
+        """Draw poses (count, 4, 4)."""
         drawn = self.mean + rng.normal(size=(count, 3)) @ np.linalg.cholesky(self.covariance).T
         later_from_earlier = self.plane.motions(drawn[:, 0], drawn[:, 1:], rng)
         return se3.inverse(later_from_earlier) if self.backwards else later_from_earlier
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of motions (n, 4, 4)."""
+        """Return the log density (n,) of poses (n, 4, 4)."""
         # The uniform measure is the same forward and backward.
         later_from_earlier = se3.inverse(target_from_source) if self.backwards else target_from_source
         turn_rad, shift_m, out_of_plane = self.plane.coordinates(later_from_earlier)
@@ -165,7 +164,7 @@ def pushed(contact_m: Array, step_m: Array, radius_m: Array) -> tuple[Array, Arr
     so that the contact's velocity v + ω ẑ × x is the finger's (Lynch, Maekawa and Tanie 1992).
 
     Args:
-        contact_m: (n, 2) contact from the centre of friction.
+        contact_m: (n, 2) contact relative to the centre of friction.
         step_m: (n, 2) the finger's motion in each of the steps.
         radius_m: (n,) c, the ratio of the friction's greatest moment to its greatest force.
     """
@@ -178,5 +177,5 @@ def pushed(contact_m: Array, step_m: Array, radius_m: Array) -> tuple[Array, Arr
         along = np.stack([(squares + x**2) * u + x * y * w, x * y * u + (squares + y**2) * w], axis=1) / total[:, None]
         turned = (x * along[:, 1] - y * along[:, 0]) / squares
         shift, turn = shift + along, turn + turned
-        contact_m = contact_m + step_m - along  # the finger stays at the same place of the object
+        contact_m = contact_m + step_m - along  # the finger does not slip on the object
     return turn, shift

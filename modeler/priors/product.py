@@ -1,4 +1,4 @@
-"""Two independent pieces of knowledge that both hold: the product of their densities."""
+"""The product of two independent priors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from modeler.priors.gaussian import Gaussian, fitted
+from modeler.priors.mixtures import Gaussian, fitted
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
@@ -24,14 +24,14 @@ _DRAWS = 5000
 _FITTED = 1000
 _ROUNDS = 5
 _GAUSSIAN_SHARE = 0.8
-_WIDER = 1.3  # of the Gaussian than of what it covers, so that weights stay bounded
+_WIDER = 1.3  # factor on the fitted Gaussian's standard deviations, so that weights stay bounded
 _OVERSAMPLING = 4
-_ASTONISHING = 25.0  # nats: seven standard deviations off
+_CONTRADICTION_NATS = 25.0  # seven standard deviations
 
 
 @dataclass(frozen=True)
 class ProductPrior(AbstractPrior):
-    """Both of two priors hold, and neither was told by the other: a held object on a table, say."""
+    """Two independent priors that both hold, such as a held object on a table."""
 
     first: AbstractPrior
     """One."""
@@ -53,28 +53,28 @@ class ProductPrior(AbstractPrior):
         return product
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> ProductPrior:
-        """Return the product of what both learnt."""
+        """Return the product of both updated priors."""
         return replace(self, first=self.first.learned(solution, edges), second=self.second.learned(solution, edges))
 
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
-        """Return the axis that all steps share, where either part has one."""
+        """Return the axis that all steps share, if either part has one."""
         return self.first.shared_axis(views) or self.second.shared_axis(views)
 
     def relaxed(self, steps: float) -> ProductPrior:
-        """Return the product with limits that hold for several steps."""
+        """Return the product with limits for several steps."""
         return replace(self, first=self.first.relaxed(steps), second=self.second.relaxed(steps))
 
 
 @dataclass(frozen=True, eq=False)
 class Product(AbstractPoseDensity):
-    """The normalised product of two densities, drawn by importance from a Gaussian fitted to it and from both."""
+    """The normalised product of two densities, sampled by importance from both and a Gaussian fitted to the product."""
 
     first: AbstractPoseDensity
     """One density."""
     second: AbstractPoseDensity
     """The other."""
     gaussian: Gaussian
-    """Covers the product."""
+    """The Gaussian fitted to the product."""
     log_volume: float
     """Log of the integral of the product."""
 
@@ -84,33 +84,33 @@ class Product(AbstractPoseDensity):
         return self.first.evidence and self.second.evidence
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw motions (count, 4, 4), by resampling a few times as many."""
+        """Draw poses (count, 4, 4), by resampling several times as many."""
         drawn, log_weights = _weighted(self.first, self.second, self.gaussian, _OVERSAMPLING * count + 200, rng)
         return drawn[rng.permutation(resampled(np.exp(log_weights - log_weights.max()), count, rng))]
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of motions (n, 4, 4); -inf outside."""
+        """Return the log density (n,) of poses (n, 4, 4); -inf outside."""
         return (
             self.first.log_density(target_from_source) + self.second.log_density(target_from_source) - self.log_volume
         )
 
     def log_evidence(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of what of both is independently known."""
+        """Return the log density (n,) of the independent knowledge of both at poses (n, 4, 4)."""
         known = self.first.log_evidence(target_from_source) + self.second.log_evidence(target_from_source)
         return known - self.log_volume if self.evidence else known
 
 
 def multiplied(first: AbstractPoseDensity, second: AbstractPoseDensity, centre_m: Array) -> Product | None:
-    """Return the product of two densities; None where they have nothing in common.
+    """Return the product of two densities; None where they are disjoint or contradict each other.
 
     A Gaussian is fitted to weighted draws of both, then to weighted draws of itself and both (population Monte Carlo).
 
     Args:
         first: one density.
         second: another.
-        centre_m: (3,) point of the source about which the Gaussian is told.
+        centre_m: (3,) point of the source whose position the Gaussian describes.
     """
-    rng = np.random.default_rng(0)  # the same two have the same product, whoever asks
+    rng = np.random.default_rng(0)  # equal densities give equal products
     gaussian, log_volume = None, -np.inf
     for _ in range(_ROUNDS):
         drawn, log_weights = _weighted(first, second, gaussian, _DRAWS, rng)
@@ -126,13 +126,13 @@ def multiplied(first: AbstractPoseDensity, second: AbstractPoseDensity, centre_m
     drawn = product.sample(_FITTED, rng)
     for part in (first, second):
         usual, here = (np.median(part.log_density(poses)) for poses in (part.sample(_FITTED, rng), drawn))
-        if here < usual - _ASTONISHING:
+        if here < usual - _CONTRADICTION_NATS:
             return None
     return product
 
 
 def resampled(weights: Array, count: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
-    """Return `count` indices, each as often as its weight (n,) asks, by systematic resampling."""
+    """Return `count` indices in proportion to weights (n,), by systematic resampling."""
     cumulative = np.cumsum(weights)
     positions = (np.arange(count) + rng.random()) / count * cumulative[-1]
     return np.minimum(np.searchsorted(cumulative, positions), len(weights) - 1)

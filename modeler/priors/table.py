@@ -1,24 +1,138 @@
-"""The object stays on its support: it turns about the plane's normal and shifts in the plane (paper, section IV)."""
+"""The table prior: the object turns about its support plane's normal and shifts in the plane (paper, section IV)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from modeler.priors.general import relaxed_limits
-from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M, OnPlane, on_plane
-from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage
+from modeler import se3
+from modeler.priors.general import centroid_offset, relaxed_limits
+from modeler.priors.mixtures import across_axis
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane, RayImage
+
+WOBBLE_DEG, WOBBLE_M = 0.2, 0.0007
+"""Standard deviations of how far tables deviate from planes, and turntables from pure rotation, in one step."""
+
+
+@dataclass(frozen=True, eq=False)
+class OnPlane:
+    """Coordinates of motions on a plane: turn and shift in the plane, and a Gaussian tilt and lift out of it."""
+
+    source_centroid_m: Array
+    """(3,)."""
+    target_centroid_m: Array
+    """(3,)."""
+    normal: Array
+    """(3,) unit."""
+    sigma_tilt_rad: float
+    """Standard deviation of the rotation out of the plane, about each direction in it."""
+    sigma_lift_m: float
+    """Standard deviation of the motion along the normal."""
+
+    @cached_property
+    def axes(self) -> Array:
+        """Two unit vectors that span the plane, and its normal (3, 3), right-handed."""
+        return np.vstack([across_axis(self.normal), self.normal])
+
+    def motions(self, turn_rad: Array, shift_m: Array, rng: np.random.Generator) -> Array:
+        """Return poses (n, 4, 4) of turns (n,) and shifts (n, 2) of the centroid, with random tilt and lift."""
+        count, axes = len(turn_rad), self.axes
+        tilt = rng.normal(0.0, self.sigma_tilt_rad, (count, 2)) @ axes[:2]
+        zero = np.zeros((count, 3))
+        turn = turn_rad[:, None] * self.normal
+        tilted = se3.exp(np.concatenate([tilt, zero], axis=1))
+        motion = se3.moved(tilted, np.concatenate([turn, zero], axis=1), np.zeros(3))
+        lift_m = rng.normal(self._lift_m, self.sigma_lift_m, (count, 1))
+        offset_m = np.concatenate([shift_m, lift_m], axis=1) @ axes
+        motion[:, :3, 3] = self.target_centroid_m + offset_m - motion[:, :3, :3] @ self.source_centroid_m
+        return motion
+
+    def coordinates(self, target_from_source: Array) -> tuple[Array, Array, Array]:
+        """Return turns (n,) in rad and shifts (n, 2) in m of poses (n, 4, 4), and the log density (n,) of the rest."""
+        rotation, normal = target_from_source[:, :3, :3], self.normal
+        tilted = np.einsum("nij,j->ni", rotation, normal)
+        upright = np.einsum("ni,i->n", tilted, normal)
+        aside = tilted - upright[:, None] * normal
+        tilt_rad = np.arctan2(np.sqrt(np.einsum("ni,ni->n", aside, aside)), upright)
+        # The rotation without its tilt is a turn about the normal.
+        twist = np.einsum("nij,ij->n", rotation, se3.hat(normal))
+        turn_rad = np.arctan2(twist, np.einsum("nii->n", rotation) - upright)
+        offset_m = centroid_offset(target_from_source, self.source_centroid_m, self.target_centroid_m) @ self.axes.T
+        out_of_plane = (
+            -0.5 * (tilt_rad / self.sigma_tilt_rad) ** 2
+            - 0.5 * ((offset_m[:, 2] - self._lift_m) / self.sigma_lift_m) ** 2
+            - np.log((2.0 * np.pi) ** 1.5 * self.sigma_tilt_rad**2 * self.sigma_lift_m)
+        )
+        return turn_rad, offset_m[:, :2], out_of_plane
+
+    @property
+    def _lift_m(self) -> float:
+        """Height of the source's centroid above the target's, which motion on the plane preserves."""
+        return float((self.source_centroid_m - self.target_centroid_m) @ self.normal)
+
+
+def on_plane(
+    source: RayImage, target: RayImage, *, turn_rad: float, shift_m: float, sigma_tilt_rad: float, sigma_lift_m: float
+) -> OnPlane:
+    """Return the coordinates of motions on the support plane of two views.
+
+    Args:
+        source: view before the motion.
+        target: view after it.
+        turn_rad: largest turn to expect.
+        shift_m: largest shift to expect.
+        sigma_tilt_rad: standard deviation of the rotation out of the plane, on top of the plane's own uncertainty.
+        sigma_lift_m: standard deviation of the motion along the normal, on top of the plane's own uncertainty.
+
+    Raises:
+        InputError: where neither view shows a support plane.
+    """
+    plane = support(source, target)
+    if plane is None:
+        raise no_plane(source, target)
+    # A normal that is off by δ tilts a turn by θ about it by 2 sin(θ/2) δ, and lifts a shift by shift · δ.
+    tilt_rad = 2.0 * np.sin(min(turn_rad, np.pi) / 2.0) * plane.sigma_tilt_rad
+    return OnPlane(
+        source.centroid_m,
+        target.centroid_m,
+        plane.normal,
+        float(np.hypot(sigma_tilt_rad, tilt_rad)),
+        float(np.hypot(sigma_lift_m, shift_m * plane.sigma_tilt_rad)),
+    )
+
+
+def no_plane(source: RayImage, target: RayImage) -> InputError:
+    """Return the error for two views without a support plane."""
+    return InputError(
+        f"frames {source.index} and {target.index} show no support plane, which the prior needs; "
+        "use the general prior or let the camera see more of the table"
+    )
+
+
+def support(source: RayImage, target: RayImage) -> Plane | None:
+    """Return the support plane of two views: the mean where both show it, None where neither does."""
+    planes = [view.plane for view in (source, target) if view.plane is not None]
+    if not planes:
+        return None
+    normal = np.sum([plane.normal for plane in planes], axis=0)
+    return Plane(
+        normal / np.linalg.norm(normal),
+        float(np.mean([plane.offset_m for plane in planes])),
+        float(np.mean([plane.sigma_tilt_rad for plane in planes])),
+        float(np.mean([plane.sigma_offset_m for plane in planes])),
+    )
 
 
 @dataclass(frozen=True)
 class TablePrior(AbstractPrior):
-    """Motion in the support plane, as surely as the plane is known."""
+    """Motion in the support plane, with the plane's own uncertainty."""
 
     max_rotation_deg: float = 50.0
     """Largest rotation about the plane's normal between the two views."""
     max_shift_m: float = 0.05
-    """Largest distance, in the plane, between the target's centroid and the source's, carried over."""
+    """Largest distance, in the plane, between the target's centroid and the source's, transformed."""
     sigma_tilt_deg: float = WOBBLE_DEG
     """Standard deviation of the rotation out of the plane, on top of the plane's own uncertainty."""
     sigma_height_m: float = WOBBLE_M
@@ -42,7 +156,7 @@ class TablePrior(AbstractPrior):
         return TableDensity(plane, limit_rad, self.max_shift_m)
 
     def relaxed(self, steps: float) -> TablePrior:
-        """Return the prior whose limits hold for several steps; what ties the motion to the plane stays."""
+        """Return the prior with limits for several steps; the tie to the plane is unchanged."""
         rotation_deg, shift_m = relaxed_limits(self.max_rotation_deg, self.max_shift_m, steps)
         return replace(self, max_rotation_deg=rotation_deg, max_shift_m=shift_m)
 
@@ -52,22 +166,22 @@ class TableDensity(AbstractPoseDensity):
     """Uniform turn and shift in a plane, Gaussian tilt and lift out of it."""
 
     plane: OnPlane
-    """Where the object stands."""
+    """The support plane's coordinates."""
     max_rotation_rad: float
-    """Largest turn from the middle, either way."""
+    """Largest turn from the middle, in either direction."""
     max_shift_m: float
-    """Radius of the disc, in the plane, of where the target's centroid lies from the source's, carried over."""
+    """Largest distance, in the plane, between the target's centroid and the source's, transformed."""
     middle_rad: float = 0.0
-    """The turn from which the limit counts."""
+    """Central turn."""
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw motions (count, 4, 4)."""
+        """Draw poses (count, 4, 4)."""
         turn_rad = self.middle_rad + rng.uniform(-self.max_rotation_rad, self.max_rotation_rad, count)
         return self.plane.motions(turn_rad, sample_disc(self.max_shift_m, count, rng), rng)
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of motions (n, 4, 4); -inf outside."""
+        """Return the log density (n,) of poses (n, 4, 4); -inf outside."""
         turn_rad, shift_m, out_of_plane = self.plane.coordinates(target_from_source)
         turn_rad = np.abs(np.remainder(turn_rad - self.middle_rad + np.pi, 2.0 * np.pi) - np.pi)
         inside = (turn_rad <= self.max_rotation_rad) & (np.sum(shift_m**2, axis=1) <= self.max_shift_m**2)
@@ -76,7 +190,7 @@ class TableDensity(AbstractPoseDensity):
 
 
 def sample_disc(radius_m: float, count: int, rng: np.random.Generator) -> Array:
-    """Draw points (count, 2) evenly over a disc about the origin."""
+    """Draw points (count, 2) uniformly over a disc about the origin."""
     distance_m = radius_m * np.sqrt(rng.random((count, 1)))
     bearing = rng.uniform(0.0, 2.0 * np.pi, count)
     return distance_m * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)

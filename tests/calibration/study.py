@@ -12,7 +12,7 @@ from calibration.specimens import FRAMES, SPECIMENS, Half, Specimen, Symmetry, l
 from modeler import se3
 from modeler.evaluation import about_point, nees, rotation_error_deg, translation_error_m, true_motion
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M
+from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.segmentation import Segmenter, telling

@@ -25,9 +25,9 @@ from loops.study import modeler
 from modeler.closure import Closer
 from modeler.evaluation import nees, true_motion
 from modeler.export import write_atomically
-from modeler.priors.on_plane import WOBBLE_DEG, WOBBLE_M
+from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.segmentation import telling
-from modeler.types import Array, Solution
+from modeler.types import Array, Solution, Step
 from sequences import AbstractSequence
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.trajectory import Tabletop
@@ -73,6 +73,7 @@ def run(shape: str, seed: int, frames: int, step_deg: float, prior: str) -> dict
     assert truth is not None
     scene = maker.segmenter.scene([case.sequence.frame(index) for index in telling(indices)])
     *_, last = maker.run(case.frames(), scene)
+    assert isinstance(last, Step)
     return judged(last.solution, truth)
 
 

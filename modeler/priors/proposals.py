@@ -1,0 +1,308 @@
+"""Proposals: densities derived from the images or the graph, which guide the search and are no evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from modeler import se3
+from modeler.features import fpfh, kabsch, mutual_matches
+from modeler.priors.general import GeneralPrior, centroid_offset
+from modeler.priors.mixtures import KernelMixture, across_axis, defensive_mixture, directions_about
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, PoseGaussian, RayImage, SharedAxis, Solution
+
+_LEAST_RAD, _LEAST_M = np.radians(2.0), 0.004  # least standard deviations: the search itself resolves less
+_WIDER = 2.0  # factor on the graph's standard deviations, which hold no systematic error
+_MOST_STEPS = 3.0  # beyond, constant velocity is no longer plausible
+_DRAWS = 20_000  # triples drawn
+_JUDGED = 1000  # at most so many of their poses are scored
+
+
+@dataclass(frozen=True)
+class AbstractProposal(AbstractPrior):
+    """A prior that adds a proposal to another prior, whose evidence, limits, learning and axis remain its own."""
+
+    known: AbstractPrior = field(default_factory=GeneralPrior)
+    """The independent knowledge."""
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
+        """Return the prior with what its independent part learned."""
+        return replace(self, known=self.known.learned(solution, edges))
+
+    def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
+        """Return the axis that all steps share, according to the independent knowledge."""
+        return self.known.shared_axis(views)
+
+    def relaxed(self, steps: float) -> AbstractPrior:
+        """Return the prior with limits for several steps."""
+        return replace(self, known=self.known.relaxed(steps))
+
+
+@dataclass(frozen=True)
+class PredictedProposal(AbstractPrior):
+    """The motion predicted from the poses so far, within the independent knowledge."""
+
+    known: AbstractPrior
+    """The independent knowledge."""
+    expected: PoseGaussian
+    """target_from_source of the pair."""
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
+        """Return the density of target_from_source.
+
+        Raises:
+            InputError: where the views lack what the prior needs.
+        """
+        covariance = se3.covariance_about(self.expected.covariance, source.centroid_m)
+        sigma_rad, sigma_m = (
+            float(np.sqrt(np.linalg.eigvalsh(c)[-1])) for c in (covariance[:3, :3], covariance[3:, 3:])
+        )
+        guess = KernelMixture(
+            self.expected.mean[None],
+            np.ones(1),
+            centre_m=source.centroid_m,
+            sigma_rad=max(_WIDER * sigma_rad, _LEAST_RAD),
+            sigma_m=max(_WIDER * sigma_m, _LEAST_M),
+            evidence=False,
+        )
+        return defensive_mixture(self.known.between(source, target), [guess])
+
+    def relaxed(self, steps: float) -> PredictedProposal:
+        """Return the prior with limits for several steps."""
+        return replace(self, known=self.known.relaxed(steps))
+
+
+@dataclass(frozen=True)
+class VelocityPrior(AbstractProposal):
+    """Constant velocity: the motion continues as between the last two frames."""
+
+    velocity_sigma_deg: float = 5.0
+    """Standard deviation of the change of rotation from one motion to the next, about each axis."""
+    velocity_sigma_m: float = 0.01
+    """Standard deviation of the change of the centroid's shift from one motion to the next, along each axis."""
+    trajectory: tuple[tuple[int, Array], ...] = field(default=(), compare=False, repr=False)
+    """Frame numbers and object_from_camera (4, 4) of the poses so far, in order of frames."""
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
+        """Return the density of target_from_source; the independent knowledge alone until two frames define a velocity.
+
+        Raises:
+            InputError: where the views lack what `known` needs.
+        """
+        known = self.known.between(source, target)
+        poses = dict(self.trajectory)
+        if len(poses) < 2 or target.index not in poses or source.index in poses:
+            return known
+        (before, object_from_before), (last, object_from_last) = self.trajectory[-2:]
+        pace = (source.index - last) / (last - before)
+        if not 0.0 < pace <= _MOST_STEPS:
+            return known
+        twist = se3.log(se3.inverse(object_from_before) @ object_from_last)
+        predicted = se3.inverse(poses[target.index]) @ object_from_last @ se3.exp(pace * twist)
+        guess = KernelMixture(
+            predicted[None],
+            np.ones(1),
+            centre_m=source.centroid_m,
+            sigma_rad=float(np.radians(self.velocity_sigma_deg) * max(pace, 1.0)),
+            sigma_m=self.velocity_sigma_m * max(pace, 1.0),
+            evidence=False,
+        )
+        return defensive_mixture(known, [guess])
+
+    def learned(self, solution: Solution, edges: Sequence[Edge]) -> VelocityPrior:
+        """Return the prior with the poses so far."""
+        trajectory = tuple(sorted(solution.trajectory.items(), key=lambda item: item[0]))
+        return replace(self, known=self.known.learned(solution, edges), trajectory=trajectory)
+
+
+@dataclass(frozen=True)
+class AxesPrior(AbstractProposal):
+    """The first principal axes of the two surfaces coincide, in either direction; the turn about them is free.
+
+    Surfaces that are not elongated yield no proposal.
+    """
+
+    axes_sigma_deg: float = 6.0
+    """Standard deviation of the angle between the axes, about each axis orthogonal to them."""
+    axes_sigma_m: float = 0.015
+    """Standard deviation of the distance between the centroids, along each axis."""
+    min_elongation: float = 1.6
+    """Least ratio of the standard deviations along the first principal axis and the second."""
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
+        """Return the density of target_from_source; the independent knowledge alone unless both surfaces are elongated.
+
+        Raises:
+            InputError: where the views lack what `known` needs.
+        """
+        known = self.known.between(source, target)
+        first, second = (long_axis(view.points_m, self.min_elongation) for view in (source, target))
+        if first is None or second is None:
+            return known
+        aligned = AlignedAxes(
+            first,
+            second,
+            source_centroid_m=source.centroid_m,
+            target_centroid_m=target.centroid_m,
+            sigma_rad=float(np.radians(self.axes_sigma_deg)),
+            sigma_m=self.axes_sigma_m,
+        )
+        return defensive_mixture(known, [aligned])
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedAxes(AbstractPoseDensity):
+    """One axis von Mises-Fisher distributed about another, up to sign; uniform turn about it; Gaussian centroid."""
+
+    source_axis: Array
+    """(3,) unit."""
+    target_axis: Array
+    """(3,) unit."""
+    source_centroid_m: Array
+    """(3,)."""
+    target_centroid_m: Array
+    """(3,)."""
+    sigma_rad: float
+    """Standard deviation of the angle between the axes, about each axis orthogonal to them."""
+    sigma_m: float
+    """Standard deviation of the distance between the centroids, along each axis."""
+    evidence: bool = False
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw poses (count, 4, 4)."""
+        carried = directions_about(self.target_axis, self.sigma_rad**-2.0, count, rng)
+        turn = rng.uniform(0.0, 2.0 * np.pi, count)
+        carried *= rng.choice([-1.0, 1.0], (count, 1))
+        spun = se3.exp(np.concatenate([turn[:, None] * self.source_axis, np.zeros((count, 3))], axis=1))
+        poses = _onto(self.source_axis, carried) @ spun
+        place_m = self.target_centroid_m + rng.normal(0.0, self.sigma_m, (count, 3))
+        poses[:, :3, 3] = place_m - poses[:, :3, :3] @ self.source_centroid_m
+        return poses
+
+    def log_density(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of poses (n, 4, 4)."""
+        concentration = self.sigma_rad**-2.0
+        cosine = np.abs(target_from_source[:, :3, :3] @ self.source_axis @ self.target_axis)
+        # The measure of rotations factors into that of one axis' image and that of the turn about it.
+        sphere = np.log(concentration / (-2.0 * np.pi * np.expm1(-2.0 * concentration)))
+        either = np.logaddexp(concentration * (cosine - 1.0), -concentration * (cosine + 1.0)) - np.log(2.0)
+        offset_m = centroid_offset(target_from_source, self.source_centroid_m, self.target_centroid_m)
+        gaussian = -0.5 * np.sum(offset_m**2, axis=1) / self.sigma_m**2 - 1.5 * np.log(2.0 * np.pi * self.sigma_m**2)
+        return sphere + either - np.log(2.0 * np.pi) + gaussian
+
+
+def long_axis(points_m: Array, min_elongation: float) -> Array | None:
+    """Return the first principal axis (3,) of points (n, 3); None where they are less elongated than required."""
+    if len(points_m) < 3:
+        return None
+    variances, axes = np.linalg.eigh(np.cov(points_m.T))
+    long = np.sqrt(variances[2]) >= min_elongation * np.sqrt(max(variances[1], 0.0))
+    return np.asarray(axes[:, 2], dtype=np.float64) if long else None
+
+
+def _onto(axis: Array, directions: Array) -> Array:
+    """Return the smallest rotations (n, 4, 4) that take a unit vector (3,) to unit vectors (n, 3)."""
+    crossed = np.cross(axis, directions)
+    sine = np.linalg.norm(crossed, axis=1, keepdims=True)
+    aside = np.where(sine > 1e-12, crossed / np.maximum(sine, 1e-300), across_axis(axis)[0])
+    angle_rad = np.arctan2(sine, (directions @ axis)[:, None])
+    return se3.exp(np.concatenate([angle_rad * aside, np.zeros_like(aside)], axis=1))
+
+
+@dataclass(frozen=True)
+class FeaturesPrior(AbstractProposal):
+    """Poses from triples of matching FPFH features, each the centre of a kernel.
+
+    Fast Point Feature Histograms (Rusu, Blodow and Beetz 2009) of downsampled surfaces are matched. Of many triples
+    with consistent distances, the poses with the most inliers are kept.
+    """
+
+    features_sigma_deg: float = 4.0
+    """Standard deviation of each kernel in rotation, about each axis."""
+    features_sigma_m: float = 0.006
+    """Standard deviation of each kernel in the position of the centroid, along each axis."""
+    bumps: int = 24
+    """Largest number of kernels."""
+    voxel: float = 1 / 25
+    """Voxel size for downsampling, as a share of the object's size."""
+    feature_radius: float = 5.0
+    """Radius of a feature's neighbourhood, in voxels."""
+    agreement: float = 2.0
+    """Largest distance of inliers, in voxels."""
+    min_points: int = 30
+    """Fewest points of each surface after downsampling; with fewer there is no proposal."""
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
+        """Return the density of target_from_source; the independent knowledge alone where no three matches agree.
+
+        Raises:
+            InputError: where the views lack what `known` needs.
+        """
+        known = self.known.between(source, target)
+        if min(len(source.points_m), len(target.points_m)) < self.min_points:
+            return known
+        sizes_m = [2.0 * float(np.sqrt(np.sum(np.var(view.points_m, axis=0)))) for view in (source, target)]
+        voxel_m = self.voxel * max(sizes_m)
+        (first_m, first), (second_m, second) = (self._features(view, voxel_m) for view in (source, target))
+        if min(len(first_m), len(second_m)) < self.min_points:
+            return known
+        pairs = mutual_matches(first, second)
+        motions, votes = self._motions(first_m[pairs[:, 0]], second_m[pairs[:, 1]], known, self.agreement * voxel_m)
+        if not len(motions):
+            return known
+        guess = KernelMixture(
+            motions,
+            votes**2 / np.sum(votes**2),
+            centre_m=source.centroid_m,
+            sigma_rad=float(np.radians(self.features_sigma_deg)),
+            sigma_m=self.features_sigma_m,
+            evidence=False,
+        )
+        return defensive_mixture(known, [guess])
+
+    def _features(self, view: RayImage, voxel_m: float) -> tuple[Array, Array]:
+        """Return the points (n, 3) of a downsampled surface and their features (n, 33)."""
+        import open3d as o3d  # slow to load, and only needed here
+
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(view.points_m))
+        cloud.normals = o3d.utility.Vector3dVector(view.normals)
+        cloud = cloud.voxel_down_sample(voxel_m)
+        cloud.normalize_normals()
+        points_m, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+        order = np.lexsort(points_m.T)  # Open3D's order is that of a hash table
+        points_m, normals = points_m[order], normals[order]
+        return points_m, fpfh(points_m, normals, self.feature_radius * voxel_m)
+
+    def _motions(
+        self, source_m: Array, target_m: Array, known: AbstractPoseDensity, reach_m: float
+    ) -> tuple[Array, Array]:
+        """Return poses (k, 4, 4) from triples of matches, and their numbers of inliers (k,).
+
+        Args:
+            source_m: (m, 3) points of the source.
+            target_m: (m, 3) their matches.
+            known: density whose support holds the poses.
+            reach_m: largest distance of inliers.
+        """
+        if len(source_m) < 3:
+            return np.zeros((0, 4, 4)), np.zeros(0)
+        rng = np.random.default_rng(0)  # equal views give equal densities
+        triples = rng.integers(len(source_m), size=(_DRAWS, 3))
+        sides, others = (
+            np.linalg.norm(points[triples] - points[np.roll(triples, 1, axis=1)], axis=2)
+            for points in (source_m, target_m)
+        )
+        triples = triples[
+            ((np.abs(sides - others) < reach_m) & (np.minimum(sides, others) > 3.0 * reach_m)).all(axis=1)
+        ]
+        if not len(triples):
+            return np.zeros((0, 4, 4)), np.zeros(0)
+        motions = kabsch(source_m[triples], target_m[triples])
+        motions = motions[np.isfinite(known.log_density(motions))][:_JUDGED]
+        carried = source_m @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
+        votes = np.sum(np.sum((carried - target_m) ** 2, axis=2) < reach_m**2, axis=1).astype(np.float64)
+        best = np.argsort(-votes, kind="stable")[: self.bumps]
+        best = best[votes[best] >= 3.0]  # at least its own three
+        return motions[best], votes[best]
