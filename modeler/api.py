@@ -14,6 +14,7 @@ import numpy.typing as npt
 from modeler.cli import compose
 from modeler.cli.advice import comes_back
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.cli.outputs import check_run_folder
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.pipeline import Modeler
 from modeler.rays import Sensor
@@ -115,6 +116,8 @@ def build(
         InputError: where the sequence cannot be read, or the folder cannot be used.
     """
     began_s = time.perf_counter()
+    inputs = [] if isinstance(sequence, AbstractSequence) else [Path(sequence)]
+    check_run_folder(Path(out), inputs, overwrite=overwrite)
     frames = sequence if isinstance(sequence, AbstractSequence) else opened(Path(sequence))
     options = PriorOptions(prior=prior if isinstance(prior, str) else None)
     modeler = compose.modeler(frames, options, MethodOptions(seed=seed), ObjectOptions())

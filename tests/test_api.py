@@ -14,6 +14,7 @@ import tabletop
 
 import modeler
 from modeler import se3
+from sequences import bundled
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
 PAIR, BUILD, LOOP = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
@@ -61,6 +62,11 @@ def test_the_sequence_of_the_readme_is_built(
     assert capfd.readouterr().out.startswith("True 2 ")
     assert (tmp_path / "runs" / "box-python" / "model.ply").exists()
     assert (tmp_path / "runs" / "box-python" / "recording.rrd").exists()
+
+
+def test_a_model_is_never_built_into_its_sequence() -> None:
+    with pytest.raises(modeler.InputError, match="only read"):
+        modeler.build(bundled("box"), bundled("box") / "run")
 
 
 def test_the_loop_of_the_readme_runs(capfd: pytest.CaptureFixture[str]) -> None:
