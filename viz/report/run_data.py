@@ -88,6 +88,9 @@ Row = Mapping[str, Any]
 """Values of an entity by component."""
 
 
+_MAX_BYTES = 4 << 30  # Rerun reads the whole file into memory; 5,000 frames of 640×480 are as many
+
+
 def recorded(recording: Path) -> dict[str, dict[int, dict[str, Any]]]:
     """Return the rows of `FRAME_PATHS` and of the pairs' captions by frame; no frames where nothing can be read.
 
@@ -98,6 +101,8 @@ def recorded(recording: Path) -> dict[str, dict[int, dict[str, Any]]]:
     if not os.path.lexists(recording):
         return rows
     check_regular(recording)
+    if recording.stat().st_size > _MAX_BYTES:
+        return rows
     try:
         steps = _steps(recording)
     except (OSError, ValueError, RuntimeError):
