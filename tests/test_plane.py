@@ -6,8 +6,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from modeler.segmentation import DepthNoise, fit_plane
-from modeler.segmentation.plane_fit import heights
-from modeler.segmentation.planes import choose_support, dominant_planes
+from modeler.segmentation.planes import choose_support, dominant_planes, heights
 
 NORMAL = np.array([0.0, -np.cos(0.6), -np.sin(0.6)])
 OFFSET_M = 0.45

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from modeler.segmentation.clusters import edge_of, mixed_pixels, pieces, voxel_clusters, without_specks
+from modeler.segmentation.depth_images import edge_of, mixed_pixels, pieces, voxel_clusters, without_specks
 
 
 def test_mixed_pixels_against_a_naive_twin(rng):

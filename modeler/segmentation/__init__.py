@@ -1,7 +1,7 @@
-"""Which pixels are the object, and what it stands on, learnt from what stays still and what changes."""
+"""Segmentation of the object and its support plane, from what is static and what moves in a sequence."""
 
-from modeler.segmentation.noise import DepthNoise
-from modeler.segmentation.plane_fit import fit_plane
+from modeler.segmentation.depth_images import DepthNoise
+from modeler.segmentation.planes import fit_plane
 from modeler.segmentation.scene import Scene, telling
 from modeler.segmentation.segmenter import Segmenter
 

@@ -1,4 +1,4 @@
-"""What a handful of frames says about a scene: what stands still, where the object is, and what it stands on."""
+"""What several frames show of a scene: what stands still, where the object is, and its support."""
 
 from __future__ import annotations
 
@@ -9,60 +9,80 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.segmentation.clusters import Labels, edge_of, pieces
-from modeler.segmentation.layers import Layers
-from modeler.segmentation.noise import DepthNoise
-from modeler.segmentation.plane_fit import heights
-from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, parallel, surroundings, upright
-from modeler.types import Array, BoolArray, Float32Array, Plane
+from modeler.segmentation.depth_images import (
+    DepthNoise,
+    Labels,
+    Layers,
+    edge_of,
+    mixed_pixels,
+    pieces,
+    planning_stride,
+    point_image,
+    without_specks,
+)
+from modeler.segmentation.planes import (
+    choose_support,
+    dominant_planes,
+    fit_beside,
+    heights,
+    parallel,
+    surroundings,
+    upright,
+)
+from modeler.types import Array, BoolArray, Camera, Float32Array, Plane
 
-_CARRIED_SHARE = 0.2  # of a pile that stands on its upper plane, for that to be a support and not a lid
-_NEIGHBOUR_SIZES = 0.5  # how far from what moves most, in its sizes, its other parts move
-_ELSEWHERE = 0.3  # of the merit of all that moves: from here on something else may be the object
-_WALL_BORDER_SHARE = 0.03  # of the image's edge that lies on a plane which runs out of the image
-_IN_FRONT_SHARE = 0.9  # of the object that a wall has in front of it
+_CARRIED_SHARE = 0.2  # share of a pile that stands on its upper plane, for that to be a support and not a lid
+_NEIGHBOUR_SIZES = 0.5  # distance, in sizes of the largest moving piece, within which its other parts move
+_ELSEWHERE = 0.3  # share of the moving pieces' score elsewhere from which the object is ambiguous
+_WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
+_IN_FRONT_SHARE = 0.9  # share of the object that is in front of a wall
 _TOUCHING_PX = 3
+_MOST = 0.5  # share of measured pixels; with more there is a background
+_ON_BORDER = 0.005  # share of measured pixels along the image's edge; with more the scene extends beyond it
+_ON_PLANE, _ABOVE, _BELOW = 0.1, 0.01, 0.2  # shares of the points: at least, at least, and at most for a support plane
+_MOSTLY = 0.7  # share of the frames
+_SPECK_SHARE = 0.003  # share of the object; smaller pieces are removed
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is known before a frame is segmented. Of an empty scene nothing is known: each frame is judged alone."""
+    """What several frames show of the scene. With an empty scene, each frame is segmented on its own."""
 
     plane: Plane | None = None
     """The support plane, where one was found."""
     still_m: Float32Array | None = None
-    """(h, w), thinned: depth of all that stands still; NaN where there is nothing."""
+    """(h, w), downsampled: depth of the static background; NaN where there is none."""
     scenery_m: Float32Array | None = None
-    """(h, w), thinned: depth of walls and things that stand about, at and beyond which is no object; else infinite."""
+    """(h, w), downsampled: depth of walls and static things, at and beyond which there is no object; else infinite."""
     zone_m: Array | None = None
     """(2, 3) low and high corner, in camera coordinates, of the box in which the object was seen."""
     areas_m2: tuple[float, float] | None = None
     """Least and greatest area that the object showed to the camera."""
     sure: bool = True
-    """Whether there is no doubt about which thing is the object and which plane its support."""
+    """Whether object and support plane are unambiguous."""
     still: bool = False
-    """Whether camera and scenery stand still, so that the scene holds for other frames."""
+    """Whether camera and background are static, so that the scene holds for other frames."""
     alone: bool = False
-    """Whether the frames show the object and nothing else."""
+    """Whether the frames show nothing but the object."""
     noise: DepthNoise | None = None
-    """Noise of the depth camera, where the frames show more of it than was expected."""
+    """Noise of the depth camera, where it exceeds what was expected."""
 
 
 def telling(indices: Sequence[int], *, count: int = 15) -> tuple[int, ...]:
-    """Return the numbers of at most `count` frames, evenly spread over a sequence, that tell what its scene is."""
+    """Return the numbers of at most `count` frames, spread evenly over a sequence, from which to learn its scene."""
     places = np.linspace(0, len(indices) - 1, min(count, len(indices))).round()
     return tuple(indices[place] for place in places.astype(np.int64).tolist())
 
 
 def learn(layers: Layers, allowed: BoolArray, noise: DepthNoise, *, least_points: float) -> Scene:
-    """Return what layers say about the scene.
+    """Return the scene that layers show.
 
     Args:
         layers: of one frame or several.
         allowed: (h, w) where the object may be.
         noise: of the depth camera.
-        least_points: pixels of the thinned image below which a motion says nothing.
+        least_points: pixels of the downsampled image below which motion is ignored.
     """
     found, sure = _moving_object(layers, allowed)
     moves = bool(np.count_nonzero(found) >= least_points)
@@ -86,10 +106,10 @@ def learn(layers: Layers, allowed: BoolArray, noise: DepthNoise, *, least_points
 
 
 def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]:
-    """Find what moves most, nearest and most centrally, and what moves next to it.
+    """Find the moving piece with the highest score (large, near, central), and what moves next to it.
 
     Returns:
-        Its pixels (h, w), and whether nothing else moves nearly as much.
+        Its pixels (h, w), and whether no other moving piece scores nearly as high.
     """
     depth = layers.front_m[..., 2]
     labels = pieces(depth, layers.moved & allowed)
@@ -106,14 +126,14 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
 def _standing_object(
     planes: Array, points: Float32Array, allowed: BoolArray, noise: DepthNoise
 ) -> tuple[Array | None, BoolArray, bool]:
-    """Find, in one image, the support at the centre and what stands on it.
+    """Find, in one image, the central support plane and what stands on it.
 
-    Climbs the parallel planes that face up, from the lowest to the highest that still carries a good part of what
-    stands on the one below it: from the floor to the table to the turntable's plate, but not to the lid of a box.
+    Goes through the parallel planes that face up, from the lowest to the highest that still carries a large part of
+    what stands on the one below: from floor to table to turntable, but not to the lid of a box.
 
     Returns:
-        The support (4,), or None where there is no plane; the pixels (h, w) of the object; and whether that was the
-        only level to choose.
+        The support (4,), or None where there is no plane; the pixels (h, w) of the object; and whether there was only
+        one candidate plane.
     """
     depth = points[..., 2]
     support, found, levels_used = None, np.zeros(depth.shape, dtype=np.bool_), 0
@@ -137,7 +157,7 @@ def _standing_object(
 
 
 def _central(labels: Labels, depth_m: Float32Array, weight: Float32Array) -> npt.NDArray[np.float64]:
-    """Return the merit of each label, 0 for label 0: its weight near the image's centre, nearer things first."""
+    """Return the score of each label, 0 for label 0: its area, weighted towards the image's centre and near depths."""
     rows, columns = (np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in labels.shape)
     centred = np.exp(-2.0 * (rows[:, None] ** 2 + columns**2))
     merit = np.bincount(labels.ravel(), np.where(labels > 0, weight * centred / depth_m**2, 0.0).ravel())
@@ -146,7 +166,7 @@ def _central(labels: Labels, depth_m: Float32Array, weight: Float32Array) -> npt
 
 
 def _walls(planes: Array, points: Float32Array, noise: DepthNoise) -> list[Array]:
-    """Return those planes that run out of the image."""
+    """Return those planes that extend beyond the image."""
     edge = edge_of(np.isfinite(points[..., 2]))
     rim = points[edge]
     tolerance = noise.tolerance_m(rim[:, 2])
@@ -155,11 +175,11 @@ def _walls(planes: Array, points: Float32Array, noise: DepthNoise) -> list[Array
 
 
 def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | None, noise: DepthNoise) -> Float32Array:
-    """Return the depth (h, w) at and beyond which is no object, infinite where that is not known.
+    """Return the depth (h, w) at and beyond which there is no object, infinite where unknown.
 
-    A still piece above the support that does not run out of the image may be the object's own: the middle of a mug on
-    a turntable looks still, and only its handle moves. Without a support, nothing still is the object's. Walls with all
-    of the object before them go on behind it.
+    A static piece above the support that lies within the image may belong to the object: the middle of a mug on a
+    turntable looks static, and only its handle moves. Without a support, nothing static is the object. Walls behind the
+    whole object are extended behind it.
     """
     back = layers.back_m[..., 2]
     above = layers.still & ~found
@@ -181,3 +201,41 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
         behind = np.float32(wall[3]) / np.maximum(-facing, np.float32(1e-6))
         depth = np.where(layers.still, depth, np.minimum(depth, behind))
     return depth
+
+
+def shows_object_alone(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> bool:
+    """Return whether depth images (n of (h, w), NaN = no measurement) show an object without background or support."""
+    alone = [is_island(depth) and not _supported(depth, camera, noise) for depth in depths_m if _seen(depth).any()]
+    return bool(alone) and sum(alone) >= _MOSTLY * len(alone)
+
+
+def is_island(depth_m: Float32Array) -> bool:
+    """Return whether the measurements (h, w) form an island: under half of the image, hardly any at its edge."""
+    seen = _seen(depth_m)
+    border = np.concatenate([seen[0], seen[-1], seen[1:-1, 0], seen[1:-1, -1]])
+    return bool(seen.mean() < _MOST and border.mean() < _ON_BORDER)
+
+
+def clean(depth_m: Float32Array, camera: Camera, noise: DepthNoise) -> BoolArray:
+    """Return the measured pixels (h, w) without specks and mixed pixels."""
+    mixed = mixed_pixels(depth_m, tolerance_m=noise.tolerance_m(depth_m), pixel_m=depth_m / np.float32(camera.fx))
+    return without_specks(_seen(depth_m) & ~mixed, _SPECK_SHARE)
+
+
+def _seen(depth_m: Float32Array) -> BoolArray:
+    return np.isfinite(depth_m)
+
+
+def _supported(depth_m: Float32Array, camera: Camera, noise: DepthNoise) -> bool:
+    """Return whether a plane that faces up carries something, and has little below it."""
+    stride = planning_stride(camera)
+    points = point_image(depth_m[::stride, ::stride], camera, stride=stride)
+    planes = dominant_planes(points, noise)
+    seen = points[np.isfinite(points[..., 2])]
+    tolerance = noise.tolerance_m(seen[:, 2])
+    for plane in planes[upright(planes)]:
+        height = heights(seen, plane)
+        above, below = np.mean(height > tolerance), np.mean(height < -tolerance)
+        if above > _ABOVE and below < _BELOW and 1.0 - above - below > _ON_PLANE:
+            return True
+    return False

@@ -1,4 +1,4 @@
-"""The segmenter: frames without masks get one, and every frame gets its support plane."""
+"""The segmenter: masks for frames without one, and the support plane of every frame."""
 
 from __future__ import annotations
 
@@ -7,45 +7,201 @@ from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
+from scipy import ndimage
 
-from modeler.segmentation.bare import clean, is_island, shows_object_alone
-from modeler.segmentation.clusters import edge_of
-from modeler.segmentation.finder import Found, find
-from modeler.segmentation.layers import planning_stride, point_image, take_apart, times_as_noisy
-from modeler.segmentation.noise import DepthNoise
+from modeler.segmentation.depth_images import (
+    DepthNoise,
+    edge_of,
+    mixed_pixels,
+    noise_ratio,
+    planning_stride,
+    point_image,
+    separate_layers,
+    voxel_clusters,
+    without_specks,
+)
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
-from modeler.segmentation.scene import Scene, learn
-from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation
+from modeler.segmentation.scene import Scene, clean, is_island, learn, shows_object_alone
+from modeler.types import Array, BoolArray, Camera, Float32Array, Frame, InputError, Outcome, Plane, Segmentation
 
-_RIVAL = 0.4  # of the best cluster's merit: from here on the choice is unsure
-_CUT_SHARE = 0.1  # of the mask's width; more on the edge of the image means that the object is cut off
-_AREA_FACTOR = 2.5  # by which the visible area may leave the range it had in the scene
-_AGREEING_SHARE = 0.5  # of what stood still, for the scene to hold in a frame
-_NOISIEST = 3.0  # times the noise that is expected; where depth changes more from frame to frame, the camera moves
-_PLANE_SHARE = 0.02  # of the surroundings of a masked object that a plane must cover
-_LOOSE_SHARE = 0.15  # of a mask on that plane: more of it than the rim of an object, seen from anywhere
+Window = tuple[slice, slice]
+_ZONE_MARGIN_M = 0.1  # distance from the object's zone at which it may still be
+_ZONE_MARGIN_SHARE = 0.3  # share of the zone's size, if that is more
+_STRAY_WEIGHT = 0.2  # weight of what lies outside the zone
+_FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
+_CLEARANCE_M = 0.001
+_LOW_M = 0.01  # creases of the support are at most so high, and apart from the object
+_LOW_SHARE = 0.3  # share of the object's height, for flat objects
+_LOW_REACH_M = 0.01
+_SPECK_SHARE = 0.003
+_RIVAL = 0.4  # ratio of the second-best cluster's score to the best's from which the choice is ambiguous
+_CUT_SHARE = 0.1  # share of the mask's width on the image's edge from which the object is truncated
+_AREA_FACTOR = 2.5  # factor by which the visible area may leave its range in the scene
+_AGREEING_SHARE = 0.5  # share of the static background that must agree for the scene to hold in a frame
+_NOISIEST = 3.0  # largest ratio to the expected noise; where depth changes more from frame to frame, the camera moves
+_PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
+_LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The object in one frame."""
+
+    mask: BoolArray
+    """(h, w) True = object."""
+    area_m2: float = 0.0
+    """Area visible to the camera."""
+    rival: float = 0.0
+    """Score of the second-best cluster relative to the best."""
+
+
+def find(depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, gap_m: float) -> Found:
+    """Find the object in a depth image, NaN where nothing was measured or no object may be.
+
+    On a downsampled image, what is above the support and in front of the background is clustered in space, and the
+    cluster with the largest area in the object's zone is chosen. Its pixels are then taken at full resolution.
+    """
+    if scene.zone_m is None:
+        return Found(np.zeros(depth_m.shape, dtype=np.bool_))
+    chosen = _choose(depth_m, camera, scene, noise, zone_m=scene.zone_m, gap_m=gap_m)
+    mask = _refine(depth_m, camera, scene, noise, chosen=chosen.mask, reach_m=_reach_m(scene.zone_m))
+    return replace(chosen, mask=mask)
+
+
+def _choose(
+    depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, zone_m: Array, gap_m: float
+) -> Found:
+    """Return the object in the downsampled image."""
+    stride = planning_stride(camera)
+    thin = np.ascontiguousarray(depth_m[::stride, ::stride])
+    chosen = np.zeros(thin.shape, dtype=np.bool_)
+    low, high = _reach_m(zone_m)
+    window = _window((thin > low[2]) & (thin < high[2]), margin=0)
+    row, column = window[0].start * stride, window[1].start * stride
+    points = point_image(thin[window], camera, stride=stride, row=row, column=column)
+    fore, _ = _foreground(points, window, scene, noise, thinning=1)
+    fore &= _inside(points, low, high)
+    if not fore.any():
+        return Found(chosen)
+    candidates = points[fore]
+    labels = voxel_clusters(candidates, low_m=low, high_m=high, gap_m=gap_m)
+    in_zone = _inside(candidates, *zone_m)
+    area = candidates[:, 2] ** 2 * (stride**2 / (camera.fx * camera.fy))
+    merit = np.bincount(labels, area * np.where(in_zone, 1.0, _STRAY_WEIGHT))
+    best = int(merit.argmax())
+    chosen[window][fore] = labels == best
+    rival = float(np.delete(merit, best).max(initial=0.0) / merit[best])
+    return Found(chosen, float(area[labels == best].sum()), rival)
+
+
+def _refine(
+    depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, chosen: BoolArray, reach_m: Array
+) -> BoolArray:
+    """Return the object's pixels at full resolution, given those in the downsampled image."""
+    stride = planning_stride(camera)
+    mask = np.zeros(depth_m.shape, dtype=np.bool_)
+    rows, columns = _window(chosen, margin=2)
+    near = np.asarray(ndimage.binary_dilation(chosen[rows, columns], np.ones((3, 3))), dtype=np.bool_)
+    height, width = depth_m.shape
+    window = (
+        slice(rows.start * stride, min(rows.stop * stride, height)),
+        slice(columns.start * stride, min(columns.stop * stride, width)),
+    )
+    depth: Float32Array = depth_m[window]
+    points = point_image(depth, camera, row=window[0].start, column=window[1].start)
+    fore, above_m = _foreground(points, window, scene, noise, thinning=stride)
+    fore &= np.repeat(np.repeat(near, stride, axis=0), stride, axis=1)[: depth.shape[0], : depth.shape[1]]
+    fore &= (depth > reach_m[0, 2]) & (depth < reach_m[1, 2])
+    if not fore.any():
+        return mask
+    if above_m is not None:
+        fore &= _not_a_crease(above_m, fore, _LOW_REACH_M * camera.fx / float(np.median(depth[fore])))
+    pixel = depth / np.float32(camera.fx)
+    fore &= ~mixed_pixels(depth, tolerance_m=noise.tolerance_m(depth), pixel_m=pixel)
+    mask[window] = without_specks(fore, _SPECK_SHARE)
+    return mask
+
+
+def _inside(points: Float32Array, low: Array, high: Array) -> BoolArray:
+    """Return which points (..., 3) lie in a box."""
+    inside = np.ones(points.shape[:-1], dtype=np.bool_)
+    for axis in range(3):
+        inside &= (points[..., axis] > np.float32(low[axis])) & (points[..., axis] < np.float32(high[axis]))
+    return inside
+
+
+def _reach_m(zone_m: Array) -> Array:
+    """Return the zone (2, 3), low and high corner, extended by how far the object may have left it."""
+    low, high = zone_m
+    margin = max(_ZONE_MARGIN_M, _ZONE_MARGIN_SHARE * float((high - low).max()))
+    return np.array([low - margin, high + margin])
+
+
+def _foreground(
+    points: Float32Array, window: Window, scene: Scene, noise: DepthNoise, *, thinning: int
+) -> tuple[BoolArray, Float32Array | None]:
+    """Return what is above the support and in front of the background (h, w), and heights (h, w) if there is a support.
+
+    Args:
+        points: (h, w, 3) part of an image of points.
+        window: which part.
+        scene: the scene.
+        noise: of the depth camera.
+        thinning: downsampling of the scene's images relative to the points.
+    """
+    depth = points[..., 2]
+    tolerance = noise.tolerance_m(depth)
+    fore, height = np.isfinite(depth), None
+    if scene.plane is not None:
+        rise = points @ scene.plane.normal.astype(np.float32)
+        height = rise + np.float32(scene.plane.offset_m)
+        slope = np.maximum(np.abs(rise / depth), np.float32(_FLATTEST_SLOPE))
+        fore &= height > tolerance * slope + np.float32(_CLEARANCE_M)
+    if scene.scenery_m is not None:
+        rows, columns = (np.arange(part.start, part.stop) // thinning for part in window)
+        fore &= depth < scene.scenery_m[rows[:, None], columns] - tolerance
+    return fore, height
+
+
+def _not_a_crease(height_m: Float32Array, fore: BoolArray, reach_px: float) -> BoolArray:
+    """Return the pixels (h, w) that are high above the support or near some that are."""
+    low = min(_LOW_M, _LOW_SHARE * float(np.percentile(height_m[fore], 95)))
+    high = (fore & (height_m > low)).astype(np.uint8)
+    return ndimage.maximum_filter(high, 2 * max(1, round(reach_px)) + 1) > 0
+
+
+def _window(mask: BoolArray, *, margin: int) -> Window:
+    """Return the part of an image that holds a mask (h, w) and a margin."""
+    if not mask.any():
+        return slice(0, 0), slice(0, 0)
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(0, int(rows[0]) - margin), min(mask.shape[0], int(rows[-1]) + 1 + margin)),
+        slice(max(0, int(columns[0]) - margin), min(mask.shape[1], int(columns[-1]) + 1 + margin)),
+    )
 
 
 @final
 @dataclass(frozen=True)
 class Segmenter:
-    """Tells the object from its support and surroundings in the frames of a depth camera.
+    """Segments the object and its support plane in the frames of a depth camera.
 
-    The camera is taken to stand still while the object turns or moves between frames. Where that is not so, or the
-    object does not move, a frame is judged by what stands at its centre. Where nothing but an island on no support was
-    measured, all of it is the object.
+    The camera is assumed static while the object moves between frames. Where it is not, or the object does not move,
+    the object is what stands at the image's centre. Where only an island without support was measured, all of it is the
+    object.
     """
 
     roi: tuple[int, int, int, int] | None = None
     """Region in which the object is: x0 y0 x1 y1 in px, x1 and y1 outside it; None = the whole image."""
     max_depth_m: float | None = None
-    """Depth beyond which nothing is the object in m; None = no limit."""
+    """Largest depth of the object in m; None = no limit."""
     min_points: int = 200
-    """Pixels below which an object is too small to register."""
+    """Number of pixels below which an object is too small to register."""
     gap_m: float = 0.012
-    """Parts of the object that are this close in m belong together across holes in the image."""
+    """Largest gap in m between parts of one object."""
     noise: DepthNoise = field(default_factory=DepthNoise)
-    """Noise that is expected of the depth camera; up to three times as much is told from a camera that moves."""
+    """Expected noise of the depth camera; up to three times as much is distinguished from camera motion."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -57,11 +213,11 @@ class Segmenter:
             raise InputError(f"--max-depth-m {self.max_depth_m:g} leaves nothing; give a positive depth in m.")
 
     def scene(self, frames: Sequence[Frame]) -> Scene:
-        """Learn what stands still, where the object is and what it stands on.
+        """Learn the static background, the object's zone and its support.
 
         Args:
-            frames: a dozen or fewer, spread over the sequence; those with masks and those of another size than the
-                first are left out.
+            frames: about a dozen, spread over the sequence; those with masks or of another size than the first are
+                ignored.
         """
         shown = [frame for frame in frames if frame.mask is None]
         shown = [frame for frame in shown if frame.depth_m.shape == shown[0].depth_m.shape]
@@ -72,7 +228,7 @@ class Segmenter:
         scene = self._learn(shown)
         if scene.zone_m is None or not scene.still:
             return scene
-        # A second look: whole masks say better than what moved where the object is and how large it looks.
+        # A second pass: whole masks determine zone and visible area better than the moving pixels.
         looks = [(frame, self._find(frame, scene)) for frame in shown]
         looks = [(frame, look) for frame, look in looks if np.count_nonzero(look.mask) >= self.min_points]
         if not looks:
@@ -86,7 +242,7 @@ class Segmenter:
     def segment(self, frame: Frame, scene: Scene) -> Segmentation:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
 
-        A frame's own mask is kept, within region and greatest depth; it is unsure where it holds much of the support.
+        A frame's own mask is kept, within region and largest depth; it is UNSURE_MASK if it covers much of the support.
         """
         if frame.mask is not None:
             mask = frame.mask & self._allowed(frame.depth_m)
@@ -114,13 +270,13 @@ class Segmenter:
         return Segmentation(found.mask, scene.plane, Outcome.CONVERGED if sure else Outcome.UNSURE_MASK)
 
     def _learn(self, frames: Sequence[Frame]) -> Scene:
-        """Return what frames without masks say about the scene, if their camera stands still."""
+        """Return the scene that frames without masks show, if their camera is static."""
         camera, depths_m, noise = frames[0].camera, [_measured(frame) for frame in frames], self.noise
-        layers, noisier = take_apart(depths_m, camera, noise), None
-        if layers.camera_moves:  # or is its depth noisier than expected?
-            factor = times_as_noisy(depths_m, camera, noise)
+        layers, noisier = separate_layers(depths_m, camera, noise), None
+        if layers.camera_moves:  # or its depth is noisier than expected
+            factor = noise_ratio(depths_m, camera, noise)
             noisier = noise = noise.times(factor)
-            layers = layers if factor > _NOISIEST else take_apart(depths_m, camera, noise)
+            layers = layers if factor > _NOISIEST else separate_layers(depths_m, camera, noise)
         if layers.camera_moves:
             return Scene()
         stride = planning_stride(camera)
@@ -133,13 +289,13 @@ class Segmenter:
         return find(self._kept(frame), frame.camera, scene, scene.noise or self.noise, gap_m=self.gap_m)
 
     def _kept(self, frame: Frame) -> Float32Array:
-        """Return the depth (h, w) within region and greatest depth, NaN elsewhere."""
+        """Return the depth (h, w) within region and largest depth, NaN elsewhere."""
         depth = _measured(frame)
         depth[~self._allowed(depth)] = np.nan
         return depth
 
     def _allowed(self, depth_m: Float32Array, stride: int = 1) -> BoolArray:
-        """Return the pixels (h, w) of a thinned depth image that region and greatest depth leave."""
+        """Return the pixels (h, w) of a downsampled depth image within region and largest depth."""
         allowed = np.ones(depth_m.shape, dtype=np.bool_) if self.max_depth_m is None else ~(depth_m > self.max_depth_m)
         if self.roi is not None:
             x0, y0, x1, y1 = (-(-edge // stride) for edge in self.roi)
@@ -149,7 +305,7 @@ class Segmenter:
         return allowed
 
     def _holds(self, frame: Frame, scene: Scene) -> bool:
-        """Return whether what stood still is where it was, or hidden."""
+        """Return whether the static background is where it was, or occluded."""
         stride = planning_stride(frame.camera)
         depth = _measured(frame)[::stride, ::stride]
         if scene.still_m is None or scene.still_m.shape != depth.shape:
@@ -159,14 +315,14 @@ class Segmenter:
         return bool(agreeing >= _AGREEING_SHARE * np.count_nonzero(np.isfinite(off)))
 
     def _share_on(self, plane: Plane, frame: Frame, mask: BoolArray) -> float:
-        """Return how much of what is measured within a mask belongs to the plane that the object stands on."""
+        """Return the share of a mask's measured pixels that lie on the support plane."""
         stride = planning_stride(frame.camera)
         points = _points(frame, stride)
         points = points[mask[::stride, ::stride] & np.isfinite(points[..., 2])].astype(np.float64)
         return float(np.mean(np.abs(plane.height_m(points)) < self.noise.tolerance_m(points[:, 2])))
 
     def _plane_beside(self, frame: Frame, mask: BoolArray) -> Plane | None:
-        """Return the support that is seen around a masked object, if any is."""
+        """Return the support plane around a masked object, if one is seen."""
         stride = planning_stride(frame.camera)
         points, found = _points(frame, stride), mask[::stride, ::stride]
         around = surroundings(points, found)
@@ -179,10 +335,10 @@ class Segmenter:
 
 
 def _measured(frame: Frame) -> Float32Array:
-    """Return a copy of the depth (h, w) with NaN for everything that is no measurement."""
+    """Return a copy of the depth (h, w) with NaN for missing measurements."""
     return np.where(frame.depth_m > 0.0, frame.depth_m, np.float32(np.nan)).astype(np.float32, copy=False)
 
 
 def _points(frame: Frame, stride: int = 1) -> Float32Array:
-    """Return the thinned points (h, w, 3) of a frame."""
+    """Return the downsampled points (h, w, 3) of a frame."""
     return point_image(_measured(frame)[::stride, ::stride], frame.camera, stride=stride)

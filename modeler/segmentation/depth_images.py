@@ -1,0 +1,234 @@
+"""Depth images: their noise, their points, what moves between them, and their connected pieces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from modeler.types import Array, BoolArray, Camera, Float32Array
+
+_PLANNING_WIDTH_PX = 320  # images are downsampled to about this width for planning
+_OUTLIERS_IN = 7  # one measurement in so many may lie behind the background erroneously
+_FEW_FRAMES = 4  # with more frames, evidence from a single frame is ignored
+_STILL_SHARE = 0.7  # share of agreeing measurements at a static pixel
+_MOVED_SHARE = 0.15  # share of measurements in front of the background at a pixel that moved
+_MOVING_CAMERA_SHARE = 0.5  # share of changing pixels from which the camera moves, not the object
+_QUARTERS_APART = 1.35  # standard deviations from the lower to the upper quartile of a Gaussian
+Labels = npt.NDArray[np.int32]
+_JUMP_SHARE = 0.03  # relative depth difference of neighbours beyond which they lie on two surfaces
+_GRID_CELLS = 80  # largest number of voxels along a side
+_GRAZING = np.tan(np.radians(85.0))  # surfaces at a more grazing angle are indistinguishable from mixed pixels
+_SEEN_SHARE = 0.4  # share of measurements in a row or column that is not blind
+_BLIND_SHARE = 0.01  # share of measurements in a blind band
+_RAGGED_SHARE = 0.02  # share of the image by which the edge of a blind band may bend after undistortion
+_EVERYWHERE = np.ones((3, 3, 3), dtype=np.bool_)
+
+
+@final
+@dataclass(frozen=True)
+class DepthNoise:
+    """Depth noise of a consumer camera: a floor, and a term that grows with the square of the depth.
+
+    The default quadratic part is that of the first Kinect (Khoshelham and Elberink, Sensors 2012, eq. 10).
+    """
+
+    floor_m: float = 0.0008
+    """Standard deviation at close range in m: quantisation and texture."""
+    quadratic_per_m: float = 0.0014
+    """Growth of the standard deviation with depth squared in m per m²."""
+
+    def sigma_m(self, depth_m: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return the standard deviation of measurements at `depth_m`, of the same shape and type."""
+        return np.sqrt(self.floor_m**2 + (self.quadratic_per_m * depth_m * depth_m) ** 2)
+
+    def tolerance_m(self, depth_m: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return the difference beyond which two measurements at `depth_m` are two surfaces: 3 sigma plus a floor."""
+        return 3.0 * self.sigma_m(depth_m) + self.floor_m
+
+    def times(self, factor: float) -> DepthNoise:
+        """Return the noise scaled by a factor."""
+        return DepthNoise(factor * self.floor_m, factor * self.quadratic_per_m)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """Background and foreground of several frames of a static camera, downsampled."""
+
+    back_m: Float32Array
+    """(h, w, 3) the background: the farthest surface on which frames agree, in camera coordinates."""
+    front_m: Float32Array
+    """(h, w, 3) the typical foreground; the background where there is none."""
+    rays: Float32Array
+    """(h, w, 3) points at depth 1 m."""
+    moved: BoolArray
+    """(h, w) True where something appears in front of the background."""
+    still: BoolArray
+    """(h, w) True where almost all frames show the background."""
+    front_share: Float32Array
+    """(h, w) share of the measurements in front of the background."""
+
+    @property
+    def camera_moves(self) -> bool:
+        """Whether so much of the image changes that the camera must move."""
+        seen = np.count_nonzero(np.isfinite(self.back_m[..., 2]))
+        return bool(np.count_nonzero(self.moved) > _MOVING_CAMERA_SHARE * max(1, seen))
+
+
+def planning_stride(camera: Camera) -> int:
+    """Return the stride by which images of a camera are downsampled for planning."""
+    return max(1, round(camera.width / _PLANNING_WIDTH_PX))
+
+
+def point_image(
+    depth_m: Float32Array, camera: Camera, *, stride: int = 1, row: int = 0, column: int = 0
+) -> Float32Array:
+    """Return the points (h, w, 3) of a depth image, downsampled by `stride`, that starts at a row and column."""
+    w = ((np.arange(depth_m.shape[1]) * stride + column - camera.cx) / camera.fx).astype(np.float32)
+    h = ((np.arange(depth_m.shape[0]) * stride + row - camera.cy) / camera.fy).astype(np.float32)
+    points = np.empty((*depth_m.shape, 3), dtype=np.float32)
+    np.multiply(w, depth_m, out=points[..., 0])
+    np.multiply(h[:, None], depth_m, out=points[..., 1])
+    points[..., 2] = depth_m
+    return points
+
+
+def separate_layers(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> Layers:
+    """Separate background and foreground in depth images (n of (h, w), NaN = no measurement) of a static camera."""
+    stride = planning_stride(camera)
+    stack, readings = _sorted(depths_m, stride)
+    frames = len(stack)
+    spare = np.where(readings > 2, np.maximum(readings // _OUTLIERS_IN, 1), 0)
+    reference = np.take_along_axis(stack, np.maximum(readings - 1 - spare, 0)[None], axis=0)[0]
+    agree = np.abs(stack - reference) < noise.tolerance_m(reference)
+    agreeing = agree.sum(axis=0)
+    back = np.where(agree, stack, np.float32(0.0)).sum(axis=0) / np.maximum(agreeing, 1).astype(np.float32)
+    back[agreeing == 0] = np.nan
+    believed = 2 if frames > _FEW_FRAMES else 1
+    nearer = (stack < back - noise.tolerance_m(back)).sum(axis=0)
+    share = (nearer / np.maximum(readings, 1)).astype(np.float32)
+    often = (share >= _MOVED_SHARE) & (nearer >= believed)
+    moved: BoolArray = np.asarray(ndimage.binary_opening(often, np.ones((3, 3))), dtype=np.bool_)
+    front = np.where(moved, np.take_along_axis(stack, (nearer // 2)[None], axis=0)[0], back)
+    back[agreeing < min(2, frames - 1)] = np.nan
+    still = (agreeing >= np.maximum(believed, _STILL_SHARE * readings)) & ~moved
+    back, front, rays = (point_image(depth, camera, stride=stride) for depth in (back, front, np.ones_like(back)))
+    return Layers(back, front, rays, moved, still, share)
+
+
+def noise_ratio(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> float:
+    """Return the ratio of the depth's spread over the frames at a pixel to `noise`: the median over all pixels.
+
+    Args:
+        depths_m: (n of (h, w), NaN = no measurement) of a camera that may stand still.
+        camera: the camera.
+        noise: what is expected of it.
+    """
+    stack, readings = _sorted(depths_m, planning_stride(camera))
+    often = readings > _FEW_FRAMES
+    if not often.any():
+        return 1.0
+    quarters = [(np.float32(share) * (readings - 1)).round().astype(np.int64) for share in (0.25, 0.5, 0.75)]
+    low, middle, high = (np.take_along_axis(stack, place[None], axis=0)[0][often] for place in quarters)
+    return float(np.median((high - low) / (_QUARTERS_APART * noise.sigma_m(middle))))
+
+
+def _sorted(depths_m: Sequence[Float32Array], stride: int) -> tuple[Float32Array, npt.NDArray[np.int64]]:
+    """Return the sorted measurements (n, h, w) of each downsampled pixel, NaN last, and their numbers."""
+    stack = np.sort(np.stack([depth[::stride, ::stride] for depth in depths_m]), axis=0)
+    return stack, np.isfinite(stack).sum(axis=0)
+
+
+def pieces(depth_m: Float32Array, within: BoolArray) -> Labels:
+    """Label the connected pieces (h, w) of a region, split at depth jumps; 0 = outside it or at a jump."""
+    kept = within.copy()
+    limit = np.float32(_JUMP_SHARE) * depth_m
+    kept[:-1] &= ~(np.abs(depth_m[1:] - depth_m[:-1]) > limit[1:])
+    kept[:, :-1] &= ~(np.abs(depth_m[:, 1:] - depth_m[:, :-1]) > limit[:, 1:])
+    return _label(kept)
+
+
+def voxel_clusters(points: npt.NDArray[np.floating], *, low_m: Array, high_m: Array, gap_m: float) -> Labels:
+    """Label points (n, 3) by connected components in space.
+
+    Args:
+        points: (n, 3), all within the box.
+        low_m: (3,) lower corner of the box.
+        high_m: (3,) upper corner of the box.
+        gap_m: voxel size, about the largest gap that is bridged; larger where the box would have too many voxels.
+
+    Returns:
+        (n,) labels from 1.
+    """
+    side = max(gap_m, float((high_m - low_m).max()) / _GRID_CELLS)
+    cell = ((points - low_m.astype(points.dtype)) / points.dtype.type(side)).astype(np.int32)
+    filled = np.zeros(tuple(((high_m - low_m) / side).astype(np.int64) + 2), dtype=np.bool_)
+    filled[cell[:, 0], cell[:, 1], cell[:, 2]] = True
+    return _label(filled, structure=_EVERYWHERE)[cell[:, 0], cell[:, 1], cell[:, 2]]
+
+
+def mixed_pixels(depth_m: Float32Array, *, tolerance_m: Float32Array, pixel_m: Float32Array) -> BoolArray:
+    """Return the mixed pixels (h, w): nearer than one neighbour and farther than another, both by a jump.
+
+    Args:
+        depth_m: (h, w), NaN = no measurement.
+        tolerance_m: (h, w) difference that noise explains.
+        pixel_m: (h, w) width of a pixel on a surface at that depth.
+    """
+    missing = ~np.isfinite(depth_m)
+    jump = np.maximum(tolerance_m, np.float32(_GRAZING) * pixel_m)
+    nearest = ndimage.minimum_filter(np.where(missing, np.float32(np.inf), depth_m), 3)
+    farthest = ndimage.maximum_filter(np.where(missing, np.float32(-np.inf), depth_m), 3)
+    return (depth_m - nearest > jump) & (farthest - depth_m > jump)
+
+
+def without_specks(mask: BoolArray, least_share: float) -> BoolArray:
+    """Return a mask (h, w) without structures one pixel wide and without pieces below a share of its pixels."""
+    count = np.pad(mask.astype(np.uint8), 1)
+    count = count[:-2] + count[1:-1] + count[2:]
+    mask = mask & (count[:, :-2] + count[:, 1:-1] + count[:, 2:] >= 4)
+    labels = _label(mask)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return (sizes >= max(1.0, least_share * sizes.sum()))[labels]
+
+
+def edge_of(seen: BoolArray) -> BoolArray:
+    """Return the pixels (h, w) at the edge of the field of view, where objects may be truncated.
+
+    These are the edges of the image and of bands in which the sensor is blind. The edge of a background without
+    measurements is different: an object that crosses it is not truncated.
+    """
+    return _outermost(seen) | _outermost(seen.T).T
+
+
+def _outermost(seen: BoolArray) -> BoolArray:
+    """Return pixels (h, w) of the first and last row, and of the first and last row with enough measurements."""
+    edge = np.zeros_like(seen)
+    rows = np.flatnonzero(seen.mean(axis=1) > _SEEN_SHARE)
+    if len(rows):
+        first, last, ragged = int(rows[0]), int(rows[-1]), round(_RAGGED_SHARE * len(seen))
+        beyond = np.pad(seen, ((1, 1), (0, 0)))
+        if _blind(seen[: max(first - ragged, 0)]):
+            edge[first] = ~beyond[first]
+        if _blind(seen[last + 1 + ragged :]):
+            edge[last] |= ~beyond[last + 2]
+    edge[[0, -1]] = True
+    return edge & seen
+
+
+def _blind(rows: BoolArray) -> bool:
+    """Return whether rows (h, w) hold only isolated measurements; beyond a table's edge an object may still be seen."""
+    return not rows.size or bool(rows.mean() < _BLIND_SHARE)
+
+
+def _label(mask: BoolArray, structure: BoolArray | None = None) -> Labels:
+    """Label the connected pieces of a mask from 1, 0 = outside."""
+    labels = np.zeros(mask.shape, dtype=np.int32)
+    ndimage.label(mask, structure=structure, output=labels)
+    return labels
