@@ -11,8 +11,9 @@ from prior_cases import CASES, held, solution, truth, turned, views
 from scipy import stats
 
 from modeler import priors, se3
+from modeler.priors.checks import check_parameter
 from modeler.priors.mixtures import Gaussian
-from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Plane
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane
 
 every_prior = pytest.mark.parametrize("name", CASES)
 PROPOSALS = [name for name, case in CASES.items() if case.proposes]
@@ -192,6 +193,35 @@ def test_priors_learn_and_grow_without_changing_what_they_are(name: str) -> None
     assert np.isfinite(prior.relaxed(2.0).between(SOURCE, TARGET).log_density(turned(-np.radians(24.0))[None]))
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0])
+@every_prior
+def test_a_value_out_of_range_is_refused_by_name(name: str, bad: float) -> None:
+    prior = CASES[name].prior(np.eye(4))
+    assert dataclasses.is_dataclass(prior)
+    for field in dataclasses.fields(prior):
+        value = getattr(prior, field.name)
+        if isinstance(value, float):
+            values = {field.name: bad}
+        elif isinstance(value, tuple) and value and isinstance(value[0], float) and bad:
+            values = {field.name: (bad, *value[1:])}
+        else:
+            continue
+        if bad == 1e308 and field.name in UNITLESS:
+            continue
+        if bad == 0.0 and field.name in MAY_BE_ZERO:
+            check_parameter(field.name, bad)
+            continue
+        with pytest.raises(InputError, match=rf"^{field.name} .*out of range; give "):
+            dataclasses.replace(prior, **values)
+
+
+@pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan), -np.eye(6), np.triu(np.ones((6, 6)))])
+def test_a_gaussian_needs_a_covariance(bad: Array) -> None:
+    with pytest.raises(InputError, match="covariance"):
+        Gaussian(np.eye(4), bad, np.zeros(3))
+
+
+MAY_BE_ZERO = {"step_sigma_deg", "axis_sigma_deg", "axis_sigma_m", "wobble_deg", "wobble_m"}  # known for certain
 UNITLESS = {"bumps", "voxel", "feature_radius", "agreement", "min_points", "min_elongation", "friction_sigma"}
 
 

@@ -194,6 +194,8 @@ def test_pokes_are_read() -> None:
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"9" * 5000: POKE}}), "is not told by a frame number"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": POKE | {"length_m": 10**400}}}), "poke '1' must be"),
         (PriorOptions(prior="turntable"), Telling({"kind": "turntable", "step_deg": 10**400}), "give --step-deg"),
+        (PriorOptions(), Telling({"kind": "turntable", "step_deg": 1e308}), "telling: sequence.json: step_deg 1e+308"),
+        (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": POKE | {"length_m": 7.0}}}), "length_m 7 is out of"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": {"point_m": [0, 0]}}}), "poke '1' must be"),
     ],
 )

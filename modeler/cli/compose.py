@@ -31,6 +31,7 @@ from modeler.priors import (
     TurntablePrior,
     VelocityPrior,
 )
+from modeler.priors.checks import ParameterError
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import AbstractPrior, AbstractRegistrar, InputError
@@ -159,9 +160,14 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
             )
         known.remove("table")
         of["turntable"]["needs_table"] = True
-    found = [
-        _known(part, of[part], sequence) if part in _GIVEN else _own_prior(part, options.prior_args) for part in known
-    ]
+    try:
+        found = [
+            _known(part, of[part], sequence) if part in _GIVEN else _own_prior(part, options.prior_args)
+            for part in known
+        ]
+    except ParameterError as error:  # options are checked already
+        where = "" if sequence is None else f"{sequence.name}: sequence.json: "
+        raise InputError(f"{where}{error}.") from error
     result = found[0]
     for other in found[1:]:
         result = ProductPrior(result, other)

@@ -71,8 +71,6 @@ class ObjectOptions:
 
 
 _Three = tuple[float, float, float]
-_LIMITS = {"deg": ("degrees", 180.0), "m": ("metres", 5.0), "s": ("seconds", 1e4)}
-"""By the ending of a parameter's name: its unit, and the most that makes sense. Lengths in mm exceed it."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +145,7 @@ class PriorOptions:
         Raises:
             InputError: where a parameter of another prior was given, or a value that is none.
         """
+        from modeler.priors.checks import ParameterError, check_parameter
         from modeler.types import InputError
 
         given = self.parameters()
@@ -156,22 +155,10 @@ class PriorOptions:
                 f"{_flag(parameter)} is no parameter of --prior {name}; leave it out, or give --prior {others}."
             )
         for parameter, value in given.items():
-            if isinstance(value, str):
-                continue
-            if isinstance(value, tuple):
-                if not all(abs(number) <= 100.0 for number in value) or not (parameter.endswith("_m") or any(value)):
-                    told = " ".join(f"{number:g}" for number in value)
-                    raise InputError(f"{_flag(parameter)} {told} is out of range; give three numbers, not all 0.")
-            elif parameter == "step_deg":
-                if not 0.0 < abs(value) <= 360.0:
-                    raise InputError(f"--step-deg {value:g} is out of range; give a turn of -360 to 360, but not 0.")
-            else:
-                unit, most = _LIMITS[parameter.rpartition("_")[2]]
-                if not 0.0 < value <= most:
-                    raise InputError(
-                        f"{_flag(parameter)} {value:g} is out of range; give a positive number of {unit}, "
-                        f"at most {most:g}."
-                    )
+            try:
+                check_parameter(parameter, value)
+            except ParameterError as error:
+                raise InputError(f"{_flag(parameter)} {error.fault}.") from error
         return given
 
     def parameters(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
+from modeler.priors.checks import MAX_LENGTH_M, check_parameters
 from modeler.priors.mixtures import directions
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage
 
@@ -23,6 +24,10 @@ class GeneralPrior(AbstractPrior):
     """Largest rotation between the two views."""
     max_offset_m: float = 0.04
     """Largest distance between the target's centroid and the source's, transformed."""
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> GeneralDensity:
         """Return the density of target_from_source."""
@@ -83,7 +88,7 @@ def relaxed_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -
     """
     rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, _WIDEST_DEG))
     chord = np.sin(np.radians(rotation_deg) / 2.0) / np.sin(np.radians(max_rotation_deg) / 2.0)
-    return rotation_deg, float(max(chord, 1.0)) * max_offset_m
+    return rotation_deg, min(float(max(chord, 1.0)) * max_offset_m, MAX_LENGTH_M)
 
 
 def turned_offset_m(max_offset_m: float, turn_rad: float) -> float:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
+from modeler.priors.checks import check_parameters
 from modeler.priors.general import GeneralPrior, reach_deg, relaxed_limits, turned_offset_m
 from modeler.priors.mixtures import KernelMixture, defensive_mixture
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, Frame, InputError, RayImage, Solution
@@ -41,6 +42,10 @@ class HeldPrior(AbstractPrior):
     """Source of the poses, for messages."""
     newest: int | None = None
     """The last frame of a running sequence: motions to it are evidence; None: no sequence, all motions are."""
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source.

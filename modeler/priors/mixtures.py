@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import i0e, i1e
 
 from modeler import se3
+from modeler.priors.checks import check_covariance
 from modeler.types import AbstractPoseDensity, Array
 
 _NODES = 4097
@@ -57,6 +58,10 @@ class Gaussian(AbstractPoseDensity):
     centre_m: Array
     """(3,) the point, in source coordinates."""
     evidence: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the covariance."""
+        check_covariance("the covariance of a Gaussian", self.covariance)
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Draw poses (count, 4, 4)."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from modeler import se3
+from modeler.priors.checks import check_parameters
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M, OnPlane, TablePrior, on_plane
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, RayImage
 
@@ -27,6 +28,10 @@ class Poke:
     """Direction of its motion in camera coordinates, of any length, projected onto the plane."""
     length_m: float
     """Length of its motion."""
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        check_parameters(self)
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,10 @@ class PokePrior(AbstractPrior):
     """Standard deviation of the rotation out of the plane, on top of the plane's own uncertainty."""
     sigma_height_m: float = WOBBLE_M
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source; after several pushes that of the table prior.

@@ -9,6 +9,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.features import fpfh, kabsch, mutual_matches
+from modeler.priors.checks import check_parameters
 from modeler.priors.general import GeneralPrior, centroid_offset
 from modeler.priors.mixtures import KernelMixture, across_axis, defensive_mixture, directions_about
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, PoseGaussian, RayImage, SharedAxis, Solution
@@ -85,6 +86,10 @@ class VelocityPrior(AbstractProposal):
     trajectory: tuple[tuple[int, Array], ...] = field(default=(), compare=False, repr=False)
     """Frame numbers and object_from_camera (4, 4) of the poses so far, in order of frames."""
 
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        check_parameters(self)
+
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source; the independent knowledge alone until two frames define a velocity.
 
@@ -130,6 +135,10 @@ class AxesPrior(AbstractProposal):
     """Standard deviation of the distance between the centroids, along each axis."""
     min_elongation: float = 1.6
     """Least ratio of the standard deviations along the first principal axis and the second."""
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source; the independent knowledge alone unless both surfaces are elongated.
@@ -233,6 +242,10 @@ class FeaturesPrior(AbstractProposal):
     """Largest distance of inliers, in voxels."""
     min_points: int = 30
     """Fewest points of each surface after downsampling; with fewer there is no proposal."""
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source; the independent knowledge alone where no three matches agree.

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from modeler import se3
+from modeler.priors.checks import check_parameters
 from modeler.priors.general import centroid_offset, relaxed_limits
 from modeler.priors.mixtures import across_axis
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane, RayImage
@@ -137,6 +138,10 @@ class TablePrior(AbstractPrior):
     """Standard deviation of the rotation out of the plane, on top of the plane's own uncertainty."""
     sigma_height_m: float = WOBBLE_M
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> TableDensity:
         """Return the density of target_from_source.

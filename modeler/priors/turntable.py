@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from modeler import se3
+from modeler.priors.checks import check_parameters
 from modeler.priors.common_axis import Axis, common_axis, turn_sense
 from modeler.priors.general import GeneralPrior, centroid_offset, reach_deg, relaxed_limits, turned_offset_m
 from modeler.priors.mixtures import defensive_mixture, directions_about
@@ -286,6 +287,10 @@ class TurntablePrior(AbstractPrior):
     proposal. 0: not known."""
     newest: int | None = None
     """The last frame of a running sequence: steps to it are evidence; None: no sequence, all steps are."""
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source.
