@@ -403,7 +403,7 @@ def test_every_poke_of_a_sequence_stands_at_its_frame() -> None:
     )
     on_table = TablePrior().between(frames[2], frames[0])
     np.testing.assert_array_equal(several.between(frames[2], frames[0]).log_density(pose), on_table.log_density(pose))
-    with pytest.raises(InputError, match="no poke is told between frames 2 and 3"):
+    with pytest.raises(InputError, match="no poke is given between frames 2 and 3"):
         several.between(frames[3], frames[2])
 
 

@@ -86,7 +86,7 @@ class PokePrior(AbstractPrior):
         )
         if np.linalg.norm(plane.axes[:2] @ pokes[0].direction) <= _LEAST_WAY * np.linalg.norm(pokes[0].direction):
             raise InputError(
-                f"the poke between frames {earlier.index} and {later.index} is directed into the table, not along it; "
+                f"the poke between frames {earlier.index} and {later.index} presses on the table, not along it; "
                 "give its direction in camera coordinates"
             )
         outcomes = self._outcomes(pokes[0], earlier, plane)
