@@ -93,7 +93,7 @@ def test_no_closure_without_coming_back() -> None:
 
 
 @pytest.mark.parametrize("angles_deg", [4.0 * np.arange(25), np.tile([0.0, 30.0], 9), [*range(0, 150, 15)] * 2])
-def test_many_small_steps_are_spanned_where_that_tells_much(angles_deg: Sequence[float]) -> None:
+def test_many_small_steps_are_spanned_where_that_adds_information(angles_deg: Sequence[float]) -> None:
     run = Run(list(angles_deg))
     run.run(Closer())
     spanning = [edge for edges in run.judged.values() for edge in edges[1:]]
@@ -147,7 +147,7 @@ def test_odometry_is_accepted_where_usable_and_refused_with_advice() -> None:
 @pytest.mark.parametrize(
     "covariance", [np.zeros((6, 6)), np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-9]), np.full((6, 6), np.nan)]
 )
-def test_covariance_that_is_none_is_refused(covariance: Array) -> None:
+def test_invalid_covariance_is_rejected(covariance: Array) -> None:
     posterior = replace(posterior_of(1, 0, np.eye(4)), pose=PoseGaussian(np.eye(4), covariance))
     (edge,) = Closer().judge([posterior], MapView({0: view(0)}, Solution({0: np.eye(4)})))
     assert not edge.accepted
@@ -225,7 +225,7 @@ def test_closure_that_the_images_contradict_is_refused_though_it_agrees() -> Non
     assert all(edge.accepted for edge in taken.judged[13])
 
 
-def test_evidence_that_scatters_or_is_not_told_refuses_nothing() -> None:
+def test_scattered_or_missing_evidence_rejects_nothing() -> None:
     for spoil in (told(13, scatter=15.0), lambda posterior: witnessed(posterior, np.nan)):
         run = Run(list(REGULAR_DEG))
         run.run(Closer(), spoil)
@@ -253,7 +253,7 @@ def test_once_all_frames_are_in_each_is_tried_over_two_steps() -> None:
         assert Closer().judge_span(witnessed(true, -1e9), MapView(run.views, run.solution, run.graph.edges)).accepted
 
 
-def test_of_small_steps_the_widest_that_tells_most_is_tried() -> None:
+def test_of_small_steps_the_most_informative_span_is_tried() -> None:
     run = Run(list(3.0 * np.arange(30)))
     run.run(Closer(max_closures=0))
     pairs = Closer().span_pairs(MapView(run.views, run.solution, run.graph.edges))

@@ -73,13 +73,13 @@ def test_coming_back_depends_on_the_path_not_on_frame_numbers() -> None:
     assert not map_view.came_back(0, 1, map_view.shortest_paths(1), away_deg=90.0)
 
 
-def test_of_views_in_reach_the_first_is_closed_on_rather_than_another() -> None:
+def test_closure_on_the_first_view_is_preferred() -> None:
     run = Run(list(16.0 * np.arange(26)))
     run.run(Closer(max_closures=1))
     assert [run.tried[frame][1:] for frame in range(20, 24) if len(run.tried[frame]) > 1] == [(0,), (0,)]
 
 
-def test_one_large_step_over_many_small_ones_is_enough_for_a_frame() -> None:
+def test_a_frame_has_one_span_at_most() -> None:
     run = Run(list(2.0 * np.arange(45)))
     run.run(Closer(max_closures=3, min_gain_nats=3.0))
     spans = [sum(edge.kind == "span" for edge in edges) for edges in run.judged.values()]

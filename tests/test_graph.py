@@ -240,7 +240,7 @@ def test_direction_nobody_observed_keeps_its_spread(sigma_roll_rad: float) -> No
         _assert_same_covariance(solution.covariances[frame], covariance * frame * (count - frame) / count)
 
 
-def test_covariance_that_is_none_is_refused() -> None:
+def test_invalid_covariance_is_rejected() -> None:
     flat = PoseGaussian(np.eye(4), np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 0.0]))
     with pytest.raises(ValueError, match="edge 1 -> 0 is not positive definite"):
         solve(PoseGraph((_edge(0, 1, flat), _edge(0, 1, flat, "closure"))), {})

@@ -112,7 +112,7 @@ def test_trajectory_gains_by_the_axis_and_stays_calibrated() -> None:
 
 
 @pytest.mark.parametrize("tilt_rad", [TABLE.sigma_tilt_rad, np.inf])
-def test_what_edges_hold_already_is_not_counted_again(tilt_rad: float) -> None:
+def test_axis_does_not_repeat_what_edges_hold(tilt_rad: float) -> None:
     """Edges hold the commanded turn and that nothing climbs, and it may be which way the axis points: exactly so."""
     seeds = 30
     shared = CommonAxis(sigma_tilt_rad=tilt_rad, sigma_shift_m=0.0005, sigma_lift_m=np.inf)
@@ -187,7 +187,7 @@ def test_axis_that_does_not_fit_is_left_out() -> None:
         np.testing.assert_array_equal(solution.trajectory[frame], pose)
 
 
-def test_axis_works_beside_closures_and_lies() -> None:
+def test_axis_works_with_true_and_false_closures() -> None:
     rng = np.random.default_rng(6)
     truth, _ = _table(rng)
     graph = _graph(rng, truth)

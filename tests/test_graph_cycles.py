@@ -1,4 +1,4 @@
-"""Ways around loops: their gaps are the same wherever the tree is rooted and whichever way its edges are written."""
+"""Cycles: their residuals depend neither on the root of the tree nor on the direction of edges."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _gaps(edges: list[Edge], root: int) -> dict[int, tuple[Array, Array]]:
 
 @pytest.mark.parametrize("root", [0, 4, 7])
 @pytest.mark.parametrize("written_back", [(), (2, 3, 6), tuple(range(1, COUNT))])
-def test_gaps_do_not_depend_on_how_the_graph_is_written(root: int, written_back: tuple[int, ...]) -> None:
+def test_residuals_do_not_depend_on_root_and_direction_of_edges(root: int, written_back: tuple[int, ...]) -> None:
     edges = _edges()
     other = [_reversed(one) if one.source in written_back and one.kind == "odometry" else one for one in edges]
     wanted, found = _gaps(edges, 0), _gaps(other, root)
@@ -60,7 +60,7 @@ def test_gaps_do_not_depend_on_how_the_graph_is_written(root: int, written_back:
         np.testing.assert_allclose(found[span][1], log_volume, atol=1e-9)
 
 
-def test_a_gap_is_told_by_the_covariances_of_both_ways() -> None:
+def test_a_residual_has_the_covariance_of_both_paths() -> None:
     rng = np.random.default_rng(1)
     first, second = (PoseGaussian(se3.exp(0.01 * rng.normal(size=6)), covariance(rng)) for _ in range(2))
     edges = [_two_modes(edge(0, 1, first)), edge(0, 1, second, "closure")]
@@ -72,7 +72,7 @@ def test_a_gap_is_told_by_the_covariances_of_both_ways() -> None:
     assert log_volume[0] == pytest.approx(0.5 * np.linalg.slogdet(spread)[1])
 
 
-def test_what_is_settled_is_open_no_more() -> None:
+def test_settled_edges_are_not_hypotheses() -> None:
     edges = _edges()
     settled = {one: np.array([0.0, 1.0]) for one in edges if one.source in OPEN[:2] and one.posterior.modes}
     frames = SpanningTree.of([Factor(one, collapse_modes(one.posterior)) for one in edges], 0)

@@ -1,4 +1,4 @@
-"""A graph that grows: each solution is the batch solution, however it came about, and takes no more than it must."""
+"""A growing graph: each incremental solution is the batch solution, with no more work than needed."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_same_arrivals_same_solution_to_the_bit() -> None:
         np.testing.assert_array_equal(one.covariances[frame], other.covariances[frame])
 
 
-def test_the_whole_graph_is_solved_but_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_batch_optimiser_runs_once(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
 
     def counted(tree: Sequence[object], *args: object, **options: object) -> object:
@@ -137,7 +137,7 @@ def _tail(count: int, rng: np.random.Generator) -> list[list[Edge]]:
     return [[edge(t, k, measured(truth, t, k, rng))] for t, k in hooks]
 
 
-def test_frames_that_hang_on_one_edge_are_as_sure_as_in_the_batch() -> None:
+def test_frames_of_one_edge_have_the_covariances_of_the_batch() -> None:
     growing = Smoother()
     for edges in [*_arrivals(np.random.default_rng(9)), *_tail(9, np.random.default_rng(10))]:
         growing = growing.plus(edges)
@@ -153,7 +153,7 @@ def test_frames_that_hang_on_one_edge_are_as_sure_as_in_the_batch() -> None:
         np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4 * np.abs(wanted).max())
 
 
-def test_covariances_of_all_are_worked_out_again_only_where_a_loop_has_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_factors_are_linearised_again_only_around_a_closed_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
     def counted(factors: Sequence[object], *args: object) -> object:
@@ -177,7 +177,7 @@ def test_covariances_of_all_are_worked_out_again_only_where_a_loop_has_closed(mo
     assert asked[6] < len(growing.graph.edges) // 2  # those around the loop
 
 
-def test_what_hangs_on_one_solution_in_two_ways_is_not_mixed_up() -> None:
+def test_two_continuations_of_one_solution_are_independent() -> None:
     trunk = Smoother()
     for edges in _arrivals(np.random.default_rng(15)):
         trunk = trunk.plus(edges)
@@ -189,7 +189,7 @@ def test_what_hangs_on_one_solution_in_two_ways_is_not_mixed_up() -> None:
     np.testing.assert_array_equal(here.covariances[COUNT - 1], there.covariances[COUNT - 1])
 
 
-def test_a_pose_that_is_asked_alone_is_worked_out_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_covariance_is_computed_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     growing = Smoother()
     for edges in _arrivals(np.random.default_rng(18)):
         growing = growing.plus(edges)

@@ -119,7 +119,7 @@ def test_all_edges_ambiguous_are_decided_by_loops_that_overlap() -> None:
     assert all(left.max() > 0.999 for left in solution.mode_weights.values())
 
 
-def test_without_a_loop_an_edge_stands_at_its_heaviest_mode_as_wide_as_all() -> None:
+def test_without_a_loop_an_edge_is_pooled_at_its_heaviest_mode() -> None:
     rng = np.random.default_rng(6)
     truth = turntable(COUNT)
     ambiguous = _ambiguous(truth, 0, 1, rng=rng, weights=[0.3, 0.7])
@@ -132,7 +132,7 @@ def test_without_a_loop_an_edge_stands_at_its_heaviest_mode_as_wide_as_all() -> 
     assert offset @ np.linalg.solve(solution.covariances[1], offset) == pytest.approx(1.0 / 0.3, rel=0.02)
 
 
-def test_what_a_loop_cannot_tell_apart_keeps_its_weights() -> None:
+def test_modes_that_no_loop_distinguishes_keep_their_weights() -> None:
     """Two edges each turned by 90° or not, and a loop that allows one turn: which of them it was stays open."""
     rng = np.random.default_rng(7)
     truth = {k: se3.inverse(spin([0.0, 0.5 * k, 0.0])) for k in range(3)}
@@ -172,7 +172,7 @@ def test_false_closure_does_not_choose_a_mode() -> None:
 
 
 @pytest.mark.parametrize("weights", [[0.4, 0.6], [0.6, 0.4]])
-def test_mode_that_was_settled_by_a_lie_is_put_right_by_the_truth(weights: list[float]) -> None:
+def test_mode_settled_by_a_false_loop_is_corrected_by_true_ones(weights: list[float]) -> None:
     rng = np.random.default_rng(12)
     graph, truth = _graph(rng, {4: weights}, [])
     modes = graph.edges[3].posterior.modes

@@ -75,7 +75,7 @@ def _all_alike(of: Edge, rng: np.random.Generator) -> Edge:
 
 
 @pytest.mark.parametrize("spoil", [_anywhere, _all_alike])
-def test_a_fifth_of_the_closures_may_lie(spoil: Callable[[Edge, np.random.Generator], Edge]) -> None:
+def test_a_fifth_of_the_closures_may_be_false(spoil: Callable[[Edge, np.random.Generator], Edge]) -> None:
     for seed in range(4):
         graph, false, truth = _two_turns(seed, spoil)
         without = rotation_error(solve(graph, {}).trajectory, truth)
@@ -85,7 +85,7 @@ def test_a_fifth_of_the_closures_may_lie(spoil: Callable[[Edge, np.random.Genera
         assert len(spoilt.outliers) <= len(false) + 1
 
 
-def test_lies_among_closures_are_found_out_as_they_come() -> None:
+def test_false_closures_are_rejected_as_they_come() -> None:
     graph, false, truth = _two_turns(11, _anywhere)
     edges = sorted([*graph.edges, *false], key=lambda e: e.source)
     growing, error = Smoother(graph=PoseGraph(first=0)), {}
