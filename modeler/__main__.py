@@ -1,8 +1,17 @@
-"""Run the command line as `python -m modeler`."""
+"""Run the command line: as `python -m modeler`, and as the console script `modeler`."""
 
+import signal
 import sys
 
-from modeler.cli import main
+
+def main() -> int:
+    """Run one command and return its exit status."""
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during an import ends without a traceback
+    from modeler.cli import main as run
+
+    signal.signal(signal.SIGINT, before)
+    return run()
+
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -5,6 +5,8 @@ inside functions, so that help appears at once.
 """
 
 import contextlib
+import errno
+import importlib
 import io
 import logging
 import os
@@ -12,7 +14,6 @@ import re
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
-from importlib import metadata
 from itertools import takewhile
 from typing import Annotated, Any, Union
 
@@ -20,8 +21,7 @@ import tyro
 
 from modeler.cli.build import Build
 from modeler.cli.calibrate_sensor import CalibrateSensor
-from modeler.cli.console import say
-from modeler.cli.console import terminable as terminable
+from modeler.cli.console import INTERRUPTED, interruptible_at_once, say, terminable
 from modeler.cli.convert import Convert
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
@@ -31,9 +31,6 @@ from modeler.cli.register import Register
 from modeler.cli.render import Render
 from modeler.cli.report import Report
 from modeler.cli.view import View
-
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells have it."""
 
 Command = Build | Info | Convert | CalibrateSensor | Register | Evaluate | Render | View | Report | Export | Join
 
@@ -69,7 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: what follows the program's name; those of the process without it.
     """
+    _open_standard_streams()
     logging.basicConfig(level=logging.WARNING, format="modeler: %(message)s")  # to stderr
+    logging.raiseExceptions = False  # stderr may be full
     # Rerun complains in its own way of a viewer that was closed, which is nobody's error, and of a disk that is full;
     # we tell what matters.
     os.environ.setdefault("RUST_LOG", "warn,re_sdk=off,re_grpc_client=off,re_log_encoding=off")
@@ -85,8 +84,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         _close_stdout()
         return 1
-    except OSError as error:
-        if error.errno is None:
+    except (MemoryError, OSError, RuntimeError) as error:
+        if _exhausted(error):
+            say("memory or threads are exhausted; raise the limits (ulimit -v, -u), or end other programs")
+            return 2
+        if not isinstance(error, OSError) or error.errno is None:
             raise
         if error.filename is not None:
             say(f"{error.filename}: cannot be used ({error.strerror}); check the path and its permissions")
@@ -109,7 +111,9 @@ def parsed(arguments: Sequence[str]) -> Command:
     if name == "help":
         name, others = (others[0], ["--help"]) if others[:1] and others[0] in COMMANDS else ("--help", [])
     if name == "--version":
-        print(f"modeler {metadata.version('modeler')}")
+        from importlib.metadata import version
+
+        print(f"modeler {version('modeler')}")
         raise SystemExit(0)
     if name in ("-h", "--help"):
         return tyro.cli(_overview(), prog="modeler", description=_DESCRIPTION, args=["--help"], config=_STYLE)
@@ -158,14 +162,49 @@ def _one_line(box: str) -> str:
 
 def _run(command: Command) -> int:
     """Run a command and return its exit status; what cannot be used is said in one line."""
-    from modeler.types import InputError
-
+    _check_environment()
+    with interruptible_at_once():
+        importlib.import_module("viz.viewer" if isinstance(command, View) else "modeler.cli.inputs")
+        from modeler.types import InputError
     try:
         with terminable():
             return command.run()
     except InputError as error:
         say(str(error).strip().removesuffix("."))
         return 2
+
+
+def _check_environment() -> None:
+    """Refuse settings of numba under which nothing can be computed.
+
+    Raises:
+        SystemExit: with status 2 and one line on stderr.
+    """
+    threads, interpreted = (os.environ.get(f"NUMBA_{name}", "") for name in ("NUM_THREADS", "DISABLE_JIT"))
+    if threads and not (threads.isdecimal() and int(threads) > 0):
+        say(f"NUMBA_NUM_THREADS={threads} is no number of threads; set it to 1 or more, or unset it")
+        raise SystemExit(2)
+    if interpreted not in ("", "0"):
+        say(f"NUMBA_DISABLE_JIT={interpreted} would leave the kernels uncompiled; unset it")
+        raise SystemExit(2)
+
+
+def _exhausted(error: Exception) -> bool:
+    """Return whether the system gave no more memory or threads."""
+    if isinstance(error, OSError):
+        return error.errno in (errno.ENOMEM, errno.EAGAIN)
+    return isinstance(error, MemoryError) or "start new thread" in str(error)
+
+
+def _open_standard_streams() -> None:
+    """Let output go nowhere that goes to a closed stream, and not into the next file that is opened."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))
 
 
 def _close_stdout() -> None:

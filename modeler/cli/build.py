@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from modeler.cli.console import Console, Interrupt, say
-from modeler.cli.options import FrameOptions, MethodOptions, ObjectOptions, PriorOptions, default
+from modeler.cli.options import MIN_VOXEL_M, FrameOptions, MethodOptions, ObjectOptions, PriorOptions, default
 
 if TYPE_CHECKING:
     from modeler.export import RunFolder, RunMeta
@@ -126,8 +126,8 @@ def _check(options: Build) -> None:
 
     if options.resume and options.overwrite:
         raise InputError("--resume keeps what --overwrite deletes; give one of them")
-    if options.voxel_m is not None and not 0.0 < options.voxel_m < 1.0:
-        raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m between 0 and 1")
+    if options.voxel_m is not None and not MIN_VOXEL_M <= options.voxel_m < 1.0:
+        raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
     if options.connect is not None:
         reachable(options.connect)  # refuses what is no address; whether somebody listens is asked when there is news
 

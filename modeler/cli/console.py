@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 from collections.abc import Iterable, Iterator
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it."""
 TERMINATED = 128 + signal.SIGTERM
 """Exit status after SIGTERM, as shells have it."""
 _ONE_BY_ONE = 3  # frames left out in a row that are told as they come
@@ -24,7 +27,33 @@ _ONE_BY_ONE = 3  # frames left out in a row that are told as they come
 def say(words: str) -> None:
     """Tell a person something in one line; names in inputs shall not steer the terminal."""
     line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(words.split()))
-    print("modeler:", line, file=sys.stderr)
+    with lost_without_harm():
+        print("modeler:", line, file=sys.stderr)
+
+
+@contextlib.contextmanager
+def lost_without_harm() -> Iterator[None]:
+    """Let messages that cannot be written be lost, these and those to come: results do not depend on them."""
+    try:
+        yield
+    except (OSError, ValueError):  # ValueError: stderr is closed
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+
+
+@contextlib.contextmanager
+def interruptible_at_once() -> Iterator[None]:
+    """Let Ctrl-C end the program where it stands, for imports: libraries turn it into errors of their own."""
+    before = signal.signal(signal.SIGINT, _quit)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _quit(number: int, frame: FrameType | None) -> None:
+    say("interrupted")
+    os._exit(INTERRUPTED)
 
 
 @contextlib.contextmanager
@@ -214,4 +243,5 @@ class Console:
         return f"{what}: {what_to_do}"
 
     def _say(self, text: str) -> None:
-        self._bar.console.print(f"modeler: {text}", markup=False)
+        with lost_without_harm():
+            self._bar.console.print(f"modeler: {text}", markup=False)

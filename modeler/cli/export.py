@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from modeler.cli.console import say
-from modeler.cli.options import MovedOptions, default
+from modeler.cli.options import MIN_VOXEL_M, MovedOptions, default
 
 if TYPE_CHECKING:
     from modeler.fusion import FusionVolume
@@ -104,8 +104,8 @@ def _check(options: Export) -> None:
         raise InputError(f"{options.out}: BOP models are PLY files; give --out a name such as obj_000001.ply")
     if options.triangles is not None and options.triangles < 4:
         raise InputError(f"--triangles {options.triangles} is too few for a solid; give at least 4")
-    if options.voxel_m is not None and not 0.0 < options.voxel_m < 1.0:
-        raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m between 0 and 1")
+    if options.voxel_m is not None and not MIN_VOXEL_M <= options.voxel_m < 1.0:
+        raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
 
 
 def _volume(options: Export) -> FusionVolume | None:

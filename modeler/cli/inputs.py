@@ -158,7 +158,7 @@ def parts_of(run: Path, moved: Sequence[Path] = ()) -> tuple[Part, ...]:
         InputError: where a folder holds no run, or a sequence is not to be found.
     """
     places = deque(moved) if moved else None
-    found = _parts(run, places)
+    found = _parts(run, places, ())
     if places:
         raise InputError(
             f"--sequence is given {len(moved)} times where {run} was made from {len(found)}; give each once"
@@ -166,11 +166,14 @@ def parts_of(run: Path, moved: Sequence[Path] = ()) -> tuple[Part, ...]:
     return found
 
 
-def _parts(run: Path, places: deque[Path] | None) -> tuple[Part, ...]:
+def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> tuple[Part, ...]:
+    """Return what a run was made of; `within` are the runs that it was joined to, from the outermost."""
+    if run.resolve() in within:
+        raise InputError(f"{run}: is part of itself; join its parts again")
     report = RunFolder(run).result()
     settings = report["settings"]
     if "joined" in settings:
-        first, second = (_parts(Path(part), places) for part in settings["joined"])
+        first, second = (_parts(Path(part), places, (*within, run.resolve())) for part in settings["joined"])
         moved = (replace(part, offset=part.offset + int(settings["offset"])) for part in second)
         return (*first, *moved)
     if places is not None and not places:

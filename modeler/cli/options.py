@@ -35,6 +35,10 @@ SEED = tyro.constructors.PrimitiveConstructorSpec(
 """How a seed is read, by every command alike."""
 
 
+MIN_VOXEL_M = 1e-5
+"""No camera resolves less; a model of such voxels fits into no memory."""
+
+
 @dataclass(frozen=True)
 class MovedOptions:
     """Where the sequence is now, if it has moved since the run was made."""

@@ -28,7 +28,7 @@ def write_atomically(path: Path, content: str | bytes, *, lasting: bool = False)
     Raises:
         InputError: where the file cannot be written.
     """
-    data = content.encode() if isinstance(content, str) else content
+    data = content.encode(errors="backslashreplace") if isinstance(content, str) else content  # names need not be text
     part = path.with_name(f".{path.name}.{os.getpid()}{PART}")
     try:
         try:

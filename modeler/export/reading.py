@@ -58,6 +58,9 @@ def read_model(path: Path) -> ObjectModel:
         raise InputError(f"{path}: not a mesh that can be read ({error}); build the model again") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{path}: holds no triangles; more views are needed for a surface")
+    vertices_m, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    if not np.isfinite(vertices_m).all() or triangles.min() < 0 or triangles.max() >= len(vertices_m):
+        raise InputError(f"{path}: is damaged, its triangles have corners that are none; build the model again")
     columns = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
     names = columns.dtype.names or () if isinstance(columns, np.ndarray) else tuple(columns)
     visual = mesh.visual
@@ -67,8 +70,8 @@ def read_model(path: Path) -> ObjectModel:
         points_m=np.zeros((0, 3)),
         normals=np.zeros((0, 3)),
         colours=np.zeros((0, 3), dtype=np.uint8) if colours is not None else None,
-        vertices_m=np.asarray(mesh.vertices, dtype=np.float64),
-        triangles=np.asarray(mesh.faces, dtype=np.int64),
+        vertices_m=vertices_m,
+        triangles=triangles,
         vertex_normals=np.asarray(mesh.vertex_normals, dtype=np.float64),
         vertex_colours=None if colours is None else np.asarray(colours)[:, :3].astype(np.uint8),
         vertex_views=np.asarray(columns["views"], dtype=np.int64).ravel() if "views" in names else None,
@@ -122,8 +125,11 @@ def fault(report: Mapping[str, Any]) -> str | None:
             wrong = _wrong(record, tests) or _impossible(record)
             if wrong is not None:
                 return f"{wrong} of entry {place} of {name!r} is missing or is not what it should be"
-    if not {pose["id"] for pose in report["poses"]} <= {frame["id"] for frame in report["frames"]}:
-        return "'poses' has frames that 'frames' has not"
+    frames, poses = ([record["id"] for record in report[name]] for name in ("frames", "poses"))
+    if len({*frames}) < len(frames) or len({*poses}) < len(poses) or not {*poses} <= {*frames}:
+        return "'frames' or 'poses' has a frame twice, or 'poses' has frames that 'frames' has not"
+    if any(edge["source"] == edge["target"] for edge in report["edges"]):
+        return "an entry of 'edges' joins a frame to itself"
     wrong = _wrong(report["settings"], _SETTINGS, may_lack=frozenset(_SETTINGS))
     return None if wrong is None else f"{wrong} of 'settings' is not what it should be"
 
@@ -159,7 +165,9 @@ def _definite(numbers: list[float | None], least: float) -> bool:
     covariance = np.array(numbers, dtype=np.float64).reshape(6, 6)
     if not (np.abs(covariance) < _WIDEST).all():  # not so of NaN
         return False
-    sigmas = np.sqrt(np.maximum(np.diag(covariance), _NARROWEST))
+    if np.diag(covariance).min() < _NARROWEST:
+        return False
+    sigmas = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sigmas, sigmas)
     return bool(np.abs(correlation - correlation.T).max() < _ROUND and np.linalg.eigvalsh(correlation)[0] > least)
 
@@ -186,6 +194,14 @@ def _null_or(test: Test) -> Test:
     return lambda value: value is None or test(value)
 
 
+def _is_text(value: Any) -> bool:
+    """Return whether it is text that a file or the name of a file can hold."""
+    try:
+        return isinstance(value, str) and b"\0" not in os.fsencode(value)
+    except UnicodeEncodeError:
+        return False
+
+
 def _numbers(count: int) -> Test:
     return lambda value: isinstance(value, list) and len(value) == count and all(map(_is_number_or_null, value))
 
@@ -199,14 +215,14 @@ def _are_modes(value: Any) -> bool:
 
 
 _WHOLE: dict[str, Test] = {
-    "sequence": _is(str),
+    "sequence": _is_text,
     "settings": _is(dict),
     "frames": _is(list),
     "edges": _is(list),
     "poses": _is(list),
     "closed": _is(bool),
     "trustworthy": _is(bool),
-    "reasons": lambda value: isinstance(value, list) and all(map(_is(str), value)),
+    "reasons": lambda value: isinstance(value, list) and all(map(_is_text, value)),
     "reason_codes": _null_or(lambda value: isinstance(value, list) and all(map(_is(str), value))),
     "seconds": lambda value: isinstance(value, dict) and all(map(_is_number, value.values())),
     "up": _null_or(_is_direction),
@@ -215,7 +231,7 @@ _FRAME: dict[str, Test] = {
     "id": _is_whole,
     "timestamp": _is_number,
     "points": _is_whole,
-    "outcome": _is(str),
+    "outcome": _is_text,
     "cause": _null_or(_is(str)),  # reports of earlier versions have none
 }
 _POSE: dict[str, Test] = {"id": _is_whole, "object_from_camera": _numbers(16), "covariance": _numbers(36)}
@@ -236,9 +252,9 @@ _EDGE: dict[str, Test] = {
     "seconds": _is_number_or_null,
 }
 _SETTINGS: dict[str, Test] = {
-    "joined": lambda value: isinstance(value, list) and len(value) == 2 and all(map(_is(str), value)),
+    "joined": lambda value: isinstance(value, list) and len(value) == 2 and all(map(_is_text, value)),
     "offset": _is_whole,
-    "sensor": _is(str),
+    "sensor": _is_text,
     "roi": _null_or(lambda value: isinstance(value, list) and len(value) == 4 and all(map(_is_whole, value))),
     "max_depth_m": _null_or(_is_number),
     "voxel_m": _null_or(_is_number),
