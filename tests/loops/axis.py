@@ -59,6 +59,7 @@ def run(sequence: AbstractSequence, seed: int) -> Step:
         seed=seed,
     )
     *_, last = maker.run((sequence.frame(index) for index in sequence.indices), Scene())
+    assert isinstance(last, Step)
     return last
 
 
