@@ -55,7 +55,7 @@ def report(folder: Path) -> dict:
         (("build", BOX, "--out", "OUT", "--frob"), "--frob; see modeler build --help"),
         (
             ("build", BOX, "--out", "OUT", "--prio", "table"),
-            "Perhaps you meant: --prior NAME[+NAME]; see",
+            "Perhaps you meant: --prior NAME[+NAME]",
         ),
         (("build", BOX, "--out", "OUT", "--intrinsics", "9", "9", "9", "9"), "--intrinsics"),
         (("build", BOX, "--out"), "Missing value for argument '--out'"),
