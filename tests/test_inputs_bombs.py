@@ -116,7 +116,7 @@ def test_a_chunk_of_mcap_is_bounded(
     refused(path, capsys)  # what is loaded once shall not count
     with frugal():
         said = refused(path, capsys)
-    assert ("more than it says" if announced == 1000 else "MB, more than 1024 MB") in said
+    assert ("more than announced" if announced == 1000 else "MB, more than 1024 MB") in said
 
 
 def test_a_chunk_of_mcap_larger_than_its_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

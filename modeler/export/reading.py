@@ -112,6 +112,9 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
+_LATER = frozenset({"modes", "cause"})  # reports of earlier versions have none
+
+
 def fault(report: Mapping[str, Any]) -> str | None:
     """Return what is wrong with a report, in words; None where nothing is.
 
@@ -134,7 +137,7 @@ def fault(report: Mapping[str, Any]) -> str | None:
     return None if wrong is None else f"{wrong} of 'settings' is not what it should be"
 
 
-def _wrong(record: Any, tests: Mapping[str, Test], may_lack: frozenset[str] = frozenset({"modes"})) -> str | None:
+def _wrong(record: Any, tests: Mapping[str, Test], may_lack: frozenset[str] = _LATER) -> str | None:
     if not isinstance(record, dict):
         return "all"
     for name, test in tests.items():
@@ -232,7 +235,7 @@ _FRAME: dict[str, Test] = {
     "timestamp": _is_number,
     "points": _is_whole,
     "outcome": _is_text,
-    "cause": _null_or(_is(str)),  # reports of earlier versions have none
+    "cause": _null_or(_is(str)),
 }
 _POSE: dict[str, Test] = {"id": _is_whole, "object_from_camera": _numbers(16), "covariance": _numbers(36)}
 _MODE: dict[str, Test] = {"weight": _is_number_or_null, "target_from_source": _numbers(16), "covariance": _numbers(36)}

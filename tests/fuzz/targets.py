@@ -228,7 +228,7 @@ def _reopen(path: Path) -> None:
 
 
 def _poses(path: Path) -> None:
-    Convert(path, path.parent / "poses.json").run()
+    Convert(path, path.parent / "poses.json", overwrite=True).run()
 
 
 def _runs(folder: Path) -> Path:
