@@ -217,6 +217,12 @@ def _are_modes(value: Any) -> bool:
     return isinstance(value, list) and all(_wrong(mode, _MODE) is None for mode in value)
 
 
+def _is_loop(value: Any) -> bool:
+    return isinstance(value, dict) and all(
+        _is_number(value.get(name)) for name in ("opening_deg", "opening_m", "sigmas")
+    )
+
+
 _WHOLE: dict[str, Test] = {
     "sequence": _is_text,
     "settings": _is(dict),
@@ -224,6 +230,7 @@ _WHOLE: dict[str, Test] = {
     "edges": _is(list),
     "poses": _is(list),
     "closed": _is(bool),
+    "loop": _null_or(_is_loop),
     "trustworthy": _is(bool),
     "reasons": lambda value: isinstance(value, list) and all(map(_is_text, value)),
     "reason_codes": _null_or(lambda value: isinstance(value, list) and all(map(_is(str), value))),

@@ -152,7 +152,7 @@ def _loop(
 ) -> dict[str, float | int | list[int]] | None:
     """Return by how much the chain of consecutive edges missed the closure that spans most of it; None without one."""
     opening = loop_opening(edges, solution, {frame: view.centroid_m for frame, view in views.items()})
-    if opening is None:
+    if opening is None or not math.isfinite(opening.sigmas):
         return None
     return {
         "frames": [opening.target, opening.source],

@@ -58,6 +58,13 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
     write_atomically(out, page)
 
 
+def _opening(loop: Mapping[str, float] | None) -> list[tuple[str, str]]:
+    """Return by how much the loop was open, as a key figure; nothing where no loop was closed."""
+    if loop is None:
+        return []
+    return [(f"{loop['opening_deg']:.1f}°, {loop['sigmas']:.1f} sd", "open loop, before optimisation")]
+
+
 def _head(result: Result, mesh: Mesh | None) -> str:
     """Return name, verdict and key figures."""
     report = result.report
@@ -72,6 +79,7 @@ def _head(result: Result, mesh: Mesh | None) -> str:
     figures = [
         (f"{len(result.poses)} of {len(report['frames'])}", "frames placed"),
         (str(closed), "loop closed" if closed == 1 else "loops closed"),
+        *_opening(report.get("loop")),
         ("none" if mesh is None else f"{mesh.total:,}", "triangles"),
         ("unknown" if total_s is None else f"{total_s:.0f} s", "build time"),
     ]
