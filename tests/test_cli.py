@@ -55,7 +55,7 @@ def report(folder: Path) -> dict:
         (("build", BOX, "--out", "OUT", "--frob"), "--frob; see modeler build --help"),
         (
             ("build", BOX, "--out", "OUT", "--prio", "table"),
-            "Perhaps you meant: --prior NAME[+NAME]",
+            "Perhaps you meant: --prior NAME[+NAME] or --prior-args NAME=VALUE; see",
         ),
         (("build", BOX, "--out", "OUT", "--intrinsics", "9", "9", "9", "9"), "--intrinsics"),
         (("build", BOX, "--out"), "Missing value for argument '--out'"),
@@ -77,6 +77,8 @@ def report(folder: Path) -> dict:
         (("build", BOX, "--out", "OUT", "--prior", "poke"), "--poke-point-m"),
         (("build", BOX, "--out", "OUT", "--prior", "turntable", "--step-deg", "0"), "--step-deg 0"),
         (("build", BOX, "--out", "OUT", "--prior", "turntable", "--step-sigma-deg", "-1"), "--step-sigma-deg -1"),
+        (("build", BOX, "--out", "OUT", "--prior", "turntable", "--step-sigma-deg", "0"), "--step-sigma-deg 0"),
+        (("build", BOX, "--out", "OUT", "--prior", "turntable", "--axis-sigma-m", "0"), "--axis-sigma-m 0"),
         (("build", BOX, "--out", "OUT", "--prior", "turntable", "--axis-direction", "0", "0", "0"), "--axis-direction"),
         (("build", BOX, "--out", "OUT", "--prior", "turntable", "--held-sigma-m", "1"), "--held-sigma-m"),
         (("build", BOX, "--out", "OUT", "--max-rotation-deg", "nan"), "--max-rotation-deg nan"),

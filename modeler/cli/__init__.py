@@ -147,7 +147,7 @@ def _first_sentence(command: type[Command]) -> str:
 
 
 def _one_line(box: str) -> str:
-    """Return the parser's error box as one line: its first section and the options it suggests, without their help."""
+    """Return the parser's error box as one line: its first section, and the options it suggests without their help."""
     rows = [re.sub(r"\x1b\[[0-9;]*m|\[/?bold\]", "", row).strip("│|╭╮╰╯").rstrip() for row in box.splitlines()[1:]]
     sections = [[]]
     for row in rows:
@@ -155,9 +155,9 @@ def _one_line(box: str) -> str:
             sections.append([])
         elif not row.startswith(_HELP_INDENT):
             sections[-1].append(row)
-    lines = [" ".join(" ".join(takewhile(bool, section)).split()) for section in sections]
-    kept = [line for number, line in enumerate(lines) if line and (not number or line.startswith("Perhaps"))]
-    return "; ".join(line.rstrip(".") for line in kept)
+    what, *others = [[" ".join(row.split()) for row in takewhile(bool, section)] for section in sections]
+    suggested = [f"{first} {' or '.join(more)}" for first, *more in filter(None, others) if first.startswith("Perhaps")]
+    return "; ".join(line.rstrip(".") for line in (" ".join(what), *suggested))
 
 
 def _run(command: Command) -> int:

@@ -160,7 +160,7 @@ class PriorOptions:
             )
         for parameter, value in given.items():
             try:
-                check_parameter(parameter, value)
+                check_parameter(parameter, value, exact=False)
             except ParameterError as error:
                 raise InputError(f"{_flag(parameter)} {error.fault}.") from error
         return given

@@ -37,12 +37,13 @@ class ParameterError(InputError):
         super().__init__(f"{name} {self.fault}")
 
 
-def check_parameter(name: str, value: object) -> None:
+def check_parameter(name: str, value: object, *, exact: bool = True) -> None:
     """Check one parameter by the unit in its name; what is no number, or three, is not checked.
 
     Args:
         name: ends with its unit: `_deg`, `_m`, `_s`. `step_deg` alone may be negative.
         value: of the parameter.
+        exact: whether a standard deviation of a turntable may be 0, as that of a simulated one is.
 
     Raises:
         ParameterError: where it is not finite, or out of range.
@@ -60,7 +61,7 @@ def check_parameter(name: str, value: object) -> None:
             raise ParameterError(name, value, f"a turn of -{_MAX_TURN_DEG:g} to {_MAX_TURN_DEG:g} degrees, but not 0")
     elif name.rpartition("_")[2] in _LIMITS:
         unit, most = _LIMITS[name.rpartition("_")[2]]
-        if not (0.0 < value <= most or (value == 0.0 and name in _MAY_BE_ZERO)):
+        if not (0.0 < value <= most or (value == 0.0 and exact and name in _MAY_BE_ZERO)):
             raise ParameterError(name, value, f"a positive number of {unit}, at most {most:g}")
     elif isinstance(value, float) and not 0.0 < value < np.inf:
         raise ParameterError(name, value, "a positive number")
