@@ -116,9 +116,9 @@ def build(
         InputError: where the sequence cannot be read, or the folder cannot be used.
     """
     began_s = time.perf_counter()
-    inputs = [] if isinstance(sequence, AbstractSequence) else [Path(sequence)]
-    check_run_folder(Path(out), inputs, overwrite=overwrite)
     frames = sequence if isinstance(sequence, AbstractSequence) else opened(Path(sequence))
+    named = () if isinstance(sequence, AbstractSequence) else (Path(sequence),)
+    check_run_folder(Path(out), (*named, *frames.inputs), overwrite=overwrite)
     options = PriorOptions(prior=prior if isinstance(prior, str) else None)
     modeler = compose.modeler(frames, options, MethodOptions(seed=seed), ObjectOptions())
     if isinstance(prior, AbstractPrior):

@@ -56,6 +56,11 @@ class AbstractSequence(ABC):
         """Known motion, `{"kind": "turntable", "step_deg": 25, …}`; None if nothing is known."""
 
     @property
+    def inputs(self) -> tuple[Path, ...]:
+        """Files and folders that are read, which nothing may be written into; none where it lies in memory."""
+        return ()
+
+    @property
     def robot_path(self) -> Path | None:
         """Trajectory of the robot hand that holds the object; None if there is none."""
         return None
@@ -155,6 +160,11 @@ class AbstractDerived(AbstractSequence):
     def motion(self) -> Mapping[str, object] | None:
         """Known motion between consecutive frames of the underlying sequence."""
         return self.whole.motion
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """Files and folders that are read."""
+        return self.whole.inputs
 
     @property
     def robot_path(self) -> Path | None:

@@ -35,6 +35,11 @@ class AbstractRecording(AbstractSequence):
         resolved = self.path.resolve()
         return (resolved.name if self._is_folder else resolved.stem) if node is None else node.text()
 
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """The folder or the file."""
+        return (self.path,)
+
     def sensor(self) -> tuple[float, float] | None:
         """Return `(sigma_wh, sigma_r_m)` from `sequence.json`; None where it does not say."""
         node = None if self._meta is None else self._meta.get("sensor")

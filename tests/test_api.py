@@ -65,8 +65,9 @@ def test_the_sequence_of_the_readme_is_built(
 
 
 def test_a_model_is_never_built_into_its_sequence() -> None:
-    with pytest.raises(modeler.InputError, match="only read"):
-        modeler.build(bundled("box"), bundled("box") / "run")
+    for sequence in (bundled("box"), modeler.open_sequence(bundled("box")).select(every=2)):
+        with pytest.raises(modeler.InputError, match="only read"):
+            modeler.build(sequence, bundled("box") / "run")
 
 
 def test_the_loop_of_the_readme_runs(capfd: pytest.CaptureFixture[str]) -> None:
