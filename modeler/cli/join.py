@@ -257,9 +257,9 @@ def _written(
     """Fuse the frames of both parts, write the run folder with its recording and return its report."""
     import numpy as np
 
-    from modeler.export.report import FrameRecord
     from modeler.fusion import Fuser, conditional_covariances
     from modeler.types import Solution
+    from modeler.verdict import FrameRecord
     from viz.stream import open_stream
 
     views = dict(parts[0].views) | dict(parts[1].views)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import platform
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,15 +25,13 @@ from modeler.types import (
     Step,
     code,
     explain,
-    joined_without,
     loop_opening,
     loops_closed,
 )
+from modeler.verdict import FrameRecord, judged
 
 _SCHEMA = 1
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
-_LITTLE_OVERLAP = 0.5  # views farther apart are registered wrongly now and then, and surely so
-_UNSURE_DEG = 5.0  # standard deviation of a frame's turn beyond which the model shows a surface several times
 _FREE_RAD = np.radians(8.0)  # two such are the usual step between views: the edge does not tell whether there was one
 _FREE_M = 0.01  # surfaces of a hand-sized object then come to lie visibly apart
 _ALIKE = np.cos(np.radians(25.0))  # nearer than this, a direction goes by the name of another
@@ -69,27 +66,6 @@ class RunMeta:
     """Version by package."""
 
 
-@dataclass(frozen=True)
-class FrameRecord:
-    """What became of one frame."""
-
-    id: int
-    """Frame number."""
-    timestamp: float
-    """Time of capture in s."""
-    points: int
-    """Number of surface points on the object."""
-    outcome: str
-    """`ACCEPTED`, or in words why the frame was left out."""
-    cause: str = ""
-    """The same for programs, as `types.code` has it; "" for frames that were accepted."""
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the frame is part of the model."""
-        return self.outcome == ACCEPTED
-
-
 def frame_record(step: Step) -> FrameRecord:
     """Return what became of the frame of a step."""
     points = 0 if step.view is None else len(step.view.points_m)
@@ -97,17 +73,6 @@ def frame_record(step: Step) -> FrameRecord:
         return FrameRecord(step.frame.index, float(step.frame.time_s), points, ACCEPTED)
     outcome, cause = explain(step.left_out), code(step.left_out)
     return FrameRecord(step.frame.index, float(step.frame.time_s), points, outcome, cause)
-
-
-@dataclass(frozen=True)
-class Shortcoming:
-    """Why a model is not to be trusted."""
-
-    code: str
-    """For programs: `doubt`, `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `closures_refused`,
-    `unconfirmed`, `never_came_back`, `little_overlap` or `unsure_rotation`."""
-    words: str
-    """For people."""
 
 
 def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[str, Any]:
@@ -121,7 +86,9 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
     solution, views, covariances = step.solution, dict(step.views), dict(step.solution.covariances.items())
     if step.view is not None:  # also where the frame was left out
         views[step.frame.index] = step.view
-    reasons = _shortcomings(step, frames, meta)
+    verdict = judged(
+        step, frames, doubts=meta.doubts, interrupted=meta.interrupted, closure_expected=meta.closure_expected
+    )
     report = {
         "schema": _SCHEMA,
         "sequence": meta.sequence,
@@ -133,9 +100,9 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "complete": step.last and not meta.interrupted,
         "closed": loops_closed(_taking_part(step)) > 0,
         "loop": _loop(step.edges_so_far, solution, views),
-        "trustworthy": not reasons,
-        "reasons": [reason.words for reason in reasons],
-        "reason_codes": [reason.code for reason in reasons],
+        "trustworthy": verdict.trustworthy,
+        "reasons": [shortcoming.words for shortcoming in verdict.shortcomings],
+        "reason_codes": [shortcoming.code for shortcoming in verdict.shortcomings],
         "up": _up(solution, views),
         "frames": [vars(frame) for frame in frames],
     }
@@ -169,75 +136,8 @@ def _up(solution: Solution, views: Mapping[int, RayImage]) -> Array | None:
     return None if first is None or first.plane is None else first.plane.normal
 
 
-def _shortcomings(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> list[Shortcoming]:
-    """Return why the model is not to be trusted; empty where it is."""
-    reasons = [Shortcoming("doubt", words) for words in meta.doubts]
-    if meta.interrupted:
-        reasons.append(Shortcoming("interrupted", f"the run was interrupted after frame {step.frame.index}"))
-    elif not step.last:
-        reasons.append(Shortcoming("unfinished", "the run has not finished"))
-    reasons += [Shortcoming("left_out", words) for words in _left_out(frames)]
-    if sum(frame.accepted for frame in frames) < 2:
-        words = "fewer than two frames were accepted: there is nothing to align"
-        reasons.append(Shortcoming("too_few_frames", words))
-    edges = _taking_part(step)
-    if not loops_closed(edges):
-        closures = [edge for edge in step.edges_so_far if edge.kind == "closure"]
-        refused = [edge for edge in closures if edge not in edges]
-        if refused:
-            last = refused[-1]
-            pair = f"frame {last.source} on frame {last.target}"
-            words = f"none of {len(closures)} closures closed a loop; the last refused, {pair}: {_reason(last, step)}"
-            reasons.append(Shortcoming("closures_refused", words))
-        elif closures:
-            words = "what joins the first frames to the last is confirmed by nothing: no loop was closed"
-            reasons.append(Shortcoming("unconfirmed", words))
-        elif meta.closure_expected:
-            words = "the object never came back to an earlier view, so that no loop was closed"
-            reasons.append(Shortcoming("never_came_back", words))
-    reasons += [
-        Shortcoming(
-            "little_overlap",
-            f"frames {edge.source} and {edge.target} share little surface (overlap {edge.posterior.overlap:.2f}), and "
-            "no other edge confirms how they were joined",
-        )
-        for edge in edges
-        if edge.posterior.overlap < _LITTLE_OVERLAP and not joined_without(edge, edges)
-    ]
-    return reasons + [Shortcoming("unsure_rotation", words) for words in _unsure(step.solution)]
-
-
-def _left_out(frames: Sequence[FrameRecord]) -> list[str]:
-    """Return in words which frames were left out and why, those that follow each other for one reason together."""
-    words = []
-    for outcome, together in itertools.groupby(sorted(frames, key=lambda frame: frame.id), key=lambda f: f.outcome):
-        ids = [frame.id for frame in together]
-        if outcome != ACCEPTED:
-            which = f"frame {ids[0]} was" if len(ids) == 1 else f"frames {ids[0]} to {ids[-1]} were"
-            words.append(f"{which} left out: {outcome}")
-    return words
-
-
-def _unsure(solution: Solution) -> list[str]:
-    """Return in words which frames nobody knows how to turn: where the graph is not sure of it, nor is the model."""
-    sigmas_deg = {
-        frame: float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])))
-        for frame, covariance in solution.covariances.items()
-    }
-    worst = max(sigmas_deg, key=lambda frame: sigmas_deg[frame], default=None)
-    if worst is None or sigmas_deg[worst] <= _UNSURE_DEG:
-        return []
-    count = sum(sigma_deg > _UNSURE_DEG for sigma_deg in sigmas_deg.values())
-    others = f", {count - 1} more by over {_UNSURE_DEG:.0f}°" if count > 1 else ""
-    return [f"frame {worst} may be turned by {sigmas_deg[worst]:.0f}° (one standard deviation){others}"]
-
-
 def _taking_part(step: Step) -> list[Edge]:
     return [edge for edge in step.edges_so_far if step.solution.takes_part(edge)]
-
-
-def _reason(edge: Edge, step: Step) -> str:
-    return explain(OptimisationOutlier() if edge in step.solution.outliers else edge.reason)
 
 
 def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) -> dict[str, Any]:

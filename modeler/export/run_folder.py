@@ -13,9 +13,10 @@ from modeler.export.files import PART, settle, settle_soon, write_atomically
 from modeler.export.formats import cloud_ply, g2o_text, mesh_ply, tum_text
 from modeler.export.pairs import Pairs
 from modeler.export.reading import fault
-from modeler.export.report import FrameRecord, RunMeta, frame_record, report_of
+from modeler.export.report import RunMeta, frame_record, report_of
 from modeler.regular_files import read_json
 from modeler.types import InputError, Step
+from modeler.verdict import FrameRecord
 
 _REPORT = "report.json"
 _OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd")
