@@ -1,14 +1,19 @@
 """Finding the object: exact masks on made-up scenes, sure where it may be, and honest where it may not."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from refusal import refused
+from scipy.spatial.transform import Rotation
 from worlds import CAMERA, OBJECT, World, iou
 
 from modeler.segmentation import Scene, Segmenter
+from modeler.segmentation.depth_images import edge_of, mixed_pixels, pieces, voxel_clusters, without_specks
 from modeler.types import Camera, Frame, Outcome
+from sequences.bop import BopSequence
 
 
 def turned(count, rng, surround=lambda world, k: world, **camera):
@@ -281,3 +286,132 @@ def test_the_same_frames_give_the_same_masks(rng):
 def test_bad_parameters_are_refused_in_one_line(fields):
     with refused("give"):
         Segmenter(**fields)
+
+
+# What segmentation is made of: mixed pixels, pieces, clusters and edges.
+
+
+def test_mixed_pixels_against_a_naive_twin(rng):
+    depth = rng.choice([0.5, 0.6, 0.7, np.nan], (20, 30)).astype(np.float32)
+    tolerance = np.full_like(depth, 0.05)
+    fast = mixed_pixels(depth, tolerance_m=tolerance, pixel_m=np.full_like(depth, 0.001))
+    for row in range(20):
+        for column in range(30):
+            around = depth[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
+            here = depth[row, column]
+            assert fast[row, column] == (np.any(here - around > 0.05) and np.any(around - here > 0.05))
+
+
+def test_pieces_end_at_jumps_and_clusters_at_gaps():
+    depth = np.full((4, 9), 0.5, dtype=np.float32)
+    depth[:, 5:] = 0.6
+    labels = pieces(depth, np.ones(depth.shape, dtype=np.bool_))
+    assert set(np.unique(labels[:, :4])) == {labels[0, 0]}
+    assert labels[0, 0] != labels[0, 8]
+    line = np.full((75, 3), 0.01)
+    line[:, 0] = np.r_[np.linspace(0.0, 0.1, 50), np.linspace(0.15, 0.2, 25)]
+    near, far = (
+        voxel_clusters(line, low_m=np.zeros(3), high_m=np.full(3, 0.21), gap_m=gap_m) for gap_m in (0.06, 0.01)
+    )
+    assert len(np.unique(near)) == 1
+    assert len(np.unique(far)) == 2
+
+
+def test_specks_go():
+    mask = np.zeros((30, 40), dtype=np.bool_)
+    mask[10:20, 10:20], mask[25, 30], mask[3:5, 3:5] = True, True, True
+    assert without_specks(mask, 0.05).sum() == 100
+
+
+def test_the_edge_of_what_is_seen():
+    seen = np.zeros((60, 80), dtype=np.bool_)
+    seen[20:, 16:] = True  # a band that the sensor leaves blind, and a table before nothing
+    edge = edge_of(seen)
+    assert edge[20:, 16].all()
+    assert edge[20, 16:].all()
+    assert edge[-1, 16:].all()
+    assert not edge[21:-1, 17:-1].any()
+    seen[10:20, 40:50] = True  # something on the table that rises over its end: there the camera sees on
+    edge = edge_of(seen)
+    assert edge[20:, 16].all()
+    assert not edge[:-1, 17:-1].any()
+
+
+def test_the_side_of_what_rises_over_the_end_of_a_table_is_no_edge():
+    seen = np.zeros((60, 80), dtype=np.bool_)
+    seen[38:58, 8:72] = True  # a table that covers a third of each column
+    seen[24:38, 30:50] = True  # with what stands there it is more than half
+    assert not edge_of(seen)[:57, 9:71].any()
+
+
+# Objects are found in whole sequences, rendered and recorded, without their masks.
+
+BUNDLED = Path(__file__).parents[1] / "sequences" / "bundled"
+REAL = Path(__file__).parents[2] / "shared" / "data"
+
+
+def bare(frames):
+    return [replace(frame, mask=None) for frame in frames]
+
+
+def test_what_rises_over_the_end_of_its_table_is_sure(rng):
+    """A table before nothing, in a part of the image: what is taller than its far end is not cut off."""
+    frames = [
+        World()
+        .box((0.0, 0.0, -0.01), (0.32, 0.2, 0.01))
+        .box((0.0, 0.05, 0.12), (0.05, 0.04, 0.12), turn_deg=20.0 * k)
+        .frame(k, rng)[0]
+        for k in range(5)
+    ]
+    segmenter = Segmenter()
+    scene = segmenter.scene(frames)
+    assert {segmenter.segment(frame, scene).outcome for frame in frames} == {Outcome.CONVERGED}
+
+
+@pytest.mark.parametrize("name", ["box", "flashlight", "tube"])
+def test_rendered_sequences_without_their_masks(name):
+    frames = list(BopSequence(BUNDLED / name))
+    segmenter = Segmenter()
+    scene = segmenter.scene(bare(frames)[:: max(1, len(frames) // 12)])
+    for frame in frames:
+        assert frame.mask is not None
+        one = segmenter.segment(replace(frame, mask=None), scene)
+        assert iou(one.mask, frame.mask & np.isfinite(frame.depth_m)) >= 0.97
+        assert one.outcome is Outcome.CONVERGED
+
+
+@pytest.mark.parametrize("name", ["box", "flashlight", "tube"])
+def test_table_of_rendered_sequences(name):
+    """The model turns about the table's normal, so that its axis is the same in every frame."""
+    truth = json.loads((BUNDLED / name / "scene_gt.json").read_text())
+    turns = np.array([np.reshape(truth[key][0]["cam_R_m2c"], (3, 3)) for key in sorted(truth, key=int)])
+    steps = Rotation.from_matrix(turns[1:] @ turns[:-1].transpose(0, 2, 1)).as_rotvec()
+    normal = steps.sum(axis=0) / np.linalg.norm(steps.sum(axis=0))
+    for frame in list(BopSequence(BUNDLED / name))[::5]:
+        plane = Segmenter().segment(frame, Scene()).plane
+        assert plane is not None
+        assert np.arccos(min(1.0, abs(plane.normal @ normal))) < 2.0 * plane.sigma_tilt_rad
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="the real sequences are not here")
+@pytest.mark.parametrize(
+    ("name", "pixels", "object_px"),
+    [
+        ("cap", (16000, 21000), (300, 230)),
+        ("kleenex", (11000, 16500), (315, 260)),
+        ("castard", (38000, 75000), (345, 250)),
+        ("dog_upright", (19000, 27000), (350, 200)),
+    ],
+)
+def test_real_sequences(name, pixels, object_px):
+    """Sizes and places are those of masks that were looked at, frame by frame."""
+    frames = [frame for frame in BopSequence(REAL / name)]
+    segmenter = Segmenter()
+    picks = np.unique(np.linspace(0, len(frames) - 1, 12).round().astype(int))
+    scene = segmenter.scene([frames[k] for k in picks])
+    assert scene.plane is not None
+    for frame in frames:
+        one = segmenter.segment(frame, scene)
+        assert one.outcome is Outcome.CONVERGED
+        assert pixels[0] < np.count_nonzero(one.mask) < pixels[1]
+        assert np.abs(np.argwhere(one.mask).mean(axis=0)[::-1] - object_px).max() < 60.0

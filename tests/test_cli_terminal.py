@@ -1,17 +1,20 @@
-"""Bars where somebody watches, and silence where nobody does."""
+"""What surrounds a command: bars where somebody watches, streams, signals and limits that become no traceback."""
 
 from __future__ import annotations
 
 import os
 import pty
 import select
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commanded import BOX
 
 from modeler.cli.advice import outcome_advice
 from modeler.cli.console import Console
@@ -19,7 +22,7 @@ from modeler.cli.inputs import reading
 from modeler.types import Failed, Outcome, PriorRefused, Searching, Segmentation, Solution, Stated, Step
 from sequences import bundled, open_sequence
 
-COMMAND = [sys.executable, "-m", "modeler", "info", str(bundled("tube"))]
+COMMAND = [sys.executable, "-m", "modeler"]
 
 
 def test_a_watched_sequence_is_the_same_sequence() -> None:
@@ -130,59 +133,29 @@ def on_a_terminal(command: list[str]) -> str:
     return said.decode()
 
 
-ENDING = """
+WATCHED = """
 from modeler.cli.console import Console
-from modeler.types import Fusing, Refining
-with Console(3, None) as console:
-    console(Fusing())
-    for done in range(8):
-        console(Refining(done, 7))
+from modeler.types import Fusing, Refining, Searching
+with Console(25, None) as console:
+    for event in {}: console(event)
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
-def test_a_terminal_sees_what_is_done_after_the_last_frame() -> None:
-    said = on_a_terminal([sys.executable, "-c", ENDING])
-    assert "registering more pairs" in said
-    assert "7/7" in said
+@pytest.mark.parametrize(
+    ("events", "told"),
+    [("[Searching(12)]", "frame 12"), ("[Fusing(), *(Refining(done, 7) for done in range(8))]", "7/7")],
+)
+def test_a_terminal_sees_which_frame_is_tried_again_and_what_follows_the_last(events: str, told: str) -> None:
+    assert told in on_a_terminal([sys.executable, "-c", WATCHED.format(events)])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
 def test_a_terminal_sees_how_far_it_is_and_how_long_it_takes() -> None:
-    said = on_a_terminal(COMMAND)
-    assert "reading" in said
+    said = on_a_terminal([*COMMAND, "info", str(bundled("tube"))])
     assert "14/14" in said
     assert "0:00:0" in said  # gone by, and to go
-    assert Path(COMMAND[-1]).name not in said  # data goes to stdout
-
-
-# The bar tells of a frame that is being tried again; without a bar nothing is said of it.
-
-
-_SEARCHING = """
-from modeler.cli.console import Console
-from modeler.types import Searching
-with Console(25, None) as console: console(Searching(12))
-"""
-
-
-def test_somebody_who_watches_sees_which_frame_is_tried_again() -> None:
-    ours, theirs = pty.openpty()
-    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120"}
-    with subprocess.Popen([sys.executable, "-c", _SEARCHING], stderr=theirs, env=environment) as process:
-        os.close(theirs)
-        said = b""
-        while select.select([ours], [], [], 60.0)[0]:
-            try:
-                piece = os.read(ours, 4096)
-            except OSError:  # the other end is closed
-                break
-            if not piece:
-                break
-            said += piece
-    os.close(ours)
-    assert process.returncode == 0
-    assert b"trying frame 12 again" in said
+    assert "tube" not in said  # data goes to stdout
 
 
 def test_nobody_is_told_where_there_is_no_bar(capfd: pytest.CaptureFixture[str]) -> None:
@@ -190,3 +163,64 @@ def test_nobody_is_told_where_there_is_no_bar(capfd: pytest.CaptureFixture[str])
         console(Searching(12))
     said = capfd.readouterr()
     assert (said.out, said.err) == ("", "")
+
+
+# Streams, signals and limits.
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", "<&- >&- 2>&-"])
+def test_a_stream_that_is_closed_changes_no_status(closed: str) -> None:
+    for arguments, status in ((["info", BOX], 0), (["view", "/nowhere"], 2)):
+        ended = subprocess.run(
+            ["sh", "-c", f'"$@" {closed}', "sh", *COMMAND, *arguments], capture_output=True, text=True, check=False
+        )
+        assert ended.returncode == status
+        assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_messages_that_cannot_be_written_change_no_status() -> None:
+    for arguments, status in ((["info", BOX], 0), (["view", "/nowhere"], 2), (["biuld"], 2)):
+        with Path("/dev/full").open("w") as full:
+            ended = subprocess.run(
+                [*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=full, check=False, timeout=120
+            )
+        assert ended.returncode == status
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("NUMBA_NUM_THREADS", "0"), ("NUMBA_NUM_THREADS", "many"), ("NUMBA_DISABLE_JIT", "1")]
+)
+def test_settings_under_which_nothing_can_be_computed_are_said(name: str, value: str) -> None:
+    ended = subprocess.run(
+        [*COMMAND, "info", BOX], env={**os.environ, name: value}, capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
+    assert name in ended.stderr
+
+
+@pytest.mark.parametrize("after_s", [0.05, 0.2, 0.4, 0.8])
+def test_ctrl_c_during_imports_leaves_no_traceback(after_s: float) -> None:
+    with subprocess.Popen([*COMMAND, "info", BOX], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        time.sleep(after_s)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=120)
+    if process.returncode in (130, -signal.SIGINT, 0):
+        assert said in (b"", b"modeler: interrupted\n")
+    else:  # Python itself was not ready to be asked
+        assert b"modeler/cli" not in said
+
+
+@pytest.mark.parametrize("error", ["MemoryError()", 'RuntimeError("can\'t start new thread")', "OSError(12, 'x')"])
+def test_exhausted_memory_or_threads_are_said_in_one_line(error: str) -> None:
+    program = f"""
+import sys
+import modeler.cli.info
+def run(self):
+    raise {error}
+modeler.cli.info.Info.run = run
+sys.exit(modeler.cli.main(["info", "x"]))
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
+    assert "memory or threads" in ended.stderr

@@ -1,0 +1,171 @@
+"""What is done to a fused mesh: closing it on its table, smoothing, and wrapping images around it."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import tabletop
+import trimesh
+
+from modeler import se3
+from modeler.export.texture import PIECE, textured
+from modeler.fusion import Fuser, FusionVolume, meshing, watertight
+from modeler.types import Array, ObjectModel, Plane
+
+VOXEL_M = 0.0025
+FUSER = Fuser(voxel_m=VOXEL_M)
+BRICK = tabletop.Box((0.07, 0.05, 0.04))
+POSES = tabletop.turntable(14)
+
+
+def plane(camera_from_model: Array, height_m: float = -BRICK.half_m[2]) -> Plane:
+    """Return a level plane of the model frame as a camera sees it."""
+    normal = camera_from_model[:3, 2]
+    return Plane(normal, float(-normal @ (camera_from_model[:3, 3] + height_m * normal)), 0.005, 0.001)
+
+
+def volume_of(planes: list[Plane], object_from_model: Array | None = None) -> FusionVolume:
+    views = tabletop.views(BRICK, POSES)
+    views = {k: replace(view, plane=planes[k]) for k, view in views.items()}
+    return FUSER.volume(views, tabletop.trajectory(POSES, object_from_model))
+
+
+def support_planes_of(volume: FusionVolume) -> Array:
+    return watertight.support_planes(volume.views, volume.grid.corners_m, volume.tau_m)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_watertight_model_stands_on_its_table(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    object_from_model = se3.exp(rng.normal(size=6) * [1, 1, 1, 0.1, 0.1, 0.1])
+    model = volume_of([plane(pose) for pose in POSES], object_from_model).model(watertight=True)
+    mesh = trimesh.Trimesh(model.vertices_m, model.triangles, process=False)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(8.0 * np.prod(BRICK.half_m), rel=0.01)
+    vertices_m = se3.transform(se3.inverse(object_from_model), model.vertices_m)
+    assert model.vertex_views is not None
+    under = (np.abs(vertices_m[:, :2]) < 0.04).all(axis=1) & (vertices_m[:, 2] < 0.0)
+    assert (model.vertex_views[under] == 0).all()
+    np.testing.assert_allclose(vertices_m[under, 2], -BRICK.half_m[2], atol=0.5 * VOXEL_M)
+    assert vertices_m[:, 2].min() > -BRICK.half_m[2] - 0.25 * VOXEL_M  # smoothing rounds edges
+
+
+def test_planes_that_are_alike_are_one_table_and_one_view_makes_none() -> None:
+    rng = np.random.default_rng(0)
+    planes = [plane(pose, -BRICK.half_m[2] + rng.normal(0.0, 3e-4)) for pose in POSES]
+    (table,) = support_planes_of(volume_of(planes))
+    np.testing.assert_allclose(table, [0.0, 0.0, 1.0, BRICK.half_m[2]], atol=3e-4)
+    wrong = replace(planes[5], offset_m=planes[5].offset_m - 0.03)
+    (same,) = support_planes_of(volume_of([*planes[:5], wrong, *planes[6:]]))
+    np.testing.assert_allclose(same, table, atol=3e-4)
+
+
+def test_an_object_that_lay_two_ways_stood_on_two_tables() -> None:
+    on_end = [
+        Plane(pose[:3, 0], float(-pose[:3, 0] @ (pose[:3, 3] - 0.07 * pose[:3, 0])), 0.005, 1e-3) for pose in POSES
+    ]
+    found = support_planes_of(volume_of([plane(pose) if k < 9 else on_end[k] for k, pose in enumerate(POSES)]))
+    np.testing.assert_allclose(found, [[0.0, 0.0, 1.0, 0.04], [1.0, 0.0, 0.0, 0.07]], atol=1e-9)
+
+
+def test_what_reaches_below_a_plane_does_not_stand_on_it() -> None:
+    volume = volume_of([plane(pose, -0.02) for pose in POSES])
+    assert len(support_planes_of(volume)) == 0
+    low_m = volume.model(watertight=True).vertices_m[:, 2].min()
+    assert low_m < -0.035
+
+
+# Smoothing of meshes: where views know the surface badly, and along the seam with what is made up.
+
+RADIUS_M, NOISE_M = 0.05, 0.0004
+BALL = trimesh.creation.icosphere(5, RADIUS_M)
+TRIANGLES = np.asarray(BALL.faces, dtype=np.int64)
+EDGE_M = float(np.mean(BALL.edges_unique_length))
+
+
+def rough(rng: np.random.Generator) -> Array:
+    """Return the ball's vertices, off along their normals."""
+    return np.asarray(BALL.vertices * (1.0 + rng.normal(0.0, NOISE_M / RADIUS_M, (len(BALL.vertices), 1))))
+
+
+def off_m(vertices_m: Array) -> Array:
+    return np.linalg.norm(vertices_m, axis=1) - RADIUS_M
+
+
+def test_only_vertices_asked_for_are_smoothed_and_nothing_shrinks(rng: np.random.Generator) -> None:
+    vertices_m = rough(rng)
+    before_m = vertices_m.copy()
+    only = vertices_m[:, 2] > 0.0
+    smooth_m = meshing.taubin_smoothed(vertices_m, TRIANGLES, meshing.WEAK_PASSES, only)
+    np.testing.assert_array_equal(smooth_m[~only], before_m[~only])
+    np.testing.assert_array_equal(vertices_m, before_m)
+    assert off_m(smooth_m[only]).std() < 0.5 * off_m(before_m[only]).std()
+    assert abs(off_m(smooth_m[only]).mean()) < 1e-3 * RADIUS_M
+    everywhere_m = meshing.taubin_smoothed(vertices_m, TRIANGLES, 3)
+    np.testing.assert_allclose(
+        meshing.taubin_smoothed(vertices_m, TRIANGLES, 3, np.ones_like(only)), everywhere_m, atol=1e-12
+    )
+
+
+def test_grown_marks_reach_as_many_rings_as_asked() -> None:
+    one = np.zeros(len(BALL.vertices), dtype=bool)
+    one[0] = True
+    np.testing.assert_array_equal(meshing.dilated(one, TRIANGLES, 0), one)
+    ring = meshing.dilated(one, TRIANGLES, 1)
+    assert set(np.flatnonzero(ring)) == {0, *BALL.vertex_neighbors[0]}
+    np.testing.assert_array_equal(meshing.dilated(one, TRIANGLES, 2), meshing.dilated(ring, TRIANGLES, 1))
+
+
+@pytest.mark.parametrize("weak_above_m", [np.inf, 0.03])
+def test_crumbs_along_the_seam_and_where_views_know_little_are_smoothed(
+    rng: np.random.Generator, weak_above_m: float
+) -> None:
+    """The upper half was seen, with crumbs along the equator."""
+    vertices_m = rough(rng)
+    crumbs = (np.abs(vertices_m[:, 2]) < 2.0 * EDGE_M) & (rng.random(len(vertices_m)) < 0.3)
+    vertices_m[crumbs] *= 1.0 + 0.5 * EDGE_M / RADIUS_M
+    seen_m = vertices_m[vertices_m[:, 2] > 0.0]
+    weak = seen_m[:, 2] > weak_above_m
+    found_m, triangles, shown = watertight.cleaned(vertices_m, TRIANGLES, seen_m, weak, voxel_m=0.5 * EDGE_M, passes=0)
+    np.testing.assert_array_equal(np.sort(triangles), np.sort(TRIANGLES))
+    np.testing.assert_array_equal(shown, vertices_m[:, 2] > 0.0)
+    equator = np.abs(vertices_m[:, 2]) < EDGE_M
+    assert off_m(found_m[equator]).std() < 0.5 * off_m(vertices_m[equator]).std()
+    top, between = vertices_m[:, 2] > 0.035, (vertices_m[:, 2] > 0.015) & (vertices_m[:, 2] < 0.025)
+    np.testing.assert_array_equal(found_m[between], vertices_m[between])
+    if np.isinf(weak_above_m):
+        np.testing.assert_array_equal(found_m[top], vertices_m[top])
+    else:
+        assert off_m(found_m[top]).std() < 0.5 * off_m(vertices_m[top]).std()
+
+
+# Images wrapped around meshes: in pieces, so that large ones take no longer than many small ones.
+
+
+def test_a_mesh_of_many_triangles_is_unwrapped_in_pieces_without_overlap() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
+    nothing = np.zeros((0, 3))
+    model = ObjectModel(
+        points_m=nothing,
+        normals=nothing,
+        colours=None,
+        vertices_m=np.asarray(ball.vertices),
+        triangles=np.asarray(ball.faces, dtype=np.int64),
+        vertex_normals=np.asarray(ball.vertices) / 0.05,
+        vertex_colours=None,
+    )
+    assert len(model.triangles) > 3 * PIECE
+
+    def paint(points_m: Array, _: Array) -> npt.NDArray[np.uint8]:
+        return np.rint(127.5 + 2400.0 * points_m).clip(0.0, 255.0).astype(np.uint8)
+
+    wrapped, texture = textured(model, paint, 5e-4)
+    corners, before = wrapped.vertices_m[wrapped.triangles], model.vertices_m[model.triangles]
+    assert sorted(map(tuple, corners.mean(axis=1).round(9))) == sorted(map(tuple, before.mean(axis=1).round(9)))
+    # Were two charts on top of each other, the image would show the colours of one of them only.
+    middle = texture.uv[wrapped.triangles].mean(axis=1)
+    height, width = texture.image.shape[:2]
+    rows, columns = ((1.0 - middle[:, 1]) * height).astype(int), (middle[:, 0] * width).astype(int)
+    shown = texture.image[rows, columns].astype(int)
+    assert np.abs(shown - paint(corners.mean(axis=1), corners[:, 0])).max() <= 6
