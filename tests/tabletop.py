@@ -80,6 +80,12 @@ def turntable(count: int, tilt_deg: float = 25.0) -> list[Array]:
     return [upright @ se3.exp(np.array([0, 0, 2.0 * np.pi * k / count, 0, 0, 0])) for k in range(count)]
 
 
+BALL = Sphere(0.06)
+BRICK = Box((0.07, 0.05, 0.04))
+PLATE = Box((0.06, 0.0025, 0.05))
+POSES = turntable(14)
+
+
 def view(
     body: Body, camera_from_model: Array, index: int, *, rng: np.random.Generator | None = None, table: bool = True
 ) -> RayImage:
@@ -138,3 +144,11 @@ def visible(body: Body, poses: list[Array]) -> Array:
 def inside(points: Array, low: Array, high: Array) -> BoolArray:
     """Return which points (n, 3) lie in a box."""
     return np.all((points >= low) & (points <= high), axis=1)
+
+
+def edge_uses(triangles: np.ndarray) -> np.ndarray:
+    """Return how often each edge of a mesh occurs in each direction, as two counts (e, 2)."""
+    directed = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges, number = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
+    forward = directed[:, 0] < directed[:, 1]
+    return np.stack([np.bincount(number[forward == side], minlength=len(edges)) for side in (True, False)], axis=1)

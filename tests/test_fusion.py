@@ -1,4 +1,4 @@
-"""Fusion: laws of the kernels, and what a fused model owes to the views."""
+"""What a fused model owes to the views."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,34 +9,20 @@ import open3d as o3d
 import pytest
 import tabletop
 import trimesh
-from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
+from tabletop import BALL, BRICK, PLATE, POSES, edge_uses
 
 from modeler import se3
-from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances, meshing
-from modeler.fusion.depth_views import depth_views, disagreement, posed_views
-from modeler.fusion.distance_field import DistanceField, VoxelGrid
-from modeler.fusion.support import exposure_gains
-from modeler.kernels import marching_cubes, occupancy, point_clouds, tsdf
+from modeler.fusion import Fuser, IncrementalTsdf, meshing
 from modeler.rays import Sensor
 from modeler.types import (
-    Edge,
     Frame,
     InputError,
     ObjectModel,
-    Outcome,
-    PoseGaussian,
-    Posterior,
     RayImage,
-    Solution,
-    Stated,
 )
 from sequences.bop import BopSequence
 
-BALL = tabletop.Sphere(0.06)
-BRICK = tabletop.Box((0.07, 0.05, 0.04))
-PLATE = tabletop.Box((0.06, 0.0025, 0.05))
-POSES = tabletop.turntable(14)
 VOXEL_M = 0.0025
 FUSER = Fuser(voxel_m=VOXEL_M)
 
@@ -64,238 +50,11 @@ def on_surface(model: ObjectModel, count: int = 20000):
     return np.einsum("nk,nkc->nc", share, model.vertices_m[chosen])
 
 
-def edge_uses(triangles):
-    """Return how often each edge of a mesh occurs in each direction, as two counts (e, 2)."""
-    directed = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    edges, number = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
-    forward = directed[:, 0] < directed[:, 1]
-    return np.stack([np.bincount(number[forward == side], minlength=len(edges)) for side in (True, False)], axis=1)
-
-
 def same(one: ObjectModel, other: ObjectModel) -> bool:
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in vars(one))
 
 
-# The kernels.
-
-
-def test_thinning_puts_points_of_one_voxel_together(rng):
-    points, weights = rng.uniform(0.0, 0.1, (500, 3)), rng.uniform(0.1, 1.0, 500)
-    cells, count = point_clouds.voxel_numbers(points, np.zeros(3), 0.02, np.array([5, 5, 4]))
-    voxels = np.floor(points / 0.02).astype(int)
-    outside = voxels[:, 2] >= 4
-    assert np.array_equal(cells == -1, outside)
-    kept, numbers = voxels[~outside], cells[~outside]
-    assert count == len(np.unique(kept, axis=0)) == numbers.max() + 1
-    assert len(np.unique(np.column_stack([kept, numbers]), axis=0)) == count
-    sums, totals = point_clouds.voxel_sums(cells, count, weights, points)
-    for cell in range(count):
-        mine = cells == cell
-        np.testing.assert_allclose(sums[cell], weights[mine] @ points[mine])
-        np.testing.assert_allclose(totals[cell], weights[mine].sum())
-
-
-def test_crowd_counts_the_points_in_the_cells_around(rng):
-    points = rng.uniform(0.0, 0.1, (200, 3))
-    cells = np.floor(points / 0.01).astype(int)
-    expected = [(np.abs(cells - cell).max(axis=1) <= 1).sum() for cell in cells]
-    assert np.array_equal(point_clouds.neighbour_counts(points, np.zeros(3), 0.01, np.array([10, 10, 10])), expected)
-
-
-def test_blocks_near_are_those_that_a_cube_around_a_point_touches(rng):
-    points, shape, reach_m = rng.uniform(0.0, 1.0, (20, 3)), np.array([9, 10, 11]), 0.03
-    found = tsdf.blocks_near(points, np.zeros(3), 0.1, reach_m, shape)
-    blocks = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), axis=-1).reshape(-1, 3)
-    gap = np.maximum(blocks * 0.1 - points[:, None], points[:, None] - (blocks + 1) * 0.1).max(axis=2)
-    assert np.array_equal(found, blocks[(gap <= reach_m).any(axis=0)])
-
-
-def test_surfels_of_a_plane_lie_in_it():
-    camera = tabletop.CAMERA
-    w, h = camera.rays()
-    normal = np.array([0.4, -0.3, -0.8]) / np.linalg.norm([0.4, -0.3, -0.8])
-    depth_m = (normal @ [0.0, 0.0, 0.8]) / (w * normal[0] + h * normal[1] + normal[2])
-    mask = np.ones(depth_m.shape, dtype=bool)
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    points, normals = point_clouds.fitted_planes(depth_m.astype(np.float32), np.argwhere(mask), mask, lens, 1e-5, 5.0)
-    np.testing.assert_allclose((points - [0.0, 0.0, 0.8]) @ normal, 0.0, atol=1e-6)
-    assert np.degrees(np.arccos((normals @ normal).clip(-1, 1))).max() < 1.5  # it leans to the camera a little
-
-
-def test_a_pixel_that_hangs_in_the_air_has_no_surfel():
-    depth_m = np.full((9, 9), 0.8, dtype=np.float32)
-    depth_m[4, 4] = 0.75
-    _, normals = point_clouds.fitted_planes(
-        depth_m, np.array([[4, 4], [2, 2]]), depth_m > 0, np.array([200.0, 200.0, 4.0, 4.0]), 1e-3, 5.0
-    )
-    assert np.array_equal(np.any(normals != 0.0, axis=1), [False, True])
-
-
-def naive_side(votes, remaining, tau_m):
-    """Twin of `tsdf.dominant_vote`."""
-    score = {k: votes[k][1] * (1.01 - abs(votes[k][0]) / tau_m) for k in remaining}
-    best = max(remaining, key=lambda k: score[k])
-    if votes[best][0] >= 0:
-        return best
-    rivals = [k for k in remaining if votes[k][0] > 0 and votes[k][2] @ votes[best][2] < tsdf.SAME_SIDE]
-    rivals = [k for k in rivals if score[k] > 0.3 * score[best]]
-    return max(rivals, key=lambda k: score[k], default=best)
-
-
-def naive_wall(voxel, vote, other, views):
-    """Return whether a vote is for surface that hides a voxel from the view of another vote."""
-    index, _, poses, intrinsics, points, normals, _ = views
-    along, _, normal, point, f = other
-    camera = -poses[vote[4], :, :3].T @ poses[vote[4], :, 3]
-    if along >= 0 or normal @ (camera - point) <= 0:
-        return False
-    way = camera - voxel
-    crossing = voxel + way * (normal @ (point - voxel)) / (normal @ way)
-    x, y, z = poses[f, :, :3] @ crossing + poses[f, :, 3]
-    column, row = round(intrinsics[f, 0] * x / z + intrinsics[f, 2]), round(intrinsics[f, 1] * y / z + intrinsics[f, 3])
-    if not (0 <= row < index.shape[1] and 0 <= column < index.shape[2]):
-        return False
-    n = index[f, row, column]
-    return n >= 0 and normals[n] @ normal > tsdf.SAME_SIDE and abs(normals[n] @ (crossing - points[n])) < -along
-
-
-def naive_integrate(voxels, tau_m, empty_weight, views):
-    """Twin of `tsdf.integrate` for single voxels (n, 3)."""
-    index, free_m, poses, intrinsics, points, normals, weights = views
-    values, totals = np.zeros(len(voxels)), np.zeros(len(voxels))
-    for number, voxel in enumerate(voxels):
-        votes, emptiness = [], 0.0
-        for f in range(len(index)):
-            x, y, z = poses[f, :, :3] @ voxel + poses[f, :, 3]
-            column = round(intrinsics[f, 0] * x / z + intrinsics[f, 2])
-            row = round(intrinsics[f, 1] * y / z + intrinsics[f, 3])
-            if not (0 <= row < index.shape[1] and 0 <= column < index.shape[2]):
-                continue
-            n = index[f, row, column]
-            along = normals[n] @ (voxel - points[n]) if n >= 0 else 2 * tau_m
-            if abs(along) <= tau_m:
-                votes.append((along, weights[n] * min(1.0, 1.5 * (1 + along / tau_m) + 1e-3), normals[n], points[n], f))
-            elif along > 0 and z < free_m[f, row, column] - tau_m:
-                emptiness += empty_weight
-        remaining = list(range(len(votes)))
-        values[number], totals[number] = (tau_m, emptiness) if emptiness else (0.0, 0.0)
-        while remaining:
-            best = naive_side(votes, remaining, tau_m)
-            side = [k for k in remaining if votes[k][2] @ votes[best][2] > tsdf.SAME_SIDE]
-            values[number], totals[number] = tau_m * emptiness, emptiness + sum(votes[k][1] for k in side)
-            values[number] = (values[number] + sum(votes[k][1] * votes[k][0] for k in side)) / totals[number]
-            against = [k for k in remaining if k not in side and naive_wall(voxel, votes[best], votes[k], views)]
-            if len(against) < tsdf.MAJORITY * len(side):
-                break
-            remaining = [k for k in remaining if k not in side]
-            values[number], totals[number] = tau_m, emptiness
-    return values, totals
-
-
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize(("one_mind", "turned_rad"), [(0.0, 1.0), (0.9, 0.4)])
-def test_integration_is_its_twin(seed, one_mind, turned_rad, monkeypatch):
-    rng = np.random.default_rng(seed)
-    frames, height, width, count = 12, 12, 14, 156
-    own = count // frames  # points of a view
-    poses = np.stack(
-        [
-            (se3.translation(np.array([0, 0, 0.5])) @ se3.exp(rng.normal(0, turned_rad, 6) * [1, 1, 1, 0, 0, 0]))[:3]
-            for _ in range(frames)
-        ]
-    )
-    normals = rng.normal(size=(count, 3))
-    normals[rng.random(count) < one_mind] = [0.1, 0.1, -1.0]
-    views = (
-        np.stack(
-            [
-                np.where(rng.random((height, width)) < 0.1, -1, rng.integers(own * k, own * (k + 1), (height, width)))
-                for k in range(frames)
-            ]
-        ).astype(np.int32),
-        rng.uniform(0.4, 0.7, (frames, height, width)).astype(np.float32),
-        poses,
-        np.tile([150.0, 160.0, 6.5, 5.5], (frames, 1)),
-        rng.uniform(-0.02, 0.02, (count, 3)),
-        normals / np.linalg.norm(normals, axis=1, keepdims=True),
-        rng.uniform(0.01, 1.0, count),
-    )
-    blocks = rng.permutation(np.stack(np.meshgrid(*[np.arange(2)] * 3), axis=-1).reshape(-1, 3))
-    origin, voxel_m, tau_m = np.full(3, -0.02), 0.04 / (2 * tsdf.SIDE), 0.015
-    values, totals = tsdf.integrate(blocks, origin, voxel_m, tau_m, 0.3, np.arange(count) // own, *views)
-    inner = np.stack(np.meshgrid(*[np.arange(tsdf.SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    voxels = origin + ((blocks[:, None] * tsdf.SIDE + inner).reshape(-1, 3) + 0.5) * voxel_m
-    expected_values, expected_totals = naive_integrate(voxels, tau_m, 0.3, views)
-    assert 0.0 < (expected_totals > 0.0).mean() <= 1.0
-    np.testing.assert_allclose(totals.ravel(), expected_totals, rtol=1e-5)
-    np.testing.assert_allclose(values.ravel(), expected_values, rtol=1e-4, atol=1e-8)
-    monkeypatch.setattr(tsdf, "MAJORITY", 1000)  # of the twin alone
-    if one_mind:  # some votes were rejected
-        assert np.any(naive_integrate(voxels, tau_m, 0.3, views)[1] != expected_totals)
-
-
 # The zero level.
-
-
-def level_of(values):
-    weights = np.zeros(values.shape, dtype=np.float32)
-    weights[1:-1, 1:-1, 1:-1] = 1.0
-    return marching_cubes.extract(values.astype(np.float32), weights, np.argwhere(weights > 0))
-
-
-def test_every_crossed_edge_of_a_cell_belongs_to_one_piece_of_at_least_three():
-    for case, pieces in enumerate(marching_cubes.PIECES):
-        for edge, piece in enumerate(pieces):
-            axis, a, b = edge // 4, edge >> 1 & 1, edge & 1
-            start = int(np.insert([a, b], axis, 0) @ [4, 2, 1])
-            crossed = (case >> start & 1) != (case >> (start + [4, 2, 1][axis]) & 1)
-            assert (piece >= 0) == crossed
-        assert all((pieces == piece).sum() >= 3 for piece in range(pieces.max() + 1))
-
-
-def test_the_zero_level_of_a_ball_is_a_sphere_seen_from_outside():
-    grid = np.stack(np.meshgrid(*[np.arange(40.0)] * 3, indexing="ij"), axis=-1)
-    vertices, triangles = level_of(np.linalg.norm(grid - 19.3, axis=-1) - 12.4)
-    assert np.abs(np.linalg.norm(vertices - 19.3, axis=1) - 12.4).max() < 0.05
-    assert np.array_equal(edge_uses(triangles), np.ones((len(triangles) * 3 // 2, 2)))  # closed, one orientation
-    corners = vertices[triangles]
-    volume = np.linalg.det(corners).sum() / 6.0
-    assert volume == pytest.approx(4.0 / 3.0 * np.pi * 12.4**3, rel=0.01)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_zero_level_of_any_field_is_closed_inside_the_grid(seed):
-    rng = np.random.default_rng(seed)
-    values = gaussian_filter(rng.normal(size=(24, 24, 24)), 1.0)
-    values[[1, 2, -2, -3]] = values[:, [1, 2, -2, -3]] = values[:, :, [1, 2, -2, -3]] = 1.0
-    _, triangles = level_of(values)
-    uses = edge_uses(triangles)
-    assert len(triangles) > 1000
-    assert np.array_equal(uses[:, 0], uses[:, 1])
-
-
-def test_the_zero_level_stays_open_where_nothing_is_known():
-    values = np.broadcast_to(np.arange(16.0) - 7.5, (16, 16, 16)).astype(np.float32)
-    weights = np.zeros(values.shape, dtype=np.float32)
-    weights[2:9, 3:13, 1:15] = 1.0
-    vertices, triangles = marching_cubes.extract(values, weights, np.argwhere(weights > 0))
-    assert np.allclose(vertices[:, 2], 7.5)
-    used = vertices[np.unique(triangles)]
-    assert np.array_equal(used.min(axis=0), [2.5, 3.5, 7.5])
-    assert np.array_equal(used.max(axis=0), [7.5, 11.5, 7.5])
-
-
-def test_gaps_are_filled_but_borders_do_not_grow():
-    values = np.zeros((14, 14, 14), dtype=np.float32) + 0.5
-    weights = np.zeros_like(values)
-    weights[2:12, 2:12, 2:12] = 1.0
-    weights[6, 6, 6] = 0.0
-    cells, means = marching_cubes.fill(values, weights, np.argwhere(weights > 0), 15)
-    assert np.array_equal(cells, [[6, 6, 6]])
-    assert means == pytest.approx([0.5])
-
-
-# The model.
 
 
 def test_the_mesh_is_the_surface_that_was_seen(ball, brick):
@@ -336,33 +95,6 @@ def test_fusing_averages_the_noise_of_the_views(rng):
     mesh, cloud = (BRICK.distance(points) for points in (on_surface(model), model.points_m))
     assert np.sqrt(np.mean(mesh**2)) < 0.5e-3  # half of a pixel's noise
     assert np.sqrt(np.mean(cloud**2)) < 1e-3
-
-
-CORNERS_M = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
-
-
-def disagreement_m(views, trajectory):
-    pairs = posed_views(views, trajectory)
-    found = disagreement(depth_views(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1), 0.02)
-    return float("nan") if found is None else found[0]
-
-
-def test_views_asked_in_batches_disagree_by_the_same(rng, monkeypatch):
-    trajectory, noisy = tabletop.trajectory(POSES), tabletop.views(BRICK, POSES, rng)
-    at_once = disagreement_m(noisy, trajectory)
-    monkeypatch.setattr("modeler.fusion.depth_views.BATCH", 100 * len(POSES))
-    assert disagreement_m(noisy, trajectory) == at_once
-
-
-def test_views_disagree_by_their_noise_and_the_error_of_their_poses(rng):
-    trajectory = tabletop.trajectory(POSES)
-    exact, noisy = tabletop.views(BRICK, POSES), tabletop.views(BRICK, POSES, rng)
-    assert disagreement_m(exact, trajectory) < 1e-4
-    # Two pixels with 1 mm along the ray each: less by the cosine along the normal.
-    assert 0.4e-3 < disagreement_m(noisy, trajectory) < np.sqrt(2.0) * 1e-3
-    off = {k: se3.translation(rng.normal(0.0, 3e-3, 3)) @ pose for k, pose in trajectory.items()}
-    assert 2e-3 < disagreement_m(exact, off) < 6e-3
-    assert np.isnan(disagreement_m({0: exact[0]}, trajectory))  # nobody to disagree with
 
 
 def test_surface_survives_poses_that_are_off_by_more_than_the_noise(rng):
@@ -590,24 +322,6 @@ def test_a_pose_that_is_unsure_counts_less():
     assert same(alike, blind)
 
 
-def test_conditional_covariances_do_not_know_of_drift(rng):
-    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-6
-
-    def edge(target, source, *, accepted=True):
-        pose = PoseGaussian(se3.exp(rng.normal(size=6)), covariance)
-        return Edge(Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.9), "odometry", accepted, Stated(""))
-
-    edges = [edge(2, 5), edge(5, 6), edge(6, 9, accepted=False), edge(2, 6)]
-    solution = Solution(trajectory={k: np.eye(4) for k in (2, 5, 6)}, outliers=(edges[3],))
-    own = conditional_covariances(solution, edges)
-    assert set(own) == {2, 5, 6}
-    np.testing.assert_allclose(own[6], covariance)
-    np.testing.assert_allclose(own[2], edges[0].posterior.pose.inverse().covariance)
-    both = np.linalg.inv(covariance) + np.linalg.inv(edges[1].posterior.pose.inverse().covariance)
-    np.testing.assert_allclose(own[5], np.linalg.inv(both))
-    assert conditional_covariances(Solution(trajectory={0: np.eye(4)}), []) == {}
-
-
 def dimmed(view: RayImage, factor: float) -> RayImage:
     assert view.frame.colour is not None
     return replace(view, frame=replace(view.frame, colour=(view.frame.colour * factor).astype(np.uint8)))
@@ -621,20 +335,6 @@ def test_differences_of_exposure_are_evened_out(brick):
     ratio = np.log(model.vertex_colours / brick.vertex_colours).mean(axis=1)
     assert np.std(ratio) < 0.03  # against 0.2 between the frames
     assert np.exp(ratio.mean()) == pytest.approx(0.79, abs=0.05)
-
-
-def test_sharp_views_have_more_say_in_colours_than_blurred_ones(rng):
-    def textured(view: RayImage, spread: int) -> RayImage:
-        levels = 120 + rng.integers(-spread, spread + 1, view.frame.depth_m.shape)
-        return replace(view, frame=replace(view.frame, colour=np.repeat(levels[..., None], 3, axis=2).astype(np.uint8)))
-
-    views = {k: textured(view, 60 if k % 3 else 20) for k, view in tabletop.views(BRICK, POSES).items()}
-    seen = depth_views(
-        posed_views(views, tabletop.trajectory(POSES)), CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1
-    )
-    say = exposure_gains(seen, seen.points_m, seen.normals, tau_m=0.005, near_m=0.003)[:, 3]
-    sharp = np.arange(len(POSES)) % 3 > 0
-    np.testing.assert_allclose(say[~sharp] / say[sharp].mean(), 20.0 / 60.0, rtol=0.15)
 
 
 def test_a_view_without_colour_leaves_the_colours_to_others(brick):
@@ -664,96 +364,6 @@ def test_what_stands_right_before_the_background_is_carved():
     # Of 40 mm there is left what others see within a margin of two pixels beside the brick, 15 mm on a table seen flat.
     assert BRICK.distance(model.vertices_m).max() < 0.018
     assert BRICK.distance(model.points_m).max() < 0.018
-
-
-# Closing what nobody saw.
-
-
-def test_views_find_cells_empty_at_a_surface_or_hidden():
-    free_m = np.full((2, 40, 40), 0.8, dtype=np.float32)
-    free_m[1] = 0.0
-    poses = np.tile(np.eye(4)[:3], (2, 1, 1))
-    intrinsics = np.tile([20.0, 20.0, 19.5, 19.5], (2, 1))
-    planes = np.array([[np.nan] * 4, [0.0, -1.0, 0.0, 0.1]])  # y points down: the table is 0.1 m below
-    shape = np.array([10, 10, 10])
-    counts = occupancy.observation_counts(
-        np.array([-0.25, -0.25, 0.5]), 0.05, shape, 0.05, free_m, poses, intrinsics, planes
-    )
-    centres = np.array([-0.25, -0.25, 0.5]) + 0.05 * (np.argwhere(np.ones(shape)) + 0.5)
-    below = centres[:, 1] > 0.15
-    assert np.array_equal(counts[0].ravel(), (centres[:, 2] < 0.75).astype(int) + below)
-    assert np.array_equal(counts[1].ravel(), np.abs(centres[:, 2] - 0.8) < 0.05)
-    assert np.array_equal(counts[2].ravel(), centres[:, 2] > 0.85)
-
-
-def test_the_smallest_surface_across_an_open_tube_is_flat():
-    size = 30
-    start, fixed = np.ones((size, size, size), dtype=np.float32), np.zeros((size, size, size), dtype=bool)
-    x, y, z = np.meshgrid(*[np.arange(size)] * 3, indexing="ij")
-    for axis in (x, y, z):
-        fixed |= (axis == 0) | (axis == size - 1)
-    radius = np.hypot(x - 14.5, y - 14.5)
-    wall = (z >= 8) & (z < 24) & (np.abs(radius - 8.0) <= 2.0)
-    lid = (z >= 22) & (z < 26) & (radius < 10.0)
-    fixed |= wall | lid
-    start[(wall & (radius < 8.0)) | (lid & (z < 24) & (radius < 8.0))] = -1.0
-    start[~fixed & (radius < 8.0)] = -1.0  # spills out of the open end, as far as it goes
-    decided = occupancy.minimal_surface(start, fixed, 600)
-    assert np.array_equal(decided[fixed], start[fixed])
-    core = radius < 5.0
-    assert (decided[core & (z >= 10) & (z < 22)] < -0.5).all()
-    assert (decided[core & (z < 6)] > 0.5).all()
-
-
-def test_a_watertight_model_is_closed_and_marks_what_it_made_up():
-    for body in (BALL, BRICK, PLATE):
-        views, trajectory = tabletop.views(body, POSES), tabletop.trajectory(POSES)
-        model = FUSER.volume(views, trajectory).model(watertight=True)
-        mesh = trimesh.Trimesh(model.vertices_m, model.triangles, process=False)
-        assert mesh.is_watertight
-        assert mesh.is_winding_consistent
-        assert np.array_equal(edge_uses(model.triangles), np.ones((len(mesh.edges_unique), 2)))
-        assert mesh.body_count == 1
-        assert model.vertex_views is not None
-        assert model.vertex_sigmas_m is not None
-        made_up = model.vertex_views == 0
-        assert np.isinf(model.vertex_sigmas_m[made_up]).all()
-        assert np.quantile(np.abs(body.distance(model.vertices_m[~made_up])), 0.95) < 0.5 * VOXEL_M
-        assert np.abs(body.distance(model.vertices_m)).max() < 0.025
-    # Of a brick, the bottom was made up, and lies where it is.
-    brick = FUSER.volume(tabletop.views(BRICK, POSES), tabletop.trajectory(POSES)).model(watertight=True)
-    assert brick.vertex_views is not None
-    under = brick.vertices_m[:, 2] < -BRICK.half_m[2] + 1e-3
-    core = (np.abs(brick.vertices_m[:, :2]) < 0.04).all(axis=1) & (brick.vertices_m[:, 2] < 0.0)
-    assert (brick.vertex_views[core] == 0).all()
-    assert np.abs(brick.vertices_m[core, 2] + BRICK.half_m[2]).max() < 3.0 * VOXEL_M
-    assert under.any()
-    volume = trimesh.Trimesh(brick.vertices_m, brick.triangles, process=False).volume
-    assert volume == pytest.approx(8.0 * np.prod(BRICK.half_m), rel=0.06)
-
-
-@pytest.mark.parametrize("off", [0, 3])
-def test_one_view_whose_pose_is_off_does_not_hollow_a_watertight_model(off):
-    body, poses = tabletop.Box((0.05, 0.04, 0.07)), tabletop.turntable(14, tilt_deg=0.0)  # neither end is seen
-    trajectory = tabletop.trajectory(poses)
-    trajectory[off] = trajectory[off] @ se3.translation(np.array([0.0, 0.0, 0.03]))
-    views = {k: tabletop.view(body, pose, k, table=False) for k, pose in enumerate(poses)}
-    model = FUSER.volume(views, trajectory).model(watertight=True)
-    volume = trimesh.Trimesh(model.vertices_m, model.triangles, process=False).volume
-    assert volume == pytest.approx(8.0 * np.prod(body.half_m), rel=0.05)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_no_edge_of_a_zero_level_has_more_than_two_triangles(seed):
-    rng = np.random.default_rng(seed)
-    values = gaussian_filter(rng.normal(size=(24, 24, 24)), 0.6).astype(np.float32)
-    weights = np.zeros(values.shape, dtype=np.float32)
-    weights[1:-1, 1:-1, 1:-1] = 1.0
-    field = DistanceField(VoxelGrid(np.zeros(3), 1.0, np.array([6, 6, 6])), values, weights, np.argwhere(weights > 0.0))
-    _, torn = marching_cubes.extract(values, weights, field.known)
-    assert edge_uses(torn).max() > 1
-    _, triangles = meshing.extracted_mesh(field)
-    assert edge_uses(triangles).max() == 1
 
 
 # Rendered sequences with the noise and the flaws of a depth camera.

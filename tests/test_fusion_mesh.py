@@ -7,6 +7,7 @@ import numpy.typing as npt
 import pytest
 import tabletop
 import trimesh
+from tabletop import BALL, BRICK, PLATE, POSES, edge_uses
 
 from modeler import se3
 from modeler.export.texture import PIECE, textured
@@ -15,8 +16,6 @@ from modeler.types import Array, ObjectModel, Plane
 
 VOXEL_M = 0.0025
 FUSER = Fuser(voxel_m=VOXEL_M)
-BRICK = tabletop.Box((0.07, 0.05, 0.04))
-POSES = tabletop.turntable(14)
 
 
 def plane(camera_from_model: Array, height_m: float = -BRICK.half_m[2]) -> Plane:
@@ -76,17 +75,55 @@ def test_what_reaches_below_a_plane_does_not_stand_on_it() -> None:
     assert low_m < -0.035
 
 
+def test_a_watertight_model_is_closed_and_marks_what_it_made_up():
+    for body in (BALL, BRICK, PLATE):
+        views, trajectory = tabletop.views(body, POSES), tabletop.trajectory(POSES)
+        model = FUSER.volume(views, trajectory).model(watertight=True)
+        mesh = trimesh.Trimesh(model.vertices_m, model.triangles, process=False)
+        assert mesh.is_watertight
+        assert mesh.is_winding_consistent
+        assert np.array_equal(edge_uses(model.triangles), np.ones((len(mesh.edges_unique), 2)))
+        assert mesh.body_count == 1
+        assert model.vertex_views is not None
+        assert model.vertex_sigmas_m is not None
+        made_up = model.vertex_views == 0
+        assert np.isinf(model.vertex_sigmas_m[made_up]).all()
+        assert np.quantile(np.abs(body.distance(model.vertices_m[~made_up])), 0.95) < 0.5 * VOXEL_M
+        assert np.abs(body.distance(model.vertices_m)).max() < 0.025
+    # Of a brick, the bottom was made up, and lies where it is.
+    brick = FUSER.volume(tabletop.views(BRICK, POSES), tabletop.trajectory(POSES)).model(watertight=True)
+    assert brick.vertex_views is not None
+    under = brick.vertices_m[:, 2] < -BRICK.half_m[2] + 1e-3
+    core = (np.abs(brick.vertices_m[:, :2]) < 0.04).all(axis=1) & (brick.vertices_m[:, 2] < 0.0)
+    assert (brick.vertex_views[core] == 0).all()
+    assert np.abs(brick.vertices_m[core, 2] + BRICK.half_m[2]).max() < 3.0 * VOXEL_M
+    assert under.any()
+    volume = trimesh.Trimesh(brick.vertices_m, brick.triangles, process=False).volume
+    assert volume == pytest.approx(8.0 * np.prod(BRICK.half_m), rel=0.06)
+
+
+@pytest.mark.parametrize("off", [0, 3])
+def test_one_view_whose_pose_is_off_does_not_hollow_a_watertight_model(off):
+    body, poses = tabletop.Box((0.05, 0.04, 0.07)), tabletop.turntable(14, tilt_deg=0.0)  # neither end is seen
+    trajectory = tabletop.trajectory(poses)
+    trajectory[off] = trajectory[off] @ se3.translation(np.array([0.0, 0.0, 0.03]))
+    views = {k: tabletop.view(body, pose, k, table=False) for k, pose in enumerate(poses)}
+    model = FUSER.volume(views, trajectory).model(watertight=True)
+    volume = trimesh.Trimesh(model.vertices_m, model.triangles, process=False).volume
+    assert volume == pytest.approx(8.0 * np.prod(body.half_m), rel=0.05)
+
+
 # Smoothing of meshes: where views know the surface badly, and along the seam with what is made up.
 
 RADIUS_M, NOISE_M = 0.05, 0.0004
-BALL = trimesh.creation.icosphere(5, RADIUS_M)
-TRIANGLES = np.asarray(BALL.faces, dtype=np.int64)
-EDGE_M = float(np.mean(BALL.edges_unique_length))
+ICOSPHERE = trimesh.creation.icosphere(5, RADIUS_M)
+TRIANGLES = np.asarray(ICOSPHERE.faces, dtype=np.int64)
+EDGE_M = float(np.mean(ICOSPHERE.edges_unique_length))
 
 
 def rough(rng: np.random.Generator) -> Array:
     """Return the ball's vertices, off along their normals."""
-    return np.asarray(BALL.vertices * (1.0 + rng.normal(0.0, NOISE_M / RADIUS_M, (len(BALL.vertices), 1))))
+    return np.asarray(ICOSPHERE.vertices * (1.0 + rng.normal(0.0, NOISE_M / RADIUS_M, (len(ICOSPHERE.vertices), 1))))
 
 
 def off_m(vertices_m: Array) -> Array:
@@ -109,11 +146,11 @@ def test_only_vertices_asked_for_are_smoothed_and_nothing_shrinks(rng: np.random
 
 
 def test_grown_marks_reach_as_many_rings_as_asked() -> None:
-    one = np.zeros(len(BALL.vertices), dtype=bool)
+    one = np.zeros(len(ICOSPHERE.vertices), dtype=bool)
     one[0] = True
     np.testing.assert_array_equal(meshing.dilated(one, TRIANGLES, 0), one)
     ring = meshing.dilated(one, TRIANGLES, 1)
-    assert set(np.flatnonzero(ring)) == {0, *BALL.vertex_neighbors[0]}
+    assert set(np.flatnonzero(ring)) == {0, *ICOSPHERE.vertex_neighbors[0]}
     np.testing.assert_array_equal(meshing.dilated(one, TRIANGLES, 2), meshing.dilated(ring, TRIANGLES, 1))
 
 

@@ -1,4 +1,4 @@
-"""One view cut to the object: what its pixels weigh, and up to where they see space empty."""
+"""Views as fusion takes them: what their pixels weigh, where they see space empty, how far they disagree."""
 
 from __future__ import annotations
 
@@ -7,10 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tabletop
+from tabletop import BRICK, POSES
 
 from modeler import se3
-from modeler.fusion.depth_views import Crop, crop, depth_views, free_of, pose_variances
-from modeler.types import Array, RayImage
+from modeler.fusion import conditional_covariances
+from modeler.fusion.depth_views import Crop, crop, depth_views, disagreement, free_of, pose_variances, posed_views
+from modeler.fusion.support import exposure_gains
+from modeler.types import (
+    Array,
+    Edge,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    Solution,
+    Stated,
+)
 
 WHOLE = slice(0, tabletop.CAMERA.height), slice(0, tabletop.CAMERA.width)
 CORNERS_M = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
@@ -91,3 +103,59 @@ def test_one_view_of_a_stack_is_looked_up_alone() -> None:
     shown = one.index[one.index >= 0]
     assert (seen.views[shown] == 1).all()
     np.testing.assert_array_equal(one.poses[0], seen.poses[1])
+
+
+def disagreement_m(views, trajectory):
+    pairs = posed_views(views, trajectory)
+    found = disagreement(depth_views(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1), 0.02)
+    return float("nan") if found is None else found[0]
+
+
+def test_views_asked_in_batches_disagree_by_the_same(rng, monkeypatch):
+    trajectory, noisy = tabletop.trajectory(POSES), tabletop.views(BRICK, POSES, rng)
+    at_once = disagreement_m(noisy, trajectory)
+    monkeypatch.setattr("modeler.fusion.depth_views.BATCH", 100 * len(POSES))
+    assert disagreement_m(noisy, trajectory) == at_once
+
+
+def test_views_disagree_by_their_noise_and_the_error_of_their_poses(rng):
+    trajectory = tabletop.trajectory(POSES)
+    exact, noisy = tabletop.views(BRICK, POSES), tabletop.views(BRICK, POSES, rng)
+    assert disagreement_m(exact, trajectory) < 1e-4
+    # Two pixels with 1 mm along the ray each: less by the cosine along the normal.
+    assert 0.4e-3 < disagreement_m(noisy, trajectory) < np.sqrt(2.0) * 1e-3
+    off = {k: se3.translation(rng.normal(0.0, 3e-3, 3)) @ pose for k, pose in trajectory.items()}
+    assert 2e-3 < disagreement_m(exact, off) < 6e-3
+    assert np.isnan(disagreement_m({0: exact[0]}, trajectory))  # nobody to disagree with
+
+
+def test_conditional_covariances_do_not_know_of_drift(rng):
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-6
+
+    def edge(target, source, *, accepted=True):
+        pose = PoseGaussian(se3.exp(rng.normal(size=6)), covariance)
+        return Edge(Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.9), "odometry", accepted, Stated(""))
+
+    edges = [edge(2, 5), edge(5, 6), edge(6, 9, accepted=False), edge(2, 6)]
+    solution = Solution(trajectory={k: np.eye(4) for k in (2, 5, 6)}, outliers=(edges[3],))
+    own = conditional_covariances(solution, edges)
+    assert set(own) == {2, 5, 6}
+    np.testing.assert_allclose(own[6], covariance)
+    np.testing.assert_allclose(own[2], edges[0].posterior.pose.inverse().covariance)
+    both = np.linalg.inv(covariance) + np.linalg.inv(edges[1].posterior.pose.inverse().covariance)
+    np.testing.assert_allclose(own[5], np.linalg.inv(both))
+    assert conditional_covariances(Solution(trajectory={0: np.eye(4)}), []) == {}
+
+
+def test_sharp_views_have_more_say_in_colours_than_blurred_ones(rng):
+    def textured(view: RayImage, spread: int) -> RayImage:
+        levels = 120 + rng.integers(-spread, spread + 1, view.frame.depth_m.shape)
+        return replace(view, frame=replace(view.frame, colour=np.repeat(levels[..., None], 3, axis=2).astype(np.uint8)))
+
+    views = {k: textured(view, 60 if k % 3 else 20) for k, view in tabletop.views(BRICK, POSES).items()}
+    seen = depth_views(
+        posed_views(views, tabletop.trajectory(POSES)), CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1
+    )
+    say = exposure_gains(seen, seen.points_m, seen.normals, tau_m=0.005, near_m=0.003)[:, 3]
+    sharp = np.arange(len(POSES)) % 3 > 0
+    np.testing.assert_allclose(say[~sharp] / say[sharp].mean(), 20.0 / 60.0, rtol=0.15)
