@@ -8,6 +8,9 @@ from sequences.base import frame_range as frame_range
 from sequences.bop import BopSequence as BopSequence
 from sequences.bop import true_mesh as true_mesh
 from sequences.bop import write_bop as write_bop
+from sequences.focal_length import FocalFactor as FocalFactor
+from sequences.focal_length import RefocusedSequence as RefocusedSequence
+from sequences.focal_length import read_focal_factor as read_focal_factor
 from sequences.intrinsics import Overrides as Overrides
 from sequences.noise_model import CalibratedSequence as CalibratedSequence
 from sequences.noise_model import NoiseModel as NoiseModel

@@ -15,7 +15,9 @@ from modeler import priors
 from modeler.cli import parsed
 from modeler.cli.options import PriorOptions
 
-COMMANDS = "build register evaluate render view report export join info convert calibrate-sensor".split()
+COMMANDS = (
+    "build register evaluate render view report export join info convert calibrate-sensor calibrate-camera".split()
+)
 DOCUMENTED = """out prior seed resume overwrite every frames roi max-depth-m max-rotation-deg max-offset-m max-shift-m
 step-deg step-sigma-deg held-sigma-deg held-sigma-m
 method view web"""
@@ -59,7 +61,9 @@ def test_every_command_that_draws_at_random_takes_a_seed(run: Run, command: str)
         assert f"--seed: takes a whole number from 0 on, not '{seed}'; see modeler {command} --help\n" in ended.err
 
 
-@pytest.mark.parametrize("command", ["info", "convert", "calibrate-sensor", "view", "report", "export"])
+@pytest.mark.parametrize(
+    "command", ["info", "convert", "calibrate-sensor", "calibrate-camera", "view", "report", "export"]
+)
 def test_commands_without_randomness_take_no_seed(run: Run, command: str) -> None:
     assert "--seed" not in run(command, "--help").out
 

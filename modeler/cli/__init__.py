@@ -20,6 +20,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from modeler.cli.build import Build
+from modeler.cli.calibrate_camera import CalibrateCamera
 from modeler.cli.calibrate_sensor import CalibrateSensor
 from modeler.cli.console import INTERRUPTED, interruptible_at_once, say, terminable
 from modeler.cli.convert import Convert
@@ -32,13 +33,27 @@ from modeler.cli.render import Render
 from modeler.cli.report import Report
 from modeler.cli.view import View
 
-Command = Build | Info | Convert | CalibrateSensor | Register | Evaluate | Render | View | Report | Export | Join
+Command = (
+    Build
+    | Info
+    | Convert
+    | CalibrateSensor
+    | CalibrateCamera
+    | Register
+    | Evaluate
+    | Render
+    | View
+    | Report
+    | Export
+    | Join
+)
 
 COMMANDS: dict[str, type[Command]] = {
     "build": Build,
     "info": Info,
     "convert": Convert,
     "calibrate-sensor": CalibrateSensor,
+    "calibrate-camera": CalibrateCamera,
     "register": Register,
     "evaluate": Evaluate,
     "render": Render,

@@ -43,6 +43,8 @@ class Build:
     """With --watch: the sequence is over when nothing has come for so long (or a file `done` has, or after Ctrl-C)."""
     sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as SEQUENCE says")] = None
     """Noise of the depth camera, as `modeler calibrate-sensor` measured it."""
+    camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as SEQUENCE says")] = None
+    """Focal length of the depth camera, as `modeler calibrate-camera` estimated it."""
     view: bool = False
     """Watch in the Rerun viewer."""
     web: bool = False
@@ -70,7 +72,7 @@ class Build:
 
         began_s = time.perf_counter()
         _check(self)
-        inputs = [self.sequence, *([] if self.sensor is None else [self.sensor])]
+        inputs = [path for path in (self.sequence, self.sensor, self.camera) if path is not None]
         check_run_folder(self.out, inputs, overwrite=self.overwrite, resume=self.resume)
         whole, frames = _opened(self)
         modeler = compose.modeler(whole, self.prior, self.method, self.where)
@@ -109,7 +111,7 @@ class Build:
         """Return what the results depend on besides sequence, seed and the prior's name, as report.json records it."""
         parts = asdict(self.prior) | asdict(self.method) | asdict(self.selection) | asdict(self.where)
         parts["voxel_m"] = self.voxel_m
-        parts["sensor"] = None if self.sensor is None else str(self.sensor)
+        parts |= {name: None if (path := getattr(self, name)) is None else str(path) for name in ("sensor", "camera")}
         return {
             name: value for name, value in parts.items() if name not in ("prior", "seed") and value not in (None, ())
         }
@@ -138,12 +140,12 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
     Raises:
         InputError: where something cannot be read.
     """
-    from modeler.cli.inputs import watched
-    from sequences import CalibratedSequence, frame_range, open_sequence, read_noise, survey
+    from modeler.cli.inputs import calibrated, watched
+    from sequences import frame_range, open_sequence, survey
 
     path = options.sequence
     whole = watched(path, options.idle_s) if options.watch else open_sequence(path)
-    whole = whole if options.sensor is None else CalibratedSequence(whole, read_noise(options.sensor))
+    whole = calibrated(whole, options.sensor, options.camera)
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     if not frames.live:
         for doubt in survey(frames, truth=False).doubts:

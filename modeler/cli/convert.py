@@ -37,6 +37,8 @@ class Convert:
     """Replace the poses of a run that OUT holds; a folder is never replaced."""
     sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as INPUT says")] = None
     """Noise of the depth camera, as `modeler calibrate-sensor` measured it, to write into sequence.json."""
+    camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as INPUT says")] = None
+    """Focal length of the depth camera, as `modeler calibrate-camera` estimated it."""
     selection: FrameOptions = field(default_factory=FrameOptions)
     given: InputOptions = field(default_factory=InputOptions)
 
@@ -46,22 +48,22 @@ class Convert:
         Raises:
             InputError: where the input cannot be used or the output cannot be written.
         """
-        from modeler.cli.inputs import reading, while_it_lasts
+        from modeler.cli.inputs import calibrated, reading, while_it_lasts
         from modeler.cli.outputs import check_files, check_folder, run_inputs
         from modeler.regular_files import read_regular
         from modeler.types import InputError
-        from sequences import CalibratedSequence, frame_range, open_sequence, read_noise, survey, write_bop
+        from sequences import frame_range, open_sequence, survey, write_bop
 
         if (self.input / "report.json").is_file():
-            if self.sensor is not None or self.selection != FrameOptions() or self.given != InputOptions():
+            if self.sensor or self.camera or self.selection != FrameOptions() or self.given != InputOptions():
                 raise InputError(f"{self.input}: the poses of a run are written as they are; leave out other options")
             check_files([self.out], run_inputs([self.input]), overwrite=self.overwrite)
             return _poses(self.input, self.out)
         if self.out.suffix in (".json", ".txt"):
             raise InputError(f"{self.input}: is no folder of a run, whose poses {self.out} could hold; give one")
-        check_folder(self.out, [self.input, *([] if self.sensor is None else [self.sensor])])
+        check_folder(self.out, [path for path in (self.input, self.sensor, self.camera) if path is not None])
         whole = open_sequence(self.input, self.given.stated())
-        whole = whole if self.sensor is None else CalibratedSequence(whole, read_noise(self.sensor))
+        whole = calibrated(whole, self.sensor, self.camera)
         kept = frame_range(self.selection.frames)
         sequence = whole.select(self.selection.every, kept)
         if sequence.live and kept.stop is None:

@@ -18,7 +18,16 @@ from modeler.fusion import Fuser, FusionVolume, conditional_covariances
 from modeler.graph import PoseGraph, solve
 from modeler.rays import Sensor
 from modeler.types import ACCEPTED, Array, Edge, Frame, InputError, RayImage, Solution
-from sequences import AbstractSequence, CalibratedSequence, WatchLimits, open_sequence, read_noise, watch
+from sequences import (
+    AbstractSequence,
+    CalibratedSequence,
+    RefocusedSequence,
+    WatchLimits,
+    open_sequence,
+    read_focal_factor,
+    read_noise,
+    watch,
+)
 from sequences.base import AbstractDerived
 
 _ALIKE = 0.02  # share by which the number of an object's points may change with the version of a library
@@ -181,9 +190,23 @@ def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> t
     where = Path(report["sequence"]) if places is None else places.popleft()
     if not where.exists():
         raise InputError(f"{where}: the sequence of {run} is not there; say where it is with --sequence")
-    whole = open_sequence(where)
-    whole = CalibratedSequence(whole, read_noise(Path(settings["sensor"]))) if "sensor" in settings else whole
-    return (Part(run, report, whole),)
+    sensor, camera = (Path(settings[name]) if name in settings else None for name in ("sensor", "camera"))
+    return (Part(run, report, calibrated(open_sequence(where), sensor, camera)),)
+
+
+def calibrated(sequence: AbstractSequence, sensor: Path | None, camera: Path | None) -> AbstractSequence:
+    """Return a sequence with what was measured of its camera.
+
+    Args:
+        sequence: as it was recorded.
+        sensor: file with the noise; None: as the sequence says.
+        camera: file with the focal length; None: as the sequence says.
+
+    Raises:
+        InputError: where a file cannot be read.
+    """
+    sequence = sequence if camera is None else RefocusedSequence(sequence, read_focal_factor(camera))
+    return sequence if sensor is None else CalibratedSequence(sequence, read_noise(sensor))
 
 
 def renumbered(view: RayImage, offset: int) -> RayImage:

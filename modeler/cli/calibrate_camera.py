@@ -1,0 +1,72 @@
+"""`modeler calibrate-camera`: the focal length that a run's loops tell."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from modeler.cli.console import say
+from modeler.cli.options import MovedOptions
+
+if TYPE_CHECKING:
+    from modeler.self_calibration import FocalLength
+
+
+@dataclass(frozen=True)
+class CalibrateCamera:
+    """Estimate a depth camera's focal length from a run in which the object came back to its first view.
+
+    Under a wrong focal length every turn comes out too small or too large, and a full turn does not close. `modeler
+    build SEQUENCE --camera FILE` uses the result for any sequence of the same camera.
+    """
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """Run folder, as `modeler build` makes it, of a full turn. Its loop may have been refused as contradicting the
+    chain; its frames must be right one by one."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """JSON file to write."""
+    overwrite: bool = False
+    """Replace the file where there is one."""
+    moved: MovedOptions = field(default_factory=MovedOptions)
+
+    def run(self) -> int:
+        """Estimate the focal length and store it; status 3 where nothing tells it.
+
+        Raises:
+            InputError: where the run cannot be used or the file cannot be written.
+        """
+        from modeler.cli.inputs import reopened
+        from modeler.cli.outputs import check_files, run_inputs
+        from modeler.export import write_atomically
+        from modeler.self_calibration import FocalCalibrator
+        from modeler.types import InputError
+        from sequences import FocalFactor, read_focal_factor
+
+        check_files([self.out], run_inputs([self.run_folder], self.moved.sequence), overwrite=self.overwrite)
+        run = reopened(self.run_folder, self.moved.sequence)
+        if len(run.parts) > 1:
+            raise InputError(f"{self.run_folder}: joins several runs; calibrate with one of them")
+        found = FocalCalibrator().estimate(run.views, run.edges, run.sensor)
+        used_px = run.views[min(run.views)].frame.camera.fx
+        file = run.report["settings"].get("camera")
+        factor = found.factor * (1.0 if file is None else read_focal_factor(Path(file)).factor)
+        stated_px = used_px * found.factor / factor
+        facts = {**asdict(found), "fx_px": found.factor * used_px, "run": str(self.run_folder)}
+        del facts["factor"]
+        write_atomically(self.out, FocalFactor(factor, stated_px).text(facts))
+        say(f"{_said(found, used_px)}: {self.out}")
+        return 0 if found.told_by == "loop" else 3
+
+
+def _said(found: FocalLength, used_px: float) -> str:
+    if found.told_by == "prior":
+        return "no loop tells the focal length; turn the object fully, with steps that overlap"
+    focal_px, sigma_px = used_px * found.factor, used_px * found.factor * found.sigma
+    loops = "1 loop" if found.loops == 1 else f"{found.loops} loops"
+    return (
+        f"the focal length is {focal_px:.1f} ± {sigma_px:.1f} px, {used_px:.1f} px was given; "
+        f"{loops} close to {found.sigmas_after:.1f} sd with it, to {found.sigmas_before:.1f} sd as given"
+    )

@@ -1,0 +1,101 @@
+"""The focal length that loops tell."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tabletop
+
+from modeler.cli import main
+from modeler.pipeline import Modeler
+from modeler.rays import Sensor
+from modeler.self_calibration import FocalCalibrator, FocalLength
+from modeler.types import Edge, RayImage, Stated
+from sequences import FocalFactor, RefocusedSequence, bundled, open_sequence, read_focal_factor
+
+STEPS = 12
+SENSOR = Sensor(sigma_r_m=1e-3)
+
+
+@cache
+def seen(stated: float) -> tuple[dict[int, RayImage], tuple[Edge, ...]]:
+    """Views of a box that turns once, and the edges of its loop, under a focal length that is stated wrongly."""
+    rng = np.random.default_rng(0)
+    views = {}
+    for index, pose in enumerate(tabletop.turntable(STEPS)):
+        frame = tabletop.view(tabletop.Box((0.08, 0.05, 0.04)), pose, index, rng=rng).frame
+        camera = replace(frame.camera, fx=stated * frame.camera.fx, fy=stated * frame.camera.fy)
+        views[index] = SENSOR.ray_image(replace(frame, camera=camera))
+    modeler = Modeler(sensor=SENSOR)
+    edges = []
+    for source in range(1, STEPS + 1):
+        target, source = source - 1, source % STEPS
+        posterior = modeler.register(views[source], views[target]).without_samples()
+        edges.append(Edge(posterior, "odometry" if source else "closure", posterior.usable, Stated("made for a test")))
+    return views, tuple(edges)
+
+
+def estimate(stated: float, *, closed: bool = True) -> FocalLength:
+    views, edges = seen(stated)
+    return FocalCalibrator().estimate(views, edges if closed else edges[:-1], SENSOR)
+
+
+@pytest.mark.parametrize("stated", [0.93, 1.0, 1.06])
+def test_a_closed_turn_tells_the_focal_length(stated: float) -> None:
+    found = estimate(stated)
+    assert found.told_by == "loop"
+    assert found.loops == 1
+    assert abs(found.factor * stated - 1.0) < 0.01
+    assert abs(np.log(found.factor * stated)) < 3.0 * found.sigma
+    assert found.sigmas_after < 1.5
+
+
+def test_an_open_chain_tells_nothing() -> None:
+    found = estimate(0.93, closed=False)
+    assert (found.factor, found.sigma, found.told_by) == (1.0, FocalCalibrator().prior_sigma, "prior")
+
+
+def test_the_file_of_a_focal_length_is_read_as_it_was_written(tmp_path: Path) -> None:
+    focal = FocalFactor(1.0 / 3.0 + 0.5, 597.522)
+    (tmp_path / "camera.json").write_text(focal.text({"sigma": 0.01}))
+    assert read_focal_factor(tmp_path / "camera.json") == focal
+
+
+def test_a_sequence_is_seen_with_the_focal_length_that_was_measured() -> None:
+    whole = open_sequence(bundled("box"))
+    before = whole.frame(3).camera
+    after = RefocusedSequence(whole, FocalFactor(1.1, before.fx)).select(frames=slice(3, 5))
+    assert [frame.camera for frame in after] == 2 * [replace(before, fx=1.1 * before.fx, fy=1.1 * before.fy)]
+
+
+def test_the_focal_length_of_another_camera_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "camera.json").write_text(FocalFactor(1.1, 400.0).text({}))
+    arguments = [
+        "build",
+        str(bundled("box")),
+        "--camera",
+        str(tmp_path / "camera.json"),
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    assert main(arguments) == 2
+    assert "400" in capfd.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_a_run_with_a_wrong_focal_length_tells_the_right_one(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    wrong, right, run = tmp_path / "wrong.json", tmp_path / "right.json", tmp_path / "run"
+    stated_px = open_sequence(bundled("box")).frame(0).camera.fx
+    wrong.write_text(FocalFactor(0.94, stated_px).text({}))
+    main(["build", str(bundled("box")), "--prior", "table", "--camera", str(wrong), "--out", str(run)])
+    assert main(["calibrate-camera", str(run), "--out", str(right)]) == 0
+    found = json.loads(right.read_text())
+    assert found["focal_factor"] == pytest.approx(1.0, abs=max(0.01, 3.0 * found["sigma"]))
+    assert main(["calibrate-camera", str(run), "--out", str(right)]) == 2  # is there
+    assert "--overwrite" in capfd.readouterr().err
