@@ -127,6 +127,7 @@ def build(
         sequence=frames.name if isinstance(sequence, AbstractSequence) else str(sequence),
         seed=seed,
         prior=type(prior).__name__ if isinstance(prior, AbstractPrior) else compose.told(options, frames)[0],
+        known=modeler.prior,
         closure_expected=comes_back(frames, None, modeler.closer.max_angle_deg),
     )
     scene = compose.scene(modeler, frames)

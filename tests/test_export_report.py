@@ -49,7 +49,9 @@ def test_report_has_the_promised_schema(tmp_path: Path) -> None:
     head = {key: report[key] for key in ("schema", "sequence", "seed", "prior", "seconds")}
     assert head == {"schema": 1, "sequence": "box", "seed": 3, "prior": "table", "seconds": {"total": 1.5}}
     assert {"modeler", "gtsam", "numpy", "python"} <= set(report["versions"])
-    assert report["frames"][1] == {"id": 5, "timestamp": 0.5, "points": 5, "outcome": "accepted", "cause": ""}
+    assert report["frames"][1] == {
+        "id": 5, "timestamp": 0.5, "points": 5, "outcome": "accepted", "cause": "", "mask": "converged"
+    }  # fmt: skip
     assert [edge["kind"] for edge in report["edges"]] == ["odometry"] * 3 + ["closure"]
     edge, posterior = report["edges"][0], made_up_steps()[1].posteriors[0]
     assert {key: edge[key] for key in ("source", "target", "accepted", "outcome", "overlap", "effective_samples")} == {

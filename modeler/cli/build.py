@@ -82,6 +82,7 @@ class Build:
             sequence=str(self.sequence),
             seed=self.method.seed,
             prior=prior,
+            known=modeler.prior,
             settings=self.settings(),
             closure_expected=comes_back(frames, self.prior.step_deg, modeler.closer.max_angle_deg),
         )

@@ -223,6 +223,14 @@ def _is_loop(value: Any) -> bool:
     )
 
 
+def _is_figure(value: Any) -> bool:
+    return (
+        isinstance(value, dict)
+        and all(_is_number_or_null(value.get(name)) for name in ("value", "limit"))
+        and isinstance(value.get("holds"), bool)
+    )
+
+
 _WHOLE: dict[str, Test] = {
     "sequence": _is_text,
     "settings": _is(dict),
@@ -234,6 +242,7 @@ _WHOLE: dict[str, Test] = {
     "trustworthy": _is(bool),
     "reasons": lambda value: isinstance(value, list) and all(map(_is_text, value)),
     "reason_codes": _null_or(lambda value: isinstance(value, list) and all(map(_is(str), value))),
+    "evidence": _null_or(lambda value: isinstance(value, dict) and all(map(_is_figure, value.values()))),
     "seconds": lambda value: isinstance(value, dict) and all(map(_is_number, value.values())),
     "up": _null_or(_is_direction),
 }
@@ -243,6 +252,7 @@ _FRAME: dict[str, Test] = {
     "points": _is_whole,
     "outcome": _is_text,
     "cause": _null_or(_is(str)),
+    "mask": _null_or(_is(str)),
 }
 _POSE: dict[str, Test] = {"id": _is_whole, "object_from_camera": _numbers(16), "covariance": _numbers(36)}
 _MODE: dict[str, Test] = {"weight": _is_number_or_null, "target_from_source": _numbers(16), "covariance": _numbers(36)}

@@ -14,6 +14,7 @@ import numpy as np
 from modeler import se3
 from modeler.types import (
     ACCEPTED,
+    AbstractPrior,
     Array,
     Edge,
     Mode,
@@ -52,6 +53,8 @@ class RunMeta:
     """Seed of every random number."""
     prior: str
     """Name of the prior."""
+    known: AbstractPrior | None = field(default=None, repr=False)
+    """The prior itself, which edges are compared with; None: there is none."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Every other option that the results depend on, as JSON values."""
     closure_expected: bool = False
@@ -69,10 +72,9 @@ class RunMeta:
 def frame_record(step: Step) -> FrameRecord:
     """Return what became of the frame of a step."""
     points = 0 if step.view is None else len(step.view.points_m)
-    if step.left_out is None:
-        return FrameRecord(step.frame.index, float(step.frame.time_s), points, ACCEPTED)
-    outcome, cause = explain(step.left_out), code(step.left_out)
-    return FrameRecord(step.frame.index, float(step.frame.time_s), points, outcome, cause)
+    reason, mask = step.left_out, step.segmentation.outcome.label
+    outcome, cause = (ACCEPTED, "") if reason is None else (explain(reason), code(reason))
+    return FrameRecord(step.frame.index, float(step.frame.time_s), points, outcome, cause, mask)
 
 
 def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[str, Any]:
@@ -87,7 +89,12 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
     if step.view is not None:  # also where the frame was left out
         views[step.frame.index] = step.view
     verdict = judged(
-        step, frames, doubts=meta.doubts, interrupted=meta.interrupted, closure_expected=meta.closure_expected
+        step,
+        frames,
+        doubts=meta.doubts,
+        interrupted=meta.interrupted,
+        closure_expected=meta.closure_expected,
+        prior=meta.known,
     )
     report = {
         "schema": _SCHEMA,
@@ -103,6 +110,10 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "trustworthy": verdict.trustworthy,
         "reasons": [shortcoming.words for shortcoming in verdict.shortcomings],
         "reason_codes": [shortcoming.code for shortcoming in verdict.shortcomings],
+        "evidence": {
+            name: {"value": figure.value, "limit": figure.limit, "holds": figure.holds}
+            for name, figure in verdict.evidence.items()
+        },
         "up": _up(solution, views),
         "frames": [vars(frame) for frame in frames],
     }

@@ -50,6 +50,7 @@ from modeler.types.solution import LoopOpening as LoopOpening
 from modeler.types.solution import Solution as Solution
 from modeler.types.solution import joined_without as joined_without
 from modeler.types.solution import loop_opening as loop_opening
+from modeler.types.solution import loop_openings as loop_openings
 from modeler.types.solution import loops_closed as loops_closed
 from modeler.types.views import Camera as Camera
 from modeler.types.views import Frame as Frame

@@ -139,8 +139,8 @@ class LoopOpening:
     """Root of NEES/6 under the stated covariances of chain and closure: about 1 where these are true."""
 
 
-def loop_opening(edges: Sequence[Edge], solution: Solution, centroids_m: Mapping[int, Array]) -> LoopOpening | None:
-    """Compare the accepted closure that spans the longest chain of odometry edges with that chain.
+def loop_openings(edges: Sequence[Edge], solution: Solution, centroids_m: Mapping[int, Array]) -> list[LoopOpening]:
+    """Compare each accepted closure whose ends a chain of odometry edges joins with that chain.
 
     Needs no ground truth: an opening of many standard deviations shows errors that the covariances do not hold, as
     those of intrinsics, or a wrong edge. The noise that consecutive edges share is not taken into account.
@@ -157,11 +157,16 @@ def loop_opening(edges: Sequence[Edge], solution: Solution, centroids_m: Mapping
             pose = solution.pose_of(edge)
             neighbours.setdefault(edge.target, []).append((edge.source, pose))
             neighbours.setdefault(edge.source, []).append((edge.target, pose.inverse()))
-    openings = [
+    return [
         _opening(edge, solution.pose_of(edge), *chain, centroids_m.get(edge.source, np.zeros(3)))
         for edge in used
         if edge.kind == "closure" and (chain := _chain(neighbours, edge.target, edge.source)) is not None
     ]
+
+
+def loop_opening(edges: Sequence[Edge], solution: Solution, centroids_m: Mapping[int, Array]) -> LoopOpening | None:
+    """Return the opening of the loop of most edges, of several the widest; None without a loop."""
+    openings = loop_openings(edges, solution, centroids_m)
     return max(openings, key=lambda opening: (opening.edges, opening.sigmas), default=None)
 
 

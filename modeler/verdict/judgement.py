@@ -3,21 +3,35 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
 from modeler.types import (
     ACCEPTED,
+    AbstractPrior,
     Edge,
     OptimisationOutlier,
+    Outcome,
     Solution,
     Step,
     explain,
     joined_without,
+    loop_openings,
     loops_closed,
+)
+from modeler.verdict.evidence import (
+    MAX_UNSURE,
+    WRONG_M,
+    Figure,
+    contradiction,
+    displacement,
+    graph_figure,
+    loop_figure,
+    other_modes,
+    seen_through,
 )
 
 _LITTLE_OVERLAP: Final = 0.5  # views farther apart are registered wrongly now and then, and surely so
@@ -38,6 +52,8 @@ class FrameRecord:
     """`ACCEPTED`, or in words why the frame was left out."""
     cause: str = ""
     """The same for programs, as `types.code` has it; "" for frames that were accepted."""
+    mask: str = Outcome.CONVERGED.label
+    """Label of the segmentation's outcome."""
 
     @property
     def accepted(self) -> bool:
@@ -50,8 +66,9 @@ class Shortcoming:
     """Why a model is not to be trusted."""
 
     code: str
-    """For programs: `doubt`, `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `closures_refused`,
-    `unconfirmed`, `never_came_back`, `little_overlap` or `unsure_rotation`."""
+    """For programs: `doubt`, `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
+    `prior_contradicted`, `loop_open`, `edges_disagree`, `closures_refused`, `unconfirmed`, `never_came_back`,
+    `seen_through`, `little_overlap`, `other_modes` or `unsure_rotation`."""
     words: str
     """For people."""
 
@@ -62,6 +79,9 @@ class Verdict:
 
     shortcomings: tuple[Shortcoming, ...] = ()
     """Why not; empty where it can be."""
+    evidence: Mapping[str, Figure] = field(default_factory=dict)
+    """Figures by name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `loop_sigmas`, `graph_chi2`,
+    `seen_through` and `other_modes`, those that the run has."""
 
     @property
     def trustworthy(self) -> bool:
@@ -76,8 +96,9 @@ def judged(
     doubts: Sequence[str] = (),
     interrupted: bool = False,
     closure_expected: bool = False,
+    prior: AbstractPrior | None = None,
 ) -> Verdict:
-    """Judge the model of a run.
+    """Judge the model of a run. Evidence is gathered after the last step, when all edges are in.
 
     Args:
         step: the latest.
@@ -85,6 +106,7 @@ def judged(
         doubts: further reasons in words not to trust it.
         interrupted: whether the user ended the run before its last frame.
         closure_expected: whether the object is known to come back to its start.
+        prior: what was known of motions before the images were compared; None: not known here.
     """
     reasons = [Shortcoming("doubt", words) for words in doubts]
     if interrupted:
@@ -96,10 +118,79 @@ def judged(
         words = "fewer than two frames were accepted: there is nothing to align"
         reasons.append(Shortcoming("too_few_frames", words))
     edges = [edge for edge in step.edges_so_far if step.solution.takes_part(edge)]
+    found = _found(step, frames, edges, prior) if step.last else []
+    reasons += [Shortcoming(finding.code, finding.words) for finding in found if not finding.figure.holds]
     reasons += _open_loop(step, edges, closure_expected=closure_expected)
     reasons += _little_overlap(edges)
     reasons += _unsure(step.solution)
-    return Verdict(tuple(reasons))
+    return Verdict(tuple(reasons), {finding.name: finding.figure for finding in found})
+
+
+@dataclass(frozen=True)
+class _Finding:
+    """A figure of the evidence, and what is said where it speaks against the model."""
+
+    name: str
+    figure: Figure
+    code: str
+    words: str
+
+
+def _found(
+    step: Step, frames: Sequence[FrameRecord], edges: Sequence[Edge], prior: AbstractPrior | None
+) -> list[_Finding]:
+    """Return the evidence of a whole run.
+
+    Args:
+        step: the last.
+        frames: what became of every frame.
+        edges: those that take part.
+        prior: what was known of motions.
+    """
+    views, solution, found = step.views, step.solution, []
+    accepted = [frame for frame in frames if frame.accepted]
+    if accepted:
+        unsure = sum(frame.mask == Outcome.UNSURE_MASK.label for frame in accepted)
+        words = f"the masks of {unsure} of {len(accepted)} frames are unsure: this may be the model of something else"
+        found.append(_Finding("unsure_masks", Figure(unsure / len(accepted), MAX_UNSURE), "unsure_masks", words))
+    if (moved_m := displacement(views, solution)) is not None:
+        words = (
+            f"nothing shows that the object moved: its surface by {1000.0 * moved_m.value:.1f} mm at most, which the "
+            f"camera's noise hides (up to {1000.0 * moved_m.limit:.1f} mm)"
+        )
+        found.append(_Finding("motion_m", moved_m, "no_motion", words))
+    if prior is not None and (against := contradiction(edges, views, solution, prior)) is not None:
+        words = (
+            f"the images contradict the prior: from frame {against.target} to {against.source} the object moved "
+            f"{against.figure.value:.0f} standard deviations from what the prior expects"
+        )
+        found.append(_Finding("prior_sds", against.figure, "prior_contradicted", words))
+    centroids_m = {frame: view.centroid_m for frame, view in views.items()}
+    if (loop := loop_figure(loop_openings(step.edges_so_far, solution, centroids_m))) is not None:
+        opening, figure = loop
+        words = (
+            f"the loop from frame {opening.target} to {opening.source} was open by "
+            f"{np.degrees(opening.rotation_rad):.1f}° and {1000.0 * opening.translation_m:.1f} mm, "
+            f"{figure.value:.1f} times what its edges state: the focal length or the depth scale is wrong, or an edge"
+        )
+        found.append(_Finding("loop_sigmas", figure, "loop_open", words))
+    if (fit := graph_figure(edges, solution)) is not None:
+        words = (
+            f"the edges contradict each other: their squared residuals are {fit.value:.1f} times what their "
+            f"covariances state (up to {fit.limit:.1f} by chance)"
+        )
+        found.append(_Finding("graph_chi2", fit, "edges_disagree", words))
+    if (through := seen_through(views, solution.trajectory)) is not None:
+        frame, share = through
+        words = (
+            f"other frames see through {100.0 * share.value:.0f} % of the surface of frame {frame} by more than "
+            f"{1000.0 * WRONG_M:.0f} mm: poses are wrong, or the object changed its shape"
+        )
+        found.append(_Finding("seen_through", share, "seen_through", words))
+    others = other_modes(edges, solution, views)
+    words = f"with a probability of {100.0 * others.value:.0f} % some pair is at another of its modes"
+    found.append(_Finding("other_modes", others, "other_modes", words))
+    return found
 
 
 def _left_out(frames: Sequence[FrameRecord]) -> list[str]:

@@ -1,0 +1,255 @@
+"""What speaks for and against a model, in figures: each beside the limit from which on it speaks against."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy import ndimage
+from scipy.stats import chi2
+
+from modeler import se3
+from modeler.types import AbstractPrior, Array, Edge, InputError, LoopOpening, RayImage, Solution
+
+MAX_UNSURE: Final = 0.5
+"""Share of frames with an unsure mask: beyond, the rule and not the exception is unsure, and what moves together with
+most masks may be anything."""
+MIN_MOTION_SDS: Final = 3.0
+"""Displacement of the surface in standard deviations of a pixel's range: below, nothing shows that anything moved."""
+TAIL: Final = 1e-6
+"""Probability of what contradicts a prior, a pair: of 100 runs of 100 pairs one contradicts its prior by chance."""
+LOOP_TAIL: Final = 1e-3
+"""Probability that the loops of a run are as far open as that by chance; that of the gate of closures."""
+MAX_SEEN_THROUGH: Final = 0.1
+"""Share of a frame's surface that other frames see through by more than `WRONG_M`: a model is called wrong where less
+than 90 % of its surface lies within 5 mm of the true one."""
+WRONG_M: Final = 0.005
+"""Error of a surface from which on it is called wrong."""
+WRONG_RAD: Final = np.radians(3.0)
+"""Error of a rotation from which on it is called wrong."""
+MAX_OTHER_MODE: Final = 0.05
+"""Probability that some pair is at another of its modes: what confidence regions of 95 % leave out."""
+
+_DRAWS: Final = 1000  # of a prior: the best of so many lies 0.2 nats below the mode of a Gaussian in six dimensions
+_MAX_VIEWS: Final = 40  # compared with each other, spread over the run: 1,600 pairs take a second
+_MAX_POINTS: Final = 400  # of each: a share of 0.1 is then known to 0.015
+_MIN_POINTS: Final = 200  # that other frames judge, of a frame: its share is then known to 0.02
+_MARGIN_PX: Final = 2  # pixels at depth edges are mixed of what lies before and behind
+_MIN_COSINE: Final = 0.5  # beyond 60° range noise grows with slope
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of the evidence."""
+
+    value: float
+    """What was found."""
+    limit: float
+    """From which on it speaks against the model."""
+    at_least: bool = False
+    """Whether smaller values speak against it, not larger ones."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether it does not speak against the model."""
+        return self.value >= self.limit if self.at_least else self.value <= self.limit
+
+
+def displacement(views: Mapping[int, RayImage], solution: Solution) -> Figure | None:
+    """Return by how much in m the surface moved most from where the first view saw it, as root mean square.
+
+    None where there are no two views.
+    """
+    frames = [frame for frame in solution.trajectory if frame in views]
+    if len(frames) < 2 or not len(views[frames[0]].points_m):
+        return None
+    first = views[frames[0]]
+    points_m = first.points_m[:: max(len(first.points_m) // _MAX_POINTS, 1)]
+    moved_m = [
+        float(
+            np.sqrt(np.mean(np.sum((se3.transform(solution.relative(frame, frames[0]), points_m) - points_m) ** 2, 1)))
+        )
+        for frame in frames[1:]
+    ]
+    return Figure(max(moved_m), MIN_MOTION_SDS * first.sigma_r_m, at_least=True)
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """The edge whose posterior lies farthest from what its prior expects."""
+
+    source: int
+    """Frame number of the source view."""
+    target: int
+    """Frame number of the target view."""
+    figure: Figure
+    """Standard deviations of a Gaussian prior in six dimensions: √(2 Δ), with Δ in nats from the prior's mode to the
+    posterior's mean. Of other densities the same, whatever their shape."""
+
+
+def contradiction(
+    edges: Sequence[Edge], views: Mapping[int, RayImage], solution: Solution, prior: AbstractPrior
+) -> Contradiction | None:
+    """Return the edge whose posterior contradicts the independent knowledge most; None where nothing can be compared.
+
+    Limits of a search, outside of which a density is zero, are those for several steps: motions beyond the limits of
+    one are looked for there.
+
+    Args:
+        edges: those that take part.
+        views: by frame number.
+        solution: the poses.
+        prior: what was known of motions before the images were compared.
+    """
+    limit = float(np.sqrt(chi2.isf(TAIL, 6)))
+    worst: Contradiction | None = None
+    for edge in edges:
+        if edge.source not in views or edge.target not in views:
+            continue
+        source, target = views[edge.source], views[edge.target]
+        try:
+            density = prior.relaxed(max(abs(edge.source - edge.target), 2)).between(source, target)
+        except InputError:  # the prior does not apply: it was not used either
+            continue
+        posterior = edge.posterior
+        means = np.stack([mode.pose.mean for mode in posterior.modes] or [posterior.pose.mean])
+        usual = density.log_evidence(density.sample(_DRAWS, np.random.default_rng(0)))
+        here = float(density.log_evidence(means).max())
+        if not np.isfinite(here):  # at a limit of the search, where the posterior is cut off
+            continue
+        sds = float(np.sqrt(2.0 * max(float(usual.max()) - here, 0.0)))
+        if worst is None or sds > worst.figure.value:
+            worst = Contradiction(edge.source, edge.target, Figure(sds, limit))
+    return worst
+
+
+def loop_figure(openings: Sequence[LoopOpening]) -> tuple[LoopOpening, Figure] | None:
+    """Return the loop that is open farthest in standard deviations, with its limit; None without a loop.
+
+    NEES of an opening follows χ² of six degrees of freedom; of several loops the largest does with a probability that
+    is at most their number times as large (Bonferroni).
+    """
+    finite = [opening for opening in openings if np.isfinite(opening.sigmas)]
+    if not finite:
+        return None
+    worst = max(finite, key=lambda opening: opening.sigmas)
+    return worst, Figure(worst.sigmas, float(np.sqrt(chi2.isf(LOOP_TAIL / len(finite), 6) / 6.0)))
+
+
+def graph_figure(edges: Sequence[Edge], solution: Solution) -> Figure | None:
+    """Return the edges' squared residuals in units of their covariances, a degree of freedom; None for a tree.
+
+    Args:
+        edges: those that take part.
+        solution: the poses.
+    """
+    freedom = 6 * (len(edges) - len(solution.trajectory) + 1)
+    if freedom <= 0 or not edges:
+        return None
+    poses = [solution.pose_of(edge) for edge in edges]
+    apart = [
+        se3.inverse(pose.mean) @ solution.relative(edge.target, edge.source)
+        for pose, edge in zip(poses, edges, strict=True)
+    ]
+    xi = se3.log(np.stack(apart))
+    whitened = np.linalg.solve(np.stack([pose.covariance for pose in poses]), xi[..., None])[..., 0]
+    return Figure(float(np.sum(xi * whitened)) / freedom, float(chi2.isf(LOOP_TAIL, freedom)) / freedom)
+
+
+def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage]) -> Figure:
+    """Return the probability that some pair is at another mode than the heaviest, by the weights that the graph leaves.
+
+    Modes that differ by less than what is called an error are one.
+
+    Args:
+        edges: those that take part.
+        solution: the poses and the weights.
+        views: by frame number.
+    """
+    settled = 1.0
+    for edge in edges:
+        weights, modes = solution.mode_weights.get((edge.source, edge.target)), edge.posterior.modes
+        if weights is None or len(weights) != len(modes) or edge.source not in views:
+            continue
+        centroid_m = views[edge.source].centroid_m[None]
+        heaviest = modes[int(np.argmax(weights))].pose.mean
+        alike = [
+            float(se3.rotation_angle(se3.inverse(heaviest) @ mode.pose.mean)) <= WRONG_RAD
+            and np.linalg.norm(se3.transform(heaviest, centroid_m) - se3.transform(mode.pose.mean, centroid_m))
+            <= WRONG_M
+            for mode in modes
+        ]
+        settled *= float(np.sum(np.asarray(weights)[alike]) / np.sum(weights))
+    return Figure(1.0 - settled, MAX_OTHER_MODE)
+
+
+def seen_through(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> tuple[int, Figure] | None:
+    """Return the frame most of whose surface other frames see through, and the share; None where none can be judged.
+
+    A surface point of one frame, carried into another, faces that camera. Where the pixel and those around it measured
+    something farther away by more than `WRONG_M`, there is no surface: one of the two poses is wrong.
+
+    Args:
+        views: by frame number.
+        trajectory: object_from_camera (4, 4) by frame number.
+    """
+    frames = [frame for frame in sorted(views) if frame in trajectory and len(views[frame].points_m)]
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _MAX_VIEWS)).astype(int))
+    frames = [frames[k] for k in chosen]
+    reaches_m = {frame: _nearest_around(views[frame]) for frame in frames}
+    counts = np.zeros((len(frames), 2))
+    for row, frame in enumerate(frames):
+        points_m, normals = _facing(views[frame])
+        for column, other in enumerate(frames):
+            if other != frame:
+                target_from_source = se3.inverse(trajectory[other]) @ trajectory[frame]
+                carried_m, turned = se3.transform(target_from_source, points_m), normals @ target_from_source[:3, :3].T
+                beyond_m = _beyond(views[other], reaches_m[other], carried_m, turned)
+                found = np.array([np.sum(beyond_m > WRONG_M), np.sum(np.abs(beyond_m) <= WRONG_M)])
+                counts[[row, column]] += found  # which of the two is wrong, is not known
+    judged = counts.sum(axis=1)
+    if not (judged >= _MIN_POINTS).any():
+        return None
+    shares = np.where(judged >= _MIN_POINTS, counts[:, 0] / np.maximum(judged, 1.0), 0.0)
+    worst = int(np.argmax(shares))
+    return frames[worst], Figure(float(shares[worst]), MAX_SEEN_THROUGH)
+
+
+def _facing(view: RayImage) -> tuple[Array, Array]:
+    """Return some surface points (n, 3) of a view that face its camera, and their normals (n, 3)."""
+    some = slice(None, None, max(len(view.points_m) // _MAX_POINTS, 1))
+    points_m, normals = view.points_m[some], view.normals[some]
+    faces = -np.sum(points_m * normals, axis=1) >= _MIN_COSINE * np.linalg.norm(points_m, axis=1)
+    return points_m[faces], normals[faces]
+
+
+def _nearest_around(view: RayImage) -> Array:
+    """Return the least depth (h, w) in m around each pixel; NaN where the pixel measured nothing."""
+    depth_m = np.asarray(view.frame.depth_m, dtype=np.float64)
+    measured = np.isfinite(depth_m) & (depth_m > 0.0)
+    near_m = ndimage.minimum_filter(np.where(measured, depth_m, np.inf), size=2 * _MARGIN_PX + 1, mode="nearest")
+    return np.where(measured, near_m, np.nan)
+
+
+def _beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> Array:
+    """Return by how much in m a view measured beyond points that face its camera: (k,), of those that can be judged.
+
+    Args:
+        view: the view.
+        near_m: (h, w) least depth around each of its pixels.
+        points_m: (n, 3) in its camera's coordinates.
+        normals: (n, 3) unit.
+    """
+    camera, depth_m = view.frame.camera, points_m[:, 2]
+    faces = -np.sum(points_m * normals, axis=1) >= _MIN_COSINE * np.linalg.norm(points_m, axis=1)
+    ahead = faces & (depth_m > 0.0)
+    points_m, depth_m = points_m[ahead], depth_m[ahead]
+    columns = np.rint(camera.fx * points_m[:, 0] / depth_m + camera.cx)
+    rows = np.rint(camera.fy * points_m[:, 1] / depth_m + camera.cy)
+    height, width = near_m.shape
+    inside = (columns >= _MARGIN_PX) & (columns < width - _MARGIN_PX)
+    inside &= (rows >= _MARGIN_PX) & (rows < height - _MARGIN_PX)
+    beyond_m = near_m[rows[inside].astype(int), columns[inside].astype(int)] - depth_m[inside]
+    return beyond_m[np.isfinite(beyond_m)]

@@ -1,0 +1,273 @@
+"""The verdict on a model: every figure of the evidence speaks against wrong models, and not against right ones."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from modeler import se3
+from modeler.graph import PoseGraph, solve
+from modeler.priors import GeneralPrior, ProductPrior, TablePrior, TurntablePrior
+from modeler.priors.mixtures import Gaussian
+from modeler.types import (
+    AbstractPoseDensity,
+    AbstractPrior,
+    Array,
+    Camera,
+    Edge,
+    Frame,
+    Mode,
+    Outcome,
+    Plane,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    Segmentation,
+    Solution,
+    Stated,
+    Step,
+    loop_openings,
+)
+from modeler.verdict import FrameRecord, judged
+from modeler.verdict.evidence import (
+    contradiction,
+    displacement,
+    graph_figure,
+    loop_figure,
+    other_modes,
+    seen_through,
+)
+
+CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
+AXES_M = np.array([0.09, 0.05, 0.03])
+MIDDLE = se3.translation(np.array([0.0, 0.0, 0.6]))
+UP = (0.0, -1.0, 0.0)
+COVARIANCE = np.diag(np.repeat([np.radians(0.3), 0.0005], 3) ** 2)
+
+
+def turned(angle_deg: float) -> Array:
+    """camera_from_object (4, 4) of an object in front of the camera, turned about the camera's vertical."""
+    return MIDDLE @ se3.exp(np.array([0.0, np.radians(angle_deg), 0.0, 0.0, 0.0, 0.0]))
+
+
+def seen(index: int, camera_from_object: Array, wall_m: float = 1.0, plane: Plane | None = None) -> RayImage:
+    """An ellipsoid before a wall, each pixel a ray that meets it or does not."""
+    w, h = CAMERA.rays()
+    rays = np.stack([w, h, np.ones_like(w)], axis=-1).reshape(-1, 3)
+    turn, middle_m = camera_from_object[:3, :3], camera_from_object[:3, 3]
+    ahead, start = (rays @ turn) / AXES_M, (-middle_m @ turn) / AXES_M  # in units of the axes it is a unit sphere
+    square, cross, rest = np.sum(ahead**2, axis=1), ahead @ start, start @ start - 1.0
+    root = cross**2 - square * rest
+    depth_m = np.where(root > 0.0, (-cross - np.sqrt(np.maximum(root, 0.0))) / square, wall_m)
+    mask = root > 0.0
+    points_m = rays[mask] * depth_m[mask, None]
+    outwards = ((points_m - middle_m) @ turn) / AXES_M**2 @ turn.T
+    normals = outwards / np.linalg.norm(outwards, axis=1, keepdims=True)
+    shape = (CAMERA.height, CAMERA.width)
+    frame = Frame(index, float(index), depth_m.reshape(shape).astype(np.float32), CAMERA, mask.reshape(shape))
+    return RayImage(frame, plane, 0.001, 0.001, points_m, normals, np.argwhere(mask.reshape(shape)))
+
+
+def views_of(angles_deg: list[float], **changes: Any) -> dict[int, RayImage]:
+    return {index: seen(index, turned(angle_deg), **changes) for index, angle_deg in enumerate(angles_deg)}
+
+
+def poses_of(angles_deg: list[float]) -> dict[int, Array]:
+    """object_from_camera (4, 4) by frame, the first frame's camera being the object's frame."""
+    return {index: turned(angles_deg[0]) @ se3.inverse(turned(angle_deg)) for index, angle_deg in enumerate(angles_deg)}
+
+
+def joined(source: int, target: int, poses: Mapping[int, Array], *, kind: Any = "odometry", **changes: Any) -> Edge:
+    motion = se3.inverse(poses[target]) @ poses[source]
+    posterior = Posterior(source, target, PoseGaussian(motion, COVARIANCE), Outcome.CONVERGED, overlap=0.8)
+    return Edge(replace(posterior, **changes), kind, True, Stated("made up"))
+
+
+STEPS_DEG = [0.0, 25.0, 50.0, 75.0]
+
+
+def test_other_frames_see_through_what_is_in_the_wrong_place() -> None:
+    angles_deg = [25.0 * k for k in range(6)]
+    views = views_of(angles_deg)
+    found = seen_through(views, poses_of(angles_deg))
+    assert found is not None
+    assert found[1].holds
+    assert found[1].value < 0.01
+    wrong = seen_through(views, poses_of([*angles_deg[:5], 125.0 - 60.0]))
+    assert wrong is not None
+    assert wrong[0] == 5
+    assert not wrong[1].holds
+    assert seen_through({0: views[0]}, poses_of([0.0])) is None  # nobody else looks
+
+
+def test_surface_that_never_moved_more_than_noise_shows_no_motion() -> None:
+    views = views_of(STEPS_DEG)
+    moved, stayed = (displacement(views, Solution(poses_of(angles))) for angles in (STEPS_DEG, [0.0, 0.3, 0.1, 0.4]))
+    assert moved is not None
+    assert stayed is not None
+    assert (moved.holds, stayed.holds) == (True, False)
+    assert displacement(views, Solution({0: np.eye(4)})) is None
+
+
+class Conveyor(AbstractPrior):
+    """A prior of a user's own, which expects a turn of 25° ± 2° about the camera's vertical."""
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
+        motion = turned(0.0) @ se3.inverse(turned(-25.0 * (source.index - target.index)))
+        return Gaussian(motion, np.diag(np.repeat([np.radians(2.0), 0.01], 3) ** 2), source.centroid_m)
+
+
+TABLE = Plane(np.array([0.0, -1.0, 0.0]), 0.1, np.radians(0.3), 0.001)
+
+
+@pytest.mark.parametrize(
+    ("prior", "found_deg", "contradicted"),
+    [
+        (TurntablePrior(25.0), 25.0, False),
+        (TurntablePrior(25.0), 28.0, False),
+        (TurntablePrior(25.0), 0.0, True),
+        (TurntablePrior(25.0, step_sign="unknown"), -25.0, False),
+        (TurntablePrior(25.0, axis_direction=UP), -25.0, True),
+        (TurntablePrior(20.0, 5.0), -70.0, True),
+        (ProductPrior(TurntablePrior(25.0), GeneralPrior()), 0.0, True),
+        (Conveyor(), 25.0, False),
+        (Conveyor(), -25.0, True),
+        (GeneralPrior(), 25.0, False),
+        (GeneralPrior(), 60.0, False),  # beyond the limits of one step, which are none of knowledge
+        (TablePrior(), 25.0, False),
+    ],
+)
+def test_pairs_are_compared_with_their_prior(prior: AbstractPrior, found_deg: float, contradicted: bool) -> None:
+    views = views_of([0.0, -found_deg], plane=TABLE if isinstance(prior, TablePrior) else None)
+    poses = poses_of([0.0, -found_deg])  # turned left-handed about y, which points down: right-handed about up
+    against = contradiction([joined(1, 0, poses)], views, Solution(poses), prior)
+    assert against is not None
+    assert against.figure.holds is not contradicted
+    assert (against.source, against.target) == (1, 0)
+
+
+def test_a_tilted_object_contradicts_its_table() -> None:
+    """A step that leaves the table's plane by 5°, where 0.2° is usual."""
+    views = views_of([0.0, 25.0], plane=TABLE)
+    tilt = MIDDLE @ se3.exp(np.array([np.radians(5.0), 0.0, 0.0, 0.0, 0.0, 0.0])) @ se3.inverse(MIDDLE)
+    right = se3.inverse(poses_of([0.0, 25.0])[1])
+    for motion, holds in ((right, True), (tilt @ right, False)):
+        poses = {0: np.eye(4), 1: se3.inverse(motion)}
+        against = contradiction([joined(1, 0, poses)], views, Solution(poses), TablePrior())
+        assert against is not None
+        assert against.figure.holds is holds
+
+
+def ring(off_deg: float, *, count: int = 15) -> tuple[list[Edge], Solution]:
+    """A chain of steps of 360° / 14 and a closure, which the chain misses by `off_deg`."""
+    step_deg = (360.0 + off_deg) / (count - 1)
+    chain = poses_of([step_deg * k for k in range(count)])
+    edges = [joined(k, k - 1, chain) for k in range(1, count)]
+    edges.append(joined(count - 1, 0, poses_of([0.0] * count), kind="closure"))
+    return edges, solve(PoseGraph(edges=tuple(edges), first=0), {})
+
+
+def test_loops_open_by_more_than_their_edges_state_speak_against_a_model() -> None:
+    """Fifteen edges of 0.3° each: a loop is uncertain by 1.2°."""
+    for off_deg, holds in ((0.0, True), (2.0, True), (8.0, False)):
+        edges, solution = ring(off_deg)
+        worst = loop_figure(loop_openings(edges, solution, {}))
+        assert worst is not None
+        opening, figure = worst
+        assert figure.holds is holds
+        assert np.degrees(opening.rotation_rad) == pytest.approx(off_deg, abs=1e-6)
+    assert loop_figure(loop_openings(edges[:-1], solution, {})) is None
+
+
+def test_each_of_many_loops_may_be_open_a_little_farther() -> None:
+    edges, solution = ring(2.0)
+    openings = loop_openings(edges, solution, {})
+    one, many = loop_figure(openings), loop_figure(openings * 50)
+    assert one is not None
+    assert many is not None
+    assert one[1].limit == pytest.approx(np.sqrt(22.458 / 6.0), rel=1e-3)  # χ² of 6 degrees of freedom, 0.001
+    assert many[1].limit > one[1].limit
+
+
+def test_edges_that_contradict_each_other_speak_against_a_model() -> None:
+    edges, solution = ring(0.0)
+    figure = graph_figure(edges, solution)
+    assert figure is not None
+    assert figure.holds
+    wrong = poses_of([0.0, 20.0])[1]
+    spoilt = replace(edges[3].posterior, pose=replace(edges[3].posterior.pose, mean=wrong))
+    spoilt_edges = [*edges[:3], replace(edges[3], posterior=spoilt), *edges[4:]]
+    figure = graph_figure(spoilt_edges, solution)
+    assert figure is not None
+    assert not figure.holds
+    assert graph_figure(edges[:-1], solution) is None  # a tree contradicts nothing
+
+
+def test_modes_that_the_graph_leaves_open_speak_against_a_model() -> None:
+    angles = [0.0, 25.0]
+    poses, views = poses_of(angles), views_of(angles)
+    motions = [se3.inverse(poses_of([0.0, angle])[1]) for angle in (25.0, 26.0, 115.0)]
+    modes = tuple(Mode(1.0 / 3.0, PoseGaussian(motion, COVARIANCE)) for motion in motions)
+    edge = joined(1, 0, poses, modes=modes)
+    for weights, holds in (((0.5, 0.49, 0.01), True), ((0.5, 0.3, 0.2), False)):
+        solution = Solution(poses, mode_weights={(1, 0): np.array(weights)})
+        figure = other_modes([edge], solution, views)
+        assert figure.holds is holds
+        assert figure.value == pytest.approx(weights[2])
+    assert other_modes([edge], Solution(poses), views).value == 0.0
+
+
+def whole_run(
+    angles_deg: list[float], *, unsure: int = 0, prior: AbstractPrior | None = None, last: bool = True
+) -> tuple[list[str], dict[str, bool]]:
+    """Codes of what is wrong with a run whose poses are true, and which figures hold."""
+    views, poses = views_of(angles_deg), poses_of(angles_deg)
+    edges = tuple(joined(k, k - 1, poses) for k in range(1, len(views)))
+    masks = [Outcome.UNSURE_MASK if index < unsure else Outcome.CONVERGED for index in views]
+    frames = [FrameRecord(k, float(k), 100, "accepted", mask=mask.label) for k, mask in enumerate(masks)]
+    newest = views[len(views) - 1]
+    assert newest.frame.mask is not None
+    step = Step(
+        frame=newest.frame,
+        segmentation=Segmentation(newest.frame.mask, None, masks[-1]),
+        view=newest,
+        posteriors=(),
+        edges=(),
+        left_out=None,
+        solution=solve(PoseGraph(edges=edges, first=0), {}),
+        model=None,
+        edges_so_far=edges,
+        views=views,
+        last=last,
+    )
+    verdict = judged(step, frames, prior=prior)
+    assert verdict.trustworthy == (not verdict.shortcomings)
+    return [found.code for found in verdict.shortcomings], {name: fig.holds for name, fig in verdict.evidence.items()}
+
+
+def test_a_sound_run_is_trusted_and_shows_its_evidence() -> None:
+    codes, holds = whole_run(STEPS_DEG, prior=TurntablePrior(-25.0))
+    assert codes == []
+    assert holds == dict.fromkeys(("unsure_masks", "motion_m", "prior_sds", "seen_through", "other_modes"), True)
+
+
+@pytest.mark.parametrize(
+    ("angles_deg", "unsure", "prior", "codes"),
+    [
+        (STEPS_DEG, 2, None, []),
+        (STEPS_DEG, 3, None, ["unsure_masks"]),
+        ([0.0, 0.1, 0.0, 0.1], 0, None, ["no_motion"]),
+        (STEPS_DEG, 0, TurntablePrior(25.0, axis_direction=UP), ["prior_contradicted"]),
+        ([0.0] * 4, 0, TurntablePrior(25.0), ["no_motion", "prior_contradicted"]),
+    ],
+)
+def test_each_fault_of_a_run_has_its_code(
+    angles_deg: list[float], unsure: int, prior: AbstractPrior | None, codes: list[str]
+) -> None:
+    assert whole_run(angles_deg, unsure=unsure, prior=prior)[0] == codes
+
+
+def test_evidence_is_gathered_once_all_edges_are_in() -> None:
+    assert whole_run(STEPS_DEG, unsure=4, last=False) == (["unfinished"], {})
