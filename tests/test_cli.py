@@ -52,29 +52,26 @@ def report(folder: Path) -> dict:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ((), "no command given"),
-        (("frobnicate", "x"), "unknown command 'frobnicate'; the commands are build, "),
-        (("biuld", "x"), "unknown command 'biuld'; did you mean 'build'?"),
+        ((), "no command"),
+        (("frobnicate", "x"), "'frobnicate'"),
+        (("biuld", "x"), "'build'?"),
         (("build", BOX), "--out"),
-        (("build", BOX, "--out", "OUT", "--frob"), "--frob; see modeler build --help"),
-        (
-            ("build", BOX, "--out", "OUT", "--prio", "table"),
-            "Perhaps you meant: --prior NAME[+NAME] or --prior-args NAME=VALUE; see",
-        ),
+        (("build", BOX, "--out", "OUT", "--frob"), "--frob"),
+        (("build", BOX, "--out", "OUT", "--prio", "table"), "--prior NAME"),
         (("build", BOX, "--out", "OUT", "--intrinsics", "9", "9", "9", "9"), "--intrinsics"),
-        (("build", BOX, "--out"), "Missing value for argument '--out'"),
-        (("--verson",), "unknown option '--verson'"),
-        (("build", BOX, "--out", "OUT", "--step-deg", "0.3rad"), "--step-deg: no type matching FLOAT"),
-        (("build", BOX, "--out", "OUT", "--max-offset-m", "40"), "give a positive number of metres, at most 5\n"),
-        (("build", BOX, "--out", "OUT", "--method", "magic"), "invalid choice 'magic'"),
-        (("export", "OUT", "--out", "OUT.glb", "--tint", "red"), "invalid choice 'red'"),
-        (("register", BOX, "one", "0"), "SOURCE: invalid literal for int() with base 10: 'one'"),
+        (("build", BOX, "--out"), "'--out'"),
+        (("--verson",), "'--verson'"),
+        (("build", BOX, "--out", "OUT", "--step-deg", "0.3rad"), "--step-deg"),
+        (("build", BOX, "--out", "OUT", "--max-offset-m", "40"), "at most 5\n"),
+        (("build", BOX, "--out", "OUT", "--method", "magic"), "'magic'"),
+        (("export", "OUT", "--out", "OUT.glb", "--tint", "red"), "'red'"),
+        (("register", BOX, "one", "0"), "SOURCE: "),
         (("build", BOX, "--out", "OUT", "--prior", "magic"), "'general', 'table'"),
-        (("build", BOX, "--out", "OUT", "--roi", "1", "2", "3"), "--roi: no type matching {INT INT INT INT}"),
+        (("build", BOX, "--out", "OUT", "--roi", "1", "2", "3"), "--roi"),
         (("build", BOX, "--out", "OUT", "--every", "0"), "--every 0"),
         (("build", BOX, "--out", "OUT", "--frames", "1-3"), "--frames '1-3'"),
         (("build", BOX, "--out", "OUT", "--frames", "50:60"), "0 to 13"),
-        (("build", BOX, "--out", "OUT", "--seed", "-1"), "--seed: takes a whole number from 0 on, not '-1'"),
+        (("build", BOX, "--out", "OUT", "--seed", "-1"), "--seed: "),
         (("build", BOX, "--out", "OUT", "--prior", "table", "--max-offset-m", "1"), "--max-offset-m"),
         (("build", BOX, "--out", "OUT", "--prior", "table+table"), "names table twice"),
         (("build", BOX, "--out", "OUT", "--prior", "held"), "no robot.txt"),
@@ -90,28 +87,22 @@ def report(folder: Path) -> dict:
         (("build", BOX, "--out", "OUT", "--resume", "--overwrite"), "--resume"),
         (("build", "NOWHERE", "--out", "OUT"), "NOWHERE"),
         (("register", BOX, "0", "99"), "no frame 99"),
-        (("register", BOX, "3", "3"), "SOURCE and TARGET are both frame 3"),
-        (
-            ("register", BOX, "0", "1", "--roi", "640", "0", "700", "9"),
-            "lies outside the images of box, which are 640 x",
-        ),
-        (("build", BOX, "--out", "OUT", "--roi", "0", "480", "9", "500"), "--roi 0 480 9 500 lies outside"),
+        (("register", BOX, "3", "3"), "both frame 3"),
+        (("register", BOX, "0", "1", "--roi", "640", "0", "700", "9"), "640 x 480"),
+        (("build", BOX, "--out", "OUT", "--roi", "0", "480", "9", "500"), "--roi 0 480 9 500"),
         (("register", BOX, "0", "1", "--max-depth-m", "0.1"), "too few points"),
         (("evaluate", "--out", "OUT"), "no sequence"),
         (("evaluate", BOX, "--out", "OUT", "--methods", "icp,magic"), "'magic'"),
         (("evaluate", BOX, "--out", "OUT", "--offsets", "0"), "--offsets 0"),
-        (
-            ("evaluate", BOX, "--out", "OUT", "--offsets", "1,14"),
-            "--offsets 14: no pair of frames is so far apart in 14",
-        ),
+        (("evaluate", BOX, "--out", "OUT", "--offsets", "1,14"), "--offsets 14"),
         (("evaluate", BOX, "--out", "OUT", "--points", "0"), "--points 0"),
-        (("build", BOX, "--out", "OUT", "--connect", "nowhere"), "--connect nowhere: not the address of a viewer"),
-        (("report", __file__, "--out", "OUT"), "there is no report; is "),
-        (("evaluate", BOX, "--out", "OUT", "--roi", "0", "480", "9", "500"), "--roi 0 480 9 500 lies outside"),
+        (("build", BOX, "--out", "OUT", "--connect", "nowhere"), "--connect nowhere"),
+        (("report", __file__, "--out", "OUT"), "no report"),
+        (("evaluate", BOX, "--out", "OUT", "--roi", "0", "480", "9", "500"), "--roi 0 480 9 500"),
         (("render", "nothing", "--out", "OUT"), "box"),
         (("view", "NOWHERE"), "NOWHERE"),
         (("export", "NOWHERE", "--out", "OUT.glb"), "NOWHERE"),
-        (("export", BOX, "--out", "OUT.glb"), "there is no report; is "),
+        (("export", BOX, "--out", "OUT.glb"), "no report"),
     ],
 )
 def test_unusable_input_gives_status_2_and_one_line(
@@ -153,9 +144,7 @@ def test_a_full_disk_under_stdout_is_told_in_one_line(arguments: tuple[str, ...]
     with Path("/dev/full").open("w") as full:
         ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert ended.returncode == 2
-    assert ended.stderr == (
-        "modeler: output cannot be written (No space left on device); make room, or send it elsewhere\n"
-    )
+    assert re.fullmatch(r"modeler: .*No space left on device.*\n", ended.stderr)
 
 
 def test_register_prints_one_edge_the_same_for_the_same_seed(run: Run) -> None:
@@ -179,12 +168,12 @@ def test_register_prints_one_edge_the_same_for_the_same_seed(run: Run) -> None:
 def test_the_sequence_says_what_is_known_and_the_user_is_told(run: Run, tmp_path: Path) -> None:
     told = run("register", BOX, "1", "0", "--method", "icp")
     assert told.status == 0
-    assert "prior table, as sequence.json says" in told.err
+    assert "prior table" in told.err
     assert told.out == run("register", BOX, "1", "0", "--method", "icp", "--prior", "table").out
     told = run("register", BOX, "1", "0", "--method", "icp", "--prior", "turntable")
-    assert "step 25°, as sequence.json says" in told.err
+    assert "step 25°" in told.err
     ended = run("build", BOX, "--out", tmp_path / "run", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:2")
-    assert ended.err.startswith("modeler: prior table, as sequence.json says\n")
+    assert ended.err.startswith("modeler: prior table")
     assert report(tmp_path / "run")["prior"] == "table"
 
 
@@ -237,13 +226,13 @@ def test_same_seed_same_bytes_and_nothing_is_replaced_unasked(run: Run, built: P
 def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(run: Run, tmp_path: Path) -> None:
     ended = run("build", BOX, "--out", tmp_path, *QUICK, "--max-depth-m", "0.1")
     assert (ended.status, ended.out) == (3, "")
-    assert "frame 0 is left out: too few points" in ended.err
+    assert f"frame 0 is left out: {Outcome.TOO_FEW_POINTS.label}" in ended.err
     told = report(tmp_path)
     assert not told["trustworthy"]
     assert told["complete"]
     assert [frame["outcome"].partition(":")[0] for frame in told["frames"]] == [Outcome.TOO_FEW_POINTS.label] * 3
-    (lost,) = (reason for reason in told["reasons"] if "left out" in reason)
-    assert lost.startswith("frames 0 to 2 were left out: too few points: ")
+    (lost,) = (reason for code, reason in zip(told["reason_codes"], told["reasons"], strict=True) if code == "left_out")
+    assert lost.startswith("frames 0 to 2 ")
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"model.ply", "cloud.ply"}
 
 
@@ -293,7 +282,7 @@ def test_a_step_between_numbers_that_leave_some_out_is_told_as_a_step_between_fr
     options, whole = PriorOptions(prior="turntable", step_deg=-10.0), open_sequence(BOX)
     assert compose.told(options, whole) == ("turntable", "")
     _, remark = compose.told(options, whole.select(every=3))
-    assert remark == "frame numbers go up by 3: -10° from one number to the next is -30° from frame to frame"
+    assert [words for words in ("by 3", "-10°", "-30°") if words not in remark] == []
     assert compose.told(PriorOptions(prior="table"), whole.select(every=3)) == ("table", "")
 
 
@@ -329,8 +318,7 @@ def test_a_step_that_the_views_contradict_is_told() -> None:
 
     prior = priors.TurntablePrior(-30.0, 2.0)
     said = other_step(steps(15.0), prior)
-    assert "turned by 15.0° from one frame number to the next, not by the 30° ± 2° that was told" in said
-    assert said.endswith("is --step-deg -15.0 meant?")
+    assert [words for words in ("15.0°", "30° ± 2°", "--step-deg -15.0") if words not in said] == []
     assert "turned by 15.0°" in other_step(steps(45.0, gap=3), prior)
     again = [edge | {"source": edge["target"], "target": edge["source"]} for edge in steps(-29.0)[:1]]
     assert other_step(steps(29.0) + again, prior) == ""  # a frame that was tried again lies before its target
@@ -347,11 +335,9 @@ def test_frames_before_the_object_came_are_told() -> None:
     def said(*outcomes: str) -> str:
         return ends_without([{"id": 2 * place, "cause": cause} for place, cause in enumerate(outcomes)])
 
-    assert said(few, few, ACCEPTED, lost, ACCEPTED) == (
-        "the object is seen from frame 4 on; --frames 4: takes those frames alone"
-    )
-    assert "seen up to frame 6; --frames :7 takes" in said(ACCEPTED, few, lost, ACCEPTED, few)
-    assert "seen from frame 2 on, up to frame 4; --frames 2:5 takes" in said(few, ACCEPTED, ACCEPTED, few)
+    assert "--frames 4: " in said(few, few, ACCEPTED, lost, ACCEPTED)
+    assert "--frames :7 " in said(ACCEPTED, few, lost, ACCEPTED, few)
+    assert "--frames 2:5 " in said(few, ACCEPTED, ACCEPTED, few)
     for whole in ((ACCEPTED, few, ACCEPTED), (lost, ACCEPTED, lost), (few, few, few), (few, ACCEPTED), ()):
         assert said(*whole) == ""
 

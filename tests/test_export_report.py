@@ -239,29 +239,33 @@ def test_a_tube_is_free_to_turn_about_its_own_axis() -> None:
 )
 def test_an_axis_goes_by_what_a_person_sees(axis: Array, words: str) -> None:
     posterior = _posterior(np.radians([12.0, 1.0, 2.0]), SURE_M, _frame_of(axis))
-    assert undetermined(posterior, _view((0.03, 0.03, 0.03))) == [f"free to turn about {words}: 12° sd"]
+    (said,) = undetermined(posterior, _view((0.03, 0.03, 0.03)))
+    assert "turn" in said
+    assert f"{words}: 12°" in said
 
 
 def test_camera_is_named_where_no_view_is_at_hand() -> None:
     posterior = _posterior(np.radians([1.0, 1.0, 20.0]), np.array([0.05, 1e-3, 1e-3]))
-    assert undetermined(posterior) == ["free to turn about the viewing direction: 20° sd"]
+    (said,) = undetermined(posterior)
+    assert "viewing direction: 20°" in said
 
 
 def test_shift_is_of_the_object_not_of_the_camera() -> None:
     """A free turn about the object moves a far camera by metres, and the object not at all."""
     turned = _posterior(np.radians([1.0, 1.0, 30.0]), SURE_M)
-    assert undetermined(turned, _view((0.03, 0.03, 0.03), plane=False)) == [
-        "free to turn about the viewing direction: 30° sd"
-    ]
+    (said,) = undetermined(turned, _view((0.03, 0.03, 0.03), plane=False))
+    assert "turn" in said
+    assert "viewing direction: 30°" in said
     shifted = _posterior(SURE_RAD, np.array([1e-3, 1e-3, 0.021]))
-    assert undetermined(shifted, _view((0.03, 0.03, 0.03), plane=False)) == [
-        "free to shift along the viewing direction: 21 mm sd"
-    ]
+    (said,) = undetermined(shifted, _view((0.03, 0.03, 0.03), plane=False))
+    assert "shift" in said
+    assert "viewing direction: 21 mm" in said
 
 
 def test_a_ball_is_free_to_turn_at_all() -> None:
     posterior = _posterior(np.radians([40.0, 30.0, 20.0]), SURE_M)
-    assert undetermined(posterior, _view((0.03, 0.03, 0.03))) == ["free to turn about any axis: 20° sd and more"]
+    (said,) = undetermined(posterior, _view((0.03, 0.03, 0.03)))
+    assert "any axis: 20°" in said
 
 
 def _two_modes() -> Posterior:
@@ -273,9 +277,8 @@ def _two_modes() -> Posterior:
 
 
 def test_modes_are_told_apart_instead_of_called_free() -> None:
-    assert undetermined(_two_modes(), _view((0.03, 0.03, 0.03))) == [
-        "perhaps turned by 90° more about the table's normal: 30 % against 70 %"
-    ]
+    (said,) = undetermined(_two_modes(), _view((0.03, 0.03, 0.03)))
+    assert [words for words in ("90°", "the table's normal", "30 %", "70 %") if words not in said] == []
 
 
 def test_modes_that_lie_near_each_other_are_told_in_one_line() -> None:
@@ -283,10 +286,9 @@ def test_modes_that_lie_near_each_other_are_told_in_one_line() -> None:
     near = PoseGaussian(sure.modes[0].pose.mean @ spin(np.radians(2.0) * NORMAL), sure.modes[0].pose.covariance)
     heaviest, turned = (replace(mode, weight=weight) for mode, weight in zip(sure.modes, (0.4, 0.3), strict=True))
     several = replace(sure, modes=(heaviest, Mode(0.2, near), turned, Mode(0.1, near)))
-    assert undetermined(several, _view((0.03, 0.03, 0.03))) == [
-        "perhaps turned by 90° more about the table's normal: 30 % against 40 %",
-        "perhaps elsewhere nearby: 20 %, 10 % against 40 %",
-    ]
+    away, nearby = undetermined(several, _view((0.03, 0.03, 0.03)))
+    assert [words for words in ("90°", "the table's normal", "30 %", "40 %") if words not in away] == []
+    assert [words for words in ("20 %", "10 %", "40 %") if words not in nearby] == []
 
 
 def test_report_holds_modes_words_and_what_the_graph_made_of_them() -> None:

@@ -205,7 +205,7 @@ def test_the_zero_level_of_any_field_is_closed_inside_the_grid(seed):
 
 
 def test_the_zero_level_stays_open_where_nothing_is_known():
-    values = np.broadcast_to(np.arange(16.0) - 7.5, (16, 16, 16)).astype(np.float32)
+    values = np.tile(np.arange(16.0, dtype=np.float32) - 7.5, (16, 16, 1))
     weights = np.zeros(values.shape, dtype=np.float32)
     weights[2:9, 3:13, 1:15] = 1.0
     vertices, triangles = marching_cubes.extract(values, weights, np.argwhere(weights > 0))

@@ -242,7 +242,7 @@ def test_direction_nobody_observed_keeps_its_spread(sigma_roll_rad: float) -> No
 
 def test_invalid_covariance_is_rejected() -> None:
     flat = PoseGaussian(np.eye(4), np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 0.0]))
-    with pytest.raises(ValueError, match="edge 1 -> 0 is not positive definite"):
+    with pytest.raises(ValueError, match="edge 1 -> 0"):
         solve(PoseGraph((_edge(0, 1, flat), _edge(0, 1, flat, "closure"))), {})
 
 

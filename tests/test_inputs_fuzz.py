@@ -26,7 +26,10 @@ KEYS = st.sampled_from(["0", "1", "cam_K", "depth_scale", "cam_R_m2c", "sensor",
 ENTRIES = st.dictionaries(KEYS, JSON | st.dictionaries(KEYS, JSON, max_size=3), max_size=4)
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow) if target.share <= 0.1 else name for name, target in TARGETS.items()],
+)
 def test_damage_is_told_in_one_line_or_does_not_matter(tmp_path: Path, name: str) -> None:
     target, rng = TARGETS[name], np.random.default_rng([7, list(TARGETS).index(name)])
     path, files = fresh(target, tmp_path / "in")

@@ -35,7 +35,7 @@ def test_what_a_person_says_counts_more(folder: Path) -> None:
 def test_the_benchmarks_own_size_needs_no_intrinsics(tmp_path: Path, frames: list[Frame]) -> None:
     write_tum(tmp_path / "s", frames)
     (tmp_path / "s" / "calibration.txt").unlink()
-    with pytest.raises(InputError, match=r"no intrinsics for images of 160 x 120"):
+    with pytest.raises(InputError, match=r"intrinsics .*160 x 120"):
         open_sequence(tmp_path / "s")
     for path in (tmp_path / "s").glob("*/*.png"):
         with Image.open(path) as picture:
@@ -96,7 +96,7 @@ def test_the_unit_of_depth_that_stands_beside_the_intrinsics_counts(
     ratio = np.nanmedian(given.frame(0).depth_m / sequence.frame(0).depth_m)
     assert ratio == pytest.approx(3.0 / float(unit.split()[0]), rel=1e-5)
     (tmp_path / "s" / "camera.json").write_text(json.dumps({**told, "depth_scale": 30}))
-    with pytest.raises(InputError, match=r"camera\.json: \"depth_scale\" is 30; it must be millimetres"):
+    with pytest.raises(InputError, match=r"camera\.json: .*depth_scale.* 30\b"):
         open_sequence(tmp_path / "s")
 
 
@@ -105,10 +105,8 @@ def test_intrinsics_of_images_of_another_size_are_asked_about(tmp_path: Path, fr
     assert not open_sequence(tmp_path / "s").notes
     path = tmp_path / "s" / "camera_intrinsic.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "width": 640, "height": 480}))
-    assert open_sequence(tmp_path / "s").notes == (
-        "camera_intrinsic.json is of images of 640 x 480 where the depth images are 160 x 120: are its intrinsics "
-        "theirs?",
-    )
+    (note,) = open_sequence(tmp_path / "s").notes
+    assert [words for words in ("camera_intrinsic.json", "640 x 480", "160 x 120") if words not in note] == []
 
 
 def test_what_may_be_meant_otherwise_is_asked(tmp_path: Path, frames: list[Frame]) -> None:
@@ -117,12 +115,11 @@ def test_what_may_be_meant_otherwise_is_asked(tmp_path: Path, frames: list[Frame
     doubled = [frames[0], replace(frames[0], index=1), frames[2], replace(frames[2], index=3)]
     write_open3d(tmp_path / "twice", doubled)
     (doubt,) = survey(open_sequence(tmp_path / "twice")).doubts
-    assert doubt == (
-        "2 of 4 frames have the depth of the frame before, to the bit (1, 3): were they saved twice? If so, remove them"
-    )
+    assert doubt.startswith("2 of 4 frames")
+    assert "(1, 3)" in doubt
     write_bop(tmp_path / "unit", [replace(one, depth_m=10.0 * one.depth_m) for one in frames], depth_scale_mm=1.0)
     (doubt,) = survey(open_sequence(tmp_path / "unit")).doubts
-    assert "very far for an object: is the unit right?" in doubt
+    assert "unit" in doubt
     cameras = [replace(one.camera, cx=one.camera.cy, cy=one.camera.cx) for one in frames]
     swapped = [replace(one, camera=camera) for one, camera in zip(frames, cameras, strict=True)]
     write_bop(tmp_path / "swapped", swapped, depth_scale_mm=1.0)
@@ -132,4 +129,5 @@ def test_what_may_be_meant_otherwise_is_asked(tmp_path: Path, frames: list[Frame
     doubled = [replace(one, camera=camera) for one, camera in zip(frames, larger, strict=True)]
     write_bop(tmp_path / "larger", doubled, depth_scale_mm=1.0)
     (doubt,) = survey(open_sequence(tmp_path / "larger")).doubts
-    assert doubt.endswith("are the intrinsics those of images of another size?")
+    assert "intrinsics" in doubt
+    assert "size" in doubt

@@ -14,7 +14,7 @@ from recordings import small_frames, small_truth
 
 from modeler import se3
 from modeler.cli import main
-from modeler.types import Camera, Frame
+from modeler.types import Camera, Frame, Outcome
 from sequences import bundled, open_sequence, write_bop
 
 QUICK = ("--prior", "table", "--method", "icp")
@@ -110,9 +110,10 @@ def test_what_is_no_single_object_ends_with_a_reason_or_a_model(
     assert said.count("is left out") == len(lost)
     if change is bare:
         assert len(lost) == 3
-        assert "not to be trusted: fewer than two frames were accepted" in said
+        assert "not to be trusted" in said
     if change is doubled:
-        assert "3 of 3 frames: unsure mask: The object is hard to tell from its surroundings; give --roi" in said
+        assert f"3 of 3 frames: {Outcome.UNSURE_MASK.label}" in said
+        assert "--roi" in said
 
 
 def test_an_object_that_fills_the_image_is_modelled_where_masks_say_so(frames: list[Frame], tmp_path: Path) -> None:
@@ -164,14 +165,14 @@ def test_frames_of_different_size_need_different_intrinsics(
 ) -> None:
     write_bop(tmp_path / "in", mixed, depth_scale_mm=1.0)
     assert main(["calibrate-sensor", str(tmp_path / "in"), "--out", str(tmp_path / "noise.json")]) == 2
-    assert "frame 1 has other intrinsics; a still scene needs one camera" in capsys.readouterr().err
+    assert "frame 1 has other intrinsics" in capsys.readouterr().err
     path = tmp_path / "in" / "scene_camera.json"
     cameras = json.loads(path.read_text())
     cameras["3"]["cam_K"] = cameras["2"]["cam_K"]
     path.write_text(json.dumps(cameras))
     assert main(["info", str(tmp_path / "in")]) == 2
     said = capsys.readouterr().err
-    assert "000003.png: is 160 x 120 pixels where 000000.png is 320 x 240, with the same cam_K" in said
+    assert [words for words in ("000003.png", "160 x 120", "000000.png", "320 x 240") if words not in said] == []
 
 
 @pytest.mark.slow

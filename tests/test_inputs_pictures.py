@@ -49,7 +49,9 @@ def test_colour_too_far_in_time_is_no_partner(tmp_path: Path, frames: list[Frame
     (tmp_path / "s" / "rgb.txt").write_text("\n".join(listed))
     sequence = open_sequence(tmp_path / "s")
     assert [frame.colour is None for frame in sequence] == [False, True, False, False]
-    assert sequence.notes == ("1 depth images have no colour image within 20 ms",)
+    (note,) = sequence.notes
+    assert note.startswith("1 depth images")
+    assert "20 ms" in note
     (tmp_path / "s" / "rgb.txt").unlink()
     assert all(frame.colour is None for frame in open_sequence(tmp_path / "s"))
 
@@ -80,7 +82,8 @@ def test_a_mask_of_the_first_frame_alone_is_taken(tmp_path: Path, frames: list[F
         path.unlink()
     sequence = open_sequence(tmp_path / "s")
     assert [frame.mask is None for frame in sequence] == [False, True, True, True]
-    assert sequence.notes == ("3 of 4 depth images have no mask",)
+    (note,) = sequence.notes
+    assert note.startswith("3 of 4 ")
 
 
 @pytest.mark.parametrize("write", [write_open3d, write_tum])
@@ -92,7 +95,7 @@ def test_masks_of_no_frame_are_reported(
     for name in (stem, "999999"):
         save(tmp_path / "s" / "mask" / f"{name}.png", np.full((120, 160), 255, np.uint8))
     sequence = open_sequence(tmp_path / "s")
-    assert any("belong to no depth image and are left out (999999.png" in note for note in sequence.notes)
+    assert any("999999.png" in note for note in sequence.notes)
 
 
 def test_numbers_within_names_tell_the_order(tmp_path: Path, frames: list[Frame]) -> None:
@@ -116,9 +119,9 @@ def test_aligned_colour_that_is_finer_than_depth_is_shrunk(tmp_path: Path, frame
         with Image.open(path) as picture:
             picture.resize((480, 360), Image.Resampling.NEAREST).save(path, quality=95)
     sequence = open_sequence(tmp_path / "s")
-    assert sequence.notes == (
-        "colour is 480 x 360 where depth is 160 x 120: it is shrunk, and taken for the depth camera's view",
-    )
+    (note,) = sequence.notes
+    assert "480 x 360" in note
+    assert "160 x 120" in note
     for frame, colour in zip(sequence, before, strict=True):
         assert frame.colour is not None
         assert colour is not None
@@ -136,9 +139,7 @@ def test_depth_of_lines_or_single_points_is_asked_about(
 
     write_open3d(tmp_path / "s", list(map(thinned, frames)))
     doubts = survey(open_sequence(tmp_path / "s")).doubts
-    assert [doubt.partition(":")[0] for doubt in doubts] == [
-        "100% of the measured pixels have no measured neighbours"
-    ] * sparse
+    assert [doubt[:5] for doubt in doubts] == ["100% "] * sparse
 
 
 def test_onboarding_scenes_are_read(tmp_path: Path, frames: list[Frame], truth: dict[int, np.ndarray]) -> None:
@@ -163,9 +164,10 @@ def test_onboarding_scenes_are_read(tmp_path: Path, frames: list[Frame], truth: 
         assert frame.colour.shape == (120, 160, 3)
     found = survey(sequence)
     assert (found.masks, found.colours, found.truths) == (2, 4, 4)
-    assert "no mask in 2 frames: the object is segmented by the program" in found.missing
-    assert sequence.notes == ("1 colour images have no depth image and are left out",)
-    with pytest.raises(InputError, match="holds a sequence; give it: obj_000001_up"):
+    assert any(what.startswith("no mask in 2 frames") for what in found.missing)
+    (note,) = sequence.notes
+    assert note.startswith("1 colour images")
+    with pytest.raises(InputError, match="obj_000001_up"):
         open_sequence(tmp_path / "onboarding_static")
 
 
@@ -194,7 +196,7 @@ def test_the_folder_of_the_images_alone_is_told_from_its_sequence(tmp_path: Path
     write_bop(tmp_path / "scene", frames[:1], depth_scale_mm=1.0)
     with pytest.raises(InputError, match=rf"give the one it lies in, {tmp_path / 'scene'}"):
         open_sequence(tmp_path / "scene" / "depth")
-    with pytest.raises(InputError, match="a file of this kind holds no sequence"):
+    with pytest.raises(InputError, match=r"000000\.png"):
         open_sequence(tmp_path / "scene" / "depth" / "000000.png")
 
 

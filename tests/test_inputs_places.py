@@ -41,24 +41,24 @@ def test_pictures_that_lie_elsewhere_are_seen(
         shutil.copytree(written / "bop" / "depth", place)
     for name in ("flat", "deeper"):
         assert main(["info", str(tmp_path / name)]) == 2
-        assert "holds images but no folder depth; put the depth images into one" in capsys.readouterr().err
+        assert "no folder depth" in capsys.readouterr().err
     (tmp_path / "deeper" / "images").rename(tmp_path / "deeper" / "Depth_16bit")
     assert main(["info", str(tmp_path / "deeper")]) == 2
-    assert "if its depth images are those in Depth_16bit, rename that to depth" in capsys.readouterr().err
+    assert "Depth_16bit" in capsys.readouterr().err
     shutil.copytree(written / "bop", tmp_path / "monday" / "take 1" / "scan")
     assert main(["info", str(tmp_path / "monday")]) == 2
-    assert "holds a sequence; give it: take 1/scan" in capsys.readouterr().err
+    assert "take 1/scan" in capsys.readouterr().err
     assert main(["info", str(tmp_path / "monday" / "take 1")]) == 2
     assert "holds a sequence; give it: scan" in capsys.readouterr().err
 
 
 def test_a_path_that_is_misspelt_is_asked_about(tmp_path: Path) -> None:
     (tmp_path / "scans").mkdir()
-    with refused(f"no such folder or file; did you mean {tmp_path / 'scans'}? Else give a folder with depth/"):
+    with refused("no such folder", f"{tmp_path / 'scans'}?"):
         open_sequence(tmp_path / "scan")
-    with refused("no such folder or file; give a folder with depth/"):
+    with refused("no such folder", "depth/"):
         open_sequence(tmp_path / "elsewhere")
-    with refused("no such folder or file; give a folder with depth/"):
+    with refused("no such folder", "depth/"):
         open_sequence(tmp_path / "nowhere" / "scans")
 
 
@@ -118,7 +118,8 @@ sys.exit(main(["convert", {str(written / "bop")!r}, "--out", {str(tmp_path / "ou
 """
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr.startswith(f"modeler: {tmp_path / 'out'}: cannot be written (File too large)")
+    assert ended.stderr.startswith(f"modeler: {tmp_path / 'out'}: ")
+    assert "File too large" in ended.stderr
     assert ended.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 

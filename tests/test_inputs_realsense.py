@@ -236,7 +236,7 @@ def test_images_are_taken_when_they_are_asked_for() -> None:
         seen.append(frame.index)
     assert seen == [0, 1, 2]
     assert [frame.index for frame in sequence.select(every=2, frames=slice(1, 6))] == [1, 3, 5]
-    with pytest.raises(InputError, match="frame 7 is not kept; the first ones are 0 to 1"):
+    with pytest.raises(InputError, match=r"frame 7 .* 0 to 1"):
         sequence.frame(7)
 
 
@@ -254,7 +254,7 @@ def test_an_image_that_comes_again_is_not_taken_for_a_new_one() -> None:
     camera = StandIn(small_frames(3), times_s=(0.0, 0.0, 0.1, 0.1, 0.1, 0.2, 0.3, *[0.3] * 200))
     sequence = begin(camera, first=2)
     assert [frame.time_s for frame in itertools.islice(sequence, 4)] == [0.0, 0.1, 0.2, 0.3]
-    with pytest.raises(InputError, match="stand-in: gives the same image again and again"):
+    with pytest.raises(InputError, match=r"stand-in: .*same image"):
         list(begin(camera, first=2))
 
 
@@ -266,17 +266,17 @@ def test_a_camera_of_the_makers_library_is_read_while_it_runs(
     path = tmp_path / ("s.db3" if version >= (2, 58) else "s.bag")
     recording.record(rs, path, 14, pause_s=0.05)
     context = rs.context()
-    with pytest.raises(InputError, match=r"realsense: no camera is plugged in"):
+    with pytest.raises(InputError, match=r"realsense: no camera"):
         open_camera("123", Overrides(), context)
     played = context.load_device(str(path))
-    with pytest.raises(InputError, match=r"realsense:123: no such camera is plugged in; there is 0123456789\."):
+    with pytest.raises(InputError, match=r"realsense:123: .* 0123456789\."):
         open_camera("123", Overrides(), context)
     monkeypatch.setattr("sequences.live.PATIENCE_MS", 500)
     monkeypatch.setattr("sequences.live.FIRST", 4)
     sequence = open_camera("0123456789", Overrides(), context)
     assert (sequence.name, sequence.depth_unit) == ("Software D455", "0.25 mm (the camera)")
     frames: list[Frame] = []
-    with pytest.raises(InputError, match=r"Software D455: gives no image .*; plug it in anew"):
+    with pytest.raises(InputError, match=r"Software D455: gives no image"):
         frames.extend(sequence)
     for frame in frames:
         raw = scene.depth(round(30.0 * (frame.time_s - 1.0)), *recording.DEPTH[:2])
@@ -324,7 +324,7 @@ def test_a_camera_that_is_unplugged_leaves_what_it_gave(
         lambda path, *_: begin(camera, 2) if str(path) == "realsense:" else open_sequence(path),
     )
     assert main([command[0], "realsense:", "--out", str(out), *command[1:]]) in (0, 3)
-    assert "modeler: stand-in: gives no image: going on with the frames so far\n" in capsys.readouterr().err
+    assert "modeler: stand-in: gives no image" in capsys.readouterr().err
     if command[0] == "convert":
         assert open_sequence(out).indices == (0, 1, 2)
     else:

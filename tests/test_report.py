@@ -203,9 +203,9 @@ def test_a_run_without_any_frame_is_said_to_have_none(
     (tmp_path / "report.json").write_text(json.dumps(report | {"poses": [], "edges": []}))
     for command in (["report"], ["export", "--out", str(tmp_path.parent / "m.ply")]):
         assert main([*command, str(tmp_path)]) == 2
-        assert capsys.readouterr().err == (
-            f"modeler: {tmp_path}: no frame of this run was accepted; report.json says why\n"
-        )
+        said = capsys.readouterr().err
+        assert said.startswith(f"modeler: {tmp_path}: no frame of this run was accepted")
+        assert said.count("\n") == 1
 
 
 def test_the_command_writes_the_page_and_says_where(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -219,7 +219,9 @@ def test_the_command_writes_the_page_and_says_where(run: Path, tmp_path: Path, c
     assert "moved" in capsys.readouterr().err
     out.unlink()
     assert main(["report", str(run), "--out", str(out), "--sequence", str(bundled("box"))]) == 2
-    assert f"box: frame 0 shows something else than the one that {run} was made from" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "box: frame 0 shows something else" in said
+    assert str(run) in said
     assert not out.exists()
 
 

@@ -53,7 +53,7 @@ def test_existing_run_is_not_written_over_unasked(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / ".model.ply.1234.part").write_text("half")
     before = (tmp_path / "report.json").read_bytes()
-    with pytest.raises(InputError, match=r"not empty; choose another place, or replace or resume the run") as caught:
+    with pytest.raises(InputError, match=r"not empty") as caught:
         RunFolder.open(tmp_path)
     assert "\n" not in str(caught.value)
     assert (tmp_path / "report.json").read_bytes() == before
@@ -173,7 +173,7 @@ def test_a_folder_that_is_no_run_is_left_alone(tmp_path: Path, how: dict[str, bo
         if report is not None:
             (tmp_path / "report.json").write_text(report)
         before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-        with pytest.raises(InputError, match="not empty, and not the folder of a run"):
+        with pytest.raises(InputError, match="not the folder of a run"):
             RunFolder.open(tmp_path, **how)
         assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -216,7 +216,7 @@ def test_file_is_whole_whatever_happens_while_it_is_written(tmp_path: Path, monk
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", fail)
-        with pytest.raises(InputError, match=r"report.json: cannot be written \(No space left on device\)"):
+        with pytest.raises(InputError, match=r"report.json: .*No space left on device"):
             write_atomically(path, "new")
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", fail)
