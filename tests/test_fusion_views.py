@@ -11,7 +11,16 @@ from tabletop import BRICK, POSES
 
 from modeler import se3
 from modeler.fusion import conditional_covariances
-from modeler.fusion.depth_views import Crop, crop, depth_views, disagreement, free_of, pose_variances, posed_views
+from modeler.fusion.depth_views import (
+    Crop,
+    crop,
+    depth_views,
+    disagreement,
+    free_of,
+    pose_variances,
+    posed_views,
+    view_blocks,
+)
 from modeler.fusion.support import exposure_gains
 from modeler.types import (
     Array,
@@ -107,7 +116,7 @@ def test_one_view_of_a_stack_is_looked_up_alone() -> None:
 
 def disagreement_m(views, trajectory):
     pairs = posed_views(views, trajectory)
-    found = disagreement(depth_views(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1), 0.02)
+    found = disagreement(view_blocks(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1), 0.02)
     return float("nan") if found is None else found[0]
 
 
@@ -153,9 +162,9 @@ def test_sharp_views_have_more_say_in_colours_than_blurred_ones(rng):
         return replace(view, frame=replace(view.frame, colour=np.repeat(levels[..., None], 3, axis=2).astype(np.uint8)))
 
     views = {k: textured(view, 60 if k % 3 else 20) for k, view in tabletop.views(BRICK, POSES).items()}
-    seen = depth_views(
+    seen = view_blocks(
         posed_views(views, tabletop.trajectory(POSES)), CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1
     )
-    say = exposure_gains(seen, seen.points_m, seen.normals, tau_m=0.005, near_m=0.003)[:, 3]
+    say = exposure_gains(seen, tau_m=0.005, near_m=0.003)[:, 3]
     sharp = np.arange(len(POSES)) % 3 > 0
     np.testing.assert_allclose(say[~sharp] / say[sharp].mean(), 20.0 / 60.0, rtol=0.15)

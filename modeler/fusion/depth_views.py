@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from modeler import se3
+from modeler.disk_arrays import DiskArrays, release
 from modeler.kernels import tsdf
 from modeler.kernels.point_clouds import fitted_planes
 from modeler.types import Array, BoolArray, Edge, InputError, RayImage, Solution
@@ -20,6 +21,10 @@ STEEPEST_RAD = 1.40  # steeper steps between neighbouring pixels (80°) are dept
 SAMPLES = 20000  # points at which views are compared
 LOOKUPS = 10_000_000  # samples times views, at most, which bounds time
 BATCH = 1_000_000  # lookups per kernel call, which bounds memory
+BLOCK_BYTES = 128 * 2**20  # of a block of views, which bounds memory
+BLOCK_VIEWS = 50  # least number in one of several blocks: views vote against outliers of others in their block
+PIXEL_BYTES, POINT_BYTES = 15, 64  # of a pixel and a surface point in `DepthViews`
+STATISTICS = 1 << 22  # points at most from which quantiles are taken, which bounds memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +140,7 @@ def pose_variances(part: Crop, covariance: Array | None, sigma_r_m: float) -> Ar
 
 @dataclass(frozen=True, eq=False)
 class DepthViews:
-    """Stacked images of all views and their surface points, as `modeler.kernels.tsdf` looks them up."""
+    """Stacked images of views and their surface points, as `modeler.kernels.tsdf` looks them up."""
 
     index: npt.NDArray[np.int32]
     """(f, h, w) number of the surface point at a pixel, -1 = none."""
@@ -204,6 +209,13 @@ def posed_views(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) 
     return pairs
 
 
+def one_by_one(pairs: Iterable[tuple[RayImage, Array]]) -> Iterator[tuple[RayImage, Array]]:
+    """Yield views and poses, and let go of the memory of each where it is on disk."""
+    for view, pose in pairs:
+        yield view, pose
+        release(view.points_m)
+
+
 def depth_views(
     pairs: list[tuple[RayImage, Array]],
     corners_m: Array,
@@ -227,12 +239,12 @@ def depth_views(
         InputError: if no view sees the object in the box.
     """
     windows = [window(view, se3.inverse(pose), corners_m) for view, pose in pairs]
-    size = (len(pairs), *(max(where[axis].stop - where[axis].start for where in windows) for axis in range(2)))
+    size = len(pairs), *_largest(windows)
     index = np.full(size, -1, dtype=np.int32)
     free_m, background_m = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.float32)
     colour = np.zeros((*size, 3), dtype=np.uint8)
     intrinsics, surfaces, counts = [], [], []
-    for number, ((view, pose), where) in enumerate(zip(pairs, windows, strict=True)):
+    for number, ((view, pose), where) in enumerate(zip(one_by_one(pairs), windows, strict=True)):
         part = crop(view, where, margin_px=margin_px, min_cosine=min_cosine, edge_weight=edge_weight)
         here = number, *map(slice, part.index.shape)
         index[here] = np.where(part.index >= 0, part.index + sum(counts), -1)
@@ -274,6 +286,100 @@ def depth_views(
     )
 
 
+def _largest(windows: Iterable[tuple[slice, slice]]) -> tuple[int, int]:
+    """Return the rows and columns that hold any of some windows."""
+    rows, columns = zip(*windows, strict=True)
+    return max(some.stop - some.start for some in rows), max(some.stop - some.start for some in columns)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewBlocks:
+    """Views in blocks, of which one at a time needs to be in memory.
+
+    Of n blocks each has every n-th view, and so sees all sides of the object that the views see.
+    """
+
+    blocks: tuple[DepthViews, ...]
+    """A single one is in memory, several are on disk."""
+    disk: DiskArrays = field(default_factory=DiskArrays)
+    """Where they are."""
+
+    def __iter__(self) -> Iterator[DepthViews]:
+        """Yield the blocks, and let go of the memory of each."""
+        for block in self.blocks:
+            yield block
+            self.disk.release()
+
+    @property
+    def count(self) -> int:
+        """Number of views."""
+        return sum(len(block.index) for block in self.blocks)
+
+    @property
+    def coloured(self) -> bool:
+        """Whether a view has colour."""
+        return any(bool(block.coloured.any()) for block in self.blocks)
+
+    def carving(self, tau_m: float) -> ViewBlocks:
+        """Return the views with empty space extended behind the background, see `DepthViews.carving`."""
+        if len(self.blocks) == 1:
+            return replace(self, blocks=(self.blocks[0].carving(tau_m),))
+        return replace(self, blocks=tuple(_on_disk(block.carving(tau_m), self.disk, "free_m") for block in self))
+
+    def thinned(self, values: Callable[[DepthViews], Array]) -> Array:
+        """Return values (n, …) of all surface points, or of every k-th where there are more than `STATISTICS`."""
+        step = thinning(sum(len(block.points_m) for block in self.blocks))
+        return np.concatenate([values(block)[::step] for block in self])
+
+
+def view_blocks(
+    pairs: list[tuple[RayImage, Array]],
+    corners_m: Array,
+    *,
+    margin_px: int,
+    min_cosine: float,
+    edge_weight: float,
+    covariances: Mapping[int, Array] | None = None,
+) -> ViewBlocks:
+    """Crop views to a box and stack them, in several blocks where one would hold more than `BLOCK_BYTES`.
+
+    Arguments and errors as for `depth_views`.
+    """
+    rows, columns = _largest(window(view, se3.inverse(pose), corners_m) for view, pose in pairs)
+    points = sum(len(view.points_m) for view, _ in pairs)
+    size = PIXEL_BYTES * len(pairs) * rows * columns + POINT_BYTES * points
+    count = max(1, min(-(-size // BLOCK_BYTES), len(pairs) // BLOCK_VIEWS))
+    blocks, disk = [], DiskArrays()
+    for first in range(count):
+        some = pairs[first::count]
+        block = depth_views(
+            some,
+            corners_m,
+            margin_px=margin_px,
+            min_cosine=min_cosine,
+            edge_weight=edge_weight,
+            covariances=covariances,
+        )
+        if count > 1:
+            block = _on_disk(block, disk, *(part.name for part in fields(block)))
+        blocks.append(block)
+    disk.release()
+    return ViewBlocks(tuple(blocks), disk)
+
+
+def _on_disk(block: DepthViews, disk: DiskArrays, *names: str) -> DepthViews:
+    """Return a block with some of its arrays on disk; in memory where they cannot be written."""
+    try:
+        return replace(block, **{name: disk.written(getattr(block, name)) for name in names})
+    except OSError:
+        return block
+
+
+def thinning(points: int) -> int:
+    """Return of which step a share of points is for quantiles: 1 unless they are more than `STATISTICS`."""
+    return max(1, points // STATISTICS)
+
+
 def _plane(view: RayImage, object_from_camera: Array) -> Array:
     """Return normal and offset (4,) of a view's support plane in the object frame, NaN where there is none."""
     if view.plane is None:
@@ -282,31 +388,35 @@ def _plane(view: RayImage, object_from_camera: Array) -> Array:
     return np.append(normal, view.plane.offset_m - normal @ object_from_camera[:3, 3])
 
 
-def disagreement(views: DepthViews, limit_m: float) -> tuple[float, float] | None:
+def disagreement(views: ViewBlocks, limit_m: float) -> tuple[float, float] | None:
     """Return robust standard deviations of the distance between the surfaces of different views, in m (F4).
 
     They contain the noise of both views and the error of their poses. None if no two views see the same surface.
 
     Args:
-        views: the views.
+        views: the views, compared within each block.
         limit_m: larger distances are between different surfaces.
 
     Returns:
         The standard deviation between two views, and that of one view of weight 1.
     """
-    samples = min(SAMPLES, -(-LOOKUPS // len(views.index)))
-    chosen = np.arange(0, len(views.points_m), max(1, len(views.points_m) // samples))
-    lookup = views.index, views.poses, views.intrinsics, views.points_m, views.normals
-    found_m = []
-    for some in np.array_split(chosen, -(-len(chosen) * len(views.index) // BATCH)):
-        distance_m, others = tsdf.disagreements(some, views.views[some], limit_m, *lookup)
-        found = others >= 0
-        mine, theirs = views.weights[some[np.nonzero(found)[0]]], views.weights[others[found]]
-        off_m = np.abs(distance_m[found])
-        found_m.append((off_m, off_m / np.sqrt(1.0 / mine + 1.0 / theirs)))
-    off_m, share_m = (np.concatenate(some) for some in zip(*found_m, strict=True))
+    samples = min(SAMPLES // len(views.blocks), -(-LOOKUPS // views.count))
+    off_m, share_m = (np.concatenate(some) for some in zip(*_distances(views, samples, limit_m), strict=True))
     # (F4)
     return (1.4826 * float(np.median(off_m)), 1.4826 * float(np.median(share_m))) if len(off_m) else None
+
+
+def _distances(blocks: ViewBlocks, samples: int, limit_m: float) -> Iterator[tuple[Array, Array]]:
+    """Yield distances between views at sampled points of each block, and these in units of what the weights imply."""
+    for views in blocks:
+        chosen = np.arange(0, len(views.points_m), max(1, len(views.points_m) // samples))
+        lookup = views.index, views.poses, views.intrinsics, views.points_m, views.normals
+        for some in np.array_split(chosen, -(-len(chosen) * len(views.index) // BATCH)):
+            distance_m, others = tsdf.disagreements(some, views.views[some], limit_m, *lookup)
+            found = others >= 0
+            mine, theirs = views.weights[some[np.nonzero(found)[0]]], views.weights[others[found]]
+            off_m = np.abs(distance_m[found])
+            yield off_m, off_m / np.sqrt(1.0 / mine + 1.0 / theirs)
 
 
 def conditional_covariances(solution: Solution, edges: Iterable[Edge]) -> Mapping[int, Array]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from modeler.fusion.depth_views import DepthViews
+from modeler.fusion.depth_views import ViewBlocks
 from modeler.kernels import marching_cubes, tsdf
 from modeler.types import Array
 
@@ -68,16 +68,26 @@ class DistanceField:
     """(n, 3) voxels with a weight, in ascending order."""
 
 
-def measured(grid: VoxelGrid, views: DepthViews, *, tau_m: float, empty_weight: float) -> DistanceField:
-    """Return the signed distance measured by the views, within ±`tau_m` of the surface (docs/method.md, F5)."""
+def measured(grid: VoxelGrid, views: ViewBlocks, *, tau_m: float, empty_weight: float) -> DistanceField:
+    """Return the signed distance measured by the views, within ±`tau_m` of the surface (docs/method.md, F5).
+
+    The distances that several blocks of views measure are averaged by their weights.
+    """
     block_m = tsdf.SIDE * grid.voxel_m
-    blocks = tsdf.blocks_near(views.points_m, grid.origin_m, block_m, tau_m, grid.blocks)
-    distance, weight = tsdf.integrate(
-        blocks, grid.origin_m, grid.voxel_m, tau_m, empty_weight, views.views, *views.lookup
-    )
+    near = np.zeros(grid.blocks, dtype=bool)
+    for some in views:
+        near[tuple(tsdf.blocks_near(some.points_m, grid.origin_m, block_m, tau_m, grid.blocks).T)] = True
+    voxels = np.argwhere(near)
+    distance, weight = (np.zeros((len(voxels), *(tsdf.SIDE,) * 3), dtype=np.float32) for _ in range(2))
+    for some in views:
+        value, share = tsdf.integrate(
+            voxels, grid.origin_m, grid.voxel_m, tau_m, empty_weight, some.views, *some.lookup
+        )
+        weight += share
+        distance += np.divide(share, weight, out=np.ones_like(share), where=weight > 0.0) * (value - distance)
     x, y, z = (int(n) for n in grid.blocks)
     values, weights = (np.zeros((x, y, z, tsdf.SIDE, tsdf.SIDE, tsdf.SIDE), dtype=np.float32) for _ in range(2))
-    values[tuple(blocks.T)], weights[tuple(blocks.T)] = distance, weight
+    values[near], weights[near] = distance, weight
     values = values.transpose(0, 3, 1, 4, 2, 5).reshape(grid.shape)
     weights = weights.transpose(0, 3, 1, 4, 2, 5).reshape(grid.shape)
     for axis in range(3):

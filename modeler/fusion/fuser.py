@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +11,16 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.fusion import meshing, watertight
-from modeler.fusion.depth_views import SMOOTHED, DepthViews, depth_views, disagreement, posed_views
+from modeler.fusion.depth_views import (
+    SMOOTHED,
+    DepthViews,
+    ViewBlocks,
+    disagreement,
+    one_by_one,
+    posed_views,
+    thinning,
+    view_blocks,
+)
 from modeler.fusion.distance_field import DistanceField, VoxelGrid, filled, grid_around, measured
 from modeler.fusion.support import ViewSupport, exposure_gains, view_support
 from modeler.kernels import point_clouds
@@ -95,12 +104,12 @@ class Fuser:
         noise_m = float(np.median([view.sigma_r_m for view, _ in pairs]))
         voxel_m = self.voxel_side_m(pairs)
         grid = grid_around(
-            np.concatenate([se3.transform(pose, view.points_m) for view, pose in pairs]),
+            _some_points(pairs),
             voxel_m=voxel_m,
             border_m=3.0 * voxel_m + 2.0 * noise_m,
             max_voxels=self.max_voxels,
         )
-        seen = depth_views(
+        seen = view_blocks(
             pairs,
             grid.corners_m,
             margin_px=self.margin_px,
@@ -119,7 +128,8 @@ class Fuser:
         Raises:
             InputError: if `voxel_m` is not a length that the views resolve.
         """
-        footprint_m = np.concatenate([view.points_m[:, 2] / view.frame.camera.fx for view, _ in pairs])
+        step = thinning(sum(len(view.points_m) for view, _ in pairs))
+        footprint_m = np.concatenate([view.points_m[::step, 2] / view.frame.camera.fx for view, _ in one_by_one(pairs)])
         pixel_m = float(np.median(footprint_m))
         if self.voxel_m is None:
             return max(pixel_m, 0.5 * float(np.median([view.sigma_r_m for view, _ in pairs])))
@@ -137,7 +147,7 @@ class FusionVolume:
 
     fuser: Fuser
     """Parameters."""
-    views: DepthViews
+    views: ViewBlocks
     """The views."""
     grid: VoxelGrid
     """The voxels."""
@@ -157,16 +167,15 @@ class FusionVolume:
         vertices, triangles, seen = self._mesh(watertight=watertight)
         normals = meshing.normals_of(vertices, triangles)
         at_vertices = self.support(vertices, normals)
-        points, point_normals = downsampled(
-            self.views.points_m,
-            self.views.normals,
-            self.views.weights,
+        points, point_normals = voxel_means(
+            ((block.points_m, block.normals, block.weights) for block in self.views),
+            np.array([_extent_m(block.points_m) for block in self.views]),
             voxel_m=self.grid.voxel_m,
             max_voxels=8 * self.fuser.max_voxels,
         )
         at_points = self.support(points, point_normals)
         kept = self._supported(at_points) & ~_outliers(points, 2.0 * self.grid.voxel_m)
-        coloured = bool(self.views.coloured.any())
+        coloured = self.views.coloured
         known = at_vertices.coloured & seen
         return ObjectModel(
             points_m=points[kept],
@@ -192,15 +201,13 @@ class FusionVolume:
     @property
     def texel_m(self) -> float:
         """Length on the surface that half a pixel of the views covers."""
-        turns, shifts = self.views.poses[:, :, :3], self.views.poses[:, :, 3]
-        centres_m = -np.einsum("fji,fj->fi", turns, shifts)[self.views.views]
-        depth_m = float(np.median(np.linalg.norm(self.views.points_m - centres_m, axis=1)))
-        return 0.5 * depth_m / float(np.median(self.views.intrinsics[:, 0]))
+        depth_m = float(np.median(self.views.thinned(_ranges_m)))
+        return 0.5 * depth_m / float(np.median(np.concatenate([block.intrinsics[:, 0] for block in self.views])))
 
     @cached_property
     def _gains(self) -> Array:
         """Exposure gains and colour weights of the views, (f, 4)."""
-        return exposure_gains(self.views, self.views.points_m, self.views.normals, tau_m=self.tau_m, near_m=self.near_m)
+        return exposure_gains(self.views, tau_m=self.tau_m, near_m=self.near_m)
 
     def _support(self, points_m: Array, normals: Array, gains: Array, *, focus: float = SOFT) -> ViewSupport:
         return view_support(
@@ -240,7 +247,7 @@ class FusionVolume:
         Surface is supported, not seen empty by several views, and does not fold over at a border.
         """
         normals = meshing.normals_of(vertices, triangles)
-        found = self._support(vertices, normals, np.zeros((len(self.views.index), 4)))
+        found = self._support(vertices, normals, np.zeros((self.views.count, 4)))
         # Closing gaps in the support must not add what several views see empty.
         empty = found.empty_views * self.fuser.empty_weight > found.weight + self.fuser.empty_weight
         seen = (found.weight > self.fuser.min_support) & self._supported(found)  # (F7)
@@ -270,22 +277,73 @@ class FusionVolume:
 def downsampled(
     points_m: Array, normals: Array, weights: Array, *, voxel_m: float, max_voxels: int
 ) -> tuple[Array, Array]:
-    """Average oriented points (n, 3) over voxels.
+    """Average oriented points (n, 3) over voxels; see `voxel_means`."""
+    box_m = _extent_m(points_m)[None]
+    return voxel_means([(points_m, normals, weights)], box_m, voxel_m=voxel_m, max_voxels=max_voxels)
+
+
+def voxel_means(
+    clouds: Iterable[tuple[Array, Array, Array]], boxes_m: Array, *, voxel_m: float, max_voxels: int
+) -> tuple[Array, Array]:
+    """Average the oriented points of several clouds over voxels.
+
+    Args:
+        clouds: points (n, 3), normals (n, 3) and weights (n,) of each.
+        boxes_m: (k, 2, 3) lowest and highest corners of boxes that hold them.
+        voxel_m: side of a voxel.
+        max_voxels: voxels are enlarged until the box of all boxes has at most this many.
 
     Returns:
         Points (m, 3) and unit normals (m, 3), in the order in which the points enter the voxels.
     """
-    low, high = points_m.min(axis=0), points_m.max(axis=0)
+    low, high = boxes_m[:, 0].min(axis=0), boxes_m[:, 1].max(axis=0)
     while np.prod(np.ceil((high - low) / voxel_m) + 1.0) > max_voxels:
         voxel_m *= 1.25
     shape = (np.ceil((high - low) / voxel_m) + 1.0).astype(np.int64)
-    cells, count = point_clouds.voxel_numbers(points_m, low, voxel_m, shape)
-    sums, totals = point_clouds.voxel_sums(cells, count, weights, np.concatenate([points_m, normals], axis=1))
-    means = sums / totals[:, None]
+    voxels, sums = np.zeros(0, dtype=np.int64), np.zeros((0, 7))
+    for points_m, normals, weights in clouds:
+        cells, count = point_clouds.voxel_numbers(points_m, low, voxel_m, shape)
+        some, totals = point_clouds.voxel_sums(cells, count, weights, np.concatenate([points_m, normals], axis=1))
+        firsts = np.empty(count, dtype=np.int64)
+        firsts[cells[::-1]] = np.arange(len(cells))[::-1]  # the last assignment counts
+        places = np.floor((points_m[firsts] - low) / voxel_m).astype(np.int64)
+        voxels = np.concatenate([voxels, np.ravel_multi_index(tuple(places.T), tuple(shape))])
+        sums = np.concatenate([sums, np.concatenate([some, totals[:, None]], axis=1)])
+        voxels, sums = _summed(voxels, sums)
+    means = sums[:, :6] / sums[:, 6:]
     lengths = np.linalg.norm(means[:, 3:], axis=1)
     # Opposite sides of a sheet thinner than a voxel cancel: such a point has no normal and is left out.
     kept = lengths > 0.1
     return means[kept, :3], means[kept, 3:] / lengths[kept, None]
+
+
+def _summed(keys: npt.NDArray[np.int64], values: Array) -> tuple[npt.NDArray[np.int64], Array]:
+    """Return distinct keys, in the order in which they first appear, and the sums of the values (n, c) of each."""
+    _, firsts, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    order = np.argsort(firsts)
+    ranks = np.empty(len(order), dtype=np.int64)
+    ranks[order] = np.arange(len(order))
+    sums = np.zeros((len(order), values.shape[1]))
+    np.add.at(sums, ranks[inverse], values)
+    return keys[firsts[order]], sums
+
+
+def _extent_m(points_m: Array) -> Array:
+    """Return the lowest and highest corners (2, 3) of the box around points (n, 3)."""
+    return np.stack([points_m.min(axis=0), points_m.max(axis=0)])
+
+
+def _some_points(pairs: list[tuple[RayImage, Array]]) -> Array:
+    """Return surface points (n, 3) of all views in the object frame, enough for quantiles."""
+    step = thinning(sum(len(view.points_m) for view, _ in pairs))
+    return np.concatenate([se3.transform(pose, view.points_m[::step]) for view, pose in one_by_one(pairs)])
+
+
+def _ranges_m(views: DepthViews) -> Array:
+    """Return the distance (n,) of each surface point from its camera."""
+    turns, shifts = views.poses[:, :, :3], views.poses[:, :, 3]
+    centres_m = -np.einsum("fji,fj->fi", turns, shifts)[views.views]
+    return np.linalg.norm(views.points_m - centres_m, axis=1)
 
 
 def _outliers(points_m: Array, cell_m: float) -> BoolArray:

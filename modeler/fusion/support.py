@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import laplace, minimum_filter
 
-from modeler.fusion.depth_views import GREY, DepthViews
+from modeler.fusion.depth_views import GREY, DepthViews, ViewBlocks
 from modeler.kernels import tsdf
-from modeler.types import Array
+from modeler.types import Array, BoolArray
 
 # Strength of the prior on the noise of a single point: the noise of all points counts as much as this many views.
 PRIOR_VIEWS = 3.0  # chosen by hand
@@ -43,7 +43,7 @@ class ViewSupport:
 
 
 def view_support(
-    views: DepthViews,
+    views: ViewBlocks,
     points_m: Array,
     normals: Array,
     *,
@@ -56,7 +56,7 @@ def view_support(
     """Return what the views observe at oriented points (docs/method.md, F7 to F9).
 
     Args:
-        views: the views.
+        views: the views, by block.
         points_m: (n, 3) in the object frame.
         normals: (n, 3) unit.
         tau_m: half width of the truncation band.
@@ -65,20 +65,18 @@ def view_support(
         gains: (f, 4) gains of red, green and blue, and the weight of each view's colours.
         focus: exponent of the view weights for colours; the larger, the more the most frontal view dominates.
     """
-    batches = [
-        tsdf.observe(
-            np.ascontiguousarray(points_m[start : start + BATCH]),
-            np.ascontiguousarray(normals[start : start + BATCH]),
-            near_m,
-            tau_m,
-            *views.lookup,
-            views.colour,
-            gains,
-            focus,
+    sums, colours = np.zeros((len(points_m), 5)), np.zeros((len(points_m), 4))
+    start = 0
+    for some in views:
+        mine = gains[start : start + len(some.index)]
+        some_sums, some_colours = _observed(
+            some, points_m, normals, tau_m=tau_m, near_m=near_m, gains=mine, focus=focus
         )
-        for start in range(0, max(len(points_m), 1), BATCH)
-    ]
-    sums, colours = (np.concatenate(part) for part in zip(*batches, strict=True))
+        start += len(some.index)
+        sums += some_sums
+        colours[:, 3] += some_colours[:, 3]
+        shares = np.divide(some_colours[:, 3], colours[:, 3], out=np.zeros(len(points_m)), where=colours[:, 3] > 0.0)
+        colours[:, :3] += shares[:, None] * (some_colours[:, :3] - colours[:, :3])
     weight, empty_views, count, first, second = sums.T
     found = count > 0.0
     safe = np.where(found, weight, 1.0)
@@ -95,32 +93,55 @@ def view_support(
     )
 
 
-def exposure_gains(views: DepthViews, points_m: Array, normals: Array, *, tau_m: float, near_m: float) -> Array:
+def _observed(
+    views: DepthViews, points_m: Array, normals: Array, *, tau_m: float, near_m: float, gains: Array, focus: float
+) -> tuple[Array, Array]:
+    """Return what `tsdf.observe` returns for the views of a block."""
+    batches = [
+        tsdf.observe(
+            np.ascontiguousarray(points_m[start : start + BATCH]),
+            np.ascontiguousarray(normals[start : start + BATCH]),
+            near_m,
+            tau_m,
+            *views.lookup,
+            views.colour,
+            gains,
+            focus,
+        )
+        for start in range(0, max(len(points_m), 1), BATCH)
+    ]
+    sums, colours = (np.concatenate(part) for part in zip(*batches, strict=True))
+    return sums, colours
+
+
+def exposure_gains(views: ViewBlocks, *, tau_m: float, near_m: float) -> Array:
     """Return (f, 4): gains of red, green and blue that equalise exposure, and colour weights, 0 without colour.
 
     Each point has one colour and each view a gain; both are fitted to the logarithms of the observed colours of
     common points (docs/method.md, F10). Sharper views have more weight.
 
     Args:
-        views: the views.
-        points_m: (n, 3) on the surface, in the object frame.
-        normals: (n, 3) unit.
+        views: the views, by block.
         tau_m: half width of the truncation band.
         near_m: largest distance along the normal to the same surface.
     """
-    result = np.concatenate([np.ones((len(views.coloured), 3)), _sharpness(views)[:, None]], axis=1)
-    with_colour = np.flatnonzero(views.coloured)
-    if len(with_colour) < 2 or not len(points_m):
+    coloured = np.concatenate([some.coloured for some in views.blocks])
+    result = np.concatenate([np.ones((len(coloured), 3)), _sharpness(views, coloured)[:, None]], axis=1)
+    with_colour = np.flatnonzero(coloured)
+    if len(with_colour) < 2:
         return result
-    chosen = np.arange(0, len(points_m), max(1, len(points_m) * len(with_colour) // EXPOSURE_LOOKUPS))
-    points_m, normals = np.ascontiguousarray(points_m[chosen]), np.ascontiguousarray(normals[chosen])
-    levels = np.zeros((len(with_colour), len(chosen), 3))
-    weights = np.zeros((len(with_colour), len(chosen)))
-    unit_gain = np.ones((1, 4))
-    for row, view in enumerate(with_colour):
-        one = views.only(int(view))
-        _, colours = tsdf.observe(points_m, normals, near_m, tau_m, *one.lookup, one.colour, unit_gain, 1.0)
-        levels[row], weights[row] = colours[:, :3], colours[:, 3]
+    points = sum(len(some.points_m) for some in views.blocks)
+    step = max(1, points * len(with_colour) // EXPOSURE_LOOKUPS)
+    points_m = np.concatenate([some.points_m[::step] for some in views])
+    normals = np.concatenate([some.normals[::step] for some in views])
+    levels, weights = np.zeros((len(with_colour), len(points_m), 3)), np.zeros((len(with_colour), len(points_m)))
+    unit_gain, row = np.ones((1, 4)), 0
+    for some in views:
+        for view in np.flatnonzero(some.coloured):
+            one = some.only(int(view))
+            _, colours = tsdf.observe(points_m, normals, near_m, tau_m, *one.lookup, one.colour, unit_gain, 1.0)
+            levels[row], weights[row] = colours[:, :3], colours[:, 3]
+            row += 1
     weights[np.any((levels < DARK) | (levels > BRIGHT), axis=2)] = 0.0
     weights[:, np.count_nonzero(weights, axis=0) < 2] = 0.0
     if not weights.any():
@@ -139,26 +160,42 @@ def _log_gains(logs: Array, observed: Array) -> Array:
         shares = weights / totals
         means = np.sum(shares * logs, axis=0)
         # Normal equations of (F10), the points' colours already eliminated.
-        normal = np.diag(weights.sum(axis=1)) - weights @ shares.T
-        ridge = 1e-3 * normal.trace() / len(logs) + (COLOUR_SIGMA / GAIN_SIGMA) ** 2
-        gain = np.linalg.solve(normal + ridge * np.eye(len(logs)), np.sum(weights * (means - logs), axis=1))
+        totals, off = weights.sum(axis=1), np.sum(weights * (means - logs), axis=1)
+        ridge = 1e-3 * (totals.sum() - np.sum(weights * shares)) / len(logs) + (COLOUR_SIGMA / GAIN_SIGMA) ** 2
+        gain = _solved(totals + ridge, weights, shares, off)
         gain = np.clip(gain - gain.mean(), -np.log(LARGEST_GAIN), np.log(LARGEST_GAIN))
         off = logs + gain[:, None] - np.sum(shares * (logs + gain[:, None]), axis=0)
         weights = observed / (1.0 + (off / COLOUR_SIGMA) ** 2)
     return gain
 
 
-def _sharpness(views: DepthViews) -> Array:
+def _solved(diagonal: Array, left: Array, right: Array, values: Array) -> Array:
+    """Return x (f,) with (diag(d) - l rᵀ) x = y, for l and r (f, n).
+
+    Of the system in f and that in n unknowns (Woodbury) the smaller one is solved.
+    """
+    if len(left) <= left.shape[1]:
+        return np.linalg.solve(np.diag(diagonal) - left @ right.T, values).astype(np.float64)
+    across = np.eye(left.shape[1]) - right.T @ (left / diagonal[:, None])
+    return (values + left @ np.linalg.solve(across, right.T @ (values / diagonal))) / diagonal
+
+
+def _sharpness(views: ViewBlocks, coloured: BoolArray) -> Array:
     """Return colour weights (f,): fine detail on the object relative to the other views; 0 without colour."""
-    sharpness = np.zeros(len(views.coloured))
-    for view in np.flatnonzero(views.coloured):
-        brightness = views.colour[view].astype(np.float64).mean(axis=2)
-        inside = np.asarray(minimum_filter(views.index[view] >= 0, size=3), dtype=bool)
-        if inside.any():
-            detail = np.median(np.abs(laplace(brightness)[inside]))
-            sharpness[view] = detail / max(float(brightness[inside].mean()), 1.0)
+    sharpness = np.concatenate([[_detail(some, view) for view in range(len(some.index))] for some in views])
     known = sharpness > 0.0
     if known.any():
         sharpness[known] = np.clip(sharpness[known] / np.median(sharpness[known]), 0.3, 3.0)
-    sharpness[views.coloured & ~known] = 1.0
+    sharpness[coloured & ~known] = 1.0
     return sharpness
+
+
+def _detail(views: DepthViews, view: int) -> float:
+    """Return fine detail on the object in a view, relative to its brightness; 0 where there is none, or no colour."""
+    if not views.coloured[view]:
+        return 0.0
+    brightness = views.colour[view].astype(np.float64).mean(axis=2)
+    inside = np.asarray(minimum_filter(views.index[view] >= 0, size=3), dtype=bool)
+    if not inside.any():
+        return 0.0
+    return float(np.median(np.abs(laplace(brightness)[inside]))) / max(float(brightness[inside].mean()), 1.0)

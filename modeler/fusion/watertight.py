@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 from scipy.spatial import KDTree
 
 from modeler.fusion import meshing
-from modeler.fusion.depth_views import DepthViews
+from modeler.fusion.depth_views import DepthViews, ViewBlocks
 from modeler.fusion.distance_field import FAINT, DistanceField, crossed
 from modeler.kernels import occupancy
 from modeler.types import Array, BoolArray
@@ -37,7 +39,7 @@ def without_rejected(field: DistanceField, rejected_m: Array, kept_m: Array, rea
     return DistanceField(grid, field.values_m, weights, np.argwhere(weights > 0.0))
 
 
-def closed_field(field: DistanceField, seen: DepthViews, tau_m: float) -> DistanceField:
+def closed_field(field: DistanceField, seen: ViewBlocks, tau_m: float) -> DistanceField:
     """Return the field with all unknown voxels classified as outside or inside.
 
     What views see empty or below the support plane is outside, unless nearly all other views see surface in front of
@@ -47,9 +49,13 @@ def closed_field(field: DistanceField, seen: DepthViews, tau_m: float) -> Distan
     grid = field.grid
     stride = max(1, int(np.ceil((float(np.prod(grid.shape)) / CELLS) ** (1.0 / 3.0))))
     blocks, cell_m = -(-grid.shape // stride), stride * grid.voxel_m
-    empty, at_surface, hidden = occupancy.observation_counts(
-        grid.origin_m, cell_m, blocks, tau_m, seen.free_m, seen.poses, seen.intrinsics, seen.planes
-    )
+    counts = [
+        occupancy.observation_counts(
+            grid.origin_m, cell_m, blocks, tau_m, some.free_m, some.poses, some.intrinsics, some.planes
+        )
+        for some in seen
+    ]
+    empty, at_surface, hidden = np.stack(counts).sum(axis=0, dtype=np.int64)[:3]
     observed = np.maximum(empty + at_surface + hidden, 1)
     seen_empty = empty > OUTVOTED * observed
     field = _without_deep_voids(field, hidden >= (1.0 - OUTVOTED) * observed, stride)
@@ -81,24 +87,30 @@ def closed_field(field: DistanceField, seen: DepthViews, tau_m: float) -> Distan
     return DistanceField(grid, whole, np.maximum(field.weights, np.float32(FAINT)), crossed(whole))
 
 
-def support_planes(seen: DepthViews, corners_m: Array, tau_m: float) -> Array:
+def support_planes(seen: ViewBlocks, corners_m: Array, tau_m: float) -> Array:
     """Return normals and offsets (k, 4) of the planes on which the object stood, in the object frame.
 
     Planes of different views are the same if they are less than `tau_m` apart all over the box with `corners_m`
     (8, 3). A plane seen by a few views alone, or with surface points below it, is left out.
     """
-    planes = seen.planes[np.isfinite(seen.planes).all(axis=1)]
+    planes = np.concatenate([some.planes for some in seen])
+    planes = planes[np.isfinite(planes).all(axis=1)]
     heights_m = corners_m @ planes[:, :3].T + planes[:, 3]
     found, remaining = [], np.arange(len(planes))
     while len(remaining):
         alike = np.abs(heights_m[:, remaining] - heights_m[:, remaining[:1]]).max(axis=0) < tau_m
         plane = np.median(planes[remaining[alike]], axis=0)
         plane /= np.linalg.norm(plane[:3])
-        below = float(np.mean(seen.points_m @ plane[:3] + plane[3] < -tau_m))
-        if np.count_nonzero(alike) > OUTVOTED * len(seen.planes) and below < BELOW_PLANE:
+        below = float(np.mean(seen.thinned(partial(_heights_m, plane)) < -tau_m))
+        if np.count_nonzero(alike) > OUTVOTED * seen.count and below < BELOW_PLANE:
             found.append(plane)
         remaining = remaining[~alike]
     return np.reshape(found, (-1, 4))
+
+
+def _heights_m(plane: Array, views: DepthViews) -> Array:
+    """Return the heights (n,) of all surface points above a plane (4,)."""
+    return views.points_m @ plane[:3] + plane[3]
 
 
 def cleaned(

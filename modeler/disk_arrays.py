@@ -1,0 +1,78 @@
+"""Arrays in a temporary file, mapped into memory: the operating system reads what is used, and drops it again."""
+
+from __future__ import annotations
+
+import mmap
+import sys
+import tempfile
+import weakref
+from typing import IO, TypeVar, final
+
+import numpy as np
+import numpy.typing as npt
+
+_Number = TypeVar("_Number", bound=np.generic)
+_ALIGNMENT = 64  # bytes, for every type of number
+
+
+@final
+class DiskArrays:
+    """Arrays in a file of `TMPDIR`, which has no name and ends with the process."""
+
+    def __init__(self, chunk_bytes: int = 128 * 2**20) -> None:
+        """Open nothing yet.
+
+        Args:
+            chunk_bytes: of the file that are mapped together, a multiple of 64 kB.
+        """
+        self._chunk_bytes = chunk_bytes
+        self._file: IO[bytes] | None = None
+        self._chunks: list[mmap.mmap] = []
+        self._end = self._filled = self._mapped = 0
+
+    def written(self, array: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
+        """Return an array that is on disk.
+
+        Raises:
+            OSError: where it cannot be written.
+        """
+        if not array.size:
+            return array
+        if self._filled + array.nbytes > self._mapped:
+            self._map(
+                max(self._chunk_bytes, -(-array.nbytes // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY)
+            )
+        assert self._file is not None
+        offset, self._filled = self._filled, -(-(self._filled + array.nbytes) // _ALIGNMENT) * _ALIGNMENT
+        self._file.seek(self._end - self._mapped + offset)
+        self._file.write(np.ascontiguousarray(array).data.cast("B"))
+        self._file.flush()
+        return np.frombuffer(self._chunks[-1], array.dtype, array.size, offset).reshape(array.shape)
+
+    def release(self) -> None:
+        """Drop from memory what was read of the arrays; where it is used again, it is read again."""
+        if sys.platform == "linux":
+            for chunk in self._chunks:
+                chunk.madvise(mmap.MADV_DONTNEED)
+
+    def _map(self, size: int) -> None:
+        """Map another part of the file; what was read of those before need not stay in memory."""
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(prefix="modeler-")
+            weakref.finalize(self, self._file.close)
+        self.release()
+        self._file.truncate(self._end + size)
+        # Writable, because compiled functions tell such arrays from others; nothing is written through it.
+        self._chunks.append(mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_WRITE, offset=self._end))
+        self._end, self._filled, self._mapped = self._end + size, 0, size
+
+
+def release(array: npt.NDArray[np.generic]) -> None:
+    """Drop from memory what was read of the part of a file in which an array lies; nothing for an array in memory."""
+    owner: object = array
+    while isinstance(owner, np.ndarray):
+        owner = owner.base
+    if isinstance(owner, memoryview):
+        owner = owner.obj
+    if isinstance(owner, mmap.mmap) and sys.platform == "linux":
+        owner.madvise(mmap.MADV_DONTNEED)
