@@ -128,7 +128,7 @@ def build(
         seed=seed,
         prior=type(prior).__name__ if isinstance(prior, AbstractPrior) else compose.told(options, frames)[0],
         known=modeler.prior,
-        closure_expected=comes_back(frames, None, modeler.closer.max_angle_deg),
+        closure_expected=comes_back(frames, modeler.prior, modeler.closer.max_angle_deg),
     )
     scene = compose.scene(modeler, frames)
     report: Mapping[str, Any] = {}

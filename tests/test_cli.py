@@ -297,7 +297,12 @@ def test_a_step_between_numbers_that_leave_some_out_is_told_as_a_step_between_fr
     ],
 )
 def test_a_turn_that_is_told_by_hand_counts_more(frames: slice, given_deg: float | None, *, expected: bool) -> None:
-    assert comes_back(open_sequence(BOX).select(frames=frames), given_deg, reach_deg=20.0) is expected
+    told = [priors.GeneralPrior()]
+    if given_deg is not None:
+        table = priors.TurntablePrior(given_deg)
+        told = [table, priors.ProductPrior(priors.GeneralPrior(), table), priors.VelocityPrior(table)]
+    for prior in told:
+        assert comes_back(open_sequence(BOX).select(frames=frames), prior, reach_deg=20.0) is expected
 
 
 def test_a_table_that_turns_the_other_way_is_asked_about() -> None:
@@ -327,6 +332,10 @@ def test_a_step_that_the_views_contradict_is_told() -> None:
     for edges in (steps(25.0), steps(90.0, gap=3), steps(15.0, count=2), [lost] * 5, []):
         assert other_step(edges, prior) == ""
     assert other_step(steps(15.0), priors.TablePrior()) == ""
+    still = other_step(steps(0.02), prior)
+    assert "turned by 0.0°" in still
+    assert "--step-deg" not in still  # which refuses 0
+    assert "turned by 15.0°" in other_step(steps(15.0), priors.ProductPrior(priors.GeneralPrior(), prior))
 
 
 def test_frames_before_the_object_came_are_told() -> None:

@@ -56,6 +56,23 @@ def test_last_frames_of_a_full_turn_close_on_the_first(name: str, angles_deg: Ar
         assert between_deg < 48.0, name
 
 
+@pytest.mark.parametrize(
+    ("angles_deg", "tried"),
+    [
+        (50.0 * np.arange(7), True),  # ends at 300°, one large step before its start
+        (45.0 * np.arange(7), False),  # at 270°: views so far apart are not registered
+        ([*(40.0 * np.arange(10)), 390.0, 420.0], False),  # a loop was closed at 360°
+    ],
+)
+def test_a_turn_of_few_large_steps_closes_from_where_it_ends(angles_deg: Sequence[float], *, tried: bool) -> None:
+    run = Run(list(angles_deg))
+    run.run(Closer())
+    last = run.numbers[-1]
+    assert (0 in run.tried[last]) is tried
+    if tried:
+        assert [edge.accepted for edge in run.judged[last] if edge.target == 0] == [True]
+
+
 @pytest.mark.parametrize("sigma_deg", [1.0, 20.0])
 def test_last_frame_is_tried_on_the_first_unless_the_graph_is_sure_that_it_is_elsewhere(sigma_deg: float) -> None:
     """A mug whose handle is hidden for four steps: registrations see half of each turn, and say so or do not."""

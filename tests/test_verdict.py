@@ -16,14 +16,18 @@ from modeler.types import (
     AbstractPrior,
     Array,
     Camera,
+    Consistency,
     Edge,
+    Failed,
     Frame,
+    LowOverlap,
     Mode,
     Outcome,
     Plane,
     PoseGaussian,
     Posterior,
     RayImage,
+    Reason,
     Segmentation,
     Solution,
     Stated,
@@ -220,11 +224,19 @@ def test_modes_that_the_graph_leaves_open_speak_against_a_model() -> None:
 
 
 def whole_run(
-    angles_deg: list[float], *, unsure: int = 0, prior: AbstractPrior | None = None, last: bool = True
+    angles_deg: list[float],
+    *,
+    unsure: int = 0,
+    prior: AbstractPrior | None = None,
+    last: bool = True,
+    refused: Reason | None = None,
+    expected: bool = False,
 ) -> tuple[list[str], dict[str, bool]]:
     """Codes of what is wrong with a run whose poses are true, and which figures hold."""
     views, poses = views_of(angles_deg), poses_of(angles_deg)
     edges = tuple(joined(k, k - 1, poses) for k in range(1, len(views)))
+    if refused is not None:
+        edges = (*edges, replace(joined(len(views) - 1, 0, poses, kind="closure"), accepted=False, reason=refused))
     masks = [Outcome.UNSURE_MASK if index < unsure else Outcome.CONVERGED for index in views]
     frames = [FrameRecord(k, float(k), 100, "accepted", mask=mask.label) for k, mask in enumerate(masks)]
     newest = views[len(views) - 1]
@@ -242,7 +254,7 @@ def whole_run(
         views=views,
         last=last,
     )
-    verdict = judged(step, frames, prior=prior)
+    verdict = judged(step, frames, prior=prior, closure_expected=expected)
     assert verdict.trustworthy == (not verdict.shortcomings)
     return [found.code for found in verdict.shortcomings], {name: fig.holds for name, fig in verdict.evidence.items()}
 
@@ -267,6 +279,30 @@ def test_each_fault_of_a_run_has_its_code(
     angles_deg: list[float], unsure: int, prior: AbstractPrior | None, codes: list[str]
 ) -> None:
     assert whole_run(angles_deg, unsure=unsure, prior=prior)[0] == codes
+
+
+TURN_DEG = [30.0 * k for k in range(13)]
+CONTRADICTS = Consistency(7.1, 4.7, 25.1, 0.018, 1.0, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("angles_deg", "refused", "expected", "codes"),
+    [
+        (TURN_DEG[:9], None, False, []),
+        (TURN_DEG[:9], None, True, ["never_came_back"]),
+        (TURN_DEG[:12], None, False, ["not_tried"]),  # 30° from the first view
+        (TURN_DEG, CONTRADICTS, False, ["closures_refused"]),
+        (TURN_DEG, LowOverlap(0.2, 0.4), False, ["closures_refused"]),
+        (TURN_DEG[:11], LowOverlap(0.2, 0.4), False, []),  # 60° apart: surface in common is not to be expected
+        (TURN_DEG[:11], Failed(Outcome.NO_OVERLAP), False, []),
+        (TURN_DEG[:11], Failed(Outcome.NO_OVERLAP), True, ["closures_refused"]),
+        (TURN_DEG[:11], CONTRADICTS, False, ["closures_refused"]),
+    ],
+)
+def test_where_a_turn_may_be_complete_a_loop_must_have_been_tried(
+    angles_deg: list[float], refused: Reason | None, expected: bool, codes: list[str]
+) -> None:
+    assert whole_run(angles_deg, refused=refused, expected=expected)[0] == codes
 
 
 def test_evidence_is_gathered_once_all_edges_are_in() -> None:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from modeler import se3
-from modeler.priors import TurntablePrior
+from modeler.priors import GeneralPrior, TablePrior, TurntablePrior
 from modeler.types import AbstractPrior, Failed, Outcome, Reason, advice
 from sequences import AbstractSequence
 
 _SURE_STEPS: Final = 3  # pairs that tell a step
 _FAR_SDS: Final = 3.0  # of the told step, from which on another one is meant
+_ROUGH: Final = 0.25  # of a step: how unevenly an object is turned by hand (11° to 37° where 18° were meant)
+_NEAR_LIMIT_DEG: Final = 15.0  # from the limit: the search follows poses beyond it so far (docs/method.md)
 _BY_OPTIONS: Final = {
     Outcome.AT_LIMIT: (
         "The motion may be larger than the prior allows; raise --max-rotation-deg (general, table), --max-offset-m "
@@ -36,18 +39,28 @@ def reason_advice(reason: Reason) -> str:
     return outcome_advice(reason.outcome) if isinstance(reason, Failed) else advice(reason)
 
 
-def comes_back(frames: AbstractSequence, given_deg: float | None, reach_deg: float) -> bool:
+def comes_back(frames: AbstractSequence, prior: AbstractPrior, reach_deg: float) -> bool:
     """Return whether the object is said to turn as far as its first view, or nearly.
 
     Args:
         frames: the sequence, which may tell the turn from frame to frame.
-        given_deg: that turn where a person tells it, who counts more.
+        prior: of the run, whose turntable counts more.
         reach_deg: how near to a view another must look for them to be registered.
     """
-    step_deg = (frames.motion or {}).get("step_deg") if given_deg is None else given_deg
+    table = turntable(prior)
+    step_deg = (frames.motion or {}).get("step_deg") if table is None else table.step_deg
     if not isinstance(step_deg, int | float):
         return False
     return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
+
+
+def turntable(prior: AbstractPrior) -> TurntablePrior | None:
+    """Return the turntable in a prior, of which it may be one of several parts; None where there is none."""
+    if isinstance(prior, TurntablePrior):
+        return prior
+    values = [getattr(prior, field.name) for field in fields(prior)] if is_dataclass(prior) else []
+    parts = (turntable(value) for value in values if isinstance(value, AbstractPrior))
+    return next((part for part in parts if part is not None), None)
 
 
 def sense_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
@@ -59,7 +72,8 @@ def sense_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
     """
     little = "little_overlap" in (report.get("reason_codes") or ())
     little = little or any(frame.get("cause") == Outcome.NO_OVERLAP.label for frame in report["frames"])
-    return little and isinstance(prior, TurntablePrior) and prior.step_sign == "known"
+    table = turntable(prior)
+    return little and table is not None and table.step_sign == "known"
 
 
 def other_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
@@ -69,23 +83,121 @@ def other_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
         edges: of the report.
         prior: of the run.
     """
+    table, turns = turntable(prior), step_angles_deg(edges)
+    if table is None or len(turns) < _SURE_STEPS:
+        return ""
+    found_deg, told_deg = float(np.median(turns)), abs(table.step_deg)
+    if abs(found_deg - told_deg) <= _FAR_SDS * table.step_sigma_deg:
+        return ""
+    meant_deg = round(float(np.copysign(found_deg, table.step_deg)), 1)
+    return (
+        f"the views turned by {found_deg:.1f}° from one frame number to the next, not by the {told_deg:g}° ± "
+        f"{table.step_sigma_deg:g}° that was told; "
+        + (f"is --step-deg {meant_deg:.1f} meant?" if meant_deg else "did the table turn?")
+    )
+
+
+def step_angles_deg(edges: Sequence[Mapping[str, Any]]) -> list[float]:
+    """Return the rotations in degrees from one frame number to the next, of the least gap that occurs.
+
+    Args:
+        edges: of the report.
+    """
     odometry = [edge for edge in edges if edge["accepted"] and edge["kind"] == "odometry"]
     gaps = [abs(edge["source"] - edge["target"]) for edge in odometry]  # frames tried again lie before their targets
     gap = min(gaps, default=1)
-    turns = [
-        np.degrees(se3.rotation_angle(np.reshape(edge["target_from_source"], (4, 4)))) / gap
+    return [
+        float(np.degrees(se3.rotation_angle(np.reshape(edge["target_from_source"], (4, 4))))) / gap
         for edge, apart in zip(odometry, gaps, strict=True)
         if apart == gap
     ]
-    if not isinstance(prior, TurntablePrior) or len(turns) < _SURE_STEPS:
-        return ""
-    found_deg, told_deg = float(np.median(turns)), abs(prior.step_deg)
-    if abs(found_deg - told_deg) <= _FAR_SDS * prior.step_sigma_deg:
-        return ""
-    return (
-        f"the views turned by {found_deg:.1f}° from one frame number to the next, not by the {told_deg:g}° ± "
-        f"{prior.step_sigma_deg:g}° that was told; is --step-deg {np.copysign(found_deg, prior.step_deg):.1f} meant?"
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """What to do next, where a model is not to be trusted."""
+
+    words: str
+    """For people."""
+    options: Mapping[str, str] = field(default_factory=dict)
+    """Of `modeler build`, by name without dashes, with their values; those given before stay."""
+    first: str = ""
+    """A command to run before; "" = none."""
+
+
+def remedy(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
+    """Return what to do next about the first reason not to trust a model; None where there is nothing to try.
+
+    Args:
+        report: of the run.
+        prior: of the run.
+    """
+    codes = sorted(report.get("reason_codes") or (), key=lambda code: code == "left_out")
+    by_code: dict[str, Callable[[Mapping[str, Any], AbstractPrior], Remedy | None]] = {
+        "left_out": _at_limit,
+        "prior_contradicted": _without_prior,
+        **dict.fromkeys(("unsure_masks", "no_motion"), _region),
+        **dict.fromkeys(("loop_open", "edges_disagree"), _camera),
+        "closures_refused": _camera,
+        **dict.fromkeys(("seen_through", "little_overlap", "other_modes", "unsure_rotation"), _more_known),
+    }
+    found = (by_code[code](report, prior) for code in codes if code in by_code)
+    return next((each for each in found if each is not None), None)
+
+
+def _region(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
+    region = {"roi": "X0 Y0 X1 Y1", "max-depth-m": "M"}
+    return Remedy("say where the object is: the pixels around it in all frames, and the depth behind it", region)
+
+
+def _camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
+    """Return how a focal length is estimated, where a loop tells it."""
+    if not any(edge["kind"] == "closure" for edge in report["edges"]):
+        return _more_known(report, prior)
+    first = "modeler calibrate-camera {run} --out camera.json"
+    return Remedy("estimate the focal length from the loop, and build with it", {"camera": "camera.json"}, first)
+
+
+def _without_prior(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
+    """Return which prior holds less; None where the step that the images show is told anyway."""
+    if other_step(report["edges"], prior):
+        return None
+    if isinstance(prior, TurntablePrior):
+        return Remedy("allow for a larger error of the step", {"step-sigma-deg": f"{3.0 * prior.step_sigma_deg:g}"})
+    return Remedy("see what the images say without it", {"prior": "general"})
+
+
+def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
+    """Return which prior holds more."""
+    if turntable(prior) is not None:
+        return None
+    if report.get("up") is not None and isinstance(prior, GeneralPrior):
+        return Remedy("say that the object stays on its table", {"prior": "table"})
+    turns = step_angles_deg(report["edges"])
+    step = f"{np.median(turns):.0f}" if turns and np.median(turns) >= 1.0 else "DEG"
+    sigma = f"{max(_ROUGH * float(np.median(turns)), 1.0):.0f}" if turns else "DEG"
+    known = {"prior": "turntable", "step-deg": step, "step-sigma-deg": sigma}
+    return Remedy("say how far it was turned from frame to frame, and how evenly", known)
+
+
+def _at_limit(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
+    """Return the limit to raise at which a frame was left out; None where none was at a limit."""
+    lost = {frame["id"] for frame in report["frames"] if frame.get("cause") == Outcome.AT_LIMIT.label}
+    edges = [edge for edge in report["edges"] if edge["source"] in lost and edge["outcome"] == Outcome.AT_LIMIT.label]
+    if not edges:
+        return None
+    turned_deg = max(
+        float(np.degrees(se3.rotation_angle(np.reshape(edge["target_from_source"], (4, 4))))) for edge in edges
     )
+    if isinstance(prior, GeneralPrior | TablePrior) and turned_deg >= prior.max_rotation_deg - _NEAR_LIMIT_DEG:
+        return Remedy(
+            "allow for larger rotations", {"max-rotation-deg": f"{min(2.0 * prior.max_rotation_deg, 180.0):g}"}
+        )
+    if isinstance(prior, GeneralPrior):
+        return Remedy("allow for larger offsets", {"max-offset-m": f"{2.0 * prior.max_offset_m:g}"})
+    if isinstance(prior, TablePrior | TurntablePrior):
+        return Remedy("allow for larger shifts", {"max-shift-m": f"{2.0 * prior.max_shift_m:g}"})
+    return None
 
 
 def ends_without(frames: Sequence[Mapping[str, Any]]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -84,7 +85,7 @@ class Build:
             prior=prior,
             known=modeler.prior,
             settings=self.settings(),
-            closure_expected=comes_back(frames, self.prior.step_deg, modeler.closer.max_angle_deg),
+            closure_expected=comes_back(frames, modeler.prior, modeler.closer.max_angle_deg),
         )
         if self.resume and RunFolder(self.out).finished(meta):
             RunFolder(self.out).pairs.drop()  # what a kill at the very end left of them
@@ -116,6 +117,22 @@ class Build:
         return {
             name: value for name, value in parts.items() if name not in ("prior", "seed") and value not in (None, ())
         }
+
+    def command(self, changes: Mapping[str, str]) -> str:
+        """Return the command line that replaces the run by one with other options, by name without dashes."""
+        given = {"prior": self.prior.prior, **self.settings(), "seed": self.method.seed}
+        usual = {"every": 1, "frames": ":", "method": "visibility", "seed": 0}
+        words = {
+            name.replace("_", "-"): shlex.join(map(str, value if isinstance(value, tuple) else (value,)))
+            for name, value in given.items()
+            if value not in (None, ()) and usual.get(name) != value
+        }
+        if changes.get("prior", words.get("prior")) != words.get("prior"):  # whose parameters are its own
+            words = {name: value for name, value in words.items() if name.replace("-", "_") not in vars(self.prior)}
+        options = " ".join(f"--{name} {value}" for name, value in {**words, **changes}.items())
+        return (
+            f"modeler build {shlex.quote(str(self.sequence))} --out {shlex.quote(str(self.out))} --overwrite {options}"
+        )
 
 
 def _check(options: Build) -> None:
@@ -216,7 +233,7 @@ def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt) -> Iterator
 
 def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
     """Say on stderr what came out, and return the exit status."""
-    from modeler.cli.advice import ends_without, other_step, sense_in_doubt
+    from modeler.cli.advice import ends_without, other_step, remedy, sense_in_doubt
     from modeler.types import ACCEPTED
 
     accepted = sum(frame["outcome"] == ACCEPTED for frame in report["frames"])
@@ -239,4 +256,8 @@ def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> in
     for remark in (other_step(report["edges"], prior), ends_without(report["frames"])):
         if remark:
             say(remark)
+    next_step = None if report["trustworthy"] else remedy(report, prior)
+    if next_step is not None:
+        before = next_step.first.format(run=shlex.quote(str(options.out)))
+        say(f"{next_step.words}: {before}{' && ' * bool(before)}{options.command(next_step.options)}")
     return 0 if report["trustworthy"] else 3

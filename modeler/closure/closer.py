@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,7 +12,18 @@ from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresho
 from modeler.closure.information_gain import InformationGain
 from modeler.closure.map_view import MapView, ShortestPaths, composed
 from modeler.closure.relocaliser import Relocaliser
-from modeler.types import Edge, EdgeKind, NotPlaced, PoseGaussian, Posterior, Reason, Solution
+from modeler.types import (
+    AWAY_DEG,
+    NEAR_DEG,
+    Edge,
+    EdgeKind,
+    NotPlaced,
+    PoseGaussian,
+    Posterior,
+    Reason,
+    Solution,
+    loops_closed,
+)
 
 _MIN_PROBABILITY = 0.02  # that a view is within reach: a return whose turn was uncertain adds much information
 _SPAN_POWER = 6.0  # an edge over 25° adds half the information of one over none, over 50° a fourteenth
@@ -27,9 +38,12 @@ class Closer:
     accepted where it is consistent with the other edges (method.md, "Closure gate").
     """
 
-    max_angle_deg: float = 45.0
+    max_angle_deg: float = NEAR_DEG
     """Largest predicted rotation in degrees to an earlier view for it to be tried."""
-    away_deg: float = 90.0
+    max_return_deg: float = 75.0
+    """The same for the last frame and the first, where no loop is closed yet: as far as views are registered at all
+    (`priors.general.relaxed_limits`). A turn of few large steps ends one step, of up to so much, before its start."""
+    away_deg: float = AWAY_DEG
     """How far in degrees the object must have turned away from an earlier view before it counts as coming back."""
     max_closures: int = 2
     """Most views besides the previous one that are tried for a frame; 0 = never close."""
@@ -73,10 +87,19 @@ class Closer:
                     chosen.append(candidate.frame)
                 spanned = spanned or not back
         first = frames[0]  # a closure on the first view is best
-        wanted = last and 0 in near and map_view.came_back(first, base.source, gain.paths, away_deg=self.away_deg)
+        wanted = last and first != base.target and self._returns(gain, float(angle_deg[0]))
+        wanted = wanted and map_view.came_back(first, base.source, gain.paths, away_deg=self.away_deg)
         if wanted or first in chosen:
             chosen = [first, *(frame for frame in chosen if frame != first)]
         return tuple(chosen[: self.max_closures])
+
+    def _returns(self, gain: InformationGain, angle_deg: float) -> bool:
+        """Return whether the last frame may be registered against the first view, `angle_deg` from it."""
+        known, first = gain.map_view, gain.map_view.frames[0]
+        closed = loops_closed([edge for edge in known.edges if known.solution.takes_part(edge)])
+        reach_deg = self.max_angle_deg if closed else max(self.max_angle_deg, self.max_return_deg)
+        probability = replace(gain, max_angle_deg=reach_deg).probability_within([first], np.array([angle_deg]))
+        return bool(probability[0] >= _MIN_PROBABILITY)
 
     def span_pairs(self, map_view: MapView) -> tuple[tuple[int, int], ...]:
         """Return pairs (source, target) of views to register once all are in: those of most information for each."""

@@ -31,6 +31,7 @@ from modeler.types import (
     InputError,
     Mode,
     Outcome,
+    PoseGaussian,
     Posterior,
     PriorRefused,
     RayImage,
@@ -128,12 +129,15 @@ class Tracker:
         tried |= {edge.target for edge in self.state.graph.edges if edge.source == view.index} if again else set()
         targets = self.closer.closure_targets(base, self.state.map_view, last=last)
         targets = [target for target in targets if target not in tried]
-        prior = self.known
         predicted = [
-            PredictedProposal(prior, self.closer.predicted_motion(base, target, self.state.solution))
-            for target in targets
+            self._predicted(self.closer.predicted_motion(base, target, self.state.solution)) for target in targets
         ]
         return tuple(self._pairs([(view, target) for target in targets], predicted))
+
+    def _predicted(self, motion: PoseGaussian) -> PredictedProposal:
+        """Return the prior of a closure whose motion the graph predicts."""
+        far = np.degrees(se3.rotation_angle(motion.mean)) > self.closer.max_angle_deg
+        return PredictedProposal(self.known.relaxed(_SPAN_STEPS) if far else self.known, motion)
 
     def spans(self, pairs: Sequence[tuple[int, int]]) -> Iterator[Posterior]:
         """Yield posteriors of pairs (source, target) of views of the graph that were not registered yet."""

@@ -44,6 +44,8 @@ from modeler.types.reasons import advice as advice
 from modeler.types.reasons import code as code
 from modeler.types.reasons import explain as explain
 from modeler.types.reasons import summary as summary
+from modeler.types.solution import AWAY_DEG as AWAY_DEG
+from modeler.types.solution import NEAR_DEG as NEAR_DEG
 from modeler.types.solution import Edge as Edge
 from modeler.types.solution import EdgeKind as EdgeKind
 from modeler.types.solution import LoopOpening as LoopOpening

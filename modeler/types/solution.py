@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -43,6 +43,12 @@ class Edge:
     def target(self) -> int:
         """Frame number of the target view."""
         return self.posterior.target
+
+
+AWAY_DEG: Final = 90.0
+"""Rotation from which on the object has turned away from a view: half of what that saw of a sphere is left."""
+NEAR_DEG: Final = 45.0
+"""Rotation up to which two views share surface whatever the shape: 85 % of what each sees of a sphere."""
 
 
 def _unsolved(target: int, source: int) -> Array:

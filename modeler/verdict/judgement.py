@@ -9,10 +9,15 @@ from typing import Final
 
 import numpy as np
 
+from modeler import se3
 from modeler.types import (
     ACCEPTED,
+    AWAY_DEG,
+    NEAR_DEG,
     AbstractPrior,
     Edge,
+    Failed,
+    LowOverlap,
     OptimisationOutlier,
     Outcome,
     Solution,
@@ -68,7 +73,7 @@ class Shortcoming:
     code: str
     """For programs: `doubt`, `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
     `prior_contradicted`, `loop_open`, `edges_disagree`, `closures_refused`, `unconfirmed`, `never_came_back`,
-    `seen_through`, `little_overlap`, `other_modes` or `unsure_rotation`."""
+    `not_tried`, `seen_through`, `little_overlap`, `other_modes` or `unsure_rotation`."""
     words: str
     """For people."""
 
@@ -215,20 +220,49 @@ def _open_loop(step: Step, edges: Sequence[Edge], *, closure_expected: bool) -> 
     if loops_closed(edges):
         return []
     closures = [edge for edge in step.edges_so_far if edge.kind == "closure"]
-    refused = [edge for edge in closures if edge not in edges]
+    joining = [edge for edge in closures if edge in edges]
+    refused = [edge for edge in closures if edge not in joining and (closure_expected or _tells(edge, step.solution))]
     if refused:
         last = refused[-1]
         why = explain(OptimisationOutlier() if last in step.solution.outliers else last.reason)
         pair = f"frame {last.source} on frame {last.target}"
         words = f"none of {len(closures)} closures closed a loop; the last refused, {pair}: {why}"
         return [Shortcoming("closures_refused", words)]
-    if closures:
+    if joining:
         words = "what joins the first frames to the last is confirmed by nothing: no loop was closed"
         return [Shortcoming("unconfirmed", words)]
     if closure_expected:
         words = "the object never came back to an earlier view, so that no loop was closed"
         return [Shortcoming("never_came_back", words)]
+    back = None if closures else _came_back(step.solution)
+    if back is not None:
+        frame, first = back
+        words = f"frame {frame} shows the object from the side of frame {first} again, and no loop was tried"
+        return [Shortcoming("not_tried", words)]
     return []
+
+
+def _tells(edge: Edge, solution: Solution) -> bool:
+    """Return whether a refused closure tells anything: far apart, views may share too little surface for one."""
+    bare = isinstance(edge.reason, LowOverlap) or edge.reason == Failed(Outcome.NO_OVERLAP)
+    known = edge.source in solution.trajectory and edge.target in solution.trajectory
+    near = known and np.degrees(se3.rotation_angle(solution.relative(edge.target, edge.source))) <= NEAR_DEG
+    return bool(near) or not bare
+
+
+def _came_back(solution: Solution) -> tuple[int, int] | None:
+    """Return the frame that comes nearest to the first view again after the object had turned away, and the first.
+
+    None where no frame comes near.
+    """
+    first, *frames = sorted(solution.trajectory) or [0]
+    angles_deg = np.array([np.degrees(se3.rotation_angle(solution.relative(first, frame))) for frame in frames])
+    away = np.flatnonzero(angles_deg >= AWAY_DEG)
+    if not len(away):
+        return None
+    after_deg = angles_deg[away[0] :]
+    nearest = int(np.argmin(after_deg))
+    return (frames[away[0] + nearest], first) if after_deg[nearest] <= NEAR_DEG else None
 
 
 def _little_overlap(edges: Sequence[Edge]) -> list[Shortcoming]:

@@ -1,0 +1,82 @@
+"""What to try next where a model is not to be trusted: by the reason, and by the limit that was hit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from modeler import priors, se3
+from modeler.cli.advice import remedy
+from modeler.cli.build import Build
+from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.types import AbstractPrior, Outcome
+
+
+def untrusted(*codes: str, turn_deg: float = 40.0, outcome: Outcome = Outcome.CONVERGED, **more: Any) -> dict[str, Any]:
+    """What a report says of a run of two frames, of which one may be left out."""
+    turn = se3.exp(np.array([0.0, np.radians(turn_deg), 0.0, 0.0, 0.0, 0.0]))
+    edge = {"accepted": outcome is Outcome.CONVERGED, "kind": "odometry", "source": 1, "target": 0}
+    edge |= {"outcome": outcome.label, "target_from_source": turn.ravel().tolist()}
+    frames = [{"id": 0, "cause": ""}, {"id": 1, "cause": "" if edge["accepted"] else outcome.label}]
+    return {"reason_codes": list(codes), "frames": frames, "edges": [edge], **more}
+
+
+@pytest.mark.parametrize(
+    ("report", "prior", "options"),
+    [
+        (untrusted("unsure_masks", "seen_through"), priors.GeneralPrior(), {"roi", "max-depth-m"}),
+        (untrusted("no_motion"), priors.GeneralPrior(), {"roi", "max-depth-m"}),
+        (untrusted("seen_through", up=[0.0, -1.0, 0.0]), priors.GeneralPrior(), {"prior": "table"}),
+        (untrusted("seen_through"), priors.GeneralPrior(), {"prior": "turntable", "step-deg": "40"}),
+        (untrusted("unsure_rotation", up=[0.0, -1.0, 0.0]), priors.TablePrior(), {"prior": "turntable"}),
+        (untrusted("unsure_rotation"), priors.TurntablePrior(25.0), None),
+        (untrusted("prior_contradicted"), priors.TurntablePrior(25.0, 2.0), {"step-sigma-deg": "6"}),
+        (untrusted("prior_contradicted"), priors.TablePrior(), {"prior": "general"}),
+        (untrusted("never_came_back"), priors.GeneralPrior(), None),
+        (
+            untrusted("left_out", turn_deg=48.0, outcome=Outcome.AT_LIMIT),
+            priors.GeneralPrior(),
+            {"max-rotation-deg": "100"},
+        ),
+        (untrusted("left_out", turn_deg=10.0, outcome=Outcome.AT_LIMIT), priors.TablePrior(), {"max-shift-m": "0.1"}),
+        (
+            untrusted("left_out", turn_deg=10.0, outcome=Outcome.AT_LIMIT),
+            priors.GeneralPrior(),
+            {"max-offset-m": "0.08"},
+        ),
+        (untrusted("left_out", outcome=Outcome.NO_OVERLAP), priors.GeneralPrior(), None),
+    ],
+)
+def test_what_to_do_next_is_the_limit_that_was_hit_or_what_is_missing(
+    report: dict[str, Any], prior: AbstractPrior, options: Any
+) -> None:
+    found = remedy(report, prior)
+    if options is None:
+        assert found is None
+    else:
+        assert found is not None
+        assert set(options) <= set(found.options)
+        if isinstance(options, dict):
+            assert options.items() <= found.options.items()
+
+
+def test_a_loop_that_is_open_leads_to_the_focal_length() -> None:
+    report = untrusted("loop_open", "edges_disagree")
+    report["edges"].append(report["edges"][0] | {"kind": "closure"})
+    found = remedy(report, priors.GeneralPrior())
+    assert found is not None
+    assert found.first.startswith("modeler calibrate-camera")
+    assert found.options == {"camera": "camera.json"}
+
+
+def test_the_command_to_try_keeps_what_was_given() -> None:
+    build = Build(Path("a b"), Path("run"), prior=PriorOptions(prior="table", max_shift_m=0.1))
+    assert build.command({"roi": "1 2 3 4"}) == (
+        "modeler build 'a b' --out run --overwrite --prior table --max-shift-m 0.1 --roi 1 2 3 4"
+    )
+    assert build.command({"prior": "general"}) == "modeler build 'a b' --out run --overwrite --prior general"
+    build = Build(Path("a"), Path("run"), where=ObjectOptions(roi=(1, 2, 3, 4)), method=MethodOptions(seed=3))
+    assert build.command({}) == "modeler build a --out run --overwrite --roi 1 2 3 4 --seed 3"
