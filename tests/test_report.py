@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -70,6 +71,29 @@ class Elements(HTMLParser):
     def handle_data(self, data: str) -> None:
         if self.open and self.open[-1] in ("h1", "h2", "h3"):
             self.headings.append(data)
+
+
+def test_the_first_screen_shows_the_evidence_beside_its_limits(run: Path, page: str, tmp_path: Path) -> None:
+    first_screen = page.partition("<h2>")[0]
+    evidence = json.loads((run / "report.json").read_text())["evidence"]
+    assert set(evidence) >= {"unsure_masks", "motion_m", "other_modes"}
+    assert first_screen.count("</td></tr>") == len(evidence)
+    assert "<th>frames with an unsure mask</th><td>0 %</td><td class='quiet'>at most 50 %</td><td>holds" in first_screen
+    assert "<th>largest motion of the surface</th>" in first_screen
+    assert "at least" in first_screen
+    older = tmp_path / "older"
+    shutil.copytree(run, older)
+    report = json.loads((older / "report.json").read_text())
+    report["evidence"]["unsure_masks"] |= {"value": 0.8, "holds": False}
+    (older / "report.json").write_text(json.dumps(report))
+    write_page(older, older / "page.html")
+    assert "<td>80 %</td><td class='quiet'>at most 50 %</td><td><b class='no'>does not hold" in (
+        older / "page.html"
+    ).read_text(encoding="utf-8")
+    del report["evidence"]
+    (older / "report.json").write_text(json.dumps(report))
+    write_page(older, older / "page.html")
+    assert "class='evidence'" not in (older / "page.html").read_text(encoding="utf-8")
 
 
 def test_the_page_is_whole_and_needs_no_network(page: str) -> None:

@@ -111,7 +111,12 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "reasons": [shortcoming.words for shortcoming in verdict.shortcomings],
         "reason_codes": [shortcoming.code for shortcoming in verdict.shortcomings],
         "evidence": {
-            name: {"value": figure.value, "limit": figure.limit, "holds": figure.holds}
+            name: {
+                "value": figure.value,
+                "limit": figure.limit,
+                "at_least": figure.at_least,
+                "holds": figure.holds,
+            }
             for name, figure in verdict.evidence.items()
         },
         "up": _up(solution, views),

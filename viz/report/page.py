@@ -21,7 +21,7 @@ from modeler import evaluation, se3
 from modeler.export import write_atomically
 from modeler.export.mesh import MOST_SIGMA_M
 from modeler.export.standing import model_upright
-from modeler.types import ACCEPTED, Array, Edge, explain, loops_closed
+from modeler.types import ACCEPTED, Array, Edge, Outcome, explain, loops_closed
 from viz import entities
 from viz.blueprint import FROM_THE_SIDE
 from viz.readings import certainty_words
@@ -91,8 +91,37 @@ def _head(result: Result, mesh: Mesh | None) -> str:
     where = escape(str(report["sequence"]))
     return (
         f"<h1>{escape(_name(result))}</h1><p class='quiet'>{where}, prior {escape(report['prior'])}, seed "
-        f"{report['seed']}</p>{verdict}<div class='figures'>{cells}</div>"
+        f"{report['seed']}</p>{verdict}<div class='figures'>{cells}</div>{_evidence(report.get('evidence') or {})}"
     )
+
+
+_CHECKS: Final = {
+    "unsure_masks": ("frames with an unsure mask", 100.0, " %"),
+    "motion_m": ("largest motion of the surface", 1000.0, " mm"),
+    "prior_sds": ("farthest pair from what the prior expects", 1.0, " sd"),
+    "loop_sigmas": ("widest open loop, before optimisation", 1.0, " sd"),
+    "graph_chi2": ("squared residuals of the edges over their covariances", 1.0, ""),
+    "seen_through": ("surface of a frame that others see through", 100.0, " %"),
+    "other_modes": ("probability of another mode", 100.0, " %"),
+}
+"""Figures of the evidence in words, each with the factor to its unit."""
+
+
+def _evidence(evidence: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the figures behind the verdict beside their limits; "" for runs of earlier versions."""
+    rows = []
+    for name, figure in evidence.items():
+        words, factor, unit = _CHECKS.get(name, (name.replace("_", " "), 1.0, ""))
+        value, limit = (
+            "unknown" if number is None else f"{factor * number:.3g}{unit}"
+            for number in (figure["value"], figure["limit"])
+        )
+        bound = "at least" if figure.get("at_least") else "at most"
+        mark = "holds" if figure["holds"] else "<b class='no'>does not hold</b>"
+        rows.append(
+            f"<tr><th>{escape(words)}</th><td>{value}</td><td class='quiet'>{bound} {limit}</td><td>{mark}</td></tr>"
+        )
+    return f"<table class='evidence'>{''.join(rows)}</table>" if rows else ""
 
 
 def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
@@ -197,6 +226,8 @@ def _settings(result: Result) -> str:
     rows |= {f"version of {name}": version for name, version in report["versions"].items()}
     lost = [frame for frame in report["frames"] if frame["outcome"] != ACCEPTED]
     rows |= {f"frame {frame['id']} left out": frame["outcome"] for frame in lost}
+    unsure = [str(frame["id"]) for frame in report["frames"] if frame.get("mask") == Outcome.UNSURE_MASK.label]
+    rows |= {"frames with an unsure mask": ", ".join(unsure)} if unsure else {}
     lines = "".join(
         f"<tr><th>{escape(str(key).replace('_', ' '))}</th><td>{escape(str(value))}</td></tr>"
         for key, value in rows.items()
@@ -287,7 +318,10 @@ def _pair_card(
     seen_m = centre_m
     if edge.source in result.poses:
         seen_m = se3.transform(se3.inverse(result.poses[edge.source].mean), centre_m[None])[0]
-    facts = certainty_words(posterior, seen_m)
+    facts = [
+        f"turned by {np.degrees(se3.rotation_angle(posterior.pose.mean)):.1f}°",
+        *certainty_words(posterior, seen_m),
+    ]
     truth = result.true_motion(edge)
     if truth is not None:
         facts += [
