@@ -9,6 +9,7 @@
 # make audit      locked packages against published advisories, where these can be reached
 
 BIN := .venv/bin
+TWO := -n 2 --dist loadfile  # processes; kernels have threads of their own
 
 .PHONY: setup demo test test-slow calibrate ablation bench same audit
 
@@ -32,10 +33,10 @@ test: setup
 	$(BIN)/ruff format --check
 	$(BIN)/basedpyright
 	$(BIN)/lint-imports
-	$(BIN)/pytest
+	$(BIN)/pytest $(TWO)
 
 test-slow: setup
-	$(BIN)/pytest -m slow
+	$(BIN)/pytest -m slow $(TWO)
 
 calibrate: setup
 	PYTHONPATH=tests $(BIN)/python -m calibration

@@ -12,6 +12,7 @@ from modeler.cli import main
 from sequences import bundled
 
 BOX = str(bundled("box"))
+QUICK = ("--prior", "table", "--method", "icp")
 FILES = {
     "model.ply",
     "cloud.ply",

@@ -58,6 +58,18 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def built(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run of `scene`, built by the command line as `QUICK` says: to be read only."""
+    from commanded import QUICK
+
+    from modeler.cli import main
+
+    folder = tmp_path_factory.mktemp("built") / "run"
+    assert main(["build", str(scene), "--out", str(folder), *QUICK]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with one intact sequence of each kind of folders of pictures: to be read only."""
     root, frames, truth = tmp_path_factory.mktemp("intact"), small_frames(3), small_truth(3)

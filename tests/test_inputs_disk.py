@@ -14,21 +14,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from commanded import QUICK
 from recordings import small_frames
 
 from modeler.cli import main
 from modeler.export import RunFolder
 from sequences import open_sequence, write_bop
 from viz.stream import ends_whole
-
-QUICK = ("--prior", "table", "--method", "icp")
-
-
-@pytest.fixture(scope="module")
-def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("disk") / "run"
-    assert main(["build", str(scene), "--out", str(folder), *QUICK]) == 0
-    return folder
 
 
 def with_files_of_at_most(size: int, *arguments: str) -> int:
@@ -47,10 +39,10 @@ def ours(said: str) -> list[str]:
 
 
 def test_a_disk_that_fills_ends_a_build_which_can_go_on(
-    scene: Path, run: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    scene: Path, built: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     command = ("build", str(scene), "--out", str(tmp_path / "run"), *QUICK)
-    size = (run / "model.ply").stat().st_size - 1
+    size = (built / "model.ply").stat().st_size - 1
     assert with_files_of_at_most(size, *command) == 2
     said = capfd.readouterr()
     assert (said.out, len(ours(said.err))) == ("", 1)
@@ -58,7 +50,7 @@ def test_a_disk_that_fills_ends_a_build_which_can_go_on(
     assert not any(path.name.endswith(".part") for path in (tmp_path / "run").rglob("*"))
     assert main([*command, "--resume"]) == 0
     for name in ("model.ply", "trajectory.txt", "graph.g2o"):
-        assert (tmp_path / "run" / name).read_bytes() == (run / name).read_bytes()
+        assert (tmp_path / "run" / name).read_bytes() == (built / name).read_bytes()
     assert RunFolder(tmp_path / "run").report()["complete"]
 
 
@@ -90,17 +82,17 @@ def write_half(scene: Path, path: Path) -> Path:
 
 @pytest.mark.parametrize("name", ["m.ply", "m.obj"])
 def test_a_disk_that_is_full_keeps_the_mesh_that_was_there(
-    run: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str
+    built: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str
 ) -> None:
     (tmp_path / name).write_text("precious")
-    assert with_files_of_at_most(3000, "export", str(run), "--out", str(tmp_path / name)) == 2
+    assert with_files_of_at_most(3000, "export", str(built), "--out", str(tmp_path / name)) == 2
     said = capfd.readouterr()
     assert (said.out, said.err.count("\n")) == ("", 1)
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: "precious"}
 
 
-def test_a_broken_input_leaves_the_run_of_before(scene: Path, run: Path, tmp_path: Path) -> None:
-    shutil.copytree(run, tmp_path / "run")
+def test_a_broken_input_leaves_the_run_of_before(scene: Path, built: Path, tmp_path: Path) -> None:
+    shutil.copytree(built, tmp_path / "run")
     shutil.copytree(scene, tmp_path / "in")
     (tmp_path / "in" / "depth" / "000002.png").write_bytes(b"")
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
@@ -123,14 +115,14 @@ def closed() -> Iterator[Path]:
 
 @pytest.mark.parametrize("command", ["build", "convert", "export", "evaluate", "poses"])
 def test_a_closed_folder_is_said(
-    scene: Path, run: Path, closed: Path, capsys: pytest.CaptureFixture[str], command: str
+    scene: Path, built: Path, closed: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     user = os.geteuid()
     os.seteuid(os.getuid())
     inputs = Path(tempfile.mkdtemp())  # pytest's own folders are closed to others
     os.chmod(inputs, 0o755)
     shutil.copytree(scene, inputs / "in")
-    shutil.copytree(run, inputs / "run")
+    shutil.copytree(built, inputs / "run")
     report = json.loads((inputs / "run" / "report.json").read_text())
     (inputs / "run" / "report.json").write_text(json.dumps(report | {"sequence": str(inputs / "in")}))
     arguments = {

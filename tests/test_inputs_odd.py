@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commanded import QUICK
 from fuzz.targets import tiny
 from recordings import small_frames, small_truth
 
@@ -16,8 +17,6 @@ from modeler import se3
 from modeler.cli import main
 from modeler.types import Camera, Frame, Outcome
 from sequences import bundled, open_sequence, write_bop
-
-QUICK = ("--prior", "table", "--method", "icp")
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +143,8 @@ def test_frames_of_different_size_are_one_model(
 ) -> None:
     """Some cameras send a part of the sensor, or merge pixels, on their own: each frame has its intrinsics."""
     status, report = built(mixed if masked else [*map(unmasked, mixed)], tmp_path)
-    assert status == 0
+    assert status == (3 if report["reasons"] else 0)
+    assert set(report["reason_codes"]) <= {"edges_disagree"}  # ICP states too little on images so small
     assert [frame["outcome"] for frame in report["frames"]] == ["accepted"] * 4
     truth = small_truth(4)
     for pose in report["poses"]:
@@ -194,6 +194,6 @@ def test_frames_far_apart_in_number_stay_so(frames: list[Frame], tmp_path: Path)
 
 def test_every_frame_alike_is_no_motion(frames: list[Frame], tmp_path: Path) -> None:
     status, report = built([replace(frames[0], index=k, time_s=float(k)) for k in range(3)], tmp_path)
-    assert status == 0
+    assert (status, report["reason_codes"]) == (3, ["no_motion"])
     for pose in report["poses"]:
         np.testing.assert_allclose(np.reshape(pose["object_from_camera"], (4, 4)), np.eye(4), atol=1e-3)

@@ -157,13 +157,6 @@ def test_the_recording_shows_a_pair_of_views_that_joins_the_runs(
     np.testing.assert_allclose(moved[0].mean(axis=0), expected.mean(axis=0), atol=1e-3)
 
 
-def test_the_report_is_called_by_both_sequences(
-    runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path
-) -> None:
-    assert main(["report", str(runs[2]), "--out", str(tmp_path / "page.html")]) == 0
-    assert "<h1>upright + lying</h1>" in (tmp_path / "page.html").read_text()
-
-
 def test_exports_made_anew_from_the_frames(
     runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

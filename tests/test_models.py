@@ -100,13 +100,6 @@ def test_refuses_what_cannot_be_compared(modelled: Modelled) -> None:
 # the command
 
 
-@pytest.fixture(scope="module")
-def built(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("models") / "run"
-    assert main(["build", str(scene), "--out", str(folder), "--prior", "table", "--method", "icp"]) == 0
-    return folder
-
-
 def _told(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
     capsys.readouterr()
     status = main([str(argument) for argument in arguments])

@@ -249,17 +249,21 @@ def test_the_command_writes_the_page_and_says_where(run: Path, tmp_path: Path, c
     assert not out.exists()
 
 
-def test_modes_and_what_a_pair_leaves_open_are_told(run: Path, tmp_path: Path) -> None:
+def test_modes_what_a_pair_leaves_open_and_both_names_of_joined_runs_are_told(run: Path, tmp_path: Path) -> None:
     report = json.loads((run / "report.json").read_bytes())
     edge = report["edges"][0]
     mode = {key: edge[key] for key in ("target_from_source", "covariance")}
     edge["modes"] = [mode | {"weight": 0.7, "weight_in_graph": 0.99}, mode | {"weight": 0.3, "weight_in_graph": 0.01}]
     edge["undetermined"] = ["free to turn about <its> axis: 12° sd"]
+    report["settings"]["joined"] = ["upright_run", "lying_run"]
+    report["sequence"] = "some/upright + other/lying"
     (tmp_path / "report.json").write_text(json.dumps(report))
     write_page(tmp_path, tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
-    assert "2 modes: 70 %, 30 %; in the pose graph 99 %, 1 %." in page
-    assert "free to turn about &lt;its&gt; axis: 12° sd." in page
+    assert [
+        words for words in ("2 modes", "70 %, 30 %", "99 %, 1 %", "&lt;its&gt; axis: 12°") if words not in page
+    ] == []
+    assert "<h1>upright + lying</h1>" in page
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path, run: Path) -> None:

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
+from commanded import QUICK
 from recordings import small_frames, small_truth, write_open3d
 from sources import SOURCES, nodes
 
@@ -14,7 +15,6 @@ from modeler.cli import main
 from sequences import open_sequence, write_bop
 
 EVIL = "../../../../evil <script>alert(1)</script>"
-QUICK = ("--prior", "table", "--method", "icp")
 RUNS_CODE = {"pickle", "cPickle", "dill", "joblib", "marshal", "shelve", "torch", "yaml", "runpy", "code"}
 
 

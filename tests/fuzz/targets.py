@@ -288,7 +288,7 @@ TARGETS |= {
     "join": Target(_runs, ("a/report.json", "b/report.json"), _command("join", "@a", "@b", "--out", "@out"), 0.1),
     "resume": Target(
         _runs,
-        ("a/report.json", "a/recording.rrd"),
+        ("a/report.json",),
         _command("build", "@s", "--out", "@a", "--resume", "--prior", "table", "--method", "icp"),
         0.1,
     ),

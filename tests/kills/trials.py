@@ -71,7 +71,8 @@ class Trials:
             time.sleep(0.05)
             if time.monotonic() - began > _LIMIT_S:
                 process.kill()
-        assert process.returncode in (0, 3), process.communicate()
+        _, said = process.communicate()
+        assert process.returncode in (0, 3), said
         changes = sum(line.startswith("change") for line in log.read_text().splitlines())
         return Undisturbed(folder, _pairs(log), changes, time.monotonic() - began, registered_s)
 
