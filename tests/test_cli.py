@@ -89,6 +89,8 @@ def report(folder: Path) -> dict:
         (("register", BOX, "0", "99"), "no frame 99"),
         (("register", BOX, "3", "3"), "both frame 3"),
         (("register", BOX, "0", "1", "--roi", "640", "0", "700", "9"), "640 x 480"),
+        (("register", BOX, "0", "1", "--roi", "600", "0", "641", "9"), "--roi 600 0 641 9"),
+        (("build", BOX, "--out", "OUT", "--roi", "0", "0", "640", "481"), "--roi 0 0 640 481"),
         (("build", BOX, "--out", "OUT", "--roi", "0", "480", "9", "500"), "--roi 0 480 9 500"),
         (("register", BOX, "0", "1", "--max-depth-m", "0.1"), "too few points"),
         (("evaluate", "--out", "OUT"), "no sequence"),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import select
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterable
 from dataclasses import replace
@@ -19,9 +21,11 @@ from commanded import BOX
 
 from modeler.cli import main
 from modeler.cli.advice import outcome_advice
-from modeler.cli.console import Console
+from modeler.cli.compose import check_region
+from modeler.cli.console import Console, Interrupt
 from modeler.cli.info import Info
 from modeler.cli.inputs import reading
+from modeler.cli.options import ObjectOptions
 from modeler.types import Failed, Outcome, PriorRefused, Reason, Searching, Segmentation, Solution, Step
 from sequences import bundled, open_sequence
 
@@ -113,7 +117,8 @@ def on_a_terminal(command: list[str]) -> str:
 
 
 WATCHED = """
-from modeler.cli.console import Console
+from modeler.cli.compose import check_region
+from modeler.cli.console import Console, Interrupt
 from modeler.types import Fusing, Refining, Searching
 with Console(25, None) as console:
     for event in {}: console(event)
@@ -198,7 +203,16 @@ def test_ctrl_c_during_imports_leaves_no_traceback(after_s: float) -> None:
         assert b"modeler/cli" not in said
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread"), OSError(12, "x")], ids=repr)
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("can't start new thread"),
+        OSError(12, "x"),
+        ImportError("libarrow.so: failed to map segment from shared object"),
+    ],
+    ids=repr,
+)
 def test_exhausted_memory_or_threads_are_said_in_one_line(
     error: Exception, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -210,3 +224,46 @@ def test_exhausted_memory_or_threads_are_said_in_one_line(
     said = capfd.readouterr()
     assert (said.out, said.err.count("\n")) == ("", 1)
     assert "memory or threads" in said.err
+
+
+def test_a_program_that_calls_a_command_handles_its_signals_again(capfd: pytest.CaptureFixture[str]) -> None:
+    def mine(number: int, frame: object) -> None:
+        raise AssertionError(number)
+
+    before = {number: signal.signal(number, mine) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        for arguments, status in ((["info", BOX], 0), (["info", "/nowhere"], 2), (["info"], 2)):
+            with pytest.raises(SystemExit) if len(arguments) < 2 else contextlib.nullcontext():
+                assert main(arguments) == status
+            assert all(signal.getsignal(number) is mine for number in before)
+        with Interrupt() as interrupt:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert interrupt.asked
+        assert signal.getsignal(signal.SIGINT) is mine
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    capfd.readouterr()
+
+
+def test_a_command_runs_in_any_thread(capfd: pytest.CaptureFixture[str]) -> None:
+    statuses: list[int] = []
+    thread = threading.Thread(target=lambda: statuses.append(main(["info", BOX])))
+    thread.start()
+    thread.join()
+    assert statuses == [0], capfd.readouterr().err
+
+
+def test_a_region_may_be_the_whole_image() -> None:
+    check_region(ObjectOptions(roi=(0, 0, 640, 480)), open_sequence(Path(BOX)))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux has them")
+@pytest.mark.parametrize("limit_mb", [200, 400])
+def test_memory_that_does_not_suffice_for_imports_is_said_in_one_line(limit_mb: int) -> None:
+    limited = f'ulimit -v {1024 * limit_mb}; exec "$@"'
+    ended = subprocess.run(
+        ["sh", "-c", limited, "sh", *COMMAND, "info", BOX], capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
+    assert "memory or threads" in ended.stderr

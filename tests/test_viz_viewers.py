@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -62,6 +63,19 @@ def test_the_page_is_served_on_this_machine_alone(run: list[Step], tmp_path: Pat
     assert listeners(server.process) == {"0100007F"}
     stream.close()
     assert server.process.poll() is not None
+
+
+def test_a_viewer_lasts_beyond_the_thread_that_starts_it() -> None:
+    served: list[viewer.Viewer] = []
+    thread = threading.Thread(target=lambda: served.append(viewer.start_web()))
+    thread.start()
+    thread.join()
+    try:
+        time.sleep(0.5)  # a signal at the thread's end would have come by now
+        assert served[0].process.poll() is None
+    finally:
+        served[0].stop()
+    assert served[0].process.poll() is not None
 
 
 def test_a_viewer_that_dies_does_not_stop_the_run(

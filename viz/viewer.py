@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -53,13 +54,16 @@ class Viewer:
 
     def wait(self) -> None:
         """Return when the viewer is closed, or end it when the user interrupts or terminates this process."""
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        before = None
+        if threading.current_thread() is threading.main_thread():  # others may not, and get no signals
+            before = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             self.process.wait()
         except KeyboardInterrupt:
             pass
         finally:
-            signal.signal(signal.SIGTERM, before)
+            if before is not None:
+                signal.signal(signal.SIGTERM, before)
             self.stop()
 
     def stop(self) -> None:
@@ -148,14 +152,7 @@ def _start(arguments: list[str], *, port: int, lasting: bool) -> subprocess.Pope
     command = [str(executable), "--bind", _HOST, *arguments]
     if not lasting and sys.platform == "linux":
         command = [sys.executable, "-I", "-S", "-c", _DIE_WITH_PARENT, str(os.getpid()), *command]
-    process = subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,  # stdout is for data; the viewer chats
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "RERUN_APP_ONLY": "true"},
-        start_new_session=True,  # Ctrl-C is for the run, which has more to send when it ends
-    )
+    process = _child_of_lasting_thread(command)
     deadline = time.monotonic() + _START_S
     while not _listens(_HOST, port, patience_s=0.2):
         if process.poll() is not None or time.monotonic() > deadline:
@@ -164,6 +161,30 @@ def _start(arguments: list[str], *, port: int, lasting: bool) -> subprocess.Pope
             raise InputError("the Rerun viewer did not start; start it by hand to see why: rerun")
         time.sleep(0.05)
     return process
+
+
+def _child_of_lasting_thread(command: list[str]) -> subprocess.Popen[bytes]:
+    """Start a process from a thread that lasts as long: Linux takes the thread that starts a process for its parent."""
+    started: Future[subprocess.Popen[bytes]] = Future()
+
+    def start() -> None:
+        try:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,  # stdout is for data; the viewer chats
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, "RERUN_APP_ONLY": "true"},
+                start_new_session=True,  # Ctrl-C is for the run, which has more to send when it ends
+            )
+        except OSError as error:
+            started.set_exception(error)
+            return
+        started.set_result(process)
+        process.wait()
+
+    threading.Thread(target=start, daemon=True).start()
+    return started.result()
 
 
 class _OneFile(BaseHTTPRequestHandler):

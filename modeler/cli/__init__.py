@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         _close_stdout()
         return 1
-    except (MemoryError, OSError, RuntimeError) as error:
+    except (MemoryError, OSError, RuntimeError, ImportError) as error:
         if _exhausted(error):
             say("memory or threads are exhausted; raise the limits (ulimit -v, -u), or end other programs")
             return 2
@@ -208,7 +208,10 @@ def _exhausted(error: Exception) -> bool:
     """Return whether the system gave no more memory or threads."""
     if isinstance(error, OSError):
         return error.errno in (errno.ENOMEM, errno.EAGAIN)
-    return isinstance(error, MemoryError) or "start new thread" in str(error)
+    words = str(error)
+    if isinstance(error, ImportError):  # as the dynamic loader words it
+        return "failed to map segment" in words or "annot allocate memory" in words
+    return isinstance(error, MemoryError) or "start new thread" in words
 
 
 def _open_standard_streams() -> None:

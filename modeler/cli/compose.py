@@ -84,18 +84,18 @@ def modeler(
 
 
 def check_region(where: ObjectOptions, sequence: AbstractSequence) -> None:
-    """Refuse a region of the image in which nothing can be.
+    """Refuse a region that is not part of the image.
 
     Raises:
-        InputError: where it lies outside the first frame.
+        InputError: where some of it lies outside the first frame.
     """
     if where.roi is None:
         return
     camera = sequence.frame(sequence.indices[0]).camera
-    if where.roi[0] >= camera.width or where.roi[1] >= camera.height:
+    if where.roi[2] > camera.width or where.roi[3] > camera.height:
         raise InputError(
-            f"--roi {' '.join(map(str, where.roi))} lies outside the images of {sequence.name}, which are "
-            f"{camera.width} x {camera.height} pixels; move it there"
+            f"--roi {' '.join(map(str, where.roi))} reaches outside the images of {sequence.name}, which are "
+            f"{camera.width} x {camera.height} pixels; give X1 up to {camera.width} and Y1 up to {camera.height}"
         )
 
 

@@ -6,7 +6,8 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
@@ -44,11 +45,21 @@ def lost_without_harm() -> Iterator[None]:
 @contextlib.contextmanager
 def interruptible_at_once() -> Iterator[None]:
     """Let Ctrl-C end the program where it stands, for imports: libraries turn it into errors of their own."""
-    before = signal.signal(signal.SIGINT, _quit)
+    with _handled(signal.SIGINT, _quit):
+        yield
+
+
+@contextlib.contextmanager
+def _handled(number: signal.Signals, handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Handle a signal, and leave it to whoever did before; outside the main thread, where nobody may, to them alone."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(number, handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, signal.SIG_DFL if before is None else before)  # None: not set by Python
 
 
 def _quit(number: int, frame: FrameType | None) -> None:
@@ -59,11 +70,8 @@ def _quit(number: int, frame: FrameType | None) -> None:
 @contextlib.contextmanager
 def terminable() -> Iterator[None]:
     """Let a request to terminate end the program as an error would, so that it puts in order what it leaves."""
-    before = signal.signal(signal.SIGTERM, _leave)
-    try:
+    with _handled(signal.SIGTERM, _leave):
         yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
@@ -77,18 +85,18 @@ class Interrupt:
         self.ended_early = False
         """Whether there were more items."""
         self._asked = False
-        self._before = signal.getsignal(signal.SIGINT)
+        self._listening = _handled(signal.SIGINT, self._note)
 
     def __enter__(self) -> Interrupt:
         """Listen to Ctrl-C."""
-        self._before = signal.signal(signal.SIGINT, self._note)
+        self._listening.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Hand Ctrl-C back."""
-        signal.signal(signal.SIGINT, self._before)
+        self._listening.__exit__(kind, error, trace)
 
     @property
     def asked(self) -> bool:

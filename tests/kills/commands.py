@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from typing import Final
 
 import recordings
 
+import sequences
 from kills.trials import environment
 from modeler.cli import main
 from sequences import write_bop
@@ -21,6 +23,8 @@ COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
     "convert": ("convert", "s", "--out", "made/out"),
     "render": ("render", "recipe.json", "--out", "made/out"),
     "export": ("export", "a", "--out", "made/out.obj"),
+    "export of texture": ("export", "a", "--out", "made/out.obj", "--texture"),
+    "calibrate-sensor": ("calibrate-sensor", "still", "--out", "made/out.json"),
     "export of poses": ("convert", "a", "--out", "made/out.json"),
     "report": ("report", "a", "--out", "made/out.html"),
     "evaluate": ("evaluate", "a", "--out", "made/out"),
@@ -37,9 +41,16 @@ _LIMIT_S: Final = 400
 
 
 def write_inputs(folder: Path) -> None:
-    """Write a sequence, two runs of it and a recipe."""
+    """Write a sequence, two runs of it, a recipe, and frames of a scene that stands still."""
     write_bop(folder / "s", recordings.small_frames(3), recordings.small_truth(3), depth_scale_mm=1.0)
     (folder / "recipe.json").write_text(_RECIPE)
+    still = json.loads((Path(sequences.__file__).parent / "recipes" / "box.json").read_bytes())
+    still["view"] = {"width": 480, "height": 360, "focal_px": 430.0}
+    still["trajectory"] = {"kind": "tabletop", "frames": 4, "step_deg": 0.0, "step_sigma_deg": 0.0, "shift_m": 0.0}
+    (folder / "still.json").write_text(json.dumps(still | {"colour": "none"}))
+    assert main(["render", str(folder / "still.json"), "--out", str(folder / "still")]) == 0
+    for name in ("mask_visib", "mask"):  # the whole scene is looked at
+        shutil.rmtree(folder / "still" / name, ignore_errors=True)
     for run in ("a", "b"):
         arguments = ["build", str(folder / "s"), "--out", str(folder / run), "--prior", "table", "--method", "icp"]
         assert main(arguments) in (0, 3)
