@@ -267,3 +267,37 @@ def test_memory_that_does_not_suffice_for_imports_is_said_in_one_line(limit_mb: 
     )
     assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
     assert "memory or threads" in ended.stderr
+
+
+@pytest.mark.parametrize("name", ["\ud800", "a\0b"])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("info", "NAME"),
+        ("build", BOX, "--out", "NAME"),
+        ("build", BOX, "--out", "run", "--sensor", "NAME"),
+        ("evaluate", BOX, "NAME", "--out", "errors"),
+        ("render", "box", "--out", "NAME"),
+    ],
+)
+def test_names_that_no_file_can_have_are_refused(
+    name: str, arguments: tuple[str, ...], capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main([name if argument == "NAME" else argument for argument in arguments]) == 2
+    said = capfd.readouterr()
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    assert "no file can have this name" in said.err
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_what_is_wrong_with_an_option_is_said_in_any_encoding(encoding: str) -> None:
+    ended = subprocess.run(
+        [*COMMAND, "build", BOX, "--out", "run", "--sede", "3"],
+        env={**os.environ, "PYTHONIOENCODING": encoding},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
+    assert "--sede" in ended.stderr
+    assert "--seed" in ended.stderr

@@ -38,14 +38,16 @@ def ours(said: str) -> list[str]:
     return [line for line in said.splitlines() if line.startswith("modeler: ")]
 
 
+@pytest.mark.parametrize("file", ["recording.rrd", "model.ply"])
 def test_a_disk_that_fills_ends_a_build_which_can_go_on(
-    scene: Path, built: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    scene: Path, built: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], file: str
 ) -> None:
     command = ("build", str(scene), "--out", str(tmp_path / "run"), *QUICK)
-    size = (built / "model.ply").stat().st_size - 1
+    size = 2048 if file == "recording.rrd" else (built / file).stat().st_size - 1
     assert with_files_of_at_most(size, *command) == 2
     said = capfd.readouterr()
     assert (said.out, len(ours(said.err))) == ("", 1)
+    assert f"{file}: cannot" in said.err
     assert "File too large" in said.err
     assert not any(path.name.endswith(".part") for path in (tmp_path / "run").rglob("*"))
     assert main([*command, "--resume"]) == 0
@@ -78,6 +80,11 @@ def write_half(scene: Path, path: Path) -> Path:
     frames = [replace(frame, colour=None) for frame in open_sequence(scene)][:2]
     write_bop(path, frames, depth_scale_mm=1.0)
     return path
+
+
+def test_a_texture_is_exported_from_the_frames_of_a_run(built: Path, tmp_path: Path) -> None:
+    assert main(["export", str(built), "--out", str(tmp_path / "m.obj"), "--texture"]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"m.obj", "m.mtl", "m.png"}
 
 
 @pytest.mark.parametrize("name", ["m.ply", "m.obj"])

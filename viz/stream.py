@@ -178,6 +178,9 @@ def _own_viewers(*, spawn: bool, web: bool) -> tuple[viewer.Viewer, ...]:
     return tuple(viewers)
 
 
+_BEGINNING = 4096  # bytes: Rerun 0.41 waits for ever for a file whose beginning it could not write
+
+
 def _file_sink(save: Path) -> rr.FileSink:
     """Return the sink that writes a file.
 
@@ -188,6 +191,8 @@ def _file_sink(save: Path) -> rr.FileSink:
 
     try:
         create_regular(save)
+        save.write_bytes(bytes(_BEGINNING))
+        os.truncate(save, 0)
     except OSError as error:
         raise InputError(f"{save}: cannot write the recording ({error.strerror}); choose another folder") from error
     return rr.FileSink(save)

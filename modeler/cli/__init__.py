@@ -13,8 +13,10 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from itertools import takewhile
+from pathlib import Path
 from typing import Annotated, Any, Union
 
 import tyro
@@ -170,8 +172,9 @@ def _one_line(box: str) -> str:
             sections.append([])
         elif not row.startswith(_HELP_INDENT):
             sections[-1].append(row)
-    what, *others = [[" ".join(row.split()) for row in takewhile(bool, section)] for section in sections]
-    suggested = [f"{first} {' or '.join(more)}" for first, *more in filter(None, others) if first.startswith("Perhaps")]
+    lines = [[" ".join(row.split()) for row in takewhile(bool, section)] for section in sections]
+    what, *others = filter(None, lines)  # where there is no border, a line below the title is a section, too
+    suggested = [f"{first} {' or '.join(more)}" for first, *more in others if first.startswith("Perhaps")]
     return "; ".join(line.rstrip(".") for line in (" ".join(what), *suggested))
 
 
@@ -183,6 +186,7 @@ def _run(command: Command) -> int:
         from modeler.types import InputError
     try:
         with terminable():
+            _check_names(command)
             return command.run()
     except InputError as error:
         say(str(error).strip().removesuffix("."))
@@ -202,6 +206,27 @@ def _check_environment() -> None:
     if interpreted not in ("", "0"):
         say(f"NUMBA_DISABLE_JIT={interpreted} would leave the kernels uncompiled; unset it")
         raise SystemExit(2)
+
+
+def _check_names(options: Any) -> None:
+    """Refuse paths that cannot be names of files.
+
+    Raises:
+        InputError: where an option is one.
+    """
+    from modeler.types import InputError
+
+    for field in fields(options):
+        value = getattr(options, field.name)
+        if is_dataclass(value):
+            _check_names(value)
+        for path in value if isinstance(value, tuple | list) else (value,):
+            try:
+                valid = not isinstance(path, Path) or b"\0" not in os.fsencode(path)
+            except UnicodeEncodeError:
+                valid = False
+            if not valid:
+                raise InputError(f"{path}: no file can have this name; correct it")
 
 
 def _exhausted(error: Exception) -> bool:

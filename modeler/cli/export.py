@@ -76,7 +76,7 @@ class Export:
             model = files.simplified(model, count)
         texture = None
         if self.texture and volume is not None:
-            if not volume.views.coloured.any():
+            if not volume.views.coloured:
                 raise InputError(f"{self.run_folder}: its frames have no colour; leave out --texture")
             model, texture = files.textured(model, volume.texture_colours, volume.texel_m)
         if self.bop:
