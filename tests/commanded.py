@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -24,8 +23,7 @@ FILES = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class Ended:
+class Ended(NamedTuple):
     status: int
     out: str
     err: str
@@ -37,7 +35,7 @@ Run = Callable[..., Ended]
 def runner(capfd: pytest.CaptureFixture[str]) -> Run:
     """Return what runs a command in this process, and tells how it ended and what it said."""
 
-    def run(*arguments: str | Path) -> Ended:
+    def run(*arguments: object) -> Ended:
         capfd.readouterr()
         try:
             status = main([str(argument) for argument in arguments])

@@ -9,9 +9,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as commands do: matrices a
 
 import numpy as np
 import pytest
+from commanded import QUICK, Run, runner
 from recordings import small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
 from turning_box import COUNT, LOST, steps
 
+from modeler.cli import main
 from modeler.types import Frame, Step
 from sequences import bundled, write_bop
 
@@ -20,6 +22,12 @@ from sequences import bundled, write_bop
 def rng():
     """Return a generator with a fixed seed."""
     return np.random.default_rng(0)
+
+
+@pytest.fixture
+def cli(capfd: pytest.CaptureFixture[str]) -> Run:
+    """Return what runs a command in this process, and tells how it ended and what it said."""
+    return runner(capfd)
 
 
 @pytest.fixture(scope="session")
@@ -60,10 +68,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def built(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a run of `scene`, built by the command line as `QUICK` says: to be read only."""
-    from commanded import QUICK
-
-    from modeler.cli import main
-
     folder = tmp_path_factory.mktemp("built") / "run"
     assert main(["build", str(scene), "--out", str(folder), *QUICK]) == 0
     return folder

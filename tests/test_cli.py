@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from commanded import BOX, FILES, Run, runner
+from commanded import BOX, FILES, Run
 
 from modeler import priors, se3
 from modeler.cli import compose, main
@@ -25,12 +25,7 @@ from modeler.export import RunFolder, model_upright
 from modeler.types import ACCEPTED, Outcome
 from sequences import open_sequence
 
-QUICK = ("--prior", "table", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:3")
-
-
-@pytest.fixture
-def run(capfd: pytest.CaptureFixture[str]) -> Run:
-    return runner(capfd)
+QUICK = ("--prior", "table", "--voxel-m", "0.004", "--frames", "0:3")
 
 
 @pytest.fixture(scope="module")
@@ -108,10 +103,10 @@ def report(folder: Path) -> dict:
     ],
 )
 def test_unusable_input_gives_status_2_and_one_line(
-    run: Run, tmp_path: Path, arguments: tuple[str, ...], says: str
+    cli: Run, tmp_path: Path, arguments: tuple[str, ...], says: str
 ) -> None:
     places = {"OUT": "out", "OUT.glb": "out.glb", "NOWHERE": "NOWHERE"}
-    ended = run(*(tmp_path / places[argument] if argument in places else argument for argument in arguments))
+    ended = cli(*(tmp_path / places[argument] if argument in places else argument for argument in arguments))
     assert (ended.status, ended.out) == (2, "")
     assert re.fullmatch(r"modeler: .+\n", ended.err)
     assert says in ended.err
@@ -149,8 +144,8 @@ def test_a_full_disk_under_stdout_is_told_in_one_line(arguments: tuple[str, ...]
     assert re.fullmatch(r"modeler: .*No space left on device.*\n", ended.stderr)
 
 
-def test_register_prints_one_edge_the_same_for_the_same_seed(run: Run) -> None:
-    ended = run("register", BOX, "1", "0", "--prior", "table", "--seed", "5")
+def test_register_prints_one_edge_the_same_for_the_same_seed(cli: Run) -> None:
+    ended = cli("register", BOX, "1", "0", "--prior", "table", "--seed", "5")
     assert ended.status == 0
     edge = json.loads(ended.out)
     assert (edge["source"], edge["target"], edge["kind"], edge["outcome"]) == (1, 0, "odometry", "converged")
@@ -163,24 +158,24 @@ def test_register_prints_one_edge_the_same_for_the_same_seed(run: Run) -> None:
     covariance = np.array(edge["covariance"]).reshape(6, 6)
     assert np.array_equal(covariance, covariance.T)
     assert np.linalg.eigvalsh(covariance)[0] > 0.0
-    assert run("register", BOX, "1", "0", "--prior", "table", "--seed", "5").out == ended.out
-    assert run("register", BOX, "1", "0", "--prior", "table", "--seed", "6").out != ended.out
+    assert cli("register", BOX, "1", "0", "--prior", "table", "--seed", "5").out == ended.out
+    assert cli("register", BOX, "1", "0", "--prior", "table", "--seed", "6").out != ended.out
 
 
-def test_the_sequence_says_what_is_known_and_the_user_is_told(run: Run, tmp_path: Path) -> None:
-    told = run("register", BOX, "1", "0", "--method", "icp")
+def test_the_sequence_says_what_is_known_and_the_user_is_told(cli: Run, tmp_path: Path) -> None:
+    told = cli("register", BOX, "1", "0", "--method", "icp")
     assert told.status == 0
     assert "prior table" in told.err
-    assert told.out == run("register", BOX, "1", "0", "--method", "icp", "--prior", "table").out
-    told = run("register", BOX, "1", "0", "--method", "icp", "--prior", "turntable")
+    assert told.out == cli("register", BOX, "1", "0", "--method", "icp", "--prior", "table").out
+    told = cli("register", BOX, "1", "0", "--method", "icp", "--prior", "turntable")
     assert "step 25°" in told.err
-    ended = run("build", BOX, "--out", tmp_path / "run", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:2")
+    ended = cli("build", BOX, "--out", tmp_path / "run", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:2")
     assert ended.err.startswith("modeler: prior table")
     assert report(tmp_path / "run")["prior"] == "table"
 
 
-def test_register_gives_the_edge_that_build_finds(run: Run, built: Path) -> None:
-    edge = json.loads(run("register", BOX, "1", "0", *QUICK[:4]).out)
+def test_register_gives_the_edge_that_build_finds(cli: Run, built: Path) -> None:
+    edge = json.loads(cli("register", BOX, "1", "0", *QUICK[:2]).out)
     found = report(built)["edges"][0]
     for name in ("source", "target", "outcome", "target_from_source", "covariance", "overlap"):
         assert edge[name] == found[name]
@@ -190,7 +185,7 @@ def test_build_fills_a_run_folder(built: Path) -> None:
     assert {path.name for path in built.iterdir()} == FILES
     told = report(built)
     assert (told["schema"], told["seed"], told["prior"]) == (1, 0, "table")
-    assert told["settings"] == {"method": "icp", "voxel_m": 0.004, "every": 1, "frames": "0:3"}
+    assert told["settings"] == {"method": "visibility", "voxel_m": 0.004, "every": 1, "frames": "0:3"}
     assert (told["complete"], told["trustworthy"], told["reasons"]) == (True, True, [])
     assert [(frame["id"], frame["outcome"]) for frame in told["frames"]] == [(k, "accepted") for k in range(3)]
     edges = {(edge["source"], edge["target"]): edge["accepted"] for edge in told["edges"]}
@@ -205,28 +200,28 @@ def test_build_fills_a_run_folder(built: Path) -> None:
     assert (built / "recording.rrd").stat().st_size > 100_000
 
 
-def test_build_says_nothing_on_stdout_and_one_line_on_stderr(run: Run, tmp_path: Path) -> None:
-    ended = run("build", BOX, "--out", tmp_path / "run", *QUICK[:-1], "0:2")
+def test_build_says_nothing_on_stdout_and_one_line_on_stderr(cli: Run, tmp_path: Path) -> None:
+    ended = cli("build", BOX, "--out", tmp_path / "run", *QUICK[:-1], "0:2")
     assert (ended.status, ended.out) == (0, "")
     assert re.fullmatch(r"modeler: 2 of 2 frames, no loop closed, \d+ s: .*\n", ended.err)
 
 
-def test_same_seed_same_bytes_and_nothing_is_replaced_unasked(run: Run, built: Path, tmp_path: Path) -> None:
+def test_same_seed_same_bytes_and_nothing_is_replaced_unasked(cli: Run, built: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(built, folder)
     (folder / "model.ply").write_text("an earlier model")
     (folder / "notes.txt").write_text("the user's own")
-    refused = run("build", BOX, "--out", folder, *QUICK)
+    refused = cli("build", BOX, "--out", folder, *QUICK)
     assert refused.status == 2
     assert (folder / "model.ply").read_text() == "an earlier model"
     assert {path.name for path in folder.iterdir()} == FILES | {"notes.txt"}
-    assert run("build", BOX, "--out", folder, *QUICK, "--overwrite").status == 0
+    assert cli("build", BOX, "--out", folder, *QUICK, "--overwrite").status == 0
     assert contents(folder) == contents(built)
     assert (folder / "notes.txt").read_text() == "the user's own"
 
 
-def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(run: Run, tmp_path: Path) -> None:
-    ended = run("build", BOX, "--out", tmp_path, *QUICK, "--max-depth-m", "0.1")
+def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(cli: Run, tmp_path: Path) -> None:
+    ended = cli("build", BOX, "--out", tmp_path, *QUICK, "--max-depth-m", "0.1")
     assert (ended.status, ended.out) == (3, "")
     assert f"frame 0 is left out: {Outcome.TOO_FEW_POINTS.label}" in ended.err
     told = report(tmp_path)
@@ -238,8 +233,8 @@ def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(run: Run, tmp_p
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"model.ply", "cloud.ply"}
 
 
-def test_evaluate_writes_errors_and_prints_a_table(run: Run, tmp_path: Path) -> None:
-    ended = run("evaluate", BOX, "--out", tmp_path, "--methods", "icp,gicp", "--frames", "0:3", "--prior", "table")
+def test_evaluate_writes_errors_and_prints_a_table(cli: Run, tmp_path: Path) -> None:
+    ended = cli("evaluate", BOX, "--out", tmp_path, "--methods", "icp,gicp", "--frames", "0:3", "--prior", "table")
     assert (ended.status, ended.err) == (0, "")
     rows = ended.out.splitlines()
     assert [row.split()[:5] for row in rows[1:]] == [["box", name, "1", "2", "2"] for name in ("icp", "gicp")]
@@ -249,8 +244,8 @@ def test_evaluate_writes_errors_and_prints_a_table(run: Run, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "glb", "stl"])
-def test_export_keeps_the_mesh(run: Run, built: Path, tmp_path: Path, suffix: str) -> None:
-    ended = run("export", built, "--out", tmp_path / f"box.{suffix}")
+def test_export_keeps_the_mesh(cli: Run, built: Path, tmp_path: Path, suffix: str) -> None:
+    ended = cli("export", built, "--out", tmp_path / f"box.{suffix}")
     assert (ended.status, ended.out) == (0, "")
     assert re.fullmatch(rf"modeler: \d+ triangles: \S+/box\.{suffix}\n", ended.err)
     mesh, original = (trimesh.load_mesh(path) for path in (tmp_path / f"box.{suffix}", built / "model.ply"))
@@ -262,7 +257,7 @@ def test_export_keeps_the_mesh(run: Run, built: Path, tmp_path: Path, suffix: st
     assert np.allclose(mesh.bounds, original.bounds, atol=1e-5)
 
 
-def test_a_rendered_sequence_can_be_opened(run: Run, tmp_path: Path) -> None:
+def test_a_rendered_sequence_can_be_opened(cli: Run, tmp_path: Path) -> None:
     recipe = {
         "name": "small",
         "object": {"kind": "box", "size_m": [0.12, 0.2, 0.06]},
@@ -271,10 +266,10 @@ def test_a_rendered_sequence_can_be_opened(run: Run, tmp_path: Path) -> None:
     }
     path = tmp_path / "small.json"
     path.write_text(json.dumps(recipe))
-    ended = run("render", path, "--out", tmp_path / "small", "--seed", "3")
+    ended = cli("render", path, "--out", tmp_path / "small", "--seed", "3")
     assert (ended.status, ended.out) == (0, ""), ended.err
     assert len(open_sequence(tmp_path / "small")) == 3
-    assert run("render", path, "--out", tmp_path / "small").status == 2
+    assert cli("render", path, "--out", tmp_path / "small").status == 2
 
 
 # What `build` remarks on at its end, and how Ctrl-C brings that about.

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from commanded import FILES, Run, runner
+from commanded import FILES, Run
 
 from modeler import priors
 from modeler.cli import main, parsed
@@ -25,40 +25,35 @@ step-deg step-sigma-deg held-sigma-deg held-sigma-m
 method view web"""
 
 
-@pytest.fixture
-def run(capfd: pytest.CaptureFixture[str]) -> Run:
-    return runner(capfd)
-
-
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help_on_stdout(run: Run, command: str) -> None:
-    assert re.search(rf"\b{command}\b", run("--help").out)
-    ended = run(command, "--help")
+def test_every_command_has_help_on_stdout(cli: Run, command: str) -> None:
+    assert re.search(rf"\b{command}\b", cli("--help").out)
+    ended = cli(command, "--help")
     assert (ended.status, ended.err) == (0, "")
     assert ended.out.startswith(f"usage: modeler {command}")
 
 
-def test_help_of_the_program_tells_each_command_in_a_sentence_and_a_command_tells_all(run: Run) -> None:
-    overall, alone = (" ".join(run(*words, "--help").out.replace("│", " ").split()) for words in ((), ("build",)))
+def test_help_of_the_program_tells_each_command_in_a_sentence_and_a_command_tells_all(cli: Run) -> None:
+    overall, alone = (" ".join(cli(*words, "--help").out.replace("│", " ").split()) for words in ((), ("build",)))
     for text in (overall, alone):
         assert "Build the model of an object from a sequence: register its frames, close loops, fuse." in text
     assert "Ctrl-C" in alone
     assert "Ctrl-C" not in overall
 
 
-def test_help_may_be_asked_for_in_a_word(run: Run) -> None:
-    assert run("help") == run("--help")
-    assert run("help", "build") == run("build", "--help")
-    assert run("help", "nonsense") == run("--help")
+def test_help_may_be_asked_for_in_a_word(cli: Run) -> None:
+    assert cli("help") == cli("--help")
+    assert cli("help", "build") == cli("build", "--help")
+    assert cli("help", "nonsense") == cli("--help")
 
 
 @pytest.mark.parametrize("command", ["build", "register", "evaluate", "render", "join"])
-def test_every_command_that_draws_at_random_takes_a_seed(run: Run, command: str) -> None:
+def test_every_command_that_draws_at_random_takes_a_seed(cli: Run, command: str) -> None:
     folders = {"register": ("S", "1", "0"), "join": ("A", "B")}.get(command, ("S",))
     out = () if command == "register" else ("--out", "OUT")
     assert parsed((command, *folders, *out, "--seed", "7")) != parsed((command, *folders, *out, "--seed", "8"))
     for seed in ("-1", "one", "1.5", "NaN"):
-        ended = run(command, *folders, *out, "--seed", seed)
+        ended = cli(command, *folders, *out, "--seed", seed)
         assert (ended.status, ended.out) == (2, "")
         assert "--seed" in ended.err
         assert f"'{seed}'" in ended.err
@@ -68,8 +63,8 @@ def test_every_command_that_draws_at_random_takes_a_seed(run: Run, command: str)
 @pytest.mark.parametrize(
     "command", ["info", "convert", "calibrate-sensor", "calibrate-camera", "view", "report", "export"]
 )
-def test_commands_without_randomness_take_no_seed(run: Run, command: str) -> None:
-    assert "--seed" not in run(command, "--help").out
+def test_commands_without_randomness_take_no_seed(cli: Run, command: str) -> None:
+    assert "--seed" not in cli(command, "--help").out
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +122,7 @@ def test_the_readme_names_every_file_of_a_run_folder() -> None:
     assert {name for name in re.findall(r"`(\w+\.\w+)`", README) if name in FILES} == FILES
 
 
-def test_the_version_is_told(run: Run) -> None:
-    ended = run("--version")
+def test_the_version_is_told(cli: Run) -> None:
+    ended = cli("--version")
     assert (ended.status, ended.err) == (0, "")
     assert re.fullmatch(r"modeler \d+\.\d+\.\d+\n", ended.out)

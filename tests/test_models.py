@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from commanded import Run
 
 from modeler import fusion, se3
-from modeler.cli import main
 from modeler.experiment import Modelled, ModelScore, model_scores
 from modeler.fusion import Fuser, Matcher
 from modeler.rays import Sensor
@@ -100,17 +100,8 @@ def test_refuses_what_cannot_be_compared(modelled: Modelled) -> None:
 # the command
 
 
-def _told(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    capsys.readouterr()
-    status = main([str(argument) for argument in arguments])
-    said = capsys.readouterr()
-    return status, said.out, said.err
-
-
-def test_evaluate_tells_how_good_the_model_of_a_run_is(
-    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    status, out, err = _told(capsys, "evaluate", built, "--out", tmp_path)
+def test_evaluate_tells_how_good_the_model_of_a_run_is(built: Path, tmp_path: Path, cli: Run) -> None:
+    status, out, err = cli("evaluate", built, "--out", tmp_path)
     assert (status, err) == (0, "")
     lines = out.splitlines()
     assert len(lines) == 5
@@ -127,14 +118,14 @@ def test_evaluate_tells_how_good_the_model_of_a_run_is(
 
 
 def test_a_run_that_cannot_be_judged_is_left_out_and_the_others_are_judged(
-    scene: Path, built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene: Path, built: Path, tmp_path: Path, cli: Run
 ) -> None:
     _, run = _without(scene, built, tmp_path, "model.ply")
     out = tmp_path / "out"
-    status, said, err = _told(capsys, "evaluate", run, built, tmp_path / "none", "--out", out)
+    status, said, err = cli("evaluate", run, built, tmp_path / "none", "--out", out)
     assert (status, said, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"modeler: {tmp_path / 'none'}: no such folder")
-    status, said, err = _told(capsys, "evaluate", run, built, "--out", out)
+    status, said, err = cli("evaluate", run, built, "--out", out)
     assert status == 2
     assert [line.split()[0] for line in said.splitlines()[1:]] == [str(built)] * 4
     assert [row["run"] for row in json.loads((out / "models.json").read_bytes())["models"]] == [str(built)] * 4
@@ -144,32 +135,30 @@ def test_a_run_that_cannot_be_judged_is_left_out_and_the_others_are_judged(
     for name in ("models.json", "models.csv"):
         (out / name).unlink()
     for runs in ((run,), (run, run)):
-        status, said, err = _told(capsys, "evaluate", *runs, "--out", out)
+        status, said, err = cli("evaluate", *runs, "--out", out)
         assert (status, said, err.count("\n")) == (2, "", 1)
         assert "no true surface" in err
     assert not (out / "models.json").exists()
 
 
-def test_another_sequence_is_not_taken_for_that_of_the_run(
-    scene: Path, built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_sequence_is_not_taken_for_that_of_the_run(scene: Path, built: Path, tmp_path: Path, cli: Run) -> None:
     sequence, run = _without(scene, built, tmp_path)
     moved = sequence.rename(tmp_path / "moved")
     page = ("report", run, "--overwrite", "--out", tmp_path / "page.html")
-    status, _, _ = _told(capsys, "report", "--sequence", moved, *page[1:])
+    status, _, _ = cli("report", "--sequence", moved, *page[1:])
     assert status == 0
     assert "Errors against ground truth" in (tmp_path / "page.html").read_text()
     for command in (page, ("export", run, "--out", tmp_path / "m.ply", "--voxel-m", "0.005")):
-        status, out, err = _told(capsys, *command, "--sequence", bundled("tube"))
+        status, out, err = cli(*command, "--sequence", bundled("tube"))
         assert (status, out, err.count("\n")) == (2, "", 1)
         assert "tube: frame 0 shows something else" in err
         assert str(run) in err
-        status, _, err = _told(capsys, *command, "--sequence", moved, "--sequence", moved)
+        status, _, err = cli(*command, "--sequence", moved, "--sequence", moved)
         assert (status, err.count("\n")) == (2, 1)
         assert "--sequence is given 2 times" in err
     assert not (tmp_path / "m.ply").exists()
     (tmp_path / "page.html").unlink()
-    assert _told(capsys, *page)[0] == 0  # without its sequence
+    assert cli(*page)[0] == 0  # without its sequence
     assert "There is no ground truth" in (tmp_path / "page.html").read_text()
 
 
@@ -189,7 +178,7 @@ def test_another_sequence_is_not_taken_for_that_of_the_run(
 )
 @pytest.mark.parametrize("value", ["gone", [1.0, 2.0], {}])
 def test_a_damaged_report_is_one_line(
-    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], place: tuple[str | int, ...], value: object
+    built: Path, tmp_path: Path, cli: Run, place: tuple[str | int, ...], value: object
 ) -> None:
     shutil.copytree(built, tmp_path / "run", ignore=shutil.ignore_patterns("*.rrd", "*.ply"))
     path = tmp_path / "run" / "report.json"
@@ -209,28 +198,28 @@ def test_a_damaged_report_is_one_line(
         ["evaluate", "--out", tmp_path],
         ["join", built, "--out", tmp_path / "joined"],
     ):
-        status, out, err = _told(capsys, command[0], tmp_path / "run", *command[1:])
+        status, out, err = cli(command[0], tmp_path / "run", *command[1:])
         assert (status, out, err.count("\n")) == (2, "", 1)
         assert f"{path}: " in err
         assert "build the run again" in err
 
 
 def test_a_joined_run_is_judged_where_its_parts_know_one_surface(
-    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    built: Path, tmp_path: Path, cli: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     joined = tmp_path / "joined"
     shutil.copytree(built, tmp_path / "other")
     monkeypatch.setattr(fusion, "Matcher", lambda: Matcher(rotations=40, scored=5))
-    assert _told(capsys, "join", built, tmp_path / "other", "--out", joined, "--pairs", "2")[0] in (0, 3)
-    status, out, err = _told(capsys, "evaluate", joined, "--out", tmp_path / "scores")
+    assert cli("join", built, tmp_path / "other", "--out", joined, "--pairs", "2")[0] in (0, 3)
+    status, out, err = cli("evaluate", joined, "--out", tmp_path / "scores")
     assert (status, err) == (0, "")
     assert [line.split()[3] for line in out.splitlines()[1:]] == ["6"] * 4
     found = json.loads((tmp_path / "scores" / "models.json").read_bytes())["models"]
     assert {row["poses"]: row["f_5mm"] > 0.8 for row in found if row["over"] == "seen"} == {"run": True, "true": True}
 
 
-def test_sequences_and_runs_are_not_mixed(built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, err = _told(capsys, "evaluate", BOX, built, "--out", tmp_path / "none")
+def test_sequences_and_runs_are_not_mixed(built: Path, tmp_path: Path, cli: Run) -> None:
+    status, out, err = cli("evaluate", BOX, built, "--out", tmp_path / "none")
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert not (tmp_path / "none").exists()
 
@@ -247,10 +236,10 @@ def _without(scene: Path, built: Path, folder: Path, *names: str) -> tuple[Path,
 
 @pytest.mark.parametrize(("missing", "told"), [("model.ply", "no true surface"), ("scene_gt.json", "no ground truth")])
 def test_runs_without_truth_are_refused_in_one_line(
-    scene: Path, built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: str, told: str
+    scene: Path, built: Path, tmp_path: Path, cli: Run, missing: str, told: str
 ) -> None:
     _, run = _without(scene, built, tmp_path, missing)
-    status, out, err = _told(capsys, "evaluate", run, "--out", tmp_path / "none")
+    status, out, err = cli("evaluate", run, "--out", tmp_path / "none")
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert told in err
     assert not (tmp_path / "none").exists()

@@ -8,15 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from commanded import Run, runner
+from commanded import Run
 from made_up import META, made_up_steps
 
 from modeler.export import RunFolder
-
-
-@pytest.fixture
-def run(capfd: pytest.CaptureFixture[str]) -> Run:
-    return runner(capfd)
 
 
 @pytest.fixture
@@ -97,36 +92,36 @@ NO_RUN = "not empty, and not the folder of a run"
         ("evaluate R --out S", READ),
     ],
 )
-def test_what_is_read_and_what_is_there_stays_as_it_is(run: Run, places: Path, command: str, says: str) -> None:
+def test_what_is_read_and_what_is_there_stays_as_it_is(cli: Run, places: Path, command: str, says: str) -> None:
     before = contents(places)
     words = [str(places / word) if (places / word.split("/")[0]).exists() and "--" not in word else word
              for word in command.split()]  # fmt: skip
     place = words.index("--out") + 1
     words[place] = os.path.join(places, command.split()[place])
-    ended = run(*words)
+    ended = cli(*words)
     assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
     assert any(part in ended.err for part in says.split("|")), ended.err
     assert contents(places) == before
 
 
 @pytest.mark.parametrize(("name", "more"), [("mine.ply", ()), ("mine.ply", ("--bop",)), ("mine.stl", ())])
-def test_a_file_is_replaced_where_that_is_asked_for(run: Run, places: Path, name: str, more: tuple[str, ...]) -> None:
+def test_a_file_is_replaced_where_that_is_asked_for(cli: Run, places: Path, name: str, more: tuple[str, ...]) -> None:
     (places / name).write_text("somebody's own")
-    assert run("export", places / "R", "--out", places / name, *more).status == 2
-    assert run("export", places / "R", "--out", places / name, *more, "--overwrite").status == 0
+    assert cli("export", places / "R", "--out", places / name, *more).status == 2
+    assert cli("export", places / "R", "--out", places / name, *more, "--overwrite").status == 0
     assert (places / name).read_bytes() != b"somebody's own"
 
 
-def test_poses_and_results_are_replaced_where_that_is_asked_for(run: Run, places: Path) -> None:
-    assert run("convert", places / "R", "--out", places / "poses.txt", "--overwrite").status == 0
+def test_poses_and_results_are_replaced_where_that_is_asked_for(cli: Run, places: Path) -> None:
+    assert cli("convert", places / "R", "--out", places / "poses.txt", "--overwrite").status == 0
     assert (places / "poses.txt").read_bytes() == (places / "R" / "trajectory.txt").read_bytes()
     (places / "results.csv").write_text("somebody's own")
-    ended = run("evaluate", places / "S", "--out", places, "--methods", "icp")
+    ended = cli("evaluate", places / "S", "--out", places, "--methods", "icp")
     assert ended.status == 2
     assert "results.csv: exists already" in ended.err
 
 
-def test_a_link_that_leads_nowhere_is_not_replaced(run: Run, places: Path) -> None:
+def test_a_link_that_leads_nowhere_is_not_replaced(cli: Run, places: Path) -> None:
     (places / "dangling.ply").symlink_to("nowhere")
-    assert run("export", places / "R", "--out", places / "dangling.ply", "--overwrite").status == 2
+    assert cli("export", places / "R", "--out", places / "dangling.ply", "--overwrite").status == 2
     assert (places / "dangling.ply").is_symlink()

@@ -17,15 +17,13 @@ from calibration.specimens import load_specimen
 
 from loops.study import mean_nees
 from modeler import se3
-from modeler.closure import Closer
 from modeler.evaluation import trajectory_errors, true_motion
 from modeler.fusion import Fuser
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline import Modeler
 from modeler.priors import TurntablePrior
 from modeler.rays import Sensor
-from modeler.registration import VisibilityRegistrar
-from modeler.segmentation import Scene, Segmenter
+from modeler.segmentation import Scene
 from modeler.types import Array, Solution, Step
 from sequences import AbstractSequence
 from sequences.rendering.renderer import RenderedSequence
@@ -50,11 +48,8 @@ def run(sequence: AbstractSequence, seed: int) -> Step:
     """Build a sequence and return the last step."""
     noise = sequence.sensor()
     maker = Modeler(
-        segmenter=Segmenter(),
         sensor=Sensor() if noise is None else Sensor(*noise),
         prior=TurntablePrior(_STEP_DEG, _SIGMA_DEG),
-        registrar=VisibilityRegistrar(),
-        closer=Closer(),
         fuser=Fuser(voxel_m=0.01),
         seed=seed,
     )
