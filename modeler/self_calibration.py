@@ -1,15 +1,15 @@
 """Self-calibration: the focal length under which the loops of a run close.
 
 A surface at angle θ to the image plane, seen with a focal length too short by a factor c, appears at atan(c tan θ), so
-that turns come out too small or too large, and the turns of a closed loop do not sum up to 360°. The mean of every edge
-is a function of log c, from its point-to-plane equations at a few focal lengths; the focal length that the run tells is
-the one of least graph error (method.md, eq. S1 to S3).
+that turns come out too small or too large, and the turns of a closed loop do not sum up to 360°. Every edge is
+registered again under a few focal lengths, which gives its mean as a function of log c; the focal length that the run
+tells is the one of least graph error (method.md, eq. S1 to S3).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, final
 
@@ -20,15 +20,14 @@ from modeler.graph import Smoother
 from modeler.graph.optimise import optimise
 from modeler.graph.pose_graph import Factor, SpanningTree, chain, collapse_modes
 from modeler.rays import Sensor
-from modeler.registration.visibility import VisibilityLikelihood
-from modeler.registration.visibility.refinement import surface_mode
-from modeler.registration.visibility.search import Search
-from modeler.types import Array, Edge, PoseGaussian, RayImage
+from modeler.types import Array, Edge, Plane, PoseGaussian, Posterior, RayImage
+
+Register = Callable[[RayImage, RayImage], Posterior]
+"""Returns the posterior of target_from_source of a source and a target view."""
 
 _STEP = 0.002  # of log c, for the curvature of the graph's error: half a standard error of a good loop
-_MAX_ROUNDS = 5  # of solving the edges again about the estimate; on captures two to four are enough
+_MAX_ROUNDS = 5  # of registering the edges again about the estimate; on captures two to four are enough
 _CONVERGED = 0.25  # standard deviations by which the last round moved the estimate
-_LOOSENING = 10.0  # standard deviations of an edge relative to those stated: its own mean holds it by 1 % only
 
 
 @final
@@ -62,21 +61,31 @@ class FocalCalibrator:
     """Largest |log c| that is considered: three standard deviations."""
     node: float = 0.05
     """Edges are solved at log c of 0 and ± this, and their means interpolated by parabolas."""
-    likelihood: VisibilityLikelihood = field(default_factory=VisibilityLikelihood)
-    """Selects the points of the views, and matches them."""
     outlier_distance: float = Smoother.outlier_distance
     """Mahalanobis distance beyond which a loop is an outlier."""
 
-    def estimate(self, views: Mapping[int, RayImage], edges: Sequence[Edge], sensor: Sensor) -> FocalLength:
+    def estimate(
+        self, views: Mapping[int, RayImage], edges: Sequence[Edge], sensor: Sensor, register: Register
+    ) -> FocalLength:
         """Return the focal length of least graph error.
 
         Args:
             views: by frame number, made with the focal length that was given.
             edges: of the run. Closures take part also where they were refused because the chain contradicts them.
             sensor: that made the views.
+            register: as the run did, with its prior.
         """
         taking_part = [edge for edge in edges if {edge.source, edge.target} <= views.keys() and _counts(edge)]
-        graph = self._graph([Factor(edge, collapse_modes(edge.posterior)) for edge in taking_part], views, 0.0, sensor)
+
+        def solved(centre: float) -> _Graph:
+            nodes = [
+                {frame: _with_focal(view, centre + shift, sensor) for frame, view in views.items()}
+                for shift in (0.0, -self.node, self.node)
+            ]
+            found = [self._moving(edge, centre, nodes, register) for edge in taking_part]
+            return _Graph([edge for edge in found if edge is not None], min(views), 0.5 * self.outlier_distance**2)
+
+        graph = solved(0.0)
         if not graph.loops:
             return FocalLength(1.0, self.prior_sigma, "prior", float("nan"), float("nan"), 0)
         conditions = 6 * graph.loops
@@ -84,7 +93,7 @@ class FocalCalibrator:
         best, curvature = self._optimum(graph)
         for _ in range(_MAX_ROUNDS):  # parabolas are exact only about the centre
             centre = best
-            graph = self._graph([moving.at(centre) for moving in graph.moving], views, centre, sensor)
+            graph = solved(centre)
             best, curvature = self._optimum(graph)
             if abs(best - centre) < _CONVERGED / np.sqrt(curvature):
                 break
@@ -115,27 +124,35 @@ class FocalCalibrator:
             best -= float(np.clip((more - less) / (2.0 * _STEP * curvature), -0.25 * self.node, 0.25 * self.node))
         return best, curvature
 
-    def _graph(self, factors: Sequence[Factor], views: Mapping[int, RayImage], centre: float, sensor: Sensor) -> _Graph:
-        """Return the graph of edges whose means follow log c, solved at a centre and ± `node`."""
-        nodes = [
-            {frame: _with_focal(view, centre + shift, sensor) for frame, view in views.items()}
-            for shift in (0.0, -self.node, self.node)
-        ]
-        moving = []
-        for factor in factors:
-            middle, less, more = (self._solved(factor, made) for made in nodes)
-            lower, upper = (se3.log(se3.inverse(middle) @ other) for other in (less, more))
-            slope, bend = 0.5 * (upper - lower) / self.node, 0.5 * (upper + lower) / self.node**2
-            moving.append(_MovingEdge(factor, centre, slope, bend))
-        return _Graph(moving, min(views), 0.5 * self.outlier_distance**2)
+    def _moving(
+        self, edge: Edge, centre: float, nodes: Sequence[Mapping[int, RayImage]], register: Register
+    ) -> _MovingEdge | None:
+        """Return an edge as a function of log c; None where it cannot be registered.
 
-    def _solved(self, factor: Factor, views: Mapping[int, RayImage]) -> Array:
-        """Return target_from_source (4, 4) of matching surface near an edge (method.md, eq. S1)."""
-        source, target = factor.source, factor.target
-        pair = self.likelihood.between(views[source], views[target], np.random.default_rng([source, target]))
-        about = se3.covariance_about(factor.pose.covariance, pair.centre_m)
-        spread = np.asarray(np.linalg.cholesky(_LOOSENING**2 * about), dtype=np.float64)
-        return surface_mode(pair, factor.pose.mean, spread, pair.centre_m, fine_m=Search().fine_m(pair))[0]
+        Args:
+            edge: of the run.
+            centre: log c of the first node.
+            nodes: the views at the centre, and at less and more by `node`.
+            register: see `estimate`.
+        """
+        middle, *others = (register(made[edge.source], made[edge.target]) for made in nodes)
+        if not middle.usable:
+            return None
+        pose = collapse_modes(middle)
+        changes = {
+            sign * self.node: se3.log(se3.inverse(pose.mean) @ collapse_modes(other).mean)
+            for sign, other in zip((-1.0, 1.0), others, strict=True)
+            if other.usable
+        }
+        if len(changes) == 2:
+            jump = np.mean(list(changes.values()), axis=0)
+            if jump @ np.linalg.solve(pose.covariance, jump) > self.outlier_distance**2:  # one is another mode
+                del changes[max(changes, key=lambda shift: np.linalg.norm(changes[shift]))]
+        if not changes:
+            return None
+        slope = np.mean([xi / shift for shift, xi in changes.items()], axis=0)
+        bend = np.mean(list(changes.values()), axis=0) / self.node**2 if len(changes) == 2 else np.zeros(6)
+        return _MovingEdge(Factor(edge, pose), centre, slope, bend)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,10 +195,17 @@ class _Graph:
 
 
 def _with_focal(view: RayImage, log_factor: float, sensor: Sensor) -> RayImage:
-    """Return a view as it is under another focal length."""
-    camera = view.frame.camera
-    scaled = replace(camera, fx=camera.fx * np.exp(log_factor), fy=camera.fy * np.exp(log_factor))
-    return sensor.ray_image(replace(view.frame, camera=scaled))
+    """Return a view as it is under another focal length: x and y of every point shrink as it grows."""
+    camera, factor = view.frame.camera, float(np.exp(log_factor))
+    scaled = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+    return sensor.ray_image(replace(view.frame, camera=scaled), view.plane and _scaled(view.plane, factor))
+
+
+def _scaled(plane: Plane, factor: float) -> Plane:
+    """Return the support plane whose points have x and y divided by a factor."""
+    normal = plane.normal * (factor, factor, 1.0)
+    length = float(np.linalg.norm(normal))
+    return replace(plane, normal=normal / length, offset_m=plane.offset_m / length)
 
 
 def _counts(edge: Edge) -> bool:

@@ -47,9 +47,11 @@ class CalibrateCamera:
 
         check_files([self.out], run_inputs([self.run_folder], self.moved.sequence), overwrite=self.overwrite)
         run = reopened(self.run_folder, self.moved.sequence)
-        if len(run.parts) > 1:
+        part, *others = run.parts
+        if others:
             raise InputError(f"{self.run_folder}: joins several runs; calibrate with one of them")
-        found = FocalCalibrator().estimate(run.views, run.edges, run.sensor)
+        register = part.modeler().register
+        found = FocalCalibrator().estimate(run.views, run.edges, run.sensor, register)
         used_px = run.views[min(run.views)].frame.camera.fx
         file = run.report["settings"].get("camera")
         factor = found.factor * (1.0 if file is None else read_focal_factor(Path(file)).factor)

@@ -6,9 +6,9 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Protocol, final
+from typing import Any, Protocol, TypeVar, final
 
 from modeler.cli import compose
 from modeler.cli.console import bar, say
@@ -16,6 +16,7 @@ from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.export import RunFolder, edges_of, poses_of
 from modeler.fusion import Fuser, FusionVolume, conditional_covariances
 from modeler.graph import PoseGraph, solve
+from modeler.pipeline import Modeler
 from modeler.rays import Sensor
 from modeler.types import ACCEPTED, Array, Edge, Frame, InputError, RayImage, Solution
 from sequences import (
@@ -30,6 +31,7 @@ from sequences import (
 )
 from sequences.base import AbstractDerived
 
+_Options = TypeVar("_Options", PriorOptions, MethodOptions, ObjectOptions)
 _ALIKE = 0.02  # share by which the number of an object's points may change with the version of a library
 
 
@@ -120,6 +122,22 @@ class Part:
         """Return the true camera_from_model (4, 4) by frame number of the joined run; None where it is not known."""
         truth = self.sequence.truth()
         return None if truth is None else {frame + self.offset: pose for frame, pose in truth.items()}
+
+    def modeler(self) -> Modeler:
+        """Return the loop with the components and the prior that the run was made with.
+
+        Raises:
+            InputError: where its settings cannot be used.
+        """
+        said: dict[str, Any] = {**self.report["settings"], **{name: self.report[name] for name in ("prior", "seed")}}
+        settings: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in said.items()
+        }
+
+        def options(kind: type[_Options]) -> _Options:
+            return kind(**{one.name: settings[one.name] for one in fields(kind) if one.name in settings})
+
+        return compose.modeler(self.sequence, options(PriorOptions), options(MethodOptions), options(ObjectOptions))
 
     def views(self, frames: Sequence[int]) -> dict[int, RayImage]:
         """Return views, made again, by frame number of the joined run.

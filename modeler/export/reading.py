@@ -112,7 +112,7 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
-_LATER = frozenset({"modes", "cause"})  # reports of earlier versions have none
+_LATER = frozenset({"modes", "cause", "mask"})  # reports of earlier versions have none
 
 
 def fault(report: Mapping[str, Any]) -> str | None:

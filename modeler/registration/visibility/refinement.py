@@ -52,7 +52,7 @@ class Refiner:
         centre_m = pair.centre_m
         mean, covariance = se3.mean(poses, weights, about_m=centre_m)
         spread = np.asarray(np.linalg.cholesky(covariance + FLOOR), dtype=np.float64)
-        mode, noise_m = surface_mode(pair, mean, spread, centre_m, fine_m=fine_m)
+        mode, noise_m = _mode(pair, mean, spread, centre_m, fine_m=fine_m)
         basis, information = self._information(pair, mode, noise_m, spread, centre_m)
         scales, axes = np.linalg.eigh(information)
         root = axes * np.sqrt(np.maximum(scales, 0.0))
@@ -120,9 +120,7 @@ def visible_share(size: float) -> float:
     return float(share**2)
 
 
-def surface_mode(
-    pair: PairLikelihood, start: Array, spread: Array, centre_m: Array, *, fine_m: float
-) -> tuple[Array, float]:
+def _mode(pair: PairLikelihood, start: Array, spread: Array, centre_m: Array, *, fine_m: float) -> tuple[Array, float]:
     """Return the mode of matching surface × a Gaussian about `start` with the root (6, 6) of its covariance, and b."""
     precision = np.linalg.inv(spread @ spread.T)
     pose, noise_m = start, pair.surface_noise_m(start, fine_m)
