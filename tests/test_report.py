@@ -21,7 +21,7 @@ from modeler.export.formats import mesh_ply
 from modeler.export.mesh import MADE_UP_RGB
 from modeler.types import Array, InputError
 from sequences import bundled
-from viz.report import write_page
+from viz.report import run_data, write_page
 from viz.report.mesh import read_mesh, scene
 from viz.report.run_data import Result, recorded, surfaces
 from viz.stream import open_stream
@@ -207,6 +207,15 @@ def test_the_viewer_shows_how_sure_each_vertex_is_and_what_is_made_up(tmp_path: 
     lightness = painted[1:4].sum(axis=1)
     assert (np.diff(lightness) > 100).all()
     np.testing.assert_array_equal(painted[3], painted[4])
+
+
+@pytest.mark.parametrize("ending", ["os.abort()", "sys.exit('damaged')", "raise ValueError"])
+def test_a_recording_that_ends_its_reader_is_as_good_as_none(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], ending: str
+) -> None:
+    monkeypatch.setattr(run_data, "_READER", f"import os, sys; {ending}")
+    assert not any(recorded(run / "recording.rrd").values())
+    assert capfd.readouterr().err == ""
 
 
 def test_without_truth_recording_or_mesh_the_page_says_so(run: Path, tmp_path: Path) -> None:

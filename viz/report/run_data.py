@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import pickle
 import re
+import subprocess
+import sys
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -103,13 +106,11 @@ def recorded(recording: Path) -> dict[str, dict[int, dict[str, Any]]]:
     check_regular(recording)
     if recording.stat().st_size > _MAX_BYTES:
         return rows
-    try:
-        steps = _steps(recording)
-    except (OSError, ValueError, RuntimeError):
-        return rows
+    steps = _steps(recording)
     for _, step in sorted(steps.items()):
-        pair = registered(step.rows.get(entities.PAIR_CAPTION, {}))
-        for path, row in step.rows.items():
+        found = {path: {name: value[0] for name, value in row.items()} for path, row in step.rows.items()}
+        pair = registered(found.get(entities.PAIR_CAPTION, {}))
+        for path, row in found.items():
             rows[path][step.frame if pair is None else pair[0]] = row
     return rows
 
@@ -156,7 +157,33 @@ class _Step:
 
 
 def _steps(recording: Path) -> dict[int, _Step]:
-    """Return the steps of a run by the time, in ns since its start, at which they were drawn."""
+    """Return the steps of a run by the time, in ns since its start, at which they were drawn; none of a damaged one.
+
+    Another process reads them, because Rerun 0.41 aborts the one in which it reads some damaged recordings.
+    """
+    read = subprocess.run(
+        [sys.executable, "-c", _READER, str(recording)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        check=False,
+    )
+    steps: dict[int, _Step] = pickle.loads(read.stdout) if read.returncode == 0 else {}
+    return steps
+
+
+_READER: Final = """
+import pickle, sys
+from pathlib import Path
+from viz.report.run_data import read_steps
+steps = read_steps(Path(sys.argv[1]))
+sys.stdout.buffer.write(pickle.dumps(steps))
+"""
+
+
+def read_steps(recording: Path) -> dict[int, _Step]:
+    """Return the steps of a run as `_steps` does, each value an array of one, for scalars are sent slowly."""
     import rerun.chunk
 
     steps: dict[int, _Step] = {}
@@ -171,9 +198,9 @@ def _steps(recording: Path) -> dict[int, _Step]:
                 component = name.partition(":")[2]
                 if component not in _COMPONENTS:
                     continue
-                times = zip(batch[entities.ELAPSED], batch[entities.FRAME].to_pylist(), batch[name], strict=True)
-                for elapsed, frame, value in times:
-                    if value.is_valid:
+                times = zip(batch[entities.ELAPSED], batch[entities.FRAME].to_pylist(), strict=True)
+                for place, (elapsed, frame) in enumerate(times):
+                    if batch[name][place].is_valid:
                         step = steps.setdefault(elapsed.value, _Step(frame))
-                        step.rows.setdefault(path, {})[component] = value
+                        step.rows.setdefault(path, {})[component] = batch[name].take([place])
     return steps
