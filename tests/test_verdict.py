@@ -38,10 +38,10 @@ from modeler.verdict import FrameRecord, judged
 from modeler.verdict.evidence import (
     contradiction,
     displacement,
+    free_space,
     graph_figure,
     loop_figure,
     other_modes,
-    seen_through,
 )
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
@@ -56,18 +56,24 @@ def turned(angle_deg: float) -> Array:
     return MIDDLE @ se3.exp(np.array([0.0, np.radians(angle_deg), 0.0, 0.0, 0.0, 0.0]))
 
 
-def seen(index: int, camera_from_object: Array, wall_m: float = 1.0, plane: Plane | None = None) -> RayImage:
+def seen(
+    index: int,
+    camera_from_object: Array,
+    wall_m: float = 1.0,
+    plane: Plane | None = None,
+    axes_m: Array = AXES_M,
+) -> RayImage:
     """An ellipsoid before a wall, each pixel a ray that meets it or does not."""
     w, h = CAMERA.rays()
     rays = np.stack([w, h, np.ones_like(w)], axis=-1).reshape(-1, 3)
     turn, middle_m = camera_from_object[:3, :3], camera_from_object[:3, 3]
-    ahead, start = (rays @ turn) / AXES_M, (-middle_m @ turn) / AXES_M  # in units of the axes it is a unit sphere
+    ahead, start = (rays @ turn) / axes_m, (-middle_m @ turn) / axes_m  # in units of the axes it is a unit sphere
     square, cross, rest = np.sum(ahead**2, axis=1), ahead @ start, start @ start - 1.0
     root = cross**2 - square * rest
     depth_m = np.where(root > 0.0, (-cross - np.sqrt(np.maximum(root, 0.0))) / square, wall_m)
     mask = root > 0.0
     points_m = rays[mask] * depth_m[mask, None]
-    outwards = ((points_m - middle_m) @ turn) / AXES_M**2 @ turn.T
+    outwards = ((points_m - middle_m) @ turn) / axes_m**2 @ turn.T
     normals = outwards / np.linalg.norm(outwards, axis=1, keepdims=True)
     shape = (CAMERA.height, CAMERA.width)
     frame = Frame(index, float(index), depth_m.reshape(shape).astype(np.float32), CAMERA, mask.reshape(shape))
@@ -95,15 +101,29 @@ STEPS_DEG = [0.0, 25.0, 50.0, 75.0]
 def test_other_frames_see_through_what_is_in_the_wrong_place() -> None:
     angles_deg = [25.0 * k for k in range(6)]
     views = views_of(angles_deg)
-    found = seen_through(views, poses_of(angles_deg))
+    found = free_space(views, poses_of(angles_deg))
     assert found is not None
-    assert found[1].holds
-    assert found[1].value < 0.01
-    wrong = seen_through(views, poses_of([*angles_deg[:5], 125.0 - 60.0]))
+    assert found.seen_through.holds
+    assert found.seen_through.value < 0.01
+    assert found.absent.holds
+    assert found.absent.value == 0.0
+    wrong = free_space(views, poses_of([*angles_deg[:5], 125.0 - 60.0]))
     assert wrong is not None
-    assert wrong[0] == 5
-    assert not wrong[1].holds
-    assert seen_through({0: views[0]}, poses_of([0.0])) is None  # nobody else looks
+    assert wrong.frame == 5
+    assert not wrong.seen_through.holds
+    assert free_space({0: views[0]}, poses_of([0.0])) is None  # nobody else looks
+
+
+def test_a_part_that_one_frame_alone_shows_is_not_there() -> None:
+    """A frame that shows more than the others: a wider object, as of a part that is elsewhere in truth."""
+    angles_deg = [5.0 * k for k in range(6)]
+    views, poses = views_of(angles_deg), poses_of(angles_deg)
+    longer = seen(2, turned(angles_deg[2]), axes_m=AXES_M * np.array([1.0, 1.3, 1.0]))
+    found = free_space(views | {2: longer}, poses)
+    assert found is not None
+    assert found.bare_frame == 2
+    assert not found.absent.holds
+    assert free_space(views, poses).absent.holds  # pyright: ignore[reportOptionalMemberAccess]
 
 
 def test_surface_that_never_moved_more_than_noise_shows_no_motion() -> None:
@@ -262,7 +282,9 @@ def whole_run(
 def test_a_sound_run_is_trusted_and_shows_its_evidence() -> None:
     codes, holds = whole_run(STEPS_DEG, prior=TurntablePrior(-25.0))
     assert codes == []
-    assert holds == dict.fromkeys(("unsure_masks", "motion_m", "prior_sds", "seen_through", "other_modes"), True)
+    assert holds == dict.fromkeys(
+        ("unsure_masks", "motion_m", "prior_sds", "seen_through", "absent", "other_modes"), True
+    )
 
 
 @pytest.mark.parametrize(

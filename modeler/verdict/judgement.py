@@ -33,10 +33,10 @@ from modeler.verdict.evidence import (
     Figure,
     contradiction,
     displacement,
+    free_space,
     graph_figure,
     loop_figure,
     other_modes,
-    seen_through,
 )
 
 _LITTLE_OVERLAP: Final = 0.5  # views farther apart are registered wrongly now and then, and surely so
@@ -73,7 +73,7 @@ class Shortcoming:
     code: str
     """For programs: `doubt`, `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
     `prior_contradicted`, `loop_open`, `edges_disagree`, `closures_refused`, `unconfirmed`, `never_came_back`,
-    `not_tried`, `seen_through`, `little_overlap`, `other_modes` or `unsure_rotation`."""
+    `not_tried`, `seen_through`, `absent`, `little_overlap`, `other_modes` or `unsure_rotation`."""
     words: str
     """For people."""
 
@@ -86,7 +86,7 @@ class Verdict:
     """Why not; empty where it can be."""
     evidence: Mapping[str, Figure] = field(default_factory=dict)
     """Figures by name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `loop_sigmas`, `graph_chi2`,
-    `seen_through` and `other_modes`, those that the run has."""
+    `seen_through`, `absent` and `other_modes`, those that the run has."""
 
     @property
     def trustworthy(self) -> bool:
@@ -185,13 +185,17 @@ def _found(
             f"covariances state (up to {fit.limit:.1f} by chance)"
         )
         found.append(_Finding("graph_chi2", fit, "edges_disagree", words))
-    if (through := seen_through(views, solution.trajectory)) is not None:
-        frame, share = through
+    if (free := free_space(views, solution.trajectory)) is not None:
         words = (
-            f"other frames see through {100.0 * share.value:.0f} % of the surface of frame {frame} by more than "
-            f"{1000.0 * WRONG_M:.0f} mm: poses are wrong, or the object changed its shape"
+            f"other frames see through {100.0 * free.seen_through.value:.0f} % of the surface of frame {free.frame} by "
+            f"more than {1000.0 * WRONG_M:.0f} mm: poses are wrong, or the object changed its shape"
         )
-        found.append(_Finding("seen_through", share, "seen_through", words))
+        found.append(_Finding("seen_through", free.seen_through, "seen_through", words))
+        words = (
+            f"{100.0 * free.absent.value:.0f} % of the surface of frame {free.bare_frame} is not there by most frames "
+            "that look: poses are wrong, or the object changed its shape"
+        )
+        found.append(_Finding("absent", free.absent, "absent", words))
     others = other_modes(edges, solution, views)
     words = f"with a probability of {100.0 * others.value:.0f} % some pair is at another of its modes"
     found.append(_Finding("other_modes", others, "other_modes", words))

@@ -102,6 +102,7 @@ _CHECKS: Final = {
     "loop_sigmas": ("widest open loop, before optimisation", 1.0, " sd"),
     "graph_chi2": ("squared residuals of the edges over their covariances", 1.0, ""),
     "seen_through": ("surface of a frame that others see through", 100.0, " %"),
+    "absent": ("surface of a frame that most others that look see through", 100.0, " %"),
     "other_modes": ("probability of another mode", 100.0, " %"),
 }
 """Figures of the evidence in words, each with the factor to its unit."""
