@@ -147,7 +147,7 @@ def mean(
         weights: (n,), non-negative, any positive sum.
         about_m: (3,) point about which ξ turns, see `moved`; the origin without it.
         start: (4, 4) where the iteration begins; the heaviest motion without it.
-        iterations: at most so many fixed-point steps.
+        iterations: largest number of fixed-point steps.
     """
     weights = np.asarray(weights, dtype=np.float64) / np.sum(weights)
     point_m = np.zeros(3) if about_m is None else np.asarray(about_m, dtype=np.float64)

@@ -31,7 +31,7 @@ class WatchLimits:
     settle_s: float = 0.5
     """The newest frame is taken once the folder has not changed for so long: its colour and mask may come late."""
     first: int = 3
-    """So many frames are awaited before anything is said of the sequence."""
+    """Number of frames to wait for before the sequence is described."""
 
 
 @final

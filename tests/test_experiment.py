@@ -234,7 +234,7 @@ def test_only_steps_once_round_are_a_loop(pairing: Pairing) -> None:
 
 def run(out: Path, *recordings: Recording) -> list[Trial]:
     told: list[Trial] = []
-    evaluate(recordings or [Recording()], experiment(), out, draw=rotation_errors, told=told.append)
+    evaluate(recordings or [Recording()], experiment(), out, draw=rotation_errors, report=told.append)
     return told
 
 

@@ -162,7 +162,7 @@ def test_exports_made_anew_from_the_frames(
 ) -> None:
     out = tmp_path / "figure.stl"
     assert main(["export", str(runs[2]), "--out", str(out), "--watertight", "--triangles", "4000"]) == 0
-    assert "% of the vertices made up" in capfd.readouterr().err
+    assert "% of the vertices interpolated" in capfd.readouterr().err
     mesh = trimesh.load_mesh(out)
     assert mesh.is_volume
     assert 3000 < len(mesh.faces) <= 4000

@@ -191,7 +191,7 @@ def test_pokes_are_read() -> None:
         ),
         (PriorOptions(prior="held", held_sigma_m=-0.1), TURNTABLE, "--held-sigma-m -0.1 is out of range"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"one": POKE}}), "poke 'one'"),
-        (PriorOptions(), Telling({"kind": "poke", "pokes": {"9" * 5000: POKE}}), "is not told by a frame number"),
+        (PriorOptions(), Telling({"kind": "poke", "pokes": {"9" * 5000: POKE}}), "has no frame number"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": POKE | {"length_m": 10**400}}}), "poke '1' must be"),
         (PriorOptions(prior="turntable"), Telling({"kind": "turntable", "step_deg": 10**400}), "give --step-deg"),
         (PriorOptions(), Telling({"kind": "turntable", "step_deg": 1e308}), "telling: sequence.json: step_deg 1e+308"),

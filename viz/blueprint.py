@@ -158,7 +158,7 @@ def _eye(first: RayImage, distance_m: float, direction: Array) -> rrb.EyeControl
 
 
 def _near(first: RayImage | None, direction: Array, radii: float) -> rrb.EyeControls3D | None:
-    """Return an eye on the object from so many of its radii away; None before there is one."""
+    """Return an eye that looks at the object from a multiple of its radius away; None before there is one."""
     return None if first is None else _eye(first, radii * _radius_m(first), direction)
 
 

@@ -19,7 +19,7 @@ from viz.drawings import CLEAR, Drawing, caption, ellipsoids, rounded_down, scal
 OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
 """From the object towards the eye that looks at the whole graph."""
 
-_POSES: Final = 150  # of more than so many poses every n-th is drawn
+_POSES: Final = 150  # largest number of poses that are all drawn; of more, every n-th
 _CAMERA_SIZE: Final = 0.1  # as a share of the distance to the object
 _CAPTION: Final = 1.0  # of captions below the object, as a share of the distance to it
 

@@ -36,7 +36,7 @@ def draw_model(step: Step) -> Drawing:
 
 
 def _mesh(model: ObjectModel) -> rr.Mesh3D:
-    """Return the mesh, coarse enough for the recording to stay small; surface that nobody saw is tinted."""
+    """Return the mesh, coarse enough for the recording to stay small; interpolated surface is tinted."""
     colours = np.full(model.vertices_m.shape, _PLAIN) if model.vertex_colours is None else model.vertex_colours
     colours = colours.astype(np.float64)
     if model.vertex_views is not None:
@@ -62,7 +62,7 @@ def coarsened(vertices: Array, triangles: npt.NDArray[np.int64], limit: int) -> 
     """
     a, b, c = np.moveaxis(vertices[triangles, :3], 1, 0)
     area_m2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    cell_m = max(math.sqrt(1.5 * area_m2 / limit), 1e-9)  # cells hold about so much surface, of two triangles
+    cell_m = max(math.sqrt(1.5 * area_m2 / limit), 1e-9)  # side of a cell that holds two triangles on average
     merged, kept = vertices, triangles
     while len(kept) > limit:
         cells = np.floor((vertices[:, :3] - vertices[:, :3].min(axis=0)) / cell_m).astype(np.int64)

@@ -220,7 +220,7 @@ def _sink(port: int) -> str:
 
 
 def _free_port() -> int:
-    """Return a port nobody listens on."""
+    """Return a free port."""
     with socket.socket() as probe:
         probe.bind((_HOST, 0))
         return int(probe.getsockname()[1])

@@ -280,7 +280,7 @@ def _guess(name: str, given: dict[str, Any], known: AbstractPrior) -> AbstractPr
 def _turntable(given: dict[str, Any], motion: Mapping[str, object]) -> TurntablePrior:
     """Return a turntable, its step as given, else as `sequence.json` says.
 
-    A step told without an axis does not say which way round it is, unless it is negative or agrees with the file.
+    A step given without an axis leaves the sense of rotation open, unless it is negative or agrees with the file.
     """
     step_deg, sigma_deg = _number(motion.get("step_deg")), _number(motion.get("sigma_deg"))
     given = dict(given)
@@ -319,17 +319,17 @@ def _poke(given: dict[str, Any], sequence: AbstractSequence | None) -> PokePrior
         if missing:
             raise InputError(f"--prior poke needs --{missing[0].replace('_', '-')} as well; give all three")
         return PokePrior(Poke(given["poke_point_m"], given["poke_direction"], given["poke_length_m"]))
-    told = None if sequence is None or sequence.motion is None else sequence.motion.get("pokes")
-    if sequence is None or not isinstance(told, dict) or not told:
+    pokes = None if sequence is None or sequence.motion is None else sequence.motion.get("pokes")
+    if sequence is None or not isinstance(pokes, dict) or not pokes:
         raise InputError("--prior poke needs --poke-point-m, --poke-direction and --poke-length-m; give them")
-    return PokePrior(pokes=dict(_one_poke(f"{sequence.name}: sequence.json", *one) for one in told.items()))
+    return PokePrior(pokes=dict(_one_poke(f"{sequence.name}: sequence.json", *one) for one in pokes.items()))
 
 
 def _one_poke(where: str, frame: str, entry: object) -> tuple[int, Poke]:
     """Return a push as `sequence.json` has it, and the first frame after it; `where` is for messages."""
     number = frame_number(frame)
     if number is None:
-        raise InputError(f"{where}: poke {frame!r} is not told by a frame number; use the first frame after it")
+        raise InputError(f"{where}: poke {frame!r} has no frame number for a key; use that of the first frame after it")
     values = entry if isinstance(entry, dict) else {}
     point_m, direction, length_m = (values.get(name) for name in ("point_m", "direction", "length_m"))
     threes = [

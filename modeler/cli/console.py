@@ -22,7 +22,7 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it."""
 TERMINATED = 128 + signal.SIGTERM
 """Exit status after SIGTERM, as shells have it."""
-_ONE_BY_ONE = 3  # frames left out in a row that are told as they come
+_ONE_BY_ONE = 3  # consecutive frames left out that are reported one by one
 
 
 def say(words: str) -> None:
@@ -142,7 +142,7 @@ def bar() -> Progress:
 
 
 class Console:
-    """A sink of steps, for a terminal; where stderr is none, only frames left out are told."""
+    """A sink of steps, for a terminal; where stderr is none, only frames left out are reported."""
 
     def __init__(self, frames: int, address: str | None) -> None:
         self._bar = bar()
@@ -152,8 +152,8 @@ class Console:
         self._placed: dict[int, bool] = {}  # a lost frame that later views place comes a second time
         self._unsure: set[int] = set()
         self._advised: set[str] = set()
-        self._told, self._aloud = "", 0
-        self._held: list[int] = []  # frames of which the same is to be told as of the last few
+        self._reported, self._aloud = "", 0
+        self._held: list[int] = []  # frames left out for the same reason as those reported last
 
     def __enter__(self) -> Console:
         """Show the bar."""
@@ -222,9 +222,9 @@ class Console:
 
     def _tell(self, frame: int, what: str) -> None:
         """Tell what became of a frame; of those that follow each other for one reason, only the first few by one."""
-        if what != self._told:
+        if what != self._reported:
             self._release()
-            self._told = what
+            self._reported = what
         self._aloud += 1
         if self._aloud > _ONE_BY_ONE:
             self._held.append(frame)
@@ -234,10 +234,10 @@ class Console:
     def _release(self) -> None:
         """Tell what was held back, together."""
         if len(self._held) == 1:
-            self._say(f"frame {self._held[0]} is {self._told}")
+            self._say(f"frame {self._held[0]} is {self._reported}")
         elif self._held:
-            self._say(f"frames {self._held[0]} to {self._held[-1]} are {self._told}")
-        self._told, self._aloud, self._held = "", 0, []
+            self._say(f"frames {self._held[0]} to {self._held[-1]} are {self._reported}")
+        self._reported, self._aloud, self._held = "", 0, []
 
     def _why(self, reason: Reason) -> str:
         """Return why a frame was left out, with what to do about it where that has not been said yet."""

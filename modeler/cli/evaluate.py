@@ -45,16 +45,16 @@ class Evaluate:
     methods: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ",".join(get_args(Method))
     """Methods to compare."""
     offsets: Annotated[str, tyro.conf.arg(metavar="N,...")] = "1"
-    """Compare frames so many apart; each is a table of its own."""
+    """Differences of frame numbers to compare; each gives a table of its own."""
     both_ways: bool = False
     """Register each pair in both directions, not only the later frame to the earlier."""
     closed: bool = False
     """Take the sequence for a full turn, its last frame followed by its first.
-    What all its steps together leave, of how much they turn one by one, is told too: that needs no ground truth."""
+    The rotation that remains of all steps in sequence, and the sum of their angles, are printed too, without truth."""
     learn: bool = False
-    """The prior learns from the pairs before, as in `build`: the axis and sense of a turntable that nobody tells."""
+    """The prior learns from the pairs before, as in `build`: the unknown axis and sense of a turntable."""
     points: Annotated[int | None, tyro.conf.arg(metavar="N"), default("all")] = None
-    """Keep so many of the object's surface points a view, drawn at random: very sparse clouds."""
+    """Keep N of the object's surface points per view, drawn at random, to simulate sparse clouds."""
     seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same errors."""
     prior: PriorOptions = field(default_factory=PriorOptions)
@@ -122,7 +122,7 @@ def _evaluate_pairs(options: Evaluate) -> int:
             plan,
             options.out,
             draw=figures.rotation_errors,
-            told=lambda trial: progress.update(task, advance=1, description=f"{trial.sequence}, {trial.method}"),
+            report=lambda trial: progress.update(task, advance=1, description=f"{trial.sequence}, {trial.method}"),
         )
     print(table(rows))
     return 0
@@ -153,8 +153,8 @@ def table(rows: Sequence[Summary]) -> str:
         for row in rows
     ]
     lines = [(*heading, "NEES", "loop deg", "of", "s"), *cells]
-    told = [number for number, column in enumerate(zip(*lines, strict=True)) if any(column[1:])]
-    return columns([tuple(line[number] for number in told) for line in lines], left=2)
+    filled = [number for number, column in enumerate(zip(*lines, strict=True)) if any(column[1:])]
+    return columns([tuple(line[number] for number in filled) for line in lines], left=2)
 
 
 def _number(value: float, digits: int) -> str:

@@ -32,9 +32,9 @@ class Export:
     overwrite: bool = False
     """Replace files that are there."""
     watertight: bool = False
-    """Close what nobody saw with made-up surface. In PLY its vertices have 0 `views` and a `sigma_m` of -1."""
+    """Fill unobserved regions with interpolated surface. In PLY its vertices have 0 `views` and a `sigma_m` of -1."""
     triangles: Annotated[int | None, tyro.conf.arg(metavar="N"), default("all")] = None
-    """Simplify the mesh to so many triangles. With --texture 8000 unless given: the detail is in the image."""
+    """Simplify the mesh to N triangles. With --texture 8000 unless given: the detail is in the image."""
     texture: bool = False
     """Colour by an image wrapped around the mesh, from the sharpest frontal views (OBJ with MTL and PNG, GLB)."""
     bop: bool = False
@@ -120,8 +120,8 @@ def _volume(options: Export) -> FusionVolume | None:
 
 
 def _tell(model: ObjectModel, options: Export) -> None:
-    """Say on stderr what was written, and how much of it nobody saw."""
-    made_up = ""
+    """Say on stderr what was written, and how much of it is interpolated."""
+    interpolated = ""
     if options.watertight and model.vertex_views is not None:
-        made_up = f", {100.0 * float((model.vertex_views == 0).mean()):.0f} % of the vertices made up"
-    say(f"{len(model.triangles)} triangles{made_up}: {options.out}")
+        interpolated = f", {100.0 * float((model.vertex_views == 0).mean()):.0f} % of the vertices interpolated"
+    say(f"{len(model.triangles)} triangles{interpolated}: {options.out}")

@@ -23,7 +23,7 @@ class Info:
     """
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
-    """A sequence in any format that `modeler build` takes; the format is told from the path."""
+    """A sequence in any format that `modeler build` takes; the format is detected from the path."""
     json: bool = False
     """Print a JSON object instead of lines."""
     given: InputOptions = field(default_factory=InputOptions)

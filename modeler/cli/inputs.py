@@ -37,16 +37,16 @@ _ALIKE = 0.02  # share by which the number of an object's points may change with
 
 @final
 @dataclass(frozen=True)
-class ToldSequence(AbstractDerived):
-    """Another sequence that tells of every frame it is asked for."""
+class ObservedSequence(AbstractDerived):
+    """Another sequence, with a callback after each frame that is read."""
 
-    told: Callable[[], None]
+    on_read: Callable[[], None]
     """Called after each frame."""
 
     def frame(self, index: int) -> Frame:
         """Return the frame with number `index`."""
         frame = self.whole.frame(index)
-        self.told()
+        self.on_read()
         return frame
 
 
@@ -78,7 +78,7 @@ def reading() -> Iterator[Watched]:
             if sequence.live:
                 return sequence
             task = progress.add_task(what, total=len(sequence))
-            return ToldSequence(sequence, lambda: progress.advance(task))
+            return ObservedSequence(sequence, lambda: progress.advance(task))
 
         yield watched
 
@@ -88,7 +88,7 @@ def watched(path: Path, idle_s: float) -> AbstractSequence:
 
     Args:
         path: where it writes.
-        idle_s: the sequence is over after so many seconds in which nothing came.
+        idle_s: the sequence is over after this many seconds without a new frame.
 
     Raises:
         InputError: where nothing readable comes.

@@ -104,7 +104,7 @@ class Join:
 
 
 def _check(options: Join) -> None:
-    """Refuse options that nobody can mean, and a folder that holds something.
+    """Refuse options out of range, and a folder that holds something.
 
     Raises:
         InputError: where they are such, or another program is writing to the folder.

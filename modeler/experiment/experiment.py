@@ -117,7 +117,7 @@ class Experiment:
     success_deg: float = 16.2
     """Rotation error below which a registration counts as right (Jian and Vemuri 2011)."""
     learn: bool = False
-    """Whether the prior learns from the pairs before, as in a build: the axis of a turntable that nobody tells."""
+    """Whether the prior learns from the pairs before, as in a build: the unknown axis of a turntable."""
     seed: int = 0
     """Each pair draws from a generator of its own, made from this and the two frame numbers, as in `register`."""
 

@@ -22,7 +22,7 @@ def evaluate(
     out: Path,
     *,
     draw: Callable[[Sequence[Trial]], bytes],
-    told: Callable[[Trial], None],
+    report: Callable[[Trial], None],
 ) -> list[Summary]:
     """Run an experiment and write `results.json`, `results.csv` and `rotation_errors.png` into a folder.
 
@@ -31,7 +31,7 @@ def evaluate(
         experiment: what to do with each.
         out: folder, made where there is none; the three files of an earlier experiment are replaced at the end.
         draw: makes a PNG of the trials.
-        told: hears of every trial as soon as it is done; there are `experiment.size(sequence)` for each sequence.
+        report: called with every trial as soon as it is done, `experiment.size(sequence)` times for each sequence.
 
     Raises:
         InputError: where a sequence has nothing to be judged by or cannot be read, or `out` cannot be written.
@@ -49,7 +49,7 @@ def evaluate(
     for recorded in sequences:
         for trial in experiment.trials(recorded):
             trials.append(trial)
-            told(trial)
+            report(trial)
     rows = summaries(trials, experiment.success_deg, loops=experiment.pairing.loops)
     write_atomically(out / "results.json", results_json(experiment, trials, rows))
     write_atomically(out / "results.csv", results_csv(trials))

@@ -94,7 +94,7 @@ def ply_bytes(
         normals: (n, 3) unit vectors.
         colours: (n, 3) RGB.
         triangles: (t, 3) vertex numbers; None: a cloud, without a face element.
-        views: (n,) number of views that saw each point, stored as `views`; 0 = made up.
+        views: (n,) number of views that saw each point, stored as `views`; 0 = interpolated.
         sigmas_m: (n,) standard deviation along the normal, stored as `sigma_m`; inf, stored as -1, where there is none.
     """
     names = ["x", "y", "z", "nx", "ny", "nz"]

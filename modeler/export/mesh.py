@@ -27,7 +27,7 @@ MODELS_INFO = "models_info.json"
 
 Tint = Literal["views", "sigma"]
 MADE_UP_RGB: Final = (230, 90, 200)
-"""Of surface that nobody saw, wherever it is shown."""
+"""Of unobserved, interpolated surface, wherever it is shown."""
 MOST_VIEWS: Final = 12
 """Views at the end of the scale."""
 MOST_SIGMA_M: Final = 2e-3
@@ -173,7 +173,7 @@ def _stl(model: ObjectModel) -> bytes:
 
 
 def simplified(model: ObjectModel, triangles: int) -> ObjectModel:
-    """Return the model with at most so many triangles, closed where it was closed.
+    """Return the model with at most `triangles` triangles, closed where it was closed.
 
     Edges are collapsed in the order of the least quadric error (Garland and Heckbert 1997, "Surface simplification
     using quadric error metrics"). Colours, views and deviations are those of the nearest old vertex.
@@ -215,7 +215,7 @@ def simplified(model: ObjectModel, triangles: int) -> ObjectModel:
 
 
 def tinted(model: ObjectModel, tint: Tint) -> ObjectModel:
-    """Return the model with vertices coloured by how well they are known; what is made up is pink.
+    """Return the model with vertices coloured by how well they are known; interpolated surface is pink.
 
     Args:
         model: with `vertex_views` and `vertex_sigmas_m`.
@@ -236,7 +236,7 @@ def tinted(model: ObjectModel, tint: Tint) -> ObjectModel:
 def sigma_rgb(sigmas_m: Array) -> Array:
     """Return colours (v, 3) of standard deviations (v,), from dark (0) to yellow (`MOST_SIGMA_M` and more).
 
-    What has none, surface that is made up, is pink.
+    Interpolated surface, which has none, is pink.
     """
     rgb = _scale_rgb(np.where(np.isfinite(sigmas_m), sigmas_m, 0.0) / MOST_SIGMA_M)
     rgb[~np.isfinite(sigmas_m)] = MADE_UP_RGB

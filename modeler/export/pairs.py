@@ -27,7 +27,7 @@ from modeler.types import (
     RayImage,
 )
 
-_DRAWN = 64  # poses by which one prior is told from another
+_DRAWN = 64  # poses at which priors are compared
 
 
 @final

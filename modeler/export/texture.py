@@ -73,7 +73,7 @@ def textured(model: ObjectModel, paint: Paint, texel_m: float) -> tuple[ObjectMo
 
 
 def _pieces(centres_m: Array, most: int) -> list[npt.NDArray[np.int64]]:
-    """Return the numbers of triangles in compact pieces of at most so many, given their centres (t, 3)."""
+    """Return the numbers of triangles in compact pieces of limited size, given their centres (t, 3)."""
     waiting, pieces = [np.arange(len(centres_m))], []
     while waiting:
         piece = waiting.pop()

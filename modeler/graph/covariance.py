@@ -11,7 +11,7 @@ a separator of variables in the cliques above. Rows that are added or removed co
 their variables to the roots (Kaess et al., iSAM2: Incremental smoothing and mapping using the Bayes tree, IJRR 2012);
 covariances are recovered by back substitution (Kaess and Dellaert, Covariance recovery from a square root information
 matrix, RAS 2009). Information and covariance are never formed, subtracted or inverted as a whole, so that a direction
-that nobody observed, metres wide, does not spoil others, micrometres wide. First order in the errors; factors are
+that no edge observes, metres wide, does not spoil others, micrometres wide. First order in the errors; factors are
 relinearised where poses have moved.
 """
 

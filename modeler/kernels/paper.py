@@ -123,7 +123,7 @@ def point_density(point_b, pose, ranges_m, intrinsics, noise, reach_sigmas):
         ranges_m: (h, w) range r of every pixel of A; 0 = no measurement, which forbids nothing.
         intrinsics: (4,) fx, fy, cx, cy of A in px.
         noise: (3, 3) L.
-        reach_sigmas: pixels farther than so many lateral standard deviations are passed over; inf = none.
+        reach_sigmas: pixels farther than this many lateral standard deviations are skipped; inf = none.
     """
     rotation = np.empty((3, 3))
     in_a = np.empty(3)

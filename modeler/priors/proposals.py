@@ -18,7 +18,7 @@ _LEAST_RAD, _LEAST_M = np.radians(2.0), 0.004  # least standard deviations: the 
 _WIDER = 2.0  # factor on the graph's standard deviations, which hold no systematic error
 _MOST_STEPS = 3.0  # beyond, constant velocity is no longer plausible
 _DRAWS = 20_000  # triples drawn
-_JUDGED = 1000  # at most so many of their poses are scored
+_JUDGED = 1000  # largest number of poses that are scored
 
 
 @dataclass(frozen=True)

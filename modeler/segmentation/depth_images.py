@@ -13,7 +13,7 @@ from scipy import ndimage
 from modeler.types import Array, BoolArray, Camera, Float32Array
 
 _PLANNING_WIDTH_PX = 320  # images are downsampled to about this width for planning
-_OUTLIERS_IN = 7  # one measurement in so many may lie behind the background erroneously
+_OUTLIERS_IN = 7  # one measurement in this many may lie behind the background by error
 _FEW_FRAMES = 4  # with more frames, evidence from a single frame is ignored
 _STILL_SHARE = 0.7  # share of agreeing measurements at a static pixel
 _MOVED_SHARE = 0.15  # share of measurements in front of the background at a pixel that moved
@@ -75,7 +75,7 @@ class Layers:
 
     @property
     def camera_moves(self) -> bool:
-        """Whether so much of the image changes that the camera must move."""
+        """Whether the share of the image that changes shows that the camera moves."""
         seen = np.count_nonzero(np.isfinite(self.back_m[..., 2]))
         return bool(np.count_nonzero(self.moved) > _MOVING_CAMERA_SHARE * max(1, seen))
 

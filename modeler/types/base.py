@@ -19,7 +19,7 @@ class InputError(Exception):
 class Outcome(enum.Enum):
     """How an attempt ended, each with a sentence of advice."""
 
-    CONVERGED = "converged", "The posterior is one compact bump; nothing to do."
+    CONVERGED = "converged", "The posterior has one narrow mode; nothing to do."
     AMBIGUOUS = "ambiguous", "Several poses explain the images; add a prior (table, turntable) or more views."
     DEGENERATE = "degenerate", "Too few distinct samples carry the weight; raise the number of samples."
     NO_OVERLAP = "no overlap", "The views share too little surface; use a smaller step between frames."

@@ -34,7 +34,7 @@ class ObjectModel:
     vertex_colours: npt.NDArray[np.uint8] | None
     """(v, 3) RGB of the vertices."""
     vertex_views: npt.NDArray[np.int64] | None = None
-    """(v,) how many views saw each vertex; 0 = surface that nobody saw, made up to close a gap. None: not known."""
+    """(v,) how many views saw each vertex; 0 = unobserved, interpolated to close a gap. None: not known."""
     vertex_sigmas_m: Array | None = None
     """(v,) standard deviation of each vertex along its normal, as far as noise and poses are known to err; inf = made
     up. None: not known."""

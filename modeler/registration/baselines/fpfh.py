@@ -47,7 +47,7 @@ class FpfhRegistrar(AbstractRegistrar):
     edge_ratio: float = 0.9
     """Smallest ratio of corresponding edges of a drawn triangle."""
     draws: int = 100_000
-    """At most so many drawn triangles."""
+    """Largest number of triangles drawn."""
     confidence: float = 0.999
     """Draws end once a better motion would have turned up with this probability."""
     scored_points: int = 400

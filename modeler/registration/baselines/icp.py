@@ -39,7 +39,7 @@ class IcpRegistrar(AbstractRegistrar):
     reach: float = 2.0
     """Largest distance of partners, in cubes; a pair so far from plane to point has no weight left."""
     iterations: int = 60
-    """At most so many steps a level."""
+    """Largest number of steps per level."""
     min_points: int = 12
     """Fewest points a side."""
     min_fitness: float = 0.1
@@ -110,7 +110,7 @@ class GicpRegistrar(AbstractRegistrar):
     neighbours: int = 10
     """Points from which the shape of a neighbourhood is taken."""
     iterations: int = 60
-    """At most so many steps a level."""
+    """Largest number of steps per level."""
     min_points: int = 12
     """Fewest points a side; levels that thinning leaves with fewer are passed over."""
     min_fitness: float = 0.1
