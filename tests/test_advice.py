@@ -29,7 +29,12 @@ def untrusted(*codes: str, turn_deg: float = 40.0, outcome: Outcome = Outcome.CO
     [
         (untrusted("unsure_masks", "seen_through"), priors.GeneralPrior(), {"roi", "max-depth-m"}),
         (untrusted("no_motion"), priors.GeneralPrior(), {"roi", "max-depth-m"}),
-        (untrusted("seen_through", up=[0.0, -1.0, 0.0]), priors.GeneralPrior(), {"prior": "table"}),
+        (untrusted("seen_through", up=[0.0, -1.0, 0.0], turn_deg=25.0), priors.GeneralPrior(), {"prior": "table"}),
+        (
+            untrusted("seen_through", up=[0.0, -1.0, 0.0], turn_deg=48.0),
+            priors.GeneralPrior(),
+            {"prior": "table", "max-rotation-deg": "100"},
+        ),
         (untrusted("seen_through"), priors.GeneralPrior(), {"prior": "turntable", "step-deg": "40"}),
         (untrusted("unsure_rotation", up=[0.0, -1.0, 0.0]), priors.TablePrior(), {"prior": "turntable"}),
         (untrusted("unsure_rotation"), priors.TurntablePrior(25.0), None),
@@ -59,6 +64,7 @@ def test_what_to_do_next_is_the_limit_that_was_hit_or_what_is_missing(
     else:
         assert found is not None
         assert set(options) <= set(found.options)
+        assert ("max-rotation-deg" in found.options) is ("max-rotation-deg" in options)
         if isinstance(options, dict):
             assert options.items() <= found.options.items()
 

@@ -171,13 +171,19 @@ def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | Non
     """Return which prior holds more."""
     if turntable(prior) is not None:
         return None
-    if report.get("up") is not None and isinstance(prior, GeneralPrior):
-        return Remedy("say that the object stays on its table", {"prior": "table"})
     turns = step_angles_deg(report["edges"])
+    if report.get("up") is not None and isinstance(prior, GeneralPrior):
+        wide = max(turns, default=0.0) >= prior.max_rotation_deg - _NEAR_LIMIT_DEG
+        options = {"max-rotation-deg": _twice_deg(prior.max_rotation_deg)} if wide else {}
+        return Remedy("say that the object stays on its table", {"prior": "table", **options})
     step = f"{np.median(turns):.0f}" if turns and np.median(turns) >= 1.0 else "DEG"
     sigma = f"{max(_ROUGH * float(np.median(turns)), 1.0):.0f}" if turns else "DEG"
     known = {"prior": "turntable", "step-deg": step, "step-sigma-deg": sigma}
     return Remedy("say how far it was turned from frame to frame, and how evenly", known)
+
+
+def _twice_deg(limit_deg: float) -> str:
+    return f"{min(2.0 * limit_deg, 180.0):g}"
 
 
 def _at_limit(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
@@ -190,9 +196,7 @@ def _at_limit(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
         float(np.degrees(se3.rotation_angle(np.reshape(edge["target_from_source"], (4, 4))))) for edge in edges
     )
     if isinstance(prior, GeneralPrior | TablePrior) and turned_deg >= prior.max_rotation_deg - _NEAR_LIMIT_DEG:
-        return Remedy(
-            "allow for larger rotations", {"max-rotation-deg": f"{min(2.0 * prior.max_rotation_deg, 180.0):g}"}
-        )
+        return Remedy("allow for larger rotations", {"max-rotation-deg": _twice_deg(prior.max_rotation_deg)})
     if isinstance(prior, GeneralPrior):
         return Remedy("allow for larger offsets", {"max-offset-m": f"{2.0 * prior.max_offset_m:g}"})
     if isinstance(prior, TablePrior | TurntablePrior):
