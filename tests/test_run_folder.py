@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commanded import Run, runner
+from fuzz.special import replace_by
 from made_up import META, made_up_steps
 
 from modeler.export import (
@@ -317,3 +318,12 @@ def test_a_sequence_whose_name_is_not_utf_8_is_not_damage(run: Run, folder: Path
     report["sequence"] = os.fsdecode(b"/nowhere/caf\xe9")
     (folder / "report.json").write_text(json.dumps(report))
     assert run("report", folder).status == 0
+
+
+@pytest.mark.parametrize(("kind", "says"), [("FIFO", "is a FIFO"), ("folder", "is a folder"), ("device", "device")])
+def test_a_report_that_is_no_file_is_said(tmp_path: Path, kind: str, says: str) -> None:
+    (tmp_path / "trajectory.txt").write_text("")
+    replace_by(kind, tmp_path / "report.json")
+    for flags in ({}, {"resume": True}, {"overwrite": True}):
+        with pytest.raises(InputError, match=rf"report\.json: .*{says}"):
+            RunFolder(tmp_path).check(**flags)

@@ -14,7 +14,7 @@ from modeler.export.formats import cloud_ply, g2o_text, mesh_ply, tum_text
 from modeler.export.pairs import Pairs
 from modeler.export.reading import fault
 from modeler.export.report import RunMeta, frame_record, report_of
-from modeler.regular_files import read_json
+from modeler.regular_files import check_regular, read_json
 from modeler.types import InputError, Step
 from modeler.verdict import FrameRecord
 
@@ -110,6 +110,8 @@ class RunFolder:
         if self.is_empty:
             return
         if not self.is_run:
+            if os.path.lexists(self.path / _REPORT):
+                check_regular(self.path / _REPORT)
             raise InputError(f"{self.path}: not empty, and not the folder of a run; choose another place")
         if not (overwrite or resume):
             raise InputError(f"{self.path}: not empty; choose another place, or replace or resume the run")
