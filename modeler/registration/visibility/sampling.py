@@ -16,7 +16,6 @@ from modeler.se3 import rows
 from modeler.types import AbstractPoseDensity, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
-_PARAMETERS = 28.0  # of one more Gaussian: mean 6, covariance 21, weight 1
 _MIN_MODE_SHARE = 0.005
 
 
@@ -231,37 +230,10 @@ class AdaptiveSampler:
         )
 
     def _fitted(self, poses: Array, weights: Array, centre_m: Array) -> GaussianMixture:
-        """Return a Gaussian of weighted poses (n, 4, 4), or several where one does not fit."""
-        mean, _ = se3.mean(poses, weights, about_m=centre_m, iterations=3)
-        shares, means, covariances = zip(*self._parts(se3.difference(mean, poses, centre_m), weights), strict=True)
-        spreads = self.widening * np.linalg.cholesky(np.stack(covariances))
-        return GaussianMixture(se3.moved(mean, np.stack(means), centre_m), spreads, np.log(shares), centre_m)
-
-    def _parts(self, xi: Array, weights: Array) -> list[tuple[float, Array, Array]]:
-        """Return share, mean (6,) and covariance (6, 6) of the Gaussians fitted to weighted ξ (n, 6).
-
-        Samples are split across the principal axis of least kurtosis, where they are uniform or bimodal, if two
-        Gaussians raise their likelihood by more than the additional parameters cost (Akaike 1974).
-        """
-        share, mean, covariance = _moments(xi, weights)
-        whole = [(share, mean, covariance)]
-        effective = share**2 / np.sum(weights**2)
-        if effective < 0.99 * self.min_fitted:
-            return whole
-        scales, axes = np.linalg.eigh(covariance)
-        side = mixture.split_by_kurtosis(xi, weights, mean, axes / np.sqrt(scales))
-        halves = [(xi[chosen], weights[chosen]) for chosen in (side, ~side)]
-        gain = 0.5 * np.linalg.slogdet(covariance)[1]
-        for half in halves:
-            part, _, narrower = _moments(*half)
-            gain += part / share * (np.log(part / share) - 0.5 * np.linalg.slogdet(narrower)[1])
-        return [part for half in halves for part in self._parts(*half)] if gain > _PARAMETERS / effective else whole
-
-
-def _moments(xi: Array, weights: Array) -> tuple[float, Array, Array]:
-    """Return the sum of weights (n,), and mean (6,) and covariance (6, 6) of ξ (n, 6)."""
-    total, mean, covariance = mixture.moments(xi, weights)
-    return total, mean, covariance + FLOOR
+        """Return the Gaussian of weighted poses (n, 4, 4), somewhat widened."""
+        mean, covariance = se3.mean(poses, weights, about_m=centre_m)
+        spread = self.widening * np.linalg.cholesky(covariance + FLOOR)
+        return GaussianMixture(mean[None], spread[None], np.zeros(1), centre_m)
 
 
 def thinned(weights: Array, count: int, rng: np.random.Generator) -> tuple[npt.NDArray[np.int64], Array]:
