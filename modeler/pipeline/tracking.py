@@ -223,8 +223,8 @@ def _promising(glance: Posterior) -> bool:
 def glancing(registrar: AbstractRegistrar) -> AbstractRegistrar | None:
     """Return a registrar that gives up a hopeless pair at a small part of the cost; None where its method has none.
 
-    Views without common surface cost most of all: the search climbs everywhere, and every place that it finds is
-    sampled again and again. A glance follows the best place alone, and once.
+    Views without common surface cost most of all: the search climbs everywhere, and samples every place that it finds.
+    A glance follows the best place alone.
     """
     if not isinstance(registrar, VisibilityRegistrar):
         return None
@@ -232,7 +232,7 @@ def glancing(registrar: AbstractRegistrar) -> AbstractRegistrar | None:
     search = replace(search, low_overlap=replace(search.low_overlap, score=-np.inf))
     adaptive = registrar.sampler.adaptive
     adaptive = replace(adaptive, max_draws=int(_GLANCE_SHARE * adaptive.max_draws))
-    sampler = replace(registrar.sampler, adaptive=adaptive, max_rounds=1)
+    sampler = replace(registrar.sampler, adaptive=adaptive)
     return replace(registrar, search=search, sampler=sampler, max_modes=1)
 
 

@@ -11,11 +11,11 @@ from unittest import mock
 import numpy as np
 
 from modeler.registration import VisibilityRegistrar
-from modeler.registration.visibility import candidates, likelihood, sampling
+from modeler.registration.visibility import candidates, likelihood
 from modeler.registration.visibility.candidates import Candidates
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.registration.visibility.search import Search, Stage
-from modeler.types import AbstractPoseDensity, Array, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, Array, RayImage
 
 Kind = Literal["default", "removed", "halved", "doubled"]
 Patch = Callable[[], AbstractContextManager[Any]]
@@ -36,15 +36,6 @@ class Variant:
     patched: Patch = nullcontext
     """What is replaced in modules while it runs."""
     seed: int = 0
-
-
-class _OneSearch(VisibilityRegistrar):
-    """Without the second, harder search."""
-
-    def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
-    ) -> Posterior:
-        return self._posterior(self.likelihood.between(source, target, rng), density, self.search, rng, 0.0)
 
 
 class _FineOnly(Search):
@@ -138,8 +129,6 @@ REMOVED: Final = (
     Variant("climb where little surface matches", "removed", _with(search__low_overlap__score=-np.inf)),
     Variant("ridge tracing", "removed", _with(search__ridges__max_steps=0)),
     Variant("coarse candidates", "removed", _with(search=_FineOnly())),
-    Variant("search from better samples (rounds)", "removed", _with(sampler__max_rounds=1)),
-    Variant("second, harder search", "removed", _OneSearch()),
     Variant("limit of survivors per basin", "removed", _with(search__descent__per_basin=_NEVER)),
     Variant(
         "survivors: all starts descend to the end",
@@ -164,7 +153,6 @@ REMOVED: Final = (
         _with(search__low_overlap__max_independent=_DEFAULT.search.max_independent),
     ),
     Variant("all modes but the best", "removed", _with(max_modes=1)),
-    Variant("splits of the sampler's Gaussians", "removed", patched=_module(sampling, _PARAMETERS=np.inf)),
     Variant("widening of the first proposal", "removed", _with(sampler__widening=1.0)),
     Variant("dead band beside silhouettes", "removed", patched=_module(likelihood, _DEAD_BAND=0.0)),
     Variant("removal of near candidates (reach)", "removed", _with(search__reach=0.0)),
@@ -228,7 +216,6 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "widening of the first proposal (1.3)": _with(sampler__widening=1.0 + 0.3 * factor),
         "widening of later proposals (1.1)": _with(sampler__adaptive__widening=1.0 + 0.1 * factor),
         "coarse share (0.4)": _scaled(factor, "sampler.coarse_share"),
-        "gain for a restart, restarts (3 nats, 20)": _scaled(factor, "sampler.restart_gain", "sampler.restarts"),
         "modes (4)": _scaled(factor, "max_modes"),
         "sampler: effective size for a fit (80)": _scaled(factor, "sampler.adaptive.min_fitted"),
         "sampler: draws at most (8000)": _scaled(factor, "sampler.adaptive.max_draws"),

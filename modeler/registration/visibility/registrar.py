@@ -42,8 +42,6 @@ class ModeSamples:
     """Noise b of matching surfaces."""
     typical_misfit: float
     """Misfit μ of a typical match (nats)."""
-    gain: float
-    """How much better (nats) the best sample is than the best candidate."""
     max_compared: float
     """Independent measurements in all points, for the comparison with other modes."""
 
@@ -75,12 +73,6 @@ class ModeSampler:
     """Standard deviations of the first proposal relative to those of the candidates."""
     coarse_share: float = 0.4
     """Share of the first proposal at coarse candidates."""
-    restart_gain: float = 3.0
-    """Where samples are this much better (nats) than the best candidate, the search continues from them,"""
-    restarts: int = 20
-    """from this many of the best,"""
-    max_rounds: int = 3
-    """and the mode is sampled at most this many times."""
     adaptive: AdaptiveSampler = field(default_factory=AdaptiveSampler)
 
     def run(
@@ -91,28 +83,7 @@ class ModeSampler:
         found: Candidates,
         rng: np.random.Generator,
     ) -> ModeSamples:
-        """Return samples of the mode of some candidates.
-
-        Matching surface alone does not lead to the maximum where free space matters, as at the ends of a tube. Where
-        samples are far better than the candidates, the search continues from the best of them.
-        """
-        mode = self._sampled(pair, density, search, found, rng)
-        for _ in range(self.max_rounds - 1):
-            if mode.gain < self.restart_gain:
-                break
-            order = np.argsort(-mode.samples.log_likelihoods, kind="stable")
-            found = search.extend(pair, density, found, mode.samples.poses[order[: self.restarts]], rng)
-            mode = self._sampled(pair, density, search, found, rng)
-        return mode
-
-    def _sampled(
-        self,
-        pair: PairLikelihood,
-        density: AbstractPoseDensity,
-        search: Search,
-        found: Candidates,
-        rng: np.random.Generator,
-    ) -> ModeSamples:
+        """Return samples of the mode of some candidates."""
         noise_m = pair.surface_noise_m(found.poses[0], search.fine_m(pair))
         typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
         within, compared = self.max_independent, self.max_compared
@@ -127,8 +98,7 @@ class ModeSampler:
                 log_weights[kind] += np.log(share) - np.logaddexp.reduce(log_weights[kind])
         gaussians = GaussianMixture(found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
         samples = self.adaptive.run(MixtureProposal(density, gaussians), likelihood, pair.centre_m, rng)
-        gain = float(samples.log_likelihoods.max() - scores[0])
-        return ModeSamples(samples, noise_m, typical_misfit, gain, compared)
+        return ModeSamples(samples, noise_m, typical_misfit, compared)
 
 
 @dataclass(frozen=True)
@@ -146,8 +116,6 @@ class VisibilityRegistrar(AbstractRegistrar):
     refiner: Refiner = field(default_factory=Refiner)
     max_modes: int = 4
     """Largest number of modes that are sampled."""
-    thorough: float = 4.0
-    """Effort of the second search, relative to the first, where the first ends without a usable posterior."""
     min_points: int = 60
     """Views with fewer surface points are not registered."""
     min_overlap: float = 0.35
@@ -169,28 +137,14 @@ class VisibilityRegistrar(AbstractRegistrar):
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         pair = self.likelihood.between(source, target, rng)
-        for search in (self.search, self.search.scaled(self.thorough)):  # a mode may be missed: then search harder
-            posterior = self._posterior(pair, density, search, rng, started)
-            if posterior.usable:
-                break
-        return posterior
-
-    def _posterior(
-        self,
-        pair: PairLikelihood,
-        density: AbstractPoseDensity,
-        search: Search,
-        rng: np.random.Generator,
-        started: float,
-    ) -> Posterior:
-        """Search modes, sample each, refine the samples, weigh the modes, and judge the outcome."""
-        found = search.run(pair, density, rng)
+        found = self.search.run(pair, density, rng)
         sampled = [
-            self.sampler.run(pair, density, search, mode, rng) for mode in found.modes(pair.centre_m)[: self.max_modes]
+            self.sampler.run(pair, density, self.search, mode, rng)
+            for mode in found.modes(pair.centre_m)[: self.max_modes]
         ]
         reference = min(sampled, key=lambda mode: mode.noise_m)
         compared = [mode.compared(pair, reference) for mode in sampled]
-        refined = [self._refined(pair, density, samples, search.fine_m(pair), rng) for samples in compared]
+        refined = [self._refined(pair, density, samples, rng) for samples in compared]
         modes = weigh_modes(refined)
         at_limit = self._share_at_limit(pair, density, found, modes[0][1], rng)
         return self._judged(pair, modes, at_limit=at_limit, seconds=time.perf_counter() - started)
@@ -200,10 +154,10 @@ class VisibilityRegistrar(AbstractRegistrar):
         pair: PairLikelihood,
         density: AbstractPoseDensity,
         samples: WeightedSamples,
-        fine_m: float,
         rng: np.random.Generator,
     ) -> WeightedSamples:
         """Return refined samples of a mode; those that would leave the prior's support stay."""
+        fine_m = self.search.fine_m(pair)
         refined = self.refiner.refine(pair, samples.poses, samples.weights, rng, fine_m=fine_m)
         inside = np.isfinite(density.log_evidence(refined))
         return replace(samples, poses=np.where(inside[:, None, None], refined, samples.poses))

@@ -379,20 +379,6 @@ class Search:
         coarse = replace(coarse, coarse=np.ones(len(coarse), dtype=np.bool_))
         return replace(fine.plus(coarse), beyond_gain=float(gain), low_overlap=low_overlap)
 
-    def extend(
-        self,
-        pair: PairLikelihood,
-        density: AbstractPoseDensity,
-        found: Candidates,
-        poses: Array,
-        rng: np.random.Generator,
-    ) -> Candidates:
-        """Return candidates, better poses (n, 4, 4) inside the prior's support, and poses along their ridges."""
-        problem, search = self.starts.problem(pair, density, rng), self._for_overlap(low_overlap=found.low_overlap)
-        poses = np.concatenate([poses, found.poses[~found.coarse]])
-        fine = search._with_ridges(problem, search._ranked(problem, poses, self.fine_m(pair)))
-        return replace(fine.plus(found.select(found.coarse)), low_overlap=found.low_overlap)
-
     def scores(self, pair: PairLikelihood, poses: Array, blur_m: float) -> Array:
         """Return the scores (n,) of poses (n, 4, 4): tempered log-likelihoods (nats)."""
         return pair.tempered(poses, blur_m, max_independent=self.max_independent)
