@@ -70,8 +70,6 @@ class Descent:
     directions that matching surface leaves open towards its mean."""
     survivors: float = 0.25
     """Largest share of the starts that goes on after the first blur."""
-    per_basin: int = 3
-    """Largest number of survivors in one basin, so that a mode near a better one is not lost."""
 
     def run(self, problem: Problem, poses: Array, blur_m: float) -> Array:
         """Return poses (n, 4, 4) after their descent."""
@@ -384,10 +382,9 @@ class Search:
         return pair.tempered(poses, blur_m, max_independent=self.max_independent)
 
     def _survivors(self, problem: Problem, poses: Array, blur_m: float) -> Array:
-        """Return the best of poses (n, 4, 4), at most a few of each basin."""
+        """Return the best of poses (n, 4, 4)."""
         ordered, _ = self._ordered(problem.pair, poses, blur_m)
-        most = int(self.descent.survivors * self.starts.count(problem))
-        return ordered[problem.best_of_basins(ordered, self.descent.per_basin, most)]
+        return ordered[: int(self.descent.survivors * len(poses))]
 
     def _rescued(
         self, problem: Problem, poses: Array, scores: Array, middle_m: float, rng: np.random.Generator
