@@ -1,4 +1,4 @@
-"""The search for modes: descent, rescue, ridges, and the climb where little surface matches."""
+"""The search for modes: descent, ridges, and the climb where little surface matches."""
 
 from dataclasses import replace
 

@@ -125,7 +125,6 @@ def _times(value: Any, factor: float) -> Any:
 
 
 REMOVED: Final = (
-    Variant("rescue of dropped basins", "removed", _with(search__rescue__basins=1)),
     Variant("climb where little surface matches", "removed", _with(search__low_overlap__score=-np.inf)),
     Variant("ridge tracing", "removed", _with(search__ridges__max_steps=0)),
     Variant("coarse candidates", "removed", _with(search=_FineOnly())),
@@ -151,7 +150,6 @@ REMOVED: Final = (
     Variant("widening of the first proposal", "removed", _with(sampler__widening=1.0)),
     Variant("dead band beside silhouettes", "removed", patched=_module(likelihood, _DEAD_BAND=0.0)),
     Variant("removal of near candidates (reach)", "removed", _with(search__reach=0.0)),
-    Variant("test of valleys before a rescue", "removed", _with(search__rescue__valley=-np.inf)),
 )
 
 
@@ -193,7 +191,6 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "iterations of the descent (4)": _scaled(factor, "search.descent.iterations"),
         "longest step (0.2 rad)": _scaled(factor, "search.descent.max_step_rad"),
         "negligible (20 nats)": _scaled(factor, "search.negligible"),
-        "rescue: basins, valley (6, 5 nats)": _scaled(factor, "search.rescue.basins", "search.rescue.valley"),
         "reach (0.5)": _scaled(factor, "search.reach"),
         "ridges: starts, steps (3, 10)": _scaled(factor, "search.ridges.starts", "search.ridges.max_steps"),
         "ridges: step (2)": _scaled(factor, "search.ridges.step"),

@@ -102,10 +102,6 @@ class Problem:
         """Return whether (n,) poses (n, 4, 4) are in the prior's support."""
         return np.isfinite(self.density.log_evidence(poses))
 
-    def best_of_basins(self, ordered: Array, per_basin: int, most: int) -> npt.NDArray[np.int64]:
-        """Return indices of the first of ordered poses (n, 4, 4): at most `per_basin` a basin and `most` in all."""
-        return mixture.suppress_neighbours(se3.rows(ordered), self.basin, self.pair.centre_m, per_basin, most)
-
     def spreads(self, poses: Array, blur_m: float, max_independent: float, precision: Array) -> Array:
         """Return roots (n, 6, 6) of covariances from matching surface and a precision (6, 6) (method.md, eq. 11)."""
         _, matrices = self.pair.normal_equations(poses, blur_m, stride=2)

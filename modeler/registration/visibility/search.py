@@ -1,4 +1,4 @@
-"""Search for modes of the posterior: descent from many samples of the prior, rescue, climb and ridge tracing."""
+"""Search for modes of the posterior: descent from many samples of the prior, climb and ridge tracing."""
 
 from __future__ import annotations
 
@@ -153,11 +153,6 @@ class Climb:
             poses = self._ascend(problem, poses, stage, partial(height, stage), rng)
         return self._survivors(problem, poses, height(stage, poses), stage.climbers)
 
-    def improve(self, problem: Problem, poses: Array, rng: np.random.Generator, *, max_independent: float) -> Array:
-        """Return the poses (n, 4, 4) reached from given ones in the last stage, in their order; else as `run`."""
-        stage = self.stages[-1]
-        return self._ascend(problem, poses, stage, partial(_height, problem, max_independent, stage), rng)
-
     def _survivors(self, problem: Problem, poses: Array, heights: Array, most: int) -> Array:
         """Return the highest of poses (n, 4, 4), one of each neighbourhood."""
         ordered = poses[np.argsort(-heights, kind="stable")]
@@ -198,39 +193,6 @@ def _height(problem: Problem, max_independent: float, stage: Stage, poses: Array
             poses[possible], stage.blur * problem.pair.size_m, max_independent=max_independent, stride=stage.stride
         )
     return heights
-
-
-@dataclass(frozen=True)
-class Rescue:
-    """Improves basins that are about to be dropped, though blurred views do not tell them apart.
-
-    Matching surface leads to the right rotation of a stool and leaves it a few millimetres off, which the silhouettes
-    of its legs do not forgive.
-    """
-
-    basins: int = 6
-    """Largest number of basins that are considered, the best first."""
-    valley: float = 5.0
-    """Least depth (nats) of the valley that separates a basin from the best: without one it is on the same ridge."""
-
-    def select(
-        self, problem: Problem, poses: Array, scores: Array, blurred: Callable[[Array], Array], negligible: float
-    ) -> Array:
-        """Return the poses to improve, of ordered poses (n, 4, 4) with scores (n,).
-
-        They are the best of a basin, negligible, not so by a blurred score, and separated from the best by a valley.
-        """
-        centre_m = problem.pair.centre_m
-        heads = problem.best_of_basins(poses, 1, self.basins)
-        dropped = poses[heads[scores[heads] < scores[:1] - negligible]]
-        if not len(dropped):
-            return dropped
-        xi = se3.difference(poses[0], dropped, centre_m)
-        shares = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
-        along = se3.moved(poses[0], (shares[:, None, None] * xi).reshape(-1, 6), centre_m)
-        profile = blurred(along).reshape(len(shares), -1)
-        apart = profile[1:-1].min(axis=0) < np.minimum(profile[0], profile[-1]) - self.valley
-        return dropped[apart & (profile[-1] > profile[0] - 2.0 * negligible)]
 
 
 @dataclass(frozen=True)
@@ -325,7 +287,6 @@ class Search:
     """Of candidates nearer to each other than this many standard deviations one is kept."""
     starts: Starts = field(default_factory=Starts)
     descent: Descent = field(default_factory=Descent)
-    rescue: Rescue = field(default_factory=Rescue)
     low_overlap: LowOverlap = field(default_factory=LowOverlap)
     ridges: RidgeTracing = field(default_factory=RidgeTracing)
     beyond: Beyond = field(default_factory=Beyond)
@@ -362,11 +323,7 @@ class Search:
         inside = problem.possible(poses)
         outside = poses[~inside]
         poses = poses[inside] if inside.any() else density.sample(self.starts.count(problem), rng)
-        poses, scores = self._ordered(pair, poses, fine_m)
-        rescued = self._rescued(problem, poses, scores, middle_m, rng)
-        if len(rescued):
-            poses, scores = self._ordered(pair, np.concatenate([poses, rescued]), fine_m)
-        fine = self._selected(problem, poses, scores, fine_m)
+        fine = self._ranked(problem, poses, fine_m)
         search, low_overlap = self, False
         if self.scores(pair, fine.poses[:1], middle_m)[0] < self.low_overlap.score:
             fine, low_overlap = self._climbed(problem, fine, rng)
@@ -385,16 +342,6 @@ class Search:
         """Return the best of poses (n, 4, 4)."""
         ordered, _ = self._ordered(problem.pair, poses, blur_m)
         return ordered[: int(self.descent.survivors * len(poses))]
-
-    def _rescued(
-        self, problem: Problem, poses: Array, scores: Array, middle_m: float, rng: np.random.Generator
-    ) -> Array:
-        """Return improved poses (m, 4, 4) for basins of ordered poses (n, 4, 4) that are about to be dropped."""
-        blurred = partial(self.scores, problem.pair, blur_m=middle_m)
-        chosen = self.rescue.select(problem, poses, scores, blurred, self.negligible)
-        if not len(chosen):
-            return chosen
-        return self.low_overlap.climb.improve(problem, chosen, rng, max_independent=self.max_independent)
 
     def _climbed(self, problem: Problem, found: Candidates, rng: np.random.Generator) -> tuple[Candidates, bool]:
         """Return the best of what descent and a climb found, and whether even then little surface matches."""
