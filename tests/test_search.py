@@ -35,11 +35,10 @@ def views(name, source, target):
     return *made, true_motion(truth, target=target, source=source)
 
 
-def candidates(poses, sigmas, scores, coarse=None):
+def candidates(poses, sigmas, scores):
     """Candidates with round Gaussians: standard deviations of ξ, the same in rad and m."""
     spreads = np.array(sigmas)[:, None, None] * np.eye(6)
-    coarse = np.zeros(len(poses), dtype=bool) if coarse is None else np.array(coarse)
-    return Candidates(np.stack(poses), np.array(scores, dtype=float), spreads, coarse)
+    return Candidates(np.stack(poses), np.array(scores, dtype=float), spreads)
 
 
 def turned(angle_rad):
@@ -53,7 +52,7 @@ def test_the_search_finds_the_motion_in_a_wide_prior(name, rng):
     pair = VisibilityLikelihood().between(source, target, rng)
     found = Search().run(pair, density, rng)
     assert np.isfinite(density.log_density(found.poses)).all()
-    assert (np.diff(found.scores[~found.coarse]) <= 0).all()
+    assert (np.diff(found.scores) <= 0).all()
     rolled_deg = min(rotation_error_deg(pose, truth) for pose in found.poses)
     assert rolled_deg < 8.0  # a flashlight's roll is all but free
 
@@ -79,7 +78,7 @@ def test_a_stool_may_have_turned_either_way():
     for seed in range(3):
         rng = np.random.default_rng(seed)
         found = Search().run(VisibilityLikelihood().between(source, target, rng), density, rng)
-        turned_deg = np.array([rotation_error_deg(pose, right) for pose in found.poses[~found.coarse]])
+        turned_deg = np.array([rotation_error_deg(pose, right) for pose in found.poses])
         assert (turned_deg < 3.0).any()
         assert (np.abs(turned_deg - 90.0) < 3.0).any()
 
@@ -103,15 +102,6 @@ def test_candidates_within_reach_of_each_other_share_a_mode():
     modes = candidates([np.eye(4), near, far], [0.01, 0.01, 0.01], [3, 2, 1]).modes(np.zeros(3))
     assert [len(mode) for mode in modes] == [2, 1]
     np.testing.assert_array_equal(modes[0].poses[0], np.eye(4))
-
-
-def test_a_coarse_candidate_joins_what_it_covers_and_is_no_mode_itself():
-    ends = [turned(-0.2), turned(0.2)]
-    alone = candidates(ends, [0.01, 0.01], [2, 1]).modes(np.zeros(3))
-    sigmas, coarse = [0.01, 0.01, 0.1, 0.1], [False, False, True, True]
-    joined = candidates([*ends, np.eye(4), turned(2.0)], sigmas, [2, 1, 0, 0], coarse).modes(np.zeros(3))
-    assert [len(mode) for mode in alone] == [1, 1]
-    assert [len(mode) for mode in joined] == [3]
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,9 @@ import numpy as np
 
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import candidates, likelihood
-from modeler.registration.visibility.candidates import Candidates
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
-from modeler.registration.visibility.search import Search, Stage
-from modeler.types import AbstractPoseDensity, Array, RayImage
+from modeler.registration.visibility.search import Stage
+from modeler.types import Array, RayImage
 
 Kind = Literal["default", "removed", "halved", "doubled"]
 Patch = Callable[[], AbstractContextManager[Any]]
@@ -36,14 +35,6 @@ class Variant:
     patched: Patch = nullcontext
     """What is replaced in modules while it runs."""
     seed: int = 0
-
-
-class _FineOnly(Search):
-    """Without coarse candidates."""
-
-    def run(self, pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator) -> Candidates:
-        found = super().run(pair, density, rng)
-        return found.select(~found.coarse)
 
 
 @dataclass(frozen=True)
@@ -127,7 +118,6 @@ def _times(value: Any, factor: float) -> Any:
 REMOVED: Final = (
     Variant("climb where little surface matches", "removed", _with(search__low_overlap__score=-np.inf)),
     Variant("ridge tracing", "removed", _with(search__ridges__max_steps=0)),
-    Variant("coarse candidates", "removed", _with(search=_FineOnly())),
     Variant("survivors: all starts descend to the end", "removed", _with(search__descent__survivors=1.0)),
     Variant("choice of starts among samples", "removed", _with(search__starts__proposals_per_start=1)),
     Variant("refinement", "removed", _with(refiner__min_patches=_NEVER)),
@@ -206,7 +196,6 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "climb: first step (0.7)": _scaled(factor, "search.low_overlap.climb.step"),
         "widening of the first proposal (1.3)": _with(sampler__widening=1.0 + 0.3 * factor),
         "widening of later proposals (1.1)": _with(sampler__adaptive__widening=1.0 + 0.1 * factor),
-        "coarse share (0.4)": _scaled(factor, "sampler.coarse_share"),
         "modes (4)": _scaled(factor, "max_modes"),
         "sampler: effective size for a fit (80)": _scaled(factor, "sampler.adaptive.min_fitted"),
         "sampler: draws at most (8000)": _scaled(factor, "sampler.adaptive.max_draws"),

@@ -20,13 +20,11 @@ class Candidates:
     """Poses found by the search, each with a Gaussian of its surroundings."""
 
     poses: Array
-    """(k, 4, 4) target_from_source, best first, coarse ones last."""
+    """(k, 4, 4) target_from_source, best first."""
     scores: Array
     """(k,) tempered log-likelihoods (nats)."""
     spreads: Array
     """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid (method.md, eq. 11)."""
-    coarse: BoolArray
-    """(k,) whether a candidate stands for what blurred surface leaves open."""
     beyond_gain: float = -np.inf
     """How much better (nats) than the best candidate a pose beyond the prior's support is."""
     low_overlap: bool = False
@@ -40,16 +38,6 @@ class Candidates:
         """Return distances (k, k) of ξ about a point (3,), row i in standard deviations of candidate i."""
         return mixture.mahalanobis_distances(se3.rows(self.poses), self.spreads, centre_m)
 
-    def plus(self, others: Candidates) -> Candidates:
-        """Return both sets of candidates, in this order."""
-        return replace(
-            self,
-            poses=np.concatenate([self.poses, others.poses]),
-            scores=np.concatenate([self.scores, others.scores]),
-            spreads=np.concatenate([self.spreads, others.spreads]),
-            coarse=np.concatenate([self.coarse, others.coarse]),
-        )
-
     def select(self, chosen: npt.NDArray[np.int64] | BoolArray) -> Candidates:
         """Return candidates by index or mask."""
         return replace(
@@ -57,7 +45,6 @@ class Candidates:
             poses=self.poses[chosen],
             scores=self.scores[chosen],
             spreads=self.spreads[chosen],
-            coarse=self.coarse[chosen],
         )
 
     def distinct(self, centre_m: Array, reach: float) -> Candidates:
@@ -74,16 +61,15 @@ class Candidates:
         """Return the candidates by mode, the best mode first.
 
         Two candidates share a mode where a chain of candidates connects them, each link within 3.5 standard deviations
-        of both its ends, or of a coarse end. A ridge, such as the spin of a can, is one mode.
+        of both its ends. A ridge, such as the spin of a can, is one mode.
         """
         near = self.distances(centre_m) <= _MODE_DISTANCE
-        linked = (near & near.T) | (near & self.coarse[:, None] & ~self.coarse)
-        linked |= linked.T
+        linked = near & near.T
         label = np.arange(len(self))
         for number in range(len(self)):  # connected components, each labelled by its best candidate
             neighbours = np.unique(label[linked[number]])
             label[np.isin(label, neighbours)] = neighbours[0]
-        return [self.select(label == name) for name in np.unique(label[~self.coarse])]
+        return [self.select(label == name) for name in np.unique(label)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,8 +71,6 @@ class ModeSampler:
     """The same between modes: the errors that all points of a side share decide between similar sides."""
     widening: float = 1.3
     """Standard deviations of the first proposal relative to those of the candidates."""
-    coarse_share: float = 0.4
-    """Share of the first proposal at coarse candidates."""
     adaptive: AdaptiveSampler = field(default_factory=AdaptiveSampler)
 
     def run(
@@ -92,11 +90,7 @@ class ModeSampler:
         likelihood = partial(pair.tempered, blur_m=noise_m, max_independent=within, typical_misfit=typical_misfit)
         scores = likelihood(found.poses)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
-        log_weights = np.where(found.coarse, found.scores, scores + volumes)
-        for kind, share in ((found.coarse, self.coarse_share), (~found.coarse, 1.0 - self.coarse_share)):
-            if kind.any():
-                log_weights[kind] += np.log(share) - np.logaddexp.reduce(log_weights[kind])
-        gaussians = GaussianMixture(found.poses, self.widening * found.spreads, log_weights, pair.centre_m)
+        gaussians = GaussianMixture(found.poses, self.widening * found.spreads, scores + volumes, pair.centre_m)
         samples = self.adaptive.run(MixtureProposal(density, gaussians), likelihood, pair.centre_m, rng)
         return ModeSamples(samples, noise_m, typical_misfit, compared)
 

@@ -317,7 +317,6 @@ class Search:
         poses = self.starts.draw(problem, self.blurs[0], rng)
         poses = self.descent.run(problem, poses, coarse_m)
         poses = self._survivors(problem, poses, coarse_m)
-        coarse = self._ranked(problem, poses, coarse_m)
         for blur in self.blurs[2:]:
             poses = self.descent.run(problem, poses, blur * pair.size_m)
         inside = problem.possible(poses)
@@ -331,8 +330,7 @@ class Search:
         fine = search._with_ridges(problem, fine)
         outside = self.beyond.signs(problem, outside, fine.poses[0])
         gain = search.scores(pair, outside, fine_m).max() - fine.scores[0] if len(outside) else -np.inf
-        coarse = replace(coarse, coarse=np.ones(len(coarse), dtype=np.bool_))
-        return replace(fine.plus(coarse), beyond_gain=float(gain), low_overlap=low_overlap)
+        return replace(fine, beyond_gain=float(gain), low_overlap=low_overlap)
 
     def scores(self, pair: PairLikelihood, poses: Array, blur_m: float) -> Array:
         """Return the scores (n,) of poses (n, 4, 4): tempered log-likelihoods (nats)."""
@@ -388,5 +386,4 @@ class Search:
         poses, scores = poses[good], scores[good]
         precision = np.asarray(np.linalg.inv(problem.gaussian.covariance), dtype=np.float64)
         spreads = problem.spreads(poses, blur_m, self.local_independent, precision)
-        found = Candidates(poses, scores, spreads, np.zeros(len(poses), dtype=np.bool_))
-        return found.distinct(problem.pair.centre_m, self.reach)
+        return Candidates(poses, scores, spreads).distinct(problem.pair.centre_m, self.reach)
