@@ -1,6 +1,5 @@
-"""The search for modes: descent, ridges, and the climb where little surface matches."""
+"""The search for modes: descent and ridges."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,15 +12,12 @@ from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.registration.visibility import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility.candidates import Candidates
-from modeler.registration.visibility.search import Climb, Descent, LowOverlap, Search, Starts
+from modeler.registration.visibility.search import Search
 from modeler.types import Outcome
 from sequences import bundled, open_sequence
 from sequences.rendering.renderer import RenderedSequence
 
 WIDE = GeneralPrior(max_rotation_deg=95.0, max_offset_m=0.08)  # the other way round a box is beyond
-BASIN = np.repeat([0.2, 0.01], 3)
-NO_CLIMB = LowOverlap(score=-np.inf)
-FEW = Climb(samples=500)
 
 
 def views(name, source, target):
@@ -112,62 +108,8 @@ def box():
     return pair, WIDE.between(source, target), truth
 
 
-def climbed(box, climb, seed=0):
-    pair, density, _ = box
-    problem = replace(Starts().problem(pair, density, np.random.default_rng(0)), basin=BASIN)
-    return climb.run(problem, np.random.default_rng(seed), max_independent=80.0)
-
-
-def heights(box, poses, climb):
-    last = climb.stages[-1]
-    return box[0].tempered(poses, last.blur * box[0].size_m, max_independent=80.0, stride=last.stride)
-
-
-def test_climbers_come_up_only_where_the_prior_allows(box):
-    poses = climbed(box, FEW)
-    assert np.isfinite(box[1].log_density(poses)).all()
-    reached = heights(box, poses, FEW)
-    assert (np.diff(reached) <= 0.0).all()
-    assert reached[0] > heights(box, climbed(box, replace(FEW, rounds=0)), FEW).max()
-
-
-def test_more_rounds_never_end_lower(box):
-    """The first rounds of a stage are the same ones, and a climber steps only up."""
-    stage = (replace(FEW.stages[-1], climbers=30),)
-    ends = [
-        heights(box, climbed(box, replace(FEW, stages=stage, rounds=rounds, apart=1e-9)), FEW) for rounds in (1, 4, 16)
-    ]
-    assert (np.diff([end.max() for end in ends]) >= 0.0).all()
-    assert (np.diff([np.median(end) for end in ends]) > 0.0).all()
-
-
-def test_poses_are_apart_and_repeat_with_the_seed(box):
-    poses = climbed(box, FEW)
-    np.testing.assert_array_equal(poses, climbed(box, FEW))
-    assert len(poses) > 3
-    assert min(rotation_error_deg(poses[0], other) for other in poses[1:]) > 1e-3
-
-
-def test_a_turn_is_found_where_surface_leads_astray(box):
-    """Most surface matches with another side of the box, though then it stands in space that was seen to be empty."""
-    pair, density, truth = box
-    dragged = Search(descent=Descent(max_independent=40.0))  # to the prior's mean, so that few end near the truth
-    astray = replace(dragged, low_overlap=NO_CLIMB).run(pair, density, np.random.default_rng(1))
-    found = dragged.run(pair, density, np.random.default_rng(1))
-    assert rotation_error_deg(astray.poses[0], truth) > 45.0
-    assert rotation_error_deg(found.poses[0], truth) < 5.0  # samples find the rest of the way
-    assert not found.low_overlap
-
-
 def test_a_uniform_prior_does_not_pull_to_its_mean(box):
     """Where little surface matches, the mean of the prior is no better than its limits."""
     pair, density, truth = box
-    found = Search(low_overlap=NO_CLIMB).run(pair, density, np.random.default_rng(1))
+    found = Search().run(pair, density, np.random.default_rng(1))
     assert rotation_error_deg(found.poses[0], truth) < 5.0
-
-
-def test_what_matches_enough_is_not_climbed(box, monkeypatch):
-    source, target, _ = views("box", source=1, target=0)
-    pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
-    monkeypatch.setattr(Climb, "run", None)
-    assert not Search().run(pair, WIDE.between(source, target), np.random.default_rng(1)).low_overlap

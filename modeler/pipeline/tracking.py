@@ -223,17 +223,15 @@ def _promising(glance: Posterior) -> bool:
 def glancing(registrar: AbstractRegistrar) -> AbstractRegistrar | None:
     """Return a registrar that gives up a hopeless pair at a small part of the cost; None where its method has none.
 
-    Views without common surface cost most of all: the search climbs everywhere, and samples every place that it finds.
-    A glance follows the best place alone.
+    Views without common surface cost most of all: every place that the search finds is sampled. A glance follows the
+    best place alone.
     """
     if not isinstance(registrar, VisibilityRegistrar):
         return None
-    search = registrar.search.scaled(_GLANCE_SHARE)
-    search = replace(search, low_overlap=replace(search.low_overlap, score=-np.inf))
     adaptive = registrar.sampler.adaptive
     adaptive = replace(adaptive, max_draws=int(_GLANCE_SHARE * adaptive.max_draws))
     sampler = replace(registrar.sampler, adaptive=adaptive)
-    return replace(registrar, search=search, sampler=sampler, max_modes=1)
+    return replace(registrar, search=registrar.search.scaled(_GLANCE_SHARE), sampler=sampler, max_modes=1)
 
 
 def believed(within: Posterior, wider: Posterior, known: AbstractPoseDensity) -> Posterior:

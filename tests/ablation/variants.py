@@ -13,7 +13,6 @@ import numpy as np
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import candidates, likelihood
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
-from modeler.registration.visibility.search import Stage
 from modeler.types import Array, RayImage
 
 Kind = Literal["default", "removed", "halved", "doubled"]
@@ -107,8 +106,6 @@ def _times(value: Any, factor: float) -> Any:
     match value:
         case tuple():
             return tuple(_times(one, factor) for one in value)
-        case Stage():
-            return replace(value, climbers=_times(value.climbers, factor))
         case int():
             return max(round(factor * value), 1)
         case _:
@@ -116,7 +113,6 @@ def _times(value: Any, factor: float) -> Any:
 
 
 REMOVED: Final = (
-    Variant("climb where little surface matches", "removed", _with(search__low_overlap__score=-np.inf)),
     Variant("ridge tracing", "removed", _with(search__ridges__max_steps=0)),
     Variant("survivors: all starts descend to the end", "removed", _with(search__descent__survivors=1.0)),
     Variant("choice of starts among samples", "removed", _with(search__starts__proposals_per_start=1)),
@@ -130,11 +126,6 @@ REMOVED: Final = (
         "independent points between modes (as within)",
         "removed",
         _with(sampler__max_compared=_DEFAULT.sampler.max_independent),
-    ),
-    Variant(
-        "independent points at low overlap (as elsewhere)",
-        "removed",
-        _with(search__low_overlap__max_independent=_DEFAULT.search.max_independent),
     ),
     Variant("all modes but the best", "removed", _with(max_modes=1)),
     Variant("widening of the first proposal", "removed", _with(sampler__widening=1.0)),
@@ -152,11 +143,8 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "independent points within a mode (70)": _scaled(factor, "sampler.max_independent"),
         "independent points between modes (40)": _scaled(factor, "sampler.max_compared"),
         "independent points of the search (120)": _scaled(factor, "search.max_independent"),
-        "independent points at low overlap (150)": _scaled(factor, "search.low_overlap.max_independent"),
         "independent points of the descent (400)": _scaled(factor, "search.descent.max_independent"),
-        "independent points of spreads and climb (40, 40)": _scaled(
-            factor, "search.local_independent", "search.low_overlap.climb.max_independent"
-        ),
+        "independent points of spreads (40)": _scaled(factor, "search.local_independent"),
         "cost of no overlap (50 nats)": _pair(no_overlap_cost=50.0 * factor),
         "scale of overlap (0.1)": _pair(overlap_scale=0.1 * factor),
         "blurs (0.25 to 0.015)": _scaled(factor, "search.blurs"),
@@ -185,15 +173,6 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "ridges: starts, steps (3, 10)": _scaled(factor, "search.ridges.starts", "search.ridges.max_steps"),
         "ridges: step (2)": _scaled(factor, "search.ridges.step"),
         "near the support (1.5 basins)": _scaled(factor, "search.beyond.near"),
-        "score of low overlap (-20 nats)": _scaled(factor, "search.low_overlap.score"),
-        "climb: samples, climbers": _scaled(
-            factor, *(f"search.low_overlap.climb.{name}" for name in ("samples", "first", "stages"))
-        ),
-        "climb: rounds, trials (10, 6)": _scaled(
-            factor, "search.low_overlap.climb.rounds", "search.low_overlap.climb.trials"
-        ),
-        "climb: apart (0.4)": _scaled(factor, "search.low_overlap.climb.apart"),
-        "climb: first step (0.7)": _scaled(factor, "search.low_overlap.climb.step"),
         "widening of the first proposal (1.3)": _with(sampler__widening=1.0 + 0.3 * factor),
         "widening of later proposals (1.1)": _with(sampler__adaptive__widening=1.0 + 0.1 * factor),
         "modes (4)": _scaled(factor, "max_modes"),

@@ -27,8 +27,6 @@ class Candidates:
     """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid (method.md, eq. 11)."""
     beyond_gain: float = -np.inf
     """How much better (nats) than the best candidate a pose beyond the prior's support is."""
-    low_overlap: bool = False
-    """Whether little surface matches, and scores are those of `Search.low_overlap`."""
 
     def __len__(self) -> int:
         """Return the number of candidates."""

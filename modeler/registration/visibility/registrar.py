@@ -84,15 +84,14 @@ class ModeSampler:
         """Return samples of the mode of some candidates."""
         noise_m = pair.surface_noise_m(found.poses[0], search.fine_m(pair))
         typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
-        within, compared = self.max_independent, self.max_compared
-        if found.low_overlap:
-            within = compared = search.low_overlap.max_independent
-        likelihood = partial(pair.tempered, blur_m=noise_m, max_independent=within, typical_misfit=typical_misfit)
+        likelihood = partial(
+            pair.tempered, blur_m=noise_m, max_independent=self.max_independent, typical_misfit=typical_misfit
+        )
         scores = likelihood(found.poses)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
         gaussians = GaussianMixture(found.poses, self.widening * found.spreads, scores + volumes, pair.centre_m)
         samples = self.adaptive.run(MixtureProposal(density, gaussians), likelihood, pair.centre_m, rng)
-        return ModeSamples(samples, noise_m, typical_misfit, compared)
+        return ModeSamples(samples, noise_m, typical_misfit, self.max_compared)
 
 
 @dataclass(frozen=True)

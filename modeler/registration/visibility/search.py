@@ -1,16 +1,12 @@
-"""Search for modes of the posterior: descent from many samples of the prior, climb and ridge tracing."""
+"""Search for modes of the posterior: descent from many samples of the prior, and ridge tracing."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 
 from modeler import se3
-from modeler.kernels import mixture
 from modeler.kernels.point_to_plane import Regulariser
 from modeler.registration.visibility.candidates import Candidates, Problem
 from modeler.registration.visibility.likelihood import PairLikelihood
@@ -84,118 +80,6 @@ class Descent:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One stage of a climb."""
-
-    blur: float
-    """Blur of the surfaces, as a share of the object's size."""
-    stride: int
-    """Every `stride`-th point is used."""
-    climbers: int
-    """Largest number of climbers that go on from here."""
-
-    def scaled(self, share: float) -> Stage:
-        """Return the stage with a share (0..1) of the climbers."""
-        return replace(self, climbers=int(np.ceil(share * self.climbers)))
-
-
-@dataclass(frozen=True)
-class Climb:
-    """Ascent of the likelihood itself by a (1 + λ) evolution strategy (Rechenberg 1973), coarse to fine.
-
-    Descent leads to where most surface matches. Where two views share little, empty space says more, and hardly any
-    surface leads to the truth. Trial steps are drawn as wide as matching surface leaves each direction open, so that
-    climbers move along a contact rather than into it. Steps grow after a success and shrink after a failure.
-    """
-
-    samples: int = 10_000
-    """Samples of the prior."""
-    first: Stage = Stage(0.25, 8, 1000)
-    """How they are scored."""
-    stages: tuple[Stage, ...] = (Stage(0.12, 8, 500), Stage(0.06, 4, 150), Stage(0.03, 2, 60), Stage(0.015, 2, 40))
-    apart: float = 0.4
-    """Of climbers within this many standard deviations of a basin, only the highest goes on."""
-    rounds: int = 10
-    """Steps of each climber at each stage."""
-    trials: int = 6
-    """Trial steps for each step: λ."""
-    max_independent: float = 40.0
-    """Independent measurements in all points, for the width of the steps."""
-    step: float = 0.7
-    """Length of the first steps, in standard deviations."""
-    growth: float = 1.2
-    """Factor of the step length after a success."""
-    decay: float = 0.8
-    """Factor of the step length after a failure."""
-
-    def scaled(self, share: float) -> Climb:
-        """Return a climb with a share (0..1) of the samples and climbers, for a narrower prior."""
-        return replace(
-            self,
-            samples=int(np.ceil(share * self.samples)),
-            first=self.first.scaled(share),
-            stages=tuple(stage.scaled(share) for stage in self.stages),
-        )
-
-    def run(self, problem: Problem, rng: np.random.Generator, *, max_independent: float) -> Array:
-        """Return the poses (n, 4, 4) reached from samples of the prior, the highest first.
-
-        Args:
-            problem: what is searched.
-            rng: source of all randomness.
-            max_independent: of the likelihood that is climbed, see `PairLikelihood.independent_points`.
-        """
-        poses, stage = problem.density.sample(self.samples, rng), self.first
-        height = partial(_height, problem, max_independent)
-        for following in self.stages:
-            poses = self._survivors(problem, poses, height(stage, poses), stage.climbers)
-            stage = following
-            poses = self._ascend(problem, poses, stage, partial(height, stage), rng)
-        return self._survivors(problem, poses, height(stage, poses), stage.climbers)
-
-    def _survivors(self, problem: Problem, poses: Array, heights: Array, most: int) -> Array:
-        """Return the highest of poses (n, 4, 4), one of each neighbourhood."""
-        ordered = poses[np.argsort(-heights, kind="stable")]
-        near = self.apart * problem.basin
-        return ordered[mixture.suppress_neighbours(se3.rows(ordered), near, problem.pair.centre_m, 1, most)]
-
-    def _ascend(
-        self,
-        problem: Problem,
-        poses: Array,
-        stage: Stage,
-        height: Callable[[Array], Array],
-        rng: np.random.Generator,
-    ) -> Array:
-        """Return the poses (n, 4, 4) reached in one stage."""
-        pair = problem.pair
-        spreads = problem.spreads(poses, stage.blur * pair.size_m, self.max_independent, np.diag(problem.basin**-2.0))
-        count, poses, heights = len(poses), poses.copy(), height(poses)
-        step, everyone = np.full(count, self.step), np.arange(count)
-        for _ in range(self.rounds):
-            draws = rng.normal(size=(count, self.trials, 6, 1)) * step[:, None, None, None]
-            xi = (spreads[:, None] @ draws).reshape(-1, 6)
-            tried = se3.moved(np.repeat(poses, self.trials, axis=0), xi, pair.centre_m)
-            reached = height(tried).reshape(count, self.trials)
-            best = np.argmax(reached, axis=1)
-            higher: npt.NDArray[np.bool_] = reached[everyone, best] > heights
-            poses[higher] = tried.reshape(count, self.trials, 4, 4)[everyone, best][higher]
-            heights = np.maximum(heights, reached[everyone, best])
-            step *= np.where(higher, self.growth, self.decay)
-        return poses
-
-
-def _height(problem: Problem, max_independent: float, stage: Stage, poses: Array) -> Array:
-    """Return tempered log-likelihoods (n,) of poses (n, 4, 4); -inf outside the prior's support."""
-    heights, possible = np.full(len(poses), -np.inf), problem.possible(poses)
-    if possible.any():
-        heights[possible] = problem.pair.tempered(
-            poses[possible], stage.blur * problem.pair.size_m, max_independent=max_independent, stride=stage.stride
-        )
-    return heights
-
-
-@dataclass(frozen=True)
 class RidgeTracing:
     """Traces ridges of the likelihood from the best candidates, in both directions of the least determined axis.
 
@@ -234,17 +118,6 @@ class RidgeTracing:
             step=self.step,
             max_steps=self.max_steps,
         )
-
-
-@dataclass(frozen=True)
-class LowOverlap:
-    """When so little surface matches that the likelihood is climbed, and how candidates are scored there."""
-
-    score: float = -20.0
-    """The best candidate scores less than this (nats) at an intermediate blur."""
-    max_independent: float = 150.0
-    """Independent measurements in all points: errors common to matches count for little where few points match."""
-    climb: Climb = field(default_factory=Climb)
 
 
 @dataclass(frozen=True)
@@ -287,7 +160,6 @@ class Search:
     """Of candidates nearer to each other than this many standard deviations one is kept."""
     starts: Starts = field(default_factory=Starts)
     descent: Descent = field(default_factory=Descent)
-    low_overlap: LowOverlap = field(default_factory=LowOverlap)
     ridges: RidgeTracing = field(default_factory=RidgeTracing)
     beyond: Beyond = field(default_factory=Beyond)
 
@@ -313,7 +185,7 @@ class Search:
             rng: source of all randomness.
         """
         problem, fine_m = self.starts.problem(pair, density, rng), self.fine_m(pair)
-        _, coarse_m, middle_m, *_ = (blur * pair.size_m for blur in self.blurs)
+        coarse_m = self.blurs[1] * pair.size_m
         poses = self.starts.draw(problem, self.blurs[0], rng)
         poses = self.descent.run(problem, poses, coarse_m)
         poses = self._survivors(problem, poses, coarse_m)
@@ -323,14 +195,10 @@ class Search:
         outside = poses[~inside]
         poses = poses[inside] if inside.any() else density.sample(self.starts.count(problem), rng)
         fine = self._ranked(problem, poses, fine_m)
-        search, low_overlap = self, False
-        if self.scores(pair, fine.poses[:1], middle_m)[0] < self.low_overlap.score:
-            fine, low_overlap = self._climbed(problem, fine, rng)
-            search = self._for_overlap(low_overlap=low_overlap)
-        fine = search._with_ridges(problem, fine)
+        fine = self._with_ridges(problem, fine)
         outside = self.beyond.signs(problem, outside, fine.poses[0])
-        gain = search.scores(pair, outside, fine_m).max() - fine.scores[0] if len(outside) else -np.inf
-        return replace(fine, beyond_gain=float(gain), low_overlap=low_overlap)
+        gain = self.scores(pair, outside, fine_m).max() - fine.scores[0] if len(outside) else -np.inf
+        return replace(fine, beyond_gain=float(gain))
 
     def scores(self, pair: PairLikelihood, poses: Array, blur_m: float) -> Array:
         """Return the scores (n,) of poses (n, 4, 4): tempered log-likelihoods (nats)."""
@@ -340,22 +208,6 @@ class Search:
         """Return the best of poses (n, 4, 4)."""
         ordered, _ = self._ordered(problem.pair, poses, blur_m)
         return ordered[: int(self.descent.survivors * len(poses))]
-
-    def _climbed(self, problem: Problem, found: Candidates, rng: np.random.Generator) -> tuple[Candidates, bool]:
-        """Return the best of what descent and a climb found, and whether even then little surface matches."""
-        pair, low = problem.pair, self.low_overlap
-        climb = low.climb.scaled(self.starts.count(problem) / self.starts.max_starts)
-        high = climb.run(problem, rng, max_independent=low.max_independent)
-        poses, fine_m = np.concatenate([found.poses, high]), self.fine_m(pair)
-        best = self._for_overlap(low_overlap=True)._ranked(problem, poses, fine_m)
-        _, share = pair.log_likelihoods(best.poses[:1], fine_m, stride=2)
-        if share[0] < pair.overlap_scale:
-            return best, True
-        return self._ranked(problem, poses, fine_m), False
-
-    def _for_overlap(self, *, low_overlap: bool) -> Search:
-        """Return the search with the scores for little matching surface, or for enough."""
-        return replace(self, max_independent=self.low_overlap.max_independent) if low_overlap else self
 
     def _with_ridges(self, problem: Problem, found: Candidates) -> Candidates:
         """Return candidates and those along their ridges, best first."""
