@@ -1,5 +1,4 @@
-"""The search for modes: descent and ridges."""
-
+"""The search for modes of the posterior."""
 
 import numpy as np
 import pytest

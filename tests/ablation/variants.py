@@ -113,7 +113,6 @@ def _times(value: Any, factor: float) -> Any:
 
 
 REMOVED: Final = (
-    Variant("ridge tracing", "removed", _with(search__ridges__max_steps=0)),
     Variant("survivors: all starts descend to the end", "removed", _with(search__descent__survivors=1.0)),
     Variant("choice of starts among samples", "removed", _with(search__starts__proposals_per_start=1)),
     Variant("refinement", "removed", _with(refiner__min_patches=_NEVER)),
@@ -170,8 +169,6 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "longest step (0.2 rad)": _scaled(factor, "search.descent.max_step_rad"),
         "negligible (20 nats)": _scaled(factor, "search.negligible"),
         "reach (0.5)": _scaled(factor, "search.reach"),
-        "ridges: starts, steps (3, 10)": _scaled(factor, "search.ridges.starts", "search.ridges.max_steps"),
-        "ridges: step (2)": _scaled(factor, "search.ridges.step"),
         "near the support (1.5 basins)": _scaled(factor, "search.beyond.near"),
         "widening of the first proposal (1.3)": _with(sampler__widening=1.0 + 0.3 * factor),
         "widening of later proposals (1.1)": _with(sampler__adaptive__widening=1.0 + 0.1 * factor),

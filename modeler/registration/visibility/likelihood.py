@@ -10,7 +10,7 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import point_likelihood, point_to_plane
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
-from modeler.kernels.point_to_plane import Regulariser, RidgeLikelihood
+from modeler.kernels.point_to_plane import Regulariser
 from modeler.se3 import matrices, rows
 from modeler.types import Array, RayImage
 
@@ -291,50 +291,6 @@ class PairLikelihood:
         projections = self.forward.projection(_DESCENT_STRIDE), self.backward.projection(_DESCENT_STRIDE)
         regulariser = _per_point(regulariser, _DESCENT_STRIDE)
         return matrices(point_to_plane.descend(rows(poses), *projections, self.centre_m, blur_m, regulariser, steps))
-
-    def trace_ridges(
-        self,
-        poses: Array,
-        spreads: Array,
-        axes: Array,
-        *,
-        blur_m: float,
-        regulariser: Regulariser,
-        max_independent: float,
-        floor: float,
-        step: float,
-        max_steps: int,
-    ) -> Array:
-        """Return the poses (n, 4, 4) on ridges from starts along their axes, while `tempered` is above a floor.
-
-        Args:
-            poses: (k, 4, 4) target_from_source.
-            spreads: (k, 6, 6) lower triangular roots of the covariances of ξ about the centre.
-            axes: (k, 6) unit vectors in units of those spreads.
-            blur_m: blur of the surfaces in m.
-            regulariser: of the descent across the axis.
-            max_independent: as for `tempered`.
-            floor: lowest tempered log-likelihood (nats).
-            step: length of a step in standard deviations.
-            max_steps: largest number of steps from each start.
-        """
-        likelihood = RidgeLikelihood(
-            forward=self.forward.projection(_DESCENT_STRIDE),
-            backward=self.backward.projection(_DESCENT_STRIDE),
-            scoring_forward=self.forward.projection(_SCORE_STRIDE),
-            scoring_backward=self.backward.projection(_SCORE_STRIDE),
-            forward_parameters=self.forward.parameters(blur_m),
-            backward_parameters=self.backward.parameters(blur_m),
-            temper=_SCORE_STRIDE * self.independent_points(max_independent) / self.points,
-            no_overlap_cost=self.no_overlap_cost,
-            per_explained=_SCORE_STRIDE / (self.points * self.overlap_scale),
-            floor=float(floor),
-        )
-        regulariser = _per_point(regulariser, _DESCENT_STRIDE)
-        visited, counts = point_to_plane.trace_ridges(
-            rows(poses), spreads, axes, step, likelihood, self.centre_m, blur_m, regulariser, max_steps
-        )
-        return matrices(visited[np.arange(max_steps) < counts[:, None]])
 
 
 def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:

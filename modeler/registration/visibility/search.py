@@ -1,4 +1,4 @@
-"""Search for modes of the posterior: descent from many samples of the prior, and ridge tracing."""
+"""Search for modes of the posterior: descent from many samples of the prior."""
 
 from __future__ import annotations
 
@@ -80,47 +80,6 @@ class Descent:
 
 
 @dataclass(frozen=True)
-class RidgeTracing:
-    """Traces ridges of the likelihood from the best candidates, in both directions of the least determined axis.
-
-    Descent from anywhere on the ridge of a can's spin ends at the same few points of it, where noise of normals leads.
-    """
-
-    starts: int = 3
-    """Number of candidates from which ridges are traced."""
-    step: float = 2.0
-    """Length of a step in standard deviations."""
-    max_steps: int = 10
-    """Largest number of steps in each direction."""
-
-    def run(
-        self,
-        problem: Problem,
-        found: Candidates,
-        regulariser: Regulariser,
-        *,
-        blur_m: float,
-        max_independent: float,
-        negligible: float,
-    ) -> Array:
-        """Return poses (n, 4, 4) along the ridges through the best candidates, as far as they are not negligible."""
-        best = found.select(np.arange(min(self.starts, len(found))))
-        scaled = best.spreads / problem.basin[:, None]
-        axes = np.linalg.eigh(scaled.transpose(0, 2, 1) @ scaled)[1][:, :, -1]  # in units of each one's own spread
-        return problem.pair.trace_ridges(
-            np.concatenate([best.poses, best.poses]),
-            np.concatenate([best.spreads, best.spreads]),
-            np.concatenate([axes, -axes]),
-            blur_m=blur_m,
-            regulariser=regulariser,
-            max_independent=max_independent,
-            floor=found.scores[0] - negligible,
-            step=self.step,
-            max_steps=self.max_steps,
-        )
-
-
-@dataclass(frozen=True)
 class Beyond:
     """Which poses beyond the prior's support are a sign that the prior's limits exclude the motion."""
 
@@ -160,7 +119,6 @@ class Search:
     """Of candidates nearer to each other than this many standard deviations one is kept."""
     starts: Starts = field(default_factory=Starts)
     descent: Descent = field(default_factory=Descent)
-    ridges: RidgeTracing = field(default_factory=RidgeTracing)
     beyond: Beyond = field(default_factory=Beyond)
 
     def scaled(self, effort: float) -> Search:
@@ -195,7 +153,6 @@ class Search:
         outside = poses[~inside]
         poses = poses[inside] if inside.any() else density.sample(self.starts.count(problem), rng)
         fine = self._ranked(problem, poses, fine_m)
-        fine = self._with_ridges(problem, fine)
         outside = self.beyond.signs(problem, outside, fine.poses[0])
         gain = self.scores(pair, outside, fine_m).max() - fine.scores[0] if len(outside) else -np.inf
         return replace(fine, beyond_gain=float(gain))
@@ -208,19 +165,6 @@ class Search:
         """Return the best of poses (n, 4, 4)."""
         ordered, _ = self._ordered(problem.pair, poses, blur_m)
         return ordered[: int(self.descent.survivors * len(poses))]
-
-    def _with_ridges(self, problem: Problem, found: Candidates) -> Candidates:
-        """Return candidates and those along their ridges, best first."""
-        fine_m = self.fine_m(problem.pair)
-        along = self.ridges.run(
-            problem,
-            found,
-            self.descent.regulariser(problem),
-            blur_m=fine_m,
-            max_independent=self.max_independent,
-            negligible=self.negligible,
-        )
-        return self._ranked(problem, np.concatenate([found.poses, along]), fine_m)
 
     def _ranked(self, problem: Problem, poses: Array, blur_m: float) -> Candidates:
         """Return those of poses (n, 4, 4) that are possible, good and distinct, best first."""
