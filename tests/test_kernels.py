@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 
 from modeler import kernels, se3
 from modeler.kernels import mixture, paper, planes, point_likelihood, point_to_plane
-from modeler.kernels.point_likelihood import Projection, buffers
+from modeler.kernels.point_likelihood import Projection
 from modeler.registration.visibility.sampling import GaussianMixture
 from modeler.se3 import matrices, rows
 
@@ -140,50 +140,6 @@ def test_visibility_is_within_its_bound_of_its_twin(seed):
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-4 * 70)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_ridge_tracing_scores_poses_as_the_likelihood_does(seed):
-    rng = np.random.default_rng(seed)
-    projections, poses = (
-        (random_projection(rng, 40), random_projection(rng, 30)),
-        np.stack([random_pose(rng, 0.3) for _ in range(5)]),
-    )
-    ridge = point_to_plane.RidgeLikelihood(
-        projections[0],
-        projections[1],
-        projections[0],
-        projections[1],
-        parameters(),
-        parameters(),
-        0.5,
-        7.0,
-        0.3,
-        -np.inf,
-    )
-    workspace = buffers(projections[0]), buffers(projections[1]), np.empty(12)
-    got = [point_to_plane.tempered_log_likelihood(row, ridge, workspace) for row in rows(poses)]
-    plain, explained = point_likelihood.log_likelihoods(rows(poses), *projections, parameters(), parameters()).T
-    np.testing.assert_allclose(got, 0.5 * plain - 7.0 * np.exp(-0.3 * explained), rtol=1e-6)
-
-
-def test_ridge_tracing_keeps_its_step_length_and_ends_at_the_floor(rng):
-    """Where nothing matches, tracing goes straight on, as far as the likelihood is above the floor."""
-    projections = random_projection(rng), random_projection(rng)
-    empty = [projection._replace(cells=np.zeros_like(projection.cells)) for projection in projections]
-    start, spread = random_pose(rng, 0.1), np.diag([0.1, 0.1, 0.1, 0.01, 0.01, 0.01])
-    axis, centre_m = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.8])
-    regulariser = point_to_plane.Regulariser(rows(start), 1e-9 * np.eye(6), np.full(6, 1e-9), 0.2)
-    for floor, steps in ((np.inf, 0), (-np.inf, 4)):
-        ridge = point_to_plane.RidgeLikelihood(
-            empty[0], empty[1], empty[0], empty[1], parameters(), parameters(), 0.5, 0.0, 0.3, floor
-        )
-        visited, counts = point_to_plane.trace_ridges(
-            rows(start[None]), spread[None], axis[None], 2.0, ridge, centre_m, 0.001, regulariser, 4
-        )
-        assert counts.tolist() == [steps]
-    want = [se3.moved(start, number * 0.2 * axis, centre_m) for number in range(1, 5)]
-    np.testing.assert_allclose(matrices(visited[0]), want, atol=1e-6)
-
-
 def test_descent_is_the_step_of_the_regularised_normal_equations(rng):
     projections, centre_m = (random_projection(rng), random_projection(rng)), np.array([0.0, 0.0, 0.8])
     poses = np.stack([random_pose(rng, 0.1) for _ in range(6)])
@@ -285,20 +241,6 @@ def test_compiled_kernels_older_than_any_source_are_dropped(tmp_path):
         os.utime(path, (modified_s, modified_s))
     kernels.drop_stale(tmp_path)
     assert [path.name for path in cache.iterdir()] == ["b.nbi"]
-
-
-@pytest.mark.parametrize("max_near", [1, 3])
-def test_of_near_poses_the_first_are_kept(rng, max_near):
-    centre_m, sigmas = np.array([0.0, 0.0, 0.8]), np.repeat([0.2, 0.01], 3)
-    poses = np.stack([random_pose(rng, 0.2) for _ in range(60)])
-    kept = mixture.suppress_neighbours(rows(poses), sigmas, centre_m, max_near, 1000)
-    near = np.linalg.norm(se3.difference(poses[:, None], poses[None], centre_m) / sigmas, axis=2) <= 1.0
-    assert kept[0] == 0
-    assert (np.diff(kept) > 0).all()
-    for number in range(len(poses)):
-        before = kept[kept < number]
-        assert (number in kept) == (near[before, number].sum() < max_near)
-    np.testing.assert_array_equal(mixture.suppress_neighbours(rows(poses), sigmas, centre_m, max_near, 5), kept[:5])
 
 
 @pytest.mark.parametrize("sigma_rad", [0.01, 0.5, 3.0])

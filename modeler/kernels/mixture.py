@@ -1,4 +1,4 @@
-"""Gaussians on SE(3): the density of their mixtures, their distances, and suppression of near duplicates."""
+"""Gaussians on SE(3): the density of their mixtures, and their distances."""
 
 import math
 
@@ -112,74 +112,3 @@ def mahalanobis_distances(means, roots, centre):
                 square += z[k] * z[k]
             result[i, j] = math.sqrt(square)
     return result
-
-
-@numba.njit(cache=True)
-def suppress_neighbours(poses, sigmas, centre, max_near, most):
-    """Return indices of the first poses, at most `max_near` of each neighbourhood and `most` in all.
-
-    Args:
-        poses: (n, 12), the best first.
-        sigmas: (6,) extent of a neighbourhood: ξ about the centre within one standard deviation.
-        centre: (3,) point in m.
-        max_near: largest number of kept poses in a neighbourhood.
-        most: largest number of kept poses.
-    """
-    kept, count = np.empty(min(len(poses), most), dtype=np.int64), 0
-    for i in range(len(poses)):
-        near = 0
-        for number in range(count):
-            xi = difference(poses[kept[number]], poses[i], centre)
-            square = 0.0
-            for k in range(6):
-                square += (xi[k] / sigmas[k]) ** 2
-            if square <= 1.0:
-                near += 1
-        if near < max_near:
-            kept[count] = i
-            count += 1
-            if count == len(kept):
-                break
-    return kept[:count]
-
-
-@numba.njit(cache=True)
-def moments(xi, weights):
-    """Return the sum of weights (n,), and mean (6,) and covariance (6, 6) of weighted ξ (n, 6)."""
-    total, mean, covariance = 0.0, np.zeros(6), np.zeros((6, 6))
-    for i in range(len(xi)):
-        total += weights[i]
-        for k in range(6):
-            mean[k] += weights[i] * xi[i, k]
-    mean /= total
-    for i in range(len(xi)):
-        for k in range(6):
-            part = weights[i] * (xi[i, k] - mean[k])
-            for m in range(k + 1):
-                covariance[k, m] += part * (xi[i, m] - mean[m])
-    for k in range(6):
-        for m in range(k + 1):
-            covariance[k, m] /= total
-            covariance[m, k] = covariance[k, m]
-    return total, mean, covariance
-
-
-@numba.njit(cache=True)
-def split_by_kurtosis(xi, weights, mean, axes):
-    """Return on which side (n,) of their mean (6,) weighted ξ (n, 6) lie along the axis of least kurtosis.
-
-    Args:
-        xi: (n, 6).
-        weights: (n,), and
-        mean: (6,) theirs.
-        axes: (6, 6), a column each, in which their variance is 1.
-    """
-    fourths, along = np.zeros(6), np.empty((len(xi), 6))
-    for i in range(len(xi)):
-        for k in range(6):
-            z = 0.0
-            for m in range(6):
-                z += (xi[i, m] - mean[m]) * axes[m, k]
-            along[i, k] = z
-            fourths[k] += weights[i] * (z * z) * (z * z)
-    return along[:, np.argmin(fourths)] > 0.0

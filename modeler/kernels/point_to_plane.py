@@ -1,4 +1,4 @@
-"""Point-to-plane equations of surface that both views measured: descent, ridge tracing, and patches of the surface."""
+"""Point-to-plane equations of surface that both views measured: descent and patches of the surface."""
 
 import math
 from typing import NamedTuple
@@ -20,15 +20,12 @@ from modeler.kernels.point_likelihood import (
     VARIANCE_M2,
     VECTOR_MATHS,
     ZERO,
-    LikelihoodParameters,
-    Projection,
     X,
     Y,
     Z,
     buffers,
     invert,
     normal_agreement,
-    pair_log_likelihood,
     plane_distance,
     project,
 )
@@ -260,106 +257,6 @@ def solve_positive_definite(matrix, vector):
         for u in range(k + 1, 6):
             vector[k] -= matrix[u, k] * vector[u]
         vector[k] /= matrix[k, k]
-
-
-class RidgeLikelihood(NamedTuple):
-    """The tempered likelihood along a ridge, and where tracing ends."""
-
-    forward: Projection
-    """The source's points in the target, and"""
-    backward: Projection
-    """the target's in the source: those of the descent."""
-    scoring_forward: Projection
-    """More of the source's points in the target, for scores, and"""
-    scoring_backward: Projection
-    """of the target's in the source."""
-    forward_parameters: LikelihoodParameters
-    """Parameters of one direction, and"""
-    backward_parameters: LikelihoodParameters
-    """of the other."""
-    temper: float
-    """Factor n / N of the log-likelihood (method.md, eq. 7)."""
-    no_overlap_cost: float
-    """Cost (nats) of a pose under which no surface matches."""
-    per_explained: float
-    """Number of e-folds by which an explained point lowers that."""
-    floor: float
-    """Tracing ends at poses below this (nats)."""
-
-
-@numba.njit(cache=True)
-def tempered_log_likelihood(pose, ridge, workspace):
-    """Return the tempered log-likelihood of a pose (12,); workspace as for `pair_log_likelihood`."""
-    projections, parameters = (
-        (ridge.scoring_forward, ridge.scoring_backward),
-        (ridge.forward_parameters, ridge.backward_parameters),
-    )
-    plain, explained = pair_log_likelihood(
-        pose, projections[0], projections[1], parameters[0], parameters[1], workspace
-    )
-    return ridge.temper * plain - ridge.no_overlap_cost * math.exp(-ridge.per_explained * explained)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def trace_ridges(poses, spreads, axes, step_length, ridge, centre, surface_m, regulariser, max_steps):
-    """Trace ridges from poses along axes: steps along, each followed by two Gauss-Newton steps across.
-
-    Args:
-        poses: (k, 12) starts.
-        spreads: (k, 6, 6) lower triangular roots of the covariances of ξ about the centre.
-        axes: (k, 6) unit vectors in units of those spreads.
-        step_length: length of a step in such units.
-        ridge: the likelihood, and the floor at which a trace ends.
-        centre: (3,) point of the source in m.
-        surface_m: noise of the surfaces in m beyond that of points and planes.
-        regulariser: see `Regulariser`.
-        max_steps: largest number of steps.
-
-    Returns:
-        (k, max_steps, 12) the poses visited, and how many (k,) of them are above the floor.
-    """
-    visited, counts = np.empty((len(poses), max_steps, 12)), np.zeros(len(poses), dtype=np.int64)
-    workspace, gradient, matrix = new_workspace(ridge.forward, ridge.backward), np.empty(6), np.empty((6, 6))
-    scoring = buffers(ridge.scoring_forward), buffers(ridge.scoring_backward), np.empty(12)
-    step, z, rotation = np.empty(6), np.empty(6), np.empty((3, 3))
-    pose, moved = np.empty(12), np.empty(12)
-    for i in range(len(poses)):
-        pose[:] = poses[i]
-        for number in range(max_steps):
-            for k in range(6):
-                z[k] = step_length * axes[i, k]
-            multiply_lower(spreads[i], z, step)
-            retract(pose, step, centre, rotation, moved)
-            pose[:] = moved
-            for _ in range(2):
-                equations(pose, ridge.forward, ridge.backward, centre, surface_m, workspace, gradient, matrix)
-                regularised_step(pose, regulariser, centre, gradient, matrix, step)
-                along = 0.0
-                for k in range(6):  # in units of the spread
-                    z[k] = step[k]
-                    for m in range(k):
-                        z[k] -= spreads[i, k, m] * z[m]
-                    z[k] /= spreads[i, k, k]
-                    along += axes[i, k] * z[k]
-                for k in range(6):
-                    z[k] -= along * axes[i, k]
-                multiply_lower(spreads[i], z, step)
-                retract(pose, step, centre, rotation, moved)
-                pose[:] = moved
-            if not tempered_log_likelihood(pose, ridge, scoring) > ridge.floor:
-                break
-            visited[i, number] = pose
-            counts[i] = number + 1
-    return visited, counts
-
-
-@numba.njit(cache=True)
-def multiply_lower(root, z, xi):
-    """Write ξ (6,), a lower triangular root (6, 6) times z (6,)."""
-    for k in range(6):
-        xi[k] = 0.0
-        for m in range(k + 1):
-            xi[k] += root[k, m] * z[m]
 
 
 @numba.njit(cache=True)
