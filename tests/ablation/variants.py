@@ -127,7 +127,6 @@ REMOVED: Final = (
         _with(sampler__max_compared=_DEFAULT.sampler.max_independent),
     ),
     Variant("all modes but the best", "removed", _with(max_modes=1)),
-    Variant("widening of the first proposal", "removed", _with(sampler__widening=1.0)),
     Variant("dead band beside silhouettes", "removed", patched=_module(likelihood, _DEAD_BAND=0.0)),
     Variant("removal of near candidates (reach)", "removed", _with(search__reach=0.0)),
 )
@@ -170,7 +169,6 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "negligible (20 nats)": _scaled(factor, "search.negligible"),
         "reach (0.5)": _scaled(factor, "search.reach"),
         "near the support (1.5 basins)": _scaled(factor, "search.beyond.near"),
-        "widening of the first proposal (1.3)": _with(sampler__widening=1.0 + 0.3 * factor),
         "widening of later proposals (1.1)": _with(sampler__adaptive__widening=1.0 + 0.1 * factor),
         "modes (4)": _scaled(factor, "max_modes"),
         "sampler: effective size for a fit (80)": _scaled(factor, "sampler.adaptive.min_fitted"),

@@ -69,8 +69,6 @@ class ModeSampler:
     """Independent measurements in the points of both views, see `PairLikelihood.independent_points`."""
     max_compared: float = 40.0
     """The same between modes: the errors that all points of a side share decide between similar sides."""
-    widening: float = 1.3
-    """Standard deviations of the first proposal relative to those of the candidates."""
     adaptive: AdaptiveSampler = field(default_factory=AdaptiveSampler)
 
     def run(
@@ -89,7 +87,7 @@ class ModeSampler:
         )
         scores = likelihood(found.poses)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
-        gaussians = GaussianMixture(found.poses, self.widening * found.spreads, scores + volumes, pair.centre_m)
+        gaussians = GaussianMixture(found.poses, found.spreads, scores + volumes, pair.centre_m)
         samples = self.adaptive.run(MixtureProposal(density, gaussians), likelihood, pair.centre_m, rng)
         return ModeSamples(samples, noise_m, typical_misfit, self.max_compared)
 
