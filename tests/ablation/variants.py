@@ -128,7 +128,6 @@ REMOVED: Final = (
     ),
     Variant("all modes but the best", "removed", _with(max_modes=1)),
     Variant("dead band beside silhouettes", "removed", patched=_module(likelihood, _DEAD_BAND=0.0)),
-    Variant("removal of near candidates (reach)", "removed", _with(search__reach=0.0)),
 )
 
 
@@ -167,7 +166,6 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "iterations of the descent (4)": _scaled(factor, "search.descent.iterations"),
         "longest step (0.2 rad)": _scaled(factor, "search.descent.max_step_rad"),
         "negligible (20 nats)": _scaled(factor, "search.negligible"),
-        "reach (0.5)": _scaled(factor, "search.reach"),
         "near the support (1.5 basins)": _scaled(factor, "search.beyond.near"),
         "widening of later proposals (1.1)": _with(sampler__adaptive__widening=1.0 + 0.1 * factor),
         "modes (4)": _scaled(factor, "max_modes"),

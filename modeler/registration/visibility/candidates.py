@@ -45,16 +45,6 @@ class Candidates:
             spreads=self.spreads[chosen],
         )
 
-    def distinct(self, centre_m: Array, reach: float) -> Candidates:
-        """Return the candidates without those within `reach` standard deviations of a better one (greedy)."""
-        kept: list[int] = []
-        left, near = np.ones(len(self), dtype=bool), self.distances(centre_m) <= reach
-        for number in range(len(self)):
-            if left[number]:
-                kept.append(number)
-                left &= ~near[number]
-        return self.select(np.array(kept, dtype=np.int64))
-
     def modes(self, centre_m: Array) -> list[Candidates]:
         """Return the candidates by mode, the best mode first.
 

@@ -115,8 +115,6 @@ class Search:
     """Independent measurements in all points, for the spread of a candidate."""
     negligible: float = 20.0
     """A candidate this many nats below the best is dropped."""
-    reach: float = 0.5
-    """Of candidates nearer to each other than this many standard deviations one is kept."""
     starts: Starts = field(default_factory=Starts)
     descent: Descent = field(default_factory=Descent)
     beyond: Beyond = field(default_factory=Beyond)
@@ -182,4 +180,4 @@ class Search:
         poses, scores = poses[good], scores[good]
         precision = np.asarray(np.linalg.inv(problem.gaussian.covariance), dtype=np.float64)
         spreads = problem.spreads(poses, blur_m, self.local_independent, precision)
-        return Candidates(poses, scores, spreads).distinct(problem.pair.centre_m, self.reach)
+        return Candidates(poses, scores, spreads)
