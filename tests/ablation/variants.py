@@ -113,8 +113,6 @@ def _times(value: Any, factor: float) -> Any:
 
 
 REMOVED: Final = (
-    Variant("survivors: all starts descend to the end", "removed", _with(search__descent__survivors=1.0)),
-    Variant("choice of starts among samples", "removed", _with(search__starts__proposals_per_start=1)),
     Variant("refinement", "removed", _with(refiner__min_patches=_NEVER)),
     Variant("estimated misfit μ", "removed", _of(_StatedMisfit)),
     Variant("estimated noise b", "removed", _of(_StatedNoise)),
@@ -144,7 +142,7 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "independent points of spreads (40)": _scaled(factor, "search.local_independent"),
         "cost of no overlap (50 nats)": _pair(no_overlap_cost=50.0 * factor),
         "scale of overlap (0.1)": _pair(overlap_scale=0.1 * factor),
-        "blurs (0.25 to 0.015)": _scaled(factor, "search.blurs"),
+        "blurs (0.12 to 0.015)": _scaled(factor, "search.blurs"),
         "starts (400, 60, 3 a basin)": _scaled(
             factor, "search.starts.max_starts", "search.starts.min_starts", "search.starts.per_basin"
         ),
@@ -161,8 +159,6 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "least patches (16)": _scaled(factor, "refiner.min_patches"),
         "points (600)": _scaled(factor, "likelihood.points"),
         "size of a basin (10°, 0.15)": _scaled(factor, "search.starts.basin_deg", "search.starts.basin"),
-        "samples for each start (15)": _scaled(factor, "search.starts.proposals_per_start"),
-        "survivors (0.25)": _scaled(factor, "search.descent.survivors"),
         "iterations of the descent (4)": _scaled(factor, "search.descent.iterations"),
         "longest step (0.2 rad)": _scaled(factor, "search.descent.max_step_rad"),
         "negligible (20 nats)": _scaled(factor, "search.negligible"),

@@ -17,7 +17,7 @@ _PRIOR_SAMPLES = 500
 
 @dataclass(frozen=True)
 class Starts:
-    """Starting poses: the best of many samples of the prior (method.md, eq. 9)."""
+    """Starting poses: samples of the prior (method.md, eq. 9)."""
 
     max_starts: int = 400
     min_starts: int = 60
@@ -27,8 +27,6 @@ class Starts:
     """Standard deviation of a basin in each rotation."""
     basin: float = 0.15
     """Standard deviation of a basin in each translation, as a share of the object's size."""
-    proposals_per_start: int = 15
-    """Samples of the prior for each start."""
 
     def problem(self, pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator) -> Problem:
         """Return what is searched, with moments of the prior from its samples."""
@@ -43,15 +41,6 @@ class Starts:
         basins = np.sqrt(np.prod(np.maximum(variances, 1.0)))
         return int(np.clip(self.per_basin * basins, self.min_starts, self.max_starts))
 
-    def draw(self, problem: Problem, blur: float, rng: np.random.Generator) -> Array:
-        """Return starting poses (n, 4, 4), in the order in which they were drawn, by their match at a coarse blur."""
-        pair, count = problem.pair, self.count(problem)
-        poses = problem.density.sample(self.proposals_per_start * count, rng)
-        plain, share = pair.log_likelihoods(poses, blur * pair.size_m, stride=8)
-        # Coarse surface matches easily: a match counts as the range that it determines, relative to a guess.
-        scores = plain - np.log(blur) * share * pair.points
-        return poses[np.sort(np.argsort(-scores, kind="stable")[:count])]
-
 
 @dataclass(frozen=True)
 class Descent:
@@ -64,8 +53,6 @@ class Descent:
     max_independent: float = 400.0
     """Independent measurements in all points: large, so that the Gaussian approximation of a uniform prior hardly pulls
     directions that matching surface leaves open towards its mean."""
-    survivors: float = 0.25
-    """Largest share of the starts that goes on after the first blur."""
 
     def run(self, problem: Problem, poses: Array, blur_m: float) -> Array:
         """Return poses (n, 4, 4) after their descent."""
@@ -107,8 +94,8 @@ class Beyond:
 class Search:
     """Finds candidates for the modes of a posterior, coarse to fine (method.md, "Search")."""
 
-    blurs: tuple[float, ...] = (0.25, 0.12, 0.06, 0.03, 0.015)
-    """Blur of the surfaces as shares of the object's size: of the starts, and of each stage of the descent."""
+    blurs: tuple[float, ...] = (0.12, 0.06, 0.03, 0.015)
+    """Blur of the surfaces in each stage of the descent, as shares of the object's size."""
     max_independent: float = 120.0
     """Independent measurements in all points, for scores; see `PairLikelihood.independent_points`."""
     local_independent: float = 40.0
@@ -141,11 +128,8 @@ class Search:
             rng: source of all randomness.
         """
         problem, fine_m = self.starts.problem(pair, density, rng), self.fine_m(pair)
-        coarse_m = self.blurs[1] * pair.size_m
-        poses = self.starts.draw(problem, self.blurs[0], rng)
-        poses = self.descent.run(problem, poses, coarse_m)
-        poses = self._survivors(problem, poses, coarse_m)
-        for blur in self.blurs[2:]:
+        poses = density.sample(self.starts.count(problem), rng)
+        for blur in self.blurs:
             poses = self.descent.run(problem, poses, blur * pair.size_m)
         inside = problem.possible(poses)
         outside = poses[~inside]
@@ -158,11 +142,6 @@ class Search:
     def scores(self, pair: PairLikelihood, poses: Array, blur_m: float) -> Array:
         """Return the scores (n,) of poses (n, 4, 4): tempered log-likelihoods (nats)."""
         return pair.tempered(poses, blur_m, max_independent=self.max_independent)
-
-    def _survivors(self, problem: Problem, poses: Array, blur_m: float) -> Array:
-        """Return the best of poses (n, 4, 4)."""
-        ordered, _ = self._ordered(problem.pair, poses, blur_m)
-        return ordered[: int(self.descent.survivors * len(poses))]
 
     def _ranked(self, problem: Problem, poses: Array, blur_m: float) -> Candidates:
         """Return those of poses (n, 4, 4) that are possible, good and distinct, best first."""
