@@ -63,16 +63,13 @@ class _StatedNoise(PairLikelihood):
 class _NoPatches(PairLikelihood):
     """With as many independent measurements on small objects as on large ones."""
 
-    def independent_points(self, most: float) -> float:
-        return most
+    @property
+    def temper(self) -> float:
+        return self.forward.model.max_independent / self.points
 
 
 def _of(kind: type[PairLikelihood]) -> VisibilityRegistrar:
     return replace(_DEFAULT, likelihood=_Other(change=lambda pair: kind(pair.forward, pair.backward, pair.size_m)))
-
-
-def _pair(**constants: float) -> VisibilityRegistrar:
-    return replace(_DEFAULT, likelihood=_Other(change=lambda pair: replace(pair, **constants)))
 
 
 def _module(module: object, **values: Any) -> Patch:
@@ -117,13 +114,8 @@ REMOVED: Final = (
     Variant("estimated misfit μ", "removed", _of(_StatedMisfit)),
     Variant("estimated noise b", "removed", _of(_StatedNoise)),
     Variant("patches (fewer independent points when small)", "removed", _of(_NoPatches)),
-    Variant("cost of no overlap", "removed", _pair(no_overlap_cost=0.0)),
+    Variant("cost of no overlap", "removed", _with(likelihood__no_overlap_cost=0.0)),
     Variant("cost of normals", "removed", _with(likelihood__normal_cost=0.0)),
-    Variant(
-        "independent points between modes (as within)",
-        "removed",
-        _with(sampler__max_compared=_DEFAULT.sampler.max_independent),
-    ),
     Variant("all modes but the best", "removed", _with(max_modes=1)),
     Variant("dead band beside silhouettes", "removed", patched=_module(likelihood, _DEAD_BAND=0.0)),
 )
@@ -135,13 +127,9 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
     silhouette = _module(likelihood, _SILHOUETTE_NOISE=0.5 * factor, _DEAD_BAND=0.25 * factor)
     cosines = _module(likelihood, _COSINES=(factor * np.array([0.1, 0.35, 0.35, 0.6])).astype(np.float32))
     plain = {
-        "independent points within a mode (70)": _scaled(factor, "sampler.max_independent"),
-        "independent points between modes (40)": _scaled(factor, "sampler.max_compared"),
-        "independent points of the search (120)": _scaled(factor, "search.max_independent"),
-        "independent points of the descent (400)": _scaled(factor, "search.descent.max_independent"),
-        "independent points of spreads (40)": _scaled(factor, "search.local_independent"),
-        "cost of no overlap (50 nats)": _pair(no_overlap_cost=50.0 * factor),
-        "scale of overlap (0.1)": _pair(overlap_scale=0.1 * factor),
+        "independent points (70)": _scaled(factor, "likelihood.max_independent"),
+        "cost of no overlap (50 nats)": _scaled(factor, "likelihood.no_overlap_cost"),
+        "scale of overlap (0.1)": _scaled(factor, "likelihood.overlap_scale"),
         "blurs (0.12 to 0.015)": _scaled(factor, "search.blurs"),
         "starts (400, 60, 3 a basin)": _scaled(
             factor, "search.starts.max_starts", "search.starts.min_starts", "search.starts.per_basin"

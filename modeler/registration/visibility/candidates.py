@@ -76,8 +76,8 @@ class Problem:
         """Return whether (n,) poses (n, 4, 4) are in the prior's support."""
         return np.isfinite(self.density.log_evidence(poses))
 
-    def spreads(self, poses: Array, blur_m: float, max_independent: float, precision: Array) -> Array:
-        """Return roots (n, 6, 6) of covariances from matching surface and a precision (6, 6) (method.md, eq. 11)."""
+    def spreads(self, poses: Array, blur_m: float) -> Array:
+        """Return roots (n, 6, 6) of covariances from matching surface and the prior (method.md, eq. 11)."""
         _, matrices = self.pair.normal_equations(poses, blur_m, stride=2)
-        held = max_independent / self.pair.points * matrices + precision
+        held = self.pair.temper * matrices + np.linalg.inv(self.gaussian.covariance)
         return np.asarray(np.linalg.cholesky(np.linalg.inv(held)), dtype=np.float64)

@@ -18,7 +18,8 @@ _MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
 _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a share of its pixels' lateral noise: they err independently
 _DEAD_BAND = 0.25  # around the silhouette, relative to the same noise: points lie inside, as the rim has no plane
 _COSINES = np.array([0.1, 0.35, 0.35, 0.6], dtype=np.float32)  # see `Projection`
-_DESCENT_STRIDE, _SCORE_STRIDE = 4, 2  # every fourth point is used for descent, every second for scores
+_DESCENT_STRIDE, _STRIDE = 4, 2  # every fourth point is used for descent, every second for scores
+_STATED_MISFIT = 0.5  # mean of r² / 2τ² if variances are as stated
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,12 @@ class VisibilityLikelihood:
     """Upper bound K (nats) of the cost of one point."""
     normal_cost: float = 2.0
     """Cost κ (nats) of a match whose normals are at right angles."""
+    max_independent: float = 70.0
+    """Largest number of independent measurements in the points of both views, whose common errors limit it."""
+    no_overlap_cost: float = 50.0
+    """Cost (nats) of a pose under which no surface matches."""
+    overlap_scale: float = 0.1
+    """Share of matching points at which that cost has fallen to its e-th part."""
 
     def between(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> PairLikelihood:
         """Return the likelihood of target_from_source, at surface points drawn with `rng`."""
@@ -89,7 +96,7 @@ class DirectedLikelihood:
             self._projections[stride] = Projection(columns, self._cells, self._camera, _COSINES)
         return self._projections[stride]
 
-    def parameters(self, blur_m: float, typical_misfit: float = 0.5) -> LikelihoodParameters:
+    def parameters(self, blur_m: float, typical_misfit: float = _STATED_MISFIT) -> LikelihoodParameters:
         """Return the parameters of the kernel under a blur of the surfaces, see method.md, eq. 4 to 6."""
         fx = self.image.frame.camera.fx
         lateral_px = max(self.image.sigma_wh * fx, 1.0)
@@ -159,10 +166,6 @@ class PairLikelihood:
     """The target's points looked up in the source."""
     size_m: float
     """Size of the object: root mean square distance in m of the surface points from their centroid."""
-    no_overlap_cost: float = 50.0
-    """Cost (nats) of a pose under which no surface matches."""
-    overlap_scale: float = 0.1
-    """Share of matching points at which that cost has fallen to its e-th part."""
 
     @property
     def centre_m(self) -> Array:
@@ -179,16 +182,17 @@ class PairLikelihood:
         """Number of disjoint smoothing balls on the surface of a view, whose errors are independent; mean of both."""
         return 0.5 * (self.forward.image.patches + self.backward.image.patches)
 
-    def independent_points(self, most: float) -> float:
-        """Return the number n of independent measurements in all points (method.md, eq. 7).
+    @property
+    def temper(self) -> float:
+        """Share n / N of independent measurements in the points (method.md, eq. 7).
 
-        Errors common to distant points limit it to `most` on an object that covers much of the image, smoothing to the
-        number of patches on a small one.
+        Errors common to distant points limit their number on an object that covers much of the image, smoothing limits
+        it to the number of patches on a small one.
         """
-        return 1.0 / (1.0 / most + 1.0 / self.patches)
+        return 1.0 / (1.0 / self.forward.model.max_independent + 1.0 / self.patches) / self.points
 
     def log_likelihoods(
-        self, poses: Array, blur_m: float, *, stride: int = 1, typical_misfit: float = 0.5
+        self, poses: Array, blur_m: float, *, stride: int = 1, typical_misfit: float = _STATED_MISFIT
     ) -> tuple[Array, Array]:
         """Return log-likelihoods (n,), not tempered, and the shares (n,) of points that matching surface explains.
 
@@ -206,27 +210,17 @@ class PairLikelihood:
         found = stride * point_likelihood.log_likelihoods(rows(poses), *projections, *parameters)
         return found[:, point_likelihood.LOG_LIKELIHOOD], found[:, point_likelihood.EXPLAINED] / self.points
 
-    def tempered(
-        self,
-        poses: Array,
-        blur_m: float,
-        *,
-        max_independent: float,
-        stride: int = _SCORE_STRIDE,
-        typical_misfit: float = 0.5,
-    ) -> Array:
+    def tempered(self, poses: Array, blur_m: float, *, typical_misfit: float = _STATED_MISFIT) -> Array:
         """Return tempered log-likelihoods (n,) of poses (n, 4, 4) (method.md, eq. 7).
 
         Args:
             poses: target_from_source.
             blur_m: blur of the surfaces in m.
-            max_independent: see `independent_points`.
-            stride: see `log_likelihoods`, as `typical_misfit`.
             typical_misfit: misfit μ of a typical match (nats).
         """
-        plain, share = self.log_likelihoods(poses, blur_m, stride=stride, typical_misfit=typical_misfit)
-        temper = self.independent_points(max_independent) / self.points
-        return temper * plain - self.no_overlap_cost * np.exp(-share / self.overlap_scale)  # method.md, eq. 7
+        plain, share = self.log_likelihoods(poses, blur_m, stride=_STRIDE, typical_misfit=typical_misfit)
+        model = self.forward.model
+        return self.temper * plain - model.no_overlap_cost * np.exp(-share / model.overlap_scale)  # method.md, eq. 7
 
     def typical_misfit(self, pose: Array, blur_m: float) -> float:
         """Return the misfit μ at which matches under a good pose (4, 4) count 0 on average (method.md, eq. 8).
@@ -241,7 +235,7 @@ class PairLikelihood:
             ]
         )
         if len(misfits) <= _MIN_MATCHES:
-            return 0.5
+            return _STATED_MISFIT
         hidden = self.forward.model.hidden_share
         low, high = 0.0, 2.0
         for _ in range(16):  # bisection: the mean grows with μ

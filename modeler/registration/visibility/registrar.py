@@ -42,8 +42,6 @@ class ModeSamples:
     """Noise b of matching surfaces."""
     typical_misfit: float
     """Misfit μ of a typical match (nats)."""
-    max_compared: float
-    """Independent measurements in all points, for the comparison with other modes."""
 
     def compared(self, pair: PairLikelihood, reference: ModeSamples) -> WeightedSamples:
         """Return the samples with their evidence under the nuisance parameters of another mode (method.md, eq. 13).
@@ -52,10 +50,7 @@ class ModeSamples:
         """
         samples, best = self.samples, int(np.argmax(self.samples.log_likelihoods))
         under_reference = pair.tempered(
-            samples.poses[best : best + 1],
-            reference.noise_m,
-            max_independent=self.max_compared,
-            typical_misfit=reference.typical_misfit,
+            samples.poses[best : best + 1], reference.noise_m, typical_misfit=reference.typical_misfit
         )
         gain = float(under_reference[0] - samples.log_likelihoods[best])
         return replace(samples, log_evidence=samples.log_evidence + gain)
@@ -65,10 +60,6 @@ class ModeSamples:
 class ModeSampler:
     """Draws samples of one mode, starting from its candidates."""
 
-    max_independent: float = 70.0
-    """Independent measurements in the points of both views, see `PairLikelihood.independent_points`."""
-    max_compared: float = 40.0
-    """The same between modes: the errors that all points of a side share decide between similar sides."""
     adaptive: AdaptiveSampler = field(default_factory=AdaptiveSampler)
 
     def run(
@@ -82,14 +73,12 @@ class ModeSampler:
         """Return samples of the mode of some candidates."""
         noise_m = pair.surface_noise_m(found.poses[0], search.fine_m(pair))
         typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
-        likelihood = partial(
-            pair.tempered, blur_m=noise_m, max_independent=self.max_independent, typical_misfit=typical_misfit
-        )
+        likelihood = partial(pair.tempered, blur_m=noise_m, typical_misfit=typical_misfit)
         scores = likelihood(found.poses)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
         gaussians = GaussianMixture(found.poses, found.spreads, scores + volumes, pair.centre_m)
         samples = self.adaptive.run(MixtureProposal(density, gaussians), likelihood, pair.centre_m, rng)
-        return ModeSamples(samples, noise_m, typical_misfit, self.max_compared)
+        return ModeSamples(samples, noise_m, typical_misfit)
 
 
 @dataclass(frozen=True)

@@ -50,18 +50,19 @@ class Descent:
     """Steps at each blur."""
     max_step_rad: float = 0.2
     """Largest rotation of a step."""
-    max_independent: float = 400.0
-    """Independent measurements in all points: large, so that the Gaussian approximation of a uniform prior hardly pulls
-    directions that matching surface leaves open towards its mean."""
 
     def run(self, problem: Problem, poses: Array, blur_m: float) -> Array:
         """Return poses (n, 4, 4) after their descent."""
         return problem.pair.descend(poses, blur_m, self.regulariser(problem), steps=self.iterations)
 
     def regulariser(self, problem: Problem) -> Regulariser:
-        """Return the regulariser of a descent: the prior's Gaussian, and damping."""
+        """Return the regulariser of a descent: the prior's Gaussian, and damping.
+
+        Matching surface is not tempered there, so that the Gaussian approximation of a uniform prior hardly pulls
+        directions that surface leaves open towards its mean.
+        """
         pair, prior = problem.pair, problem.gaussian
-        precision = np.asarray(np.linalg.inv(self.max_independent / pair.points * prior.covariance), dtype=np.float64)
+        precision = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
         damping = np.repeat([1.0 / self.max_step_rad, 1.0 / (self.max_step_rad * pair.size_m)], 3) ** 2
         return Regulariser(se3.rows(prior.mean), precision, 0.0025 * pair.points * damping, self.max_step_rad)
 
@@ -96,10 +97,6 @@ class Search:
 
     blurs: tuple[float, ...] = (0.12, 0.06, 0.03, 0.015)
     """Blur of the surfaces in each stage of the descent, as shares of the object's size."""
-    max_independent: float = 120.0
-    """Independent measurements in all points, for scores; see `PairLikelihood.independent_points`."""
-    local_independent: float = 40.0
-    """Independent measurements in all points, for the spread of a candidate."""
     negligible: float = 20.0
     """A candidate this many nats below the best is dropped."""
     starts: Starts = field(default_factory=Starts)
@@ -136,27 +133,12 @@ class Search:
         poses = poses[inside] if inside.any() else density.sample(self.starts.count(problem), rng)
         fine = self._ranked(problem, poses, fine_m)
         outside = self.beyond.signs(problem, outside, fine.poses[0])
-        gain = self.scores(pair, outside, fine_m).max() - fine.scores[0] if len(outside) else -np.inf
+        gain = pair.tempered(outside, fine_m).max() - fine.scores[0] if len(outside) else -np.inf
         return replace(fine, beyond_gain=float(gain))
 
-    def scores(self, pair: PairLikelihood, poses: Array, blur_m: float) -> Array:
-        """Return the scores (n,) of poses (n, 4, 4): tempered log-likelihoods (nats)."""
-        return pair.tempered(poses, blur_m, max_independent=self.max_independent)
-
     def _ranked(self, problem: Problem, poses: Array, blur_m: float) -> Candidates:
-        """Return those of poses (n, 4, 4) that are possible, good and distinct, best first."""
-        return self._selected(problem, *self._ordered(problem.pair, poses[problem.possible(poses)], blur_m), blur_m)
-
-    def _ordered(self, pair: PairLikelihood, poses: Array, blur_m: float) -> tuple[Array, Array]:
-        """Return poses (n, 4, 4) and their scores (n,), best first."""
-        scores = self.scores(pair, poses, blur_m)
+        """Return those of poses (n, 4, 4) that are not negligible, best first."""
+        scores = problem.pair.tempered(poses, blur_m)
         order = np.argsort(-scores, kind="stable")
-        return poses[order], scores[order]
-
-    def _selected(self, problem: Problem, poses: Array, scores: Array, blur_m: float) -> Candidates:
-        """Return those of ordered poses (n, 4, 4) with scores (n,) that are good and distinct."""
-        good = scores > scores[:1] - self.negligible
-        poses, scores = poses[good], scores[good]
-        precision = np.asarray(np.linalg.inv(problem.gaussian.covariance), dtype=np.float64)
-        spreads = problem.spreads(poses, blur_m, self.local_independent, precision)
-        return Candidates(poses, scores, spreads)
+        order = order[scores[order] > scores.max() - self.negligible]
+        return Candidates(poses[order], scores[order], problem.spreads(poses[order], blur_m))
