@@ -106,7 +106,7 @@ def test_a_poor_proposal_costs_samples_and_not_correctness() -> None:
 
 def test_it_draws_no_more_than_it_may_and_states_its_effective_size() -> None:
     narrow = gaussian(away(4.0 * SIGMAS), 0.01 * SIGMAS)
-    found = AdaptiveSampler(initial=200, max_draws=400).run(
+    found = AdaptiveSampler(draws=200, max_draws=400).run(
         Around(SIGMAS), narrow.log_density, CENTRE_M, np.random.default_rng(0)
     )
     assert len(found.poses) <= 400

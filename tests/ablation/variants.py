@@ -140,8 +140,8 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "silhouette noise and dead band (0.5, 0.25)": silhouette,
         "surface noise (0.1)": _scaled(factor, "likelihood.surface_noise"),
         "surface detail (0.003)": _scaled(factor, "likelihood.surface_detail"),
-        "sampler's sizes (400, 200, 580, 750)": _scaled(
-            factor, *(f"sampler.adaptive.{name}" for name in ("initial", "draws", "enough", "kept"))
+        "sampler's sizes (400, 580, 750)": _scaled(
+            factor, *(f"sampler.adaptive.{name}" for name in ("draws", "enough", "kept"))
         ),
         "patches of the refinement (2⁵)": _with(refiner__halvings=4 if factor < 1.0 else 6),
         "least patches (16)": _scaled(factor, "refiner.min_patches"),
@@ -151,7 +151,6 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "longest step (0.2 rad)": _scaled(factor, "search.descent.max_step_rad"),
         "negligible (20 nats)": _scaled(factor, "search.negligible"),
         "near the support (1.5 basins)": _scaled(factor, "search.beyond.near"),
-        "widening of later proposals (1.1)": _with(sampler__adaptive__widening=1.0 + 0.1 * factor),
         "modes (4)": _scaled(factor, "max_modes"),
         "sampler: effective size for a fit (80)": _scaled(factor, "sampler.adaptive.min_fitted"),
         "sampler: draws at most (8000)": _scaled(factor, "sampler.adaptive.max_draws"),

@@ -169,20 +169,14 @@ class AdaptiveSampler:
     determine a covariance, they are tempered for the next proposal.
     """
 
-    initial: int = 400
-    """Samples of the first round; regions that it misses altogether, later rounds may miss too."""
-    draws: int = 200
-    """Least number of samples of a later round."""
+    draws: int = 400
+    """Samples of a round; regions that the first misses altogether, later ones may miss too."""
     enough: float = 580.0
     """Effective sample size at which the rounds end."""
     max_draws: int = 8000
     """No further round begins after this many samples."""
     min_fitted: float = 80.0
     """Least effective size of the samples to which a Gaussian is fitted."""
-    widening: float = 1.1
-    """Standard deviations of a proposal relative to those of the samples that it is fitted to."""
-    efficiency: float = 0.75
-    """Expected effective size per sample of an untempered round, from which its sample count follows."""
     kept: int = 750
     """Largest number of samples in the result."""
 
@@ -197,8 +191,8 @@ class AdaptiveSampler:
             centre_m: (3,) point of the source about which Gaussians are fitted.
             rng: source of all randomness.
         """
-        first = proposal.sample(self.initial, rng)
-        log_count = float(np.log(self.initial))
+        first = proposal.sample(self.draws, rng)
+        log_count = float(np.log(self.draws))
 
         def weighed(poses: Array, log_density: Array) -> _Draws:
             log_prior = proposal.log_evidence(poses)
@@ -211,12 +205,10 @@ class AdaptiveSampler:
         drawn, fitted = weighed(first, log_count + proposal.log_density(first)), None
         log_weights = drawn.log_weights
         while (effective := effective_samples(log_weights)) < self.enough and len(drawn.poses) < self.max_draws:
-            even = effective >= self.min_fitted
-            power = 1.0 if even else _power(log_weights, self.min_fitted)
-            count = max(int((self.enough - effective) / self.efficiency) + 1, self.draws) if even else self.draws
-            new = self._fitted(drawn.poses, normalised(power * log_weights), centre_m).times(count)
+            power = 1.0 if effective >= self.min_fitted else _power(log_weights, self.min_fitted)
+            new = _fitted(drawn.poses, normalised(power * log_weights), centre_m).times(self.draws)
             fitted = new if fitted is None else fitted.plus(new)
-            poses = new.sample(count, rng)
+            poses = new.sample(self.draws, rng)
             log_density = np.logaddexp(log_count + proposal.log_density(poses), fitted.log_density(poses))
             drawn = drawn.reweighted(new).plus(weighed(poses, log_density))
             log_weights = drawn.log_weights
@@ -229,11 +221,12 @@ class AdaptiveSampler:
             pareto_tail(log_weights),
         )
 
-    def _fitted(self, poses: Array, weights: Array, centre_m: Array) -> GaussianMixture:
-        """Return the Gaussian of weighted poses (n, 4, 4), somewhat widened."""
-        mean, covariance = se3.mean(poses, weights, about_m=centre_m)
-        spread = self.widening * np.linalg.cholesky(covariance + FLOOR)
-        return GaussianMixture(mean[None], spread[None], np.zeros(1), centre_m)
+
+def _fitted(poses: Array, weights: Array, centre_m: Array) -> GaussianMixture:
+    """Return the Gaussian of weighted poses (n, 4, 4)."""
+    mean, covariance = se3.mean(poses, weights, about_m=centre_m)
+    spread = np.asarray(np.linalg.cholesky(covariance + FLOOR), dtype=np.float64)
+    return GaussianMixture(mean[None], spread[None], np.zeros(1), centre_m)
 
 
 def thinned(weights: Array, count: int, rng: np.random.Generator) -> tuple[npt.NDArray[np.int64], Array]:
