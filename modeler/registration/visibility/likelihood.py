@@ -28,8 +28,6 @@ class VisibilityLikelihood:
 
     points: int = 600
     """Surface points taken from each view."""
-    surface_noise: float = 0.1
-    """Least error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
     surface_detail: float = 0.003
     """Least error of local planes on a curved surface, as a share of the object's size."""
     hidden_share: float = 0.5
@@ -134,8 +132,7 @@ class DirectedLikelihood:
     @cached_property
     def _min_blur_m(self) -> float:
         """Least noise of matching surfaces."""
-        detail_m = self.model.surface_detail * self.size_m
-        return float(np.hypot(detail_m, self.model.surface_noise * self.image.sigma_r_m))
+        return self.model.surface_detail * self.size_m
 
     @cached_property
     def _measured_share(self) -> float:
