@@ -19,7 +19,6 @@ from modeler.evaluation import rotation_error_deg, sample_surface, true_motion
 from modeler.priors import TablePrior
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
-from modeler.registration.visibility.registrar import ModeSampler
 from modeler.registration.visibility.sampling import AdaptiveSampler
 from modeler.types import Outcome, PoseGaussian, Posterior
 from sequences.rendering.renderer import RenderedSequence
@@ -158,7 +157,7 @@ def test_only_answers_that_are_given_are_judged() -> None:
 
 
 def test_a_study_runs_and_repeats_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    quick = ModeSampler(adaptive=AdaptiveSampler(enough=200.0, kept=300))
+    quick = AdaptiveSampler(enough=200.0, kept=300)
     box = Specimen("box", "n-fold", "tuning")
     small = Study(
         specimens=(box,),

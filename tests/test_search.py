@@ -10,8 +10,7 @@ from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.registration.visibility import VisibilityLikelihood, VisibilityRegistrar
-from modeler.registration.visibility.candidates import Candidates
-from modeler.registration.visibility.search import Search
+from modeler.registration.visibility.search import Candidates, Search
 from modeler.types import Outcome
 from sequences import bundled, open_sequence
 from sequences.rendering.renderer import RenderedSequence
@@ -92,11 +91,17 @@ def test_the_posterior_of_a_tube_spans_its_roll(seed):
     assert abs(mean) < 3.0 * sigma_deg
 
 
-def test_candidates_within_reach_of_each_other_share_a_mode():
-    near, far = turned(0.02), turned(1.5)
-    modes = candidates([np.eye(4), near, far], [0.01, 0.01, 0.01], [3, 2, 1]).modes(np.zeros(3))
-    assert [len(mode) for mode in modes] == [2, 1]
+def test_a_chain_of_candidates_shares_a_mode():
+    basin = np.repeat([0.2, 0.01], 3)
+    poses = [np.eye(4), turned(1.5), turned(0.3), turned(0.15)]
+    modes = candidates(poses, [0.01, 0.01, 0.01, 0.01], [4, 3, 2, 1]).modes(np.zeros(3), basin)
+    assert [len(mode) for mode in modes] == [3, 1]
     np.testing.assert_array_equal(modes[0].poses[0], np.eye(4))
+
+
+def test_candidates_near_a_better_one_are_dropped():
+    found = candidates([np.eye(4), turned(0.005), turned(0.02)], [0.01, 0.01, 0.01], [3, 2, 1]).distinct(np.zeros(3))
+    assert found.scores.tolist() == [3.0, 1.0]
 
 
 @pytest.fixture(scope="module")

@@ -228,9 +228,7 @@ def glancing(registrar: AbstractRegistrar) -> AbstractRegistrar | None:
     """
     if not isinstance(registrar, VisibilityRegistrar):
         return None
-    adaptive = registrar.sampler.adaptive
-    adaptive = replace(adaptive, max_draws=int(_GLANCE_SHARE * adaptive.max_draws))
-    sampler = replace(registrar.sampler, adaptive=adaptive)
+    sampler = replace(registrar.sampler, max_draws=int(_GLANCE_SHARE * registrar.sampler.max_draws))
     return replace(registrar, search=registrar.search.scaled(_GLANCE_SHARE), sampler=sampler, max_modes=1)
 
 

@@ -7,7 +7,8 @@ from modeler.types import AbstractPoseDensity, Array, Outcome, PoseGaussian, Pos
 
 FLOOR = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
 """Added to sample covariances (6, 6) of ξ (rad, m), so that they are positive definite."""
-_SAMPLES = 500  # of a prior, for its mean and covariance
+PRIOR_SAMPLES = 500
+"""Samples of a prior, for its mean and covariance."""
 
 
 def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaussian:
@@ -88,7 +89,7 @@ def failed(
     if density is None or rng is None:
         pose = PoseGaussian(np.eye(4), np.diag(np.repeat([np.pi, 10.0], 3) ** 2))
     else:
-        pose = weighted_gaussian(density.sample(_SAMPLES, rng), np.ones(_SAMPLES), source.centroid_m)
+        pose = weighted_gaussian(density.sample(PRIOR_SAMPLES, rng), np.ones(PRIOR_SAMPLES), source.centroid_m)
     return Posterior(source=source.index, target=target.index, pose=pose, outcome=outcome, overlap=0.0, seconds=0.0)
 
 

@@ -11,7 +11,7 @@ from unittest import mock
 import numpy as np
 
 from modeler.registration import VisibilityRegistrar
-from modeler.registration.visibility import candidates, likelihood
+from modeler.registration.visibility import likelihood
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.types import Array, RayImage
 
@@ -77,7 +77,7 @@ def _module(module: object, **values: Any) -> Patch:
 
 
 def _changed(component: Any, constants: Mapping[str, object]) -> Any:
-    """Return a component with other values of constants, named by their path: `search.starts.basin`."""
+    """Return a component with other values of constants, named by their path: `search.basin`."""
     for path, value in constants.items():
         name, _, rest = path.partition(".")
         component = replace(component, **{name: _changed(getattr(component, name), {rest: value}) if rest else value})
@@ -131,30 +131,25 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "cost of no overlap (50 nats)": _scaled(factor, "likelihood.no_overlap_cost"),
         "scale of overlap (0.1)": _scaled(factor, "likelihood.overlap_scale"),
         "blurs (0.12 to 0.015)": _scaled(factor, "search.blurs"),
-        "starts (400, 60, 3 a basin)": _scaled(
-            factor, "search.starts.max_starts", "search.starts.min_starts", "search.starts.per_basin"
-        ),
+        "starts (400, 60, 3 a basin)": _scaled(factor, "search.max_starts", "search.min_starts", "search.per_basin"),
         "hidden share η (0.5; 0.25 and 0.75)": _with(likelihood__hidden_share=hidden),
         "cost of one point K (10 nats)": _scaled(factor, "likelihood.max_point_cost"),
         "cost of normals κ (2 nats)": _scaled(factor, "likelihood.normal_cost"),
         "silhouette noise and dead band (0.5, 0.25)": silhouette,
         "surface detail (0.003)": _scaled(factor, "likelihood.surface_detail"),
         "sampler's sizes (400, 580, 750)": _scaled(
-            factor, *(f"sampler.adaptive.{name}" for name in ("draws", "enough", "kept"))
+            factor, *(f"sampler.{name}" for name in ("draws", "enough", "kept"))
         ),
         "patches of the refinement (2⁵)": _with(refiner__halvings=4 if factor < 1.0 else 6),
         "least patches (16)": _scaled(factor, "refiner.min_patches"),
         "points (600)": _scaled(factor, "likelihood.points"),
-        "size of a basin (10°, 0.15)": _scaled(factor, "search.starts.basin_deg", "search.starts.basin"),
-        "iterations of the descent (4)": _scaled(factor, "search.descent.iterations"),
-        "longest step (0.2 rad)": _scaled(factor, "search.descent.max_step_rad"),
-        "negligible (20 nats)": _scaled(factor, "search.negligible"),
-        "near the support (1.5 basins)": _scaled(factor, "search.beyond.near"),
+        "size of a basin (0.2)": _scaled(factor, "search.basin"),
+        "iterations of the descent (4)": _scaled(factor, "search.steps"),
+        "negligible (10 nats)": _scaled(factor, "search.negligible"),
         "modes (4)": _scaled(factor, "max_modes"),
-        "sampler: effective size for a fit (80)": _scaled(factor, "sampler.adaptive.min_fitted"),
-        "sampler: draws at most (8000)": _scaled(factor, "sampler.adaptive.max_draws"),
+        "sampler: effective size for a fit (80)": _scaled(factor, "sampler.min_fitted"),
+        "sampler: draws at most (8000)": _scaled(factor, "sampler.max_draws"),
         "refinement: matches of a patch (6)": _scaled(factor, "refiner.min_matches"),
-        "distance between modes (3.5)": _module(candidates, _MODE_DISTANCE=3.5 * factor),
         "cosines of visibility (0.1 to 0.6)": cosines,
     }
     return {

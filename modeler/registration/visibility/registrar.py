@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 
 from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
-from modeler.registration.visibility.candidates import Candidates
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.registration.visibility.refinement import Refiner
 from modeler.registration.visibility.sampling import (
@@ -19,7 +18,7 @@ from modeler.registration.visibility.sampling import (
     WeightedSamples,
     weigh_modes,
 )
-from modeler.registration.visibility.search import Search
+from modeler.registration.visibility.search import Candidates, Search
 from modeler.types import (
     AbstractPoseDensity,
     AbstractRegistrar,
@@ -57,31 +56,6 @@ class ModeSamples:
 
 
 @dataclass(frozen=True)
-class ModeSampler:
-    """Draws samples of one mode, starting from its candidates."""
-
-    adaptive: AdaptiveSampler = field(default_factory=AdaptiveSampler)
-
-    def run(
-        self,
-        pair: PairLikelihood,
-        density: AbstractPoseDensity,
-        search: Search,
-        found: Candidates,
-        rng: np.random.Generator,
-    ) -> ModeSamples:
-        """Return samples of the mode of some candidates."""
-        noise_m = pair.surface_noise_m(found.poses[0], search.fine_m(pair))
-        typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
-        likelihood = partial(pair.tempered, blur_m=noise_m, typical_misfit=typical_misfit)
-        scores = likelihood(found.poses)
-        volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
-        gaussians = GaussianMixture(found.poses, found.spreads, scores + volumes, pair.centre_m)
-        samples = self.adaptive.run(MixtureProposal(density, gaussians), likelihood, pair.centre_m, rng)
-        return ModeSamples(samples, noise_m, typical_misfit)
-
-
-@dataclass(frozen=True)
 class VisibilityRegistrar(AbstractRegistrar):
     """The paper's likelihood with normals: surface that faces a camera is seen by it, other surface is hidden.
 
@@ -92,7 +66,7 @@ class VisibilityRegistrar(AbstractRegistrar):
 
     likelihood: VisibilityLikelihood = field(default_factory=VisibilityLikelihood)
     search: Search = field(default_factory=Search)
-    sampler: ModeSampler = field(default_factory=ModeSampler)
+    sampler: AdaptiveSampler = field(default_factory=AdaptiveSampler)
     refiner: Refiner = field(default_factory=Refiner)
     max_modes: int = 4
     """Largest number of modes that are sampled."""
@@ -118,16 +92,26 @@ class VisibilityRegistrar(AbstractRegistrar):
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         pair = self.likelihood.between(source, target, rng)
         found = self.search.run(pair, density, rng)
-        sampled = [
-            self.sampler.run(pair, density, self.search, mode, rng)
-            for mode in found.modes(pair.centre_m)[: self.max_modes]
-        ]
+        modes_found = found.modes(pair.centre_m, self.search.extent(pair))[: self.max_modes]
+        sampled = [self._sampled(pair, density, mode, rng) for mode in modes_found]
         reference = min(sampled, key=lambda mode: mode.noise_m)
         compared = [mode.compared(pair, reference) for mode in sampled]
         refined = [self._refined(pair, density, samples, rng) for samples in compared]
         modes = weigh_modes(refined)
         at_limit = self._share_at_limit(pair, density, found, modes[0][1], rng)
         return self._judged(pair, modes, at_limit=at_limit, seconds=time.perf_counter() - started)
+
+    def _sampled(
+        self, pair: PairLikelihood, density: AbstractPoseDensity, found: Candidates, rng: np.random.Generator
+    ) -> ModeSamples:
+        """Return samples of the mode of some candidates."""
+        noise_m = pair.surface_noise_m(found.poses[0], self.search.fine_m(pair))
+        typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
+        likelihood = partial(pair.tempered, blur_m=noise_m, typical_misfit=typical_misfit)
+        volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
+        gaussians = GaussianMixture(found.poses, found.spreads, likelihood(found.poses) + volumes, pair.centre_m)
+        samples = self.sampler.run(MixtureProposal(density, gaussians), likelihood, pair.centre_m, rng)
+        return ModeSamples(samples, noise_m, typical_misfit)
 
     def _refined(
         self,

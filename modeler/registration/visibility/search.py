@@ -1,120 +1,107 @@
-"""Search for modes of the posterior: descent from many samples of the prior."""
+"""Search for modes of the posterior: descent from many samples of the prior (method.md, eq. 9 to 11)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from modeler import se3
+from modeler.kernels import mixture
 from modeler.kernels.point_to_plane import Regulariser
-from modeler.registration.visibility.candidates import Candidates, Problem
+from modeler.registration.posterior import PRIOR_SAMPLES
 from modeler.registration.visibility.likelihood import PairLikelihood
-from modeler.types import AbstractPoseDensity, Array, PoseGaussian
-
-_PRIOR_SAMPLES = 500
+from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 
 
-@dataclass(frozen=True)
-class Starts:
-    """Starting poses: samples of the prior (method.md, eq. 9)."""
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Poses found by the search, each with a Gaussian of its surroundings."""
 
-    max_starts: int = 400
-    min_starts: int = 60
-    per_basin: float = 3.0
-    """Starts for each basin that the prior covers."""
-    basin_deg: float = 10.0
-    """Standard deviation of a basin in each rotation."""
-    basin: float = 0.15
-    """Standard deviation of a basin in each translation, as a share of the object's size."""
+    poses: Array
+    """(k, 4, 4) target_from_source, best first."""
+    scores: Array
+    """(k,) tempered log-likelihoods (nats)."""
+    spreads: Array
+    """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid (method.md, eq. 11)."""
+    beyond_gain: float = -np.inf
+    """How much better (nats) than the best candidate a pose beyond the prior's support is."""
 
-    def problem(self, pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator) -> Problem:
-        """Return what is searched, with moments of the prior from its samples."""
-        poses = density.sample(_PRIOR_SAMPLES, rng)
-        mean, covariance = se3.mean(poses, np.ones(len(poses)), about_m=pair.centre_m, iterations=4)
-        gaussian = PoseGaussian(mean, covariance + np.diag(np.repeat([1e-4, 1e-5], 3) ** 2))
-        return Problem(pair, density, gaussian, np.repeat([np.deg2rad(self.basin_deg), self.basin * pair.size_m], 3))
+    def __len__(self) -> int:
+        """Return the number of candidates."""
+        return len(self.poses)
 
-    def count(self, problem: Problem) -> int:
-        """Return the number of starts for the width of the prior."""
-        variances = np.linalg.eigvalsh(problem.gaussian.covariance / np.outer(problem.basin, problem.basin))
-        basins = np.sqrt(np.prod(np.maximum(variances, 1.0)))
-        return int(np.clip(self.per_basin * basins, self.min_starts, self.max_starts))
+    def select(self, chosen: npt.NDArray[np.int64] | BoolArray) -> Candidates:
+        """Return candidates by index or mask."""
+        return replace(self, poses=self.poses[chosen], scores=self.scores[chosen], spreads=self.spreads[chosen])
 
+    def distinct(self, centre_m: Array) -> Candidates:
+        """Return the candidates without those within a standard deviation of a better one (greedy)."""
+        kept: list[int] = []
+        left = np.ones(len(self), dtype=bool)
+        near = mixture.mahalanobis_distances(se3.rows(self.poses), self.spreads, centre_m) <= 1.0
+        for number in range(len(self)):
+            if left[number]:
+                kept.append(number)
+                left &= ~near[number]
+        return self.select(np.array(kept, dtype=np.int64))
 
-@dataclass(frozen=True)
-class Descent:
-    """Damped Gauss-Newton steps on matching surface, regularised by the prior (method.md, eq. 10)."""
+    def modes(self, centre_m: Array, basin: Array) -> list[Candidates]:
+        """Return the candidates by mode, the best mode first.
 
-    iterations: int = 4
-    """Steps at each blur."""
-    max_step_rad: float = 0.2
-    """Largest rotation of a step."""
-
-    def run(self, problem: Problem, poses: Array, blur_m: float) -> Array:
-        """Return poses (n, 4, 4) after their descent."""
-        return problem.pair.descend(poses, blur_m, self.regulariser(problem), steps=self.iterations)
-
-    def regulariser(self, problem: Problem) -> Regulariser:
-        """Return the regulariser of a descent: the prior's Gaussian, and damping.
-
-        Matching surface is not tempered there, so that the Gaussian approximation of a uniform prior hardly pulls
-        directions that surface leaves open towards its mean.
+        Two candidates share a mode where a chain of candidates connects them, each link within the extent (6,) of a
+        basin. A ridge, such as the spin of a can, is one mode.
         """
-        pair, prior = problem.pair, problem.gaussian
-        precision = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
-        damping = np.repeat([1.0 / self.max_step_rad, 1.0 / (self.max_step_rad * pair.size_m)], 3) ** 2
-        return Regulariser(se3.rows(prior.mean), precision, 0.0025 * pair.points * damping, self.max_step_rad)
-
-
-@dataclass(frozen=True)
-class Beyond:
-    """Which poses beyond the prior's support are a sign that the prior's limits exclude the motion."""
-
-    near: float = 1.5
-    """Those this many basins beyond the support at most,"""
-    enough_overlap: float = 0.5
-    """where the best pose inside shows more of the surface than this; else all."""
-
-    def signs(self, problem: Problem, poses: Array, best: Array) -> Array:
-        """Return those of poses (n, 4, 4) outside the support; `best` (4, 4) is the best inside.
-
-        Surface leads a quarter turn round a carton, where other sides of it may match better than the right ones; that
-        is no sign that the limits exclude the motion.
-        """
-        pair = problem.pair
-        if not (len(poses) and pair.overlap(best) > self.enough_overlap):
-            return poses
-        back = se3.difference(poses, problem.gaussian.mean, pair.centre_m)
-        basins = np.linalg.norm(back / problem.basin, axis=1, keepdims=True)
-        nearer = se3.moved(poses, back * np.minimum(self.near / np.maximum(basins, 1e-12), 1.0), pair.centre_m)
-        return poses[problem.possible(nearer)]
+        apart = se3.difference(self.poses[:, None], self.poses[None], centre_m) / basin
+        linked = np.sum(apart**2, axis=-1) <= 1.0
+        label = np.arange(len(self))
+        for number in range(len(self)):  # connected components, each labelled by its best candidate
+            neighbours = np.unique(label[linked[number]])
+            label[np.isin(label, neighbours)] = neighbours[0]
+        return [self.select(label == name) for name in np.unique(label)]
 
 
 @dataclass(frozen=True)
 class Search:
     """Finds candidates for the modes of a posterior, coarse to fine (method.md, "Search")."""
 
+    basin: float = 0.2
+    """Extent of a basin of attraction: rotation in rad, translation as a share of the object's size."""
+    per_basin: float = 3.0
+    """Starts for each basin that the prior covers,"""
+    min_starts: int = 60
+    """but no fewer than this,"""
+    max_starts: int = 400
+    """and no more."""
     blurs: tuple[float, ...] = (0.12, 0.06, 0.03, 0.015)
     """Blur of the surfaces in each stage of the descent, as shares of the object's size."""
-    negligible: float = 20.0
+    steps: int = 4
+    """Gauss-Newton steps at each blur."""
+    negligible: float = 10.0
     """A candidate this many nats below the best is dropped."""
-    starts: Starts = field(default_factory=Starts)
-    descent: Descent = field(default_factory=Descent)
-    beyond: Beyond = field(default_factory=Beyond)
+    enough_overlap: float = 0.5
+    """Where the best pose inside the prior's support shows more of the surface than this, poses beyond it count only
+    within a basin of the support."""
 
     def scaled(self, effort: float) -> Search:
         """Return a search with `effort` times the starts."""
-        starts = replace(
-            self.starts,
-            max_starts=int(effort * self.starts.max_starts),
-            per_basin=effort * self.starts.per_basin,
-        )
-        return replace(self, starts=starts)
+        return replace(self, max_starts=int(effort * self.max_starts), per_basin=effort * self.per_basin)
 
     def fine_m(self, pair: PairLikelihood) -> float:
         """Return the smallest blur in m."""
         return self.blurs[-1] * pair.size_m
+
+    def extent(self, pair: PairLikelihood) -> Array:
+        """Return the extent (6,) of a basin in rad and m."""
+        return self.basin * np.repeat([1.0, pair.size_m], 3)
+
+    def starts(self, pair: PairLikelihood, prior: PoseGaussian) -> int:
+        """Return the number of starts for the width of the prior (method.md, eq. 9)."""
+        extent = self.extent(pair)
+        variances = np.linalg.eigvalsh(prior.covariance / np.outer(extent, extent))
+        basins = np.sqrt(np.prod(np.maximum(variances, 1.0)))
+        return int(np.clip(self.per_basin * basins, self.min_starts, self.max_starts))
 
     def run(self, pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator) -> Candidates:
         """Return candidates, best first; always one at least.
@@ -124,21 +111,57 @@ class Search:
             density: the prior.
             rng: source of all randomness.
         """
-        problem, fine_m = self.starts.problem(pair, density, rng), self.fine_m(pair)
-        poses = density.sample(self.starts.count(problem), rng)
+        prior, fine_m = _moments(pair, density, rng), self.fine_m(pair)
+        started = density.sample(self.starts(pair, prior), rng)
+        poses, regulariser = started, self._regulariser(pair, prior)
         for blur in self.blurs:
-            poses = self.descent.run(problem, poses, blur * pair.size_m)
-        inside = problem.possible(poses)
+            poses = pair.descend(poses, blur * pair.size_m, regulariser, steps=self.steps)
+        inside = np.isfinite(density.log_evidence(poses))
         outside = poses[~inside]
-        poses = poses[inside] if inside.any() else density.sample(self.starts.count(problem), rng)
-        fine = self._ranked(problem, poses, fine_m)
-        outside = self.beyond.signs(problem, outside, fine.poses[0])
-        gain = pair.tempered(outside, fine_m).max() - fine.scores[0] if len(outside) else -np.inf
-        return replace(fine, beyond_gain=float(gain))
-
-    def _ranked(self, problem: Problem, poses: Array, blur_m: float) -> Candidates:
-        """Return those of poses (n, 4, 4) that are not negligible, best first."""
-        scores = problem.pair.tempered(poses, blur_m)
+        poses = poses[inside] if inside.any() else started
+        scores = pair.tempered(poses, fine_m)
         order = np.argsort(-scores, kind="stable")
         order = order[scores[order] > scores.max() - self.negligible]
-        return Candidates(poses[order], scores[order], problem.spreads(poses[order], blur_m))
+        found = Candidates(poses[order], scores[order], _spreads(pair, prior, poses[order], fine_m))
+        outside = self._signs(pair, prior, density, outside, found.poses[0])
+        gain = pair.tempered(outside, fine_m).max() - found.scores[0] if len(outside) else -np.inf
+        return replace(found.distinct(pair.centre_m), beyond_gain=float(gain))
+
+    def _regulariser(self, pair: PairLikelihood, prior: PoseGaussian) -> Regulariser:
+        """Return the regulariser of a descent: the prior's Gaussian, and damping (method.md, eq. 10).
+
+        Matching surface is not tempered there, so that the Gaussian approximation of a uniform prior hardly pulls
+        directions that surface leaves open towards its mean.
+        """
+        precision = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
+        damping = 0.0025 * pair.points / self.extent(pair) ** 2
+        return Regulariser(se3.rows(prior.mean), precision, damping, self.basin)
+
+    def _signs(
+        self, pair: PairLikelihood, prior: PoseGaussian, density: AbstractPoseDensity, poses: Array, best: Array
+    ) -> Array:
+        """Return those of poses (n, 4, 4) outside the prior's support that may show that its limits exclude the motion.
+
+        Surface leads a quarter turn round a carton, where other sides of it may match better than the right ones; that
+        is no sign. `best` (4, 4) is the best pose inside.
+        """
+        if not (len(poses) and pair.overlap(best) > self.enough_overlap):
+            return poses
+        back = se3.difference(poses, prior.mean, pair.centre_m)
+        basins = np.linalg.norm(back / self.extent(pair), axis=1, keepdims=True)
+        nearer = se3.moved(poses, back / np.maximum(basins, 1.0), pair.centre_m)
+        return poses[np.isfinite(density.log_evidence(nearer))]
+
+
+def _moments(pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator) -> PoseGaussian:
+    """Return mean and covariance of the prior, of ξ about the pair's centre."""
+    poses = density.sample(PRIOR_SAMPLES, rng)
+    mean, covariance = se3.mean(poses, np.ones(len(poses)), about_m=pair.centre_m, iterations=4)
+    return PoseGaussian(mean, covariance + np.diag(np.repeat([1e-4, 1e-5], 3) ** 2))
+
+
+def _spreads(pair: PairLikelihood, prior: PoseGaussian, poses: Array, blur_m: float) -> Array:
+    """Return roots (n, 6, 6) of covariances from matching surface and the prior (method.md, eq. 11)."""
+    _, matrices = pair.normal_equations(poses, blur_m, stride=2)
+    precision = pair.temper * matrices + np.linalg.inv(prior.covariance)
+    return np.asarray(np.linalg.cholesky(np.linalg.inv(precision)), dtype=np.float64)
