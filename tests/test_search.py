@@ -93,7 +93,7 @@ def test_the_posterior_of_a_tube_spans_its_roll(seed):
 
 def test_a_chain_of_candidates_shares_a_mode():
     basin = np.repeat([0.2, 0.01], 3)
-    poses = [np.eye(4), turned(1.5), turned(0.3), turned(0.15)]
+    poses = [np.eye(4), turned(1.5), turned(0.7), turned(0.35)]
     modes = candidates(poses, [0.01, 0.01, 0.01, 0.01], [4, 3, 2, 1]).modes(np.zeros(3), basin)
     assert [len(mode) for mode in modes] == [3, 1]
     np.testing.assert_array_equal(modes[0].poses[0], np.eye(4))

@@ -50,11 +50,11 @@ class Candidates:
     def modes(self, centre_m: Array, basin: Array) -> list[Candidates]:
         """Return the candidates by mode, the best mode first.
 
-        Two candidates share a mode where a chain of candidates connects them, each link within the extent (6,) of a
-        basin. A ridge, such as the spin of a can, is one mode.
+        Two candidates share a mode where a chain of candidates connects them, of which neighbours have basins, of the
+        extent (6,), that overlap. A ridge, such as the spin of a can, is one mode.
         """
         apart = se3.difference(self.poses[:, None], self.poses[None], centre_m) / basin
-        linked = np.sum(apart**2, axis=-1) <= 1.0
+        linked = np.linalg.norm(apart, axis=-1) <= 2.0
         label = np.arange(len(self))
         for number in range(len(self)):  # connected components, each labelled by its best candidate
             neighbours = np.unique(label[linked[number]])
