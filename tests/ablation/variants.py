@@ -136,6 +136,7 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "cost of one point K (10 nats)": _scaled(factor, "likelihood.max_point_cost"),
         "cost of normals κ (2 nats)": _scaled(factor, "likelihood.normal_cost"),
         "silhouette noise and dead band (0.5, 0.25)": silhouette,
+        "surface noise (0.1)": _scaled(factor, "likelihood.surface_noise"),
         "surface detail (0.003)": _scaled(factor, "likelihood.surface_detail"),
         "sampler's sizes (400, 580, 750)": _scaled(
             factor, *(f"sampler.{name}" for name in ("draws", "enough", "kept"))

@@ -28,6 +28,8 @@ class VisibilityLikelihood:
 
     points: int = 600
     """Surface points taken from each view."""
+    surface_noise: float = 0.1
+    """Least error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
     surface_detail: float = 0.003
     """Least error of local planes on a curved surface, as a share of the object's size."""
     hidden_share: float = 0.5
@@ -132,7 +134,8 @@ class DirectedLikelihood:
     @cached_property
     def _min_blur_m(self) -> float:
         """Least noise of matching surfaces."""
-        return self.model.surface_detail * self.size_m
+        detail_m = self.model.surface_detail * self.size_m
+        return float(np.hypot(detail_m, self.model.surface_noise * self.image.sigma_r_m))
 
     @cached_property
     def _measured_share(self) -> float:
