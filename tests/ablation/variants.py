@@ -110,6 +110,7 @@ def _times(value: Any, factor: float) -> Any:
 
 
 REMOVED: Final = (
+    Variant("choice of starts among samples", "removed", _with(search__proposals=1)),
     Variant("refinement", "removed", _with(refiner__min_patches=_NEVER)),
     Variant("estimated misfit μ", "removed", _of(_StatedMisfit)),
     Variant("estimated noise b", "removed", _of(_StatedNoise)),
@@ -144,6 +145,7 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "patches of the refinement (2⁵)": _with(refiner__halvings=4 if factor < 1.0 else 6),
         "least patches (16)": _scaled(factor, "refiner.min_patches"),
         "points (600)": _scaled(factor, "likelihood.points"),
+        "samples for each start (15)": _scaled(factor, "search.proposals"),
         "size of a basin (0.2)": _scaled(factor, "search.basin"),
         "iterations of the descent (4)": _scaled(factor, "search.steps"),
         "negligible (10 nats)": _scaled(factor, "search.negligible"),

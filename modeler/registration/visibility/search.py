@@ -73,7 +73,9 @@ class Search:
     min_starts: int = 60
     """but no fewer than this,"""
     max_starts: int = 400
-    """and no more."""
+    """and no more,"""
+    proposals: int = 15
+    """each the best of so many samples of the prior on average."""
     blurs: tuple[float, ...] = (0.12, 0.06, 0.03, 0.015)
     """Blur of the surfaces in each stage of the descent, as shares of the object's size."""
     steps: int = 4
@@ -112,7 +114,7 @@ class Search:
             rng: source of all randomness.
         """
         prior, fine_m = _moments(pair, density, rng), self.fine_m(pair)
-        started = density.sample(self.starts(pair, prior), rng)
+        started = self._drawn(pair, density, self.starts(pair, prior), rng)
         poses, regulariser = started, self._regulariser(pair, prior)
         for blur in self.blurs:
             poses = pair.descend(poses, blur * pair.size_m, regulariser, steps=self.steps)
@@ -126,6 +128,14 @@ class Search:
         outside = self._signs(pair, prior, density, outside, found.poses[0])
         gain = pair.tempered(outside, fine_m).max() - found.scores[0] if len(outside) else -np.inf
         return replace(found.distinct(pair.centre_m), beyond_gain=float(gain))
+
+    def _drawn(self, pair: PairLikelihood, density: AbstractPoseDensity, count: int, rng: np.random.Generator) -> Array:
+        """Return starting poses (n, 4, 4): samples of the prior that match best at twice the coarsest blur."""
+        poses, blur = density.sample(self.proposals * count, rng), 2.0 * self.blurs[0]
+        plain, share = pair.log_likelihoods(poses, blur * pair.size_m, stride=8)
+        # Coarse surface matches easily: a match counts as the range that it determines, relative to a guess.
+        scores = plain - np.log(blur) * share * pair.points
+        return poses[np.argsort(-scores, kind="stable")[:count]]
 
     def _regulariser(self, pair: PairLikelihood, prior: PoseGaussian) -> Regulariser:
         """Return the regulariser of a descent: the prior's Gaussian, and damping (method.md, eq. 10).
