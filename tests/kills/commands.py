@@ -31,8 +31,8 @@ COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
     "join": ("join", "a", "b", "--out", "made/out"),
 }
 """Arguments; names are relative to the folder of the inputs."""
-# What consists of several files, and was killed between two, is there in part.
-_AGAIN: Final = {"join": ("--overwrite",), "export of texture": ("--overwrite",)}
+# A kill between two files, or behind the last, leaves files that are there already.
+_AGAIN: Final = {name: ("--overwrite",) for name in ("join", "export of texture", "calibrate-sensor")}
 _RECIPE: Final = (
     '{"object": {"kind": "box", "size_m": [0.1, 0.08, 0.06]}, "view": {"width": 80, "height": 60, "focal_px": 72},'
     ' "trajectory": {"kind": "tabletop", "frames": 3}}'
