@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import re
 import subprocess
 import sys
@@ -12,10 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 
 from modeler import se3
 from modeler.export import RunFolder, edges_of, poses_of
@@ -169,17 +169,33 @@ def _steps(recording: Path) -> dict[int, _Step]:
         stderr=subprocess.DEVNULL,
         check=False,
     )
-    steps: dict[int, _Step] = pickle.loads(read.stdout) if read.returncode == 0 else {}
+    steps: dict[int, _Step] = {}
+    source = pa.BufferReader(read.stdout if read.returncode == 0 else b"")
+    while source.tell() < source.size():
+        with pa.ipc.open_stream(source) as stream:
+            row, said = stream.read_all(), stream.schema.metadata
+        step = steps.setdefault(int(said[b"elapsed"]), _Step(int(said[b"frame"])))
+        step.rows.setdefault(said[b"path"].decode(), {})[said[b"component"].decode()] = row["value"].combine_chunks()
     return steps
 
 
 _READER: Final = """
-import pickle, sys
+import sys
 from pathlib import Path
-from viz.report.run_data import read_steps
-steps = read_steps(Path(sys.argv[1]))
-sys.stdout.buffer.write(pickle.dumps(steps))
+from viz.report.run_data import write_steps
+write_steps(Path(sys.argv[1]), sys.stdout.buffer)
 """
+
+
+def write_steps(recording: Path, out: BinaryIO) -> None:
+    """Write the steps of a run, each value as an Arrow stream of one row."""
+    for elapsed, step in read_steps(recording).items():
+        for path, values in step.rows.items():
+            for component, value in values.items():
+                row = pa.record_batch([value], names=["value"])
+                said = {"elapsed": str(elapsed), "frame": str(step.frame), "path": path, "component": component}
+                with pa.ipc.new_stream(out, row.schema.with_metadata(said)) as stream:
+                    stream.write_batch(row.replace_schema_metadata(said))
 
 
 def read_steps(recording: Path) -> dict[int, _Step]:
