@@ -59,7 +59,8 @@ def test_a_disk_that_fills_ends_a_build_which_can_go_on(
 def test_a_recording_that_is_cut_off_is_said(scene: Path, tmp_path: Path) -> None:
     short = write_half(scene, tmp_path / "in")
     assert main(["build", str(short), "--out", str(tmp_path / "run"), *QUICK]) == 0
-    size = max(path.stat().st_size for path in (tmp_path / "run").iterdir() if path.suffix != ".rrd")
+    sizes = [path.stat().st_size for path in (tmp_path / "run").iterdir() if path.suffix != ".rrd"]
+    size = max(sizes) + 1000  # report.json holds times, whose digits vary
     recording = tmp_path / "run" / "recording.rrd"
     assert recording.stat().st_size > size
     assert ends_whole(recording)
