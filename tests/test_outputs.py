@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from dataclasses import replace
@@ -102,6 +103,18 @@ def test_what_is_read_and_what_is_there_stays_as_it_is(cli: Run, places: Path, c
     assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
     assert any(part in ended.err for part in says.split("|")), ended.err
     assert contents(places) == before
+
+
+@pytest.mark.parametrize("kind", ["sensor", "camera"])
+def test_the_calibration_that_a_run_was_made_with_is_only_read(cli: Run, places: Path, kind: str) -> None:
+    report = json.loads((places / "R" / "report.json").read_bytes())
+    report["settings"][kind] = str(places / "calibration.json")
+    (places / "R" / "report.json").write_text(json.dumps(report))
+    (places / "calibration.json").write_text("measured")
+    ended = cli("calibrate-camera", places / "R", "--out", places / "calibration.json", "--overwrite")
+    assert ended.status == 2
+    assert READ in ended.err
+    assert (places / "calibration.json").read_text() == "measured"
 
 
 @pytest.mark.parametrize(("name", "more"), [("mine.ply", ()), ("mine.ply", ("--bop",)), ("mine.stl", ())])

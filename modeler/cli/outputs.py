@@ -76,7 +76,7 @@ def check_run_folder(out: Path, inputs: Iterable[Path], *, overwrite: bool, resu
 
 
 def run_inputs(runs: Iterable[Path], moved: Iterable[Path] = ()) -> tuple[Path, ...]:
-    """Return run folders with all that they were made from: sequences, and the runs that they join.
+    """Return run folders with all that they were made from: sequences, calibrations, and the runs that they join.
 
     Args:
         runs: run folders; what is none is returned as it is.
@@ -96,11 +96,12 @@ def run_inputs(runs: Iterable[Path], moved: Iterable[Path] = ()) -> tuple[Path, 
         except InputError:
             continue
         settings = report.get("settings")
-        joined = settings.get("joined") if isinstance(settings, dict) else None
-        if isinstance(joined, list):
-            waiting += [Path(part) for part in joined if isinstance(part, str)]
-        elif isinstance(report.get("sequence"), str):
-            found[Path(report["sequence"])] = None
+        settings = settings if isinstance(settings, dict) else {}
+        if isinstance(settings.get("joined"), list):
+            waiting += [Path(part) for part in settings["joined"] if isinstance(part, str)]
+            continue
+        files = (report.get("sequence"), settings.get("sensor"), settings.get("camera"))
+        found |= {Path(file): None for file in files if isinstance(file, str)}
     return (*found, *moved)
 
 
