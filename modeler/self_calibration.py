@@ -88,8 +88,7 @@ class FocalCalibrator:
         graph = solved(0.0)
         if not graph.loops:
             return FocalLength(1.0, self.prior_sigma, "prior", float("nan"), float("nan"), 0)
-        conditions = 6 * graph.loops
-        before = graph.error(0.0)
+        before = graph.chi_square(0.0)
         best, curvature = self._optimum(graph)
         for _ in range(_MAX_ROUNDS):  # parabolas are exact only about the centre
             centre = best
@@ -97,15 +96,17 @@ class FocalCalibrator:
             best, curvature = self._optimum(graph)
             if abs(best - centre) < _CONVERGED / np.sqrt(curvature):
                 break
-        after = graph.error(best)
-        scale = max(2.0 * after / max(conditions - 1, 1), 1.0)  # where loops disagree by more than they state
+        if not graph.loops:  # those that there were cannot be registered with the estimate
+            return FocalLength(1.0, self.prior_sigma, "prior", float(np.sqrt(before)), float("nan"), 0)
+        after, conditions = graph.chi_square(best), 6 * graph.loops
+        scale = max(after * conditions / (conditions - 1), 1.0)  # where loops disagree by more than they state
         sigma = min(float(np.sqrt(scale / curvature)), self.prior_sigma)
         return FocalLength(
             factor=float(np.exp(best)),
             sigma=sigma,
             told_by="loop" if sigma < 0.5 * self.prior_sigma else "prior",
-            sigmas_before=float(np.sqrt(2.0 * before / conditions)),
-            sigmas_after=float(np.sqrt(2.0 * after / conditions)),
+            sigmas_before=float(np.sqrt(before)),
+            sigmas_after=float(np.sqrt(after)),
             loops=graph.loops,
         )
 
@@ -157,14 +158,16 @@ class FocalCalibrator:
 
 @dataclass(frozen=True, eq=False)
 class _MovingEdge:
+    """An edge whose mean follows the focal length."""
+
     factor: Factor
     """At the centre."""
     centre: float
     """log c."""
     slope: Array
-    """(6,)"""
+    """(6,) ξ by log c, at the centre."""
     bend: Array
-    """(6,)"""
+    """(6,) ξ by its square."""
 
     def at(self, log_factor: float) -> Factor:
         """Return the factor under a focal length (method.md, eq. S2)."""
@@ -175,9 +178,13 @@ class _MovingEdge:
 
 @dataclass(frozen=True, eq=False)
 class _Graph:
+    """The edges of a run as functions of the focal length."""
+
     moving: Sequence[_MovingEdge]
     root: int
+    """Frame whose pose is the identity."""
     threshold: float
+    """Error in nats beyond which a loop is an outlier."""
 
     @cached_property
     def loops(self) -> int:
@@ -189,6 +196,10 @@ class _Graph:
         spanning = self._spanning(log_factor)
         start = chain(spanning.tree, self.root, {})
         return optimise(spanning.tree, spanning.loops, start, root=self.root, threshold=self.threshold).error
+
+    def chi_square(self, log_factor: float) -> float:
+        """Return the squared normalised residuals of the loops, a condition: 1 where all is true."""
+        return 2.0 * self.error(log_factor) / (6 * self.loops)
 
     def _spanning(self, log_factor: float) -> SpanningTree:
         return SpanningTree.of([moving.at(log_factor) for moving in self.moving], self.root)
