@@ -13,6 +13,7 @@ from modeler import se3
 from modeler.fusion import conditional_covariances
 from modeler.fusion.depth_views import (
     Crop,
+    Cropping,
     crop,
     depth_views,
     disagreement,
@@ -35,6 +36,7 @@ from modeler.types import (
 
 WHOLE = slice(0, tabletop.CAMERA.height), slice(0, tabletop.CAMERA.width)
 CORNERS_M = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
+CROPPING = Cropping(margin_px=2, min_cosine=0.15, edge_weight=0.1)
 
 
 def stepped(step_m: float) -> RayImage:
@@ -50,7 +52,7 @@ def stepped(step_m: float) -> RayImage:
 
 
 def part_of(view: RayImage) -> Crop:
-    return crop(view, WHOLE, margin_px=2, min_cosine=0.15, edge_weight=0.1)
+    return crop(view, WHOLE, CROPPING)
 
 
 def weight_image(part: Crop) -> Array:
@@ -73,7 +75,7 @@ def test_a_view_counts_as_little_as_noise_grows_with_distance() -> None:
     near = tabletop.turntable(1)[0]
     far = se3.translation(np.array([0.0, 0.0, tabletop.DISTANCE_M])) @ near
     pairs = [(tabletop.view(ball, pose, k), se3.inverse(pose)) for k, pose in enumerate((near, far))]
-    seen = depth_views(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1)
+    seen = depth_views(pairs, CORNERS_M, CROPPING)
     most = [seen.weights[seen.views == number].max() for number in (0, 1)]
     assert most[1] / most[0] == pytest.approx((0.75 / 1.55) ** 4, rel=0.02)
 
@@ -106,7 +108,7 @@ def test_one_view_of_a_stack_is_looked_up_alone() -> None:
     poses = tabletop.turntable(3)
     views = tabletop.views(tabletop.Sphere(0.05), poses)
     pairs = [(views[k], se3.inverse(pose)) for k, pose in enumerate(poses)]
-    seen = depth_views(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1)
+    seen = depth_views(pairs, CORNERS_M, CROPPING)
     one = seen.only(1)
     assert len(one.index) == len(one.free_m) == len(one.poses) == len(one.intrinsics) == len(one.planes) == 1
     shown = one.index[one.index >= 0]
@@ -116,7 +118,7 @@ def test_one_view_of_a_stack_is_looked_up_alone() -> None:
 
 def disagreement_m(views, trajectory):
     pairs = posed_views(views, trajectory)
-    found = disagreement(view_blocks(pairs, CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1), 0.02)
+    found = disagreement(view_blocks(pairs, CORNERS_M, CROPPING), 0.02)
     return float("nan") if found is None else found[0]
 
 
@@ -162,9 +164,7 @@ def test_sharp_views_have_more_say_in_colours_than_blurred_ones(rng):
         return replace(view, frame=replace(view.frame, colour=np.repeat(levels[..., None], 3, axis=2).astype(np.uint8)))
 
     views = {k: textured(view, 60 if k % 3 else 20) for k, view in tabletop.views(BRICK, POSES).items()}
-    seen = view_blocks(
-        posed_views(views, tabletop.trajectory(POSES)), CORNERS_M, margin_px=2, min_cosine=0.15, edge_weight=0.1
-    )
+    seen = view_blocks(posed_views(views, tabletop.trajectory(POSES)), CORNERS_M, CROPPING)
     say = exposure_gains(seen, tau_m=0.005, near_m=0.003)[:, 3]
     sharp = np.arange(len(POSES)) % 3 > 0
     np.testing.assert_allclose(say[~sharp] / say[sharp].mean(), 20.0 / 60.0, rtol=0.15)

@@ -27,6 +27,18 @@ PIXEL_BYTES, POINT_BYTES = 15, 64  # of a pixel and a surface point in `DepthVie
 STATISTICS = 1 << 22  # points at most from which quantiles are taken, which bounds memory
 
 
+@dataclass(frozen=True)
+class Cropping:
+    """Which pixels of a view count, and for how much."""
+
+    margin_px: int
+    """A pixel carves only as far as all pixels within this distance."""
+    min_cosine: float
+    """Points seen at a smaller cosine between normal and ray are left out."""
+    edge_weight: float
+    """Factor on the weight of pixels next to a silhouette or depth step."""
+
+
 @dataclass(frozen=True, eq=False)
 class Crop:
     """One view cropped to a window: its images, and the surface points seen in it, in camera coordinates."""
@@ -61,7 +73,7 @@ def window(view: RayImage, camera_from_object: Array, corners_m: Array) -> tuple
     return slice(top, bottom), slice(left, right)
 
 
-def crop(view: RayImage, where: tuple[slice, slice], *, margin_px: int, min_cosine: float, edge_weight: float) -> Crop:
+def crop(view: RayImage, where: tuple[slice, slice], cropping: Cropping) -> Crop:
     """Crop a view to a window.
 
     Pixels of the object without a surface point (silhouettes, thin parts, grazing angles) get one from a plane fitted
@@ -93,15 +105,15 @@ def crop(view: RayImage, where: tuple[slice, slice], *, margin_px: int, min_cosi
         step = far - near > 2.0 * depth_m / camera.fx * np.tan(STEEPEST_RAD) + 4.0 * view.sigma_r_m
     edges = step | np.logical_not(minimum_filter(mask, size=3))
     cosine = -np.sum(points_m * normals, axis=1) / np.linalg.norm(points_m, axis=1)
-    weights = cosine * np.where(edges[tuple(pixels.T)], edge_weight, 1.0)  # (F1)
-    kept = cosine >= min_cosine
+    weights = cosine * np.where(edges[tuple(pixels.T)], cropping.edge_weight, 1.0)  # (F1)
+    kept = cosine >= cropping.min_cosine
     pixels = pixels[kept]
     index = np.full(depth_m.shape, -1, dtype=np.int32)
     index[tuple(pixels.T)] = np.arange(len(pixels))
-    around = np.asarray(maximum_filter(mask, size=2 * margin_px + 1, mode="nearest"), dtype=bool)
+    around = np.asarray(maximum_filter(mask, size=2 * cropping.margin_px + 1, mode="nearest"), dtype=bool)
     return Crop(
         index=index,
-        free_m=free_of(depth_m, margin_px),
+        free_m=free_of(depth_m, cropping.margin_px),
         background_m=np.where(measured & ~around, depth_m, 0.0).astype(np.float32),
         colour=colour,
         intrinsics=intrinsics,
@@ -219,10 +231,7 @@ def one_by_one(pairs: Iterable[tuple[RayImage, Array]]) -> Iterator[tuple[RayIma
 def depth_views(
     pairs: list[tuple[RayImage, Array]],
     corners_m: Array,
-    *,
-    margin_px: int,
-    min_cosine: float,
-    edge_weight: float,
+    cropping: Cropping,
     covariances: Mapping[int, Array] | None = None,
 ) -> DepthViews:
     """Crop views to a box and stack them.
@@ -230,9 +239,7 @@ def depth_views(
     Args:
         pairs: views with object_from_camera.
         corners_m: (8, 3) corners of the box in the object frame.
-        margin_px: a pixel carves only as far as all pixels within this distance.
-        min_cosine: points seen at a smaller cosine between normal and ray are left out.
-        edge_weight: factor on the weight of pixels next to a silhouette or depth step.
+        cropping: which pixels count.
         covariances: (6, 6) of object_from_camera by frame number; poses without one count as exact.
 
     Raises:
@@ -245,7 +252,7 @@ def depth_views(
     colour = np.zeros((*size, 3), dtype=np.uint8)
     intrinsics, surfaces, counts = [], [], []
     for number, ((view, pose), where) in enumerate(zip(one_by_one(pairs), windows, strict=True)):
-        part = crop(view, where, margin_px=margin_px, min_cosine=min_cosine, edge_weight=edge_weight)
+        part = crop(view, where, cropping)
         here = number, *map(slice, part.index.shape)
         index[here] = np.where(part.index >= 0, part.index + sum(counts), -1)
         free_m[here], background_m[here] = part.free_m, part.background_m
@@ -335,10 +342,7 @@ class ViewBlocks:
 def view_blocks(
     pairs: list[tuple[RayImage, Array]],
     corners_m: Array,
-    *,
-    margin_px: int,
-    min_cosine: float,
-    edge_weight: float,
+    cropping: Cropping,
     covariances: Mapping[int, Array] | None = None,
 ) -> ViewBlocks:
     """Crop views to a box and stack them, in several blocks where one would hold more than `BLOCK_BYTES`.
@@ -351,15 +355,7 @@ def view_blocks(
     count = max(1, min(-(-size // BLOCK_BYTES), len(pairs) // BLOCK_VIEWS))
     blocks, disk = [], DiskArrays()
     for first in range(count):
-        some = pairs[first::count]
-        block = depth_views(
-            some,
-            corners_m,
-            margin_px=margin_px,
-            min_cosine=min_cosine,
-            edge_weight=edge_weight,
-            covariances=covariances,
-        )
+        block = depth_views(pairs[first::count], corners_m, cropping, covariances)
         if count > 1:
             block = _on_disk(block, disk, *(part.name for part in fields(block)))
         blocks.append(block)

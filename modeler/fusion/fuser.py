@@ -13,6 +13,7 @@ from modeler import se3
 from modeler.fusion import meshing, watertight
 from modeler.fusion.depth_views import (
     SMOOTHED,
+    Cropping,
     DepthViews,
     ViewBlocks,
     disagreement,
@@ -109,14 +110,8 @@ class Fuser:
             border_m=3.0 * voxel_m + 2.0 * noise_m,
             max_voxels=self.max_voxels,
         )
-        seen = view_blocks(
-            pairs,
-            grid.corners_m,
-            margin_px=self.margin_px,
-            min_cosine=self.min_cosine,
-            edge_weight=self.edge_weight,
-            covariances=covariances,
-        )
+        cropping = Cropping(self.margin_px, self.min_cosine, self.edge_weight)
+        seen = view_blocks(pairs, grid.corners_m, cropping, covariances)
         limit_m = 0.05 * float(np.linalg.norm(grid.shape)) * grid.voxel_m
         spread_m, sigma_m = disagreement(seen, limit_m) or (noise_m, SMOOTHED * noise_m)
         tau_m = 3.0 * grid.voxel_m + 2.0 * spread_m  # (F4)

@@ -11,7 +11,7 @@ from scipy import ndimage
 from scipy.stats import chi2
 
 from modeler import se3
-from modeler.types import AbstractPrior, Array, Edge, InputError, LoopOpening, RayImage, Solution
+from modeler.types import AbstractPrior, Array, BoolArray, Edge, InputError, LoopOpening, RayImage, Solution
 
 MAX_UNSURE: Final = 0.5
 """Share of frames with an unsure mask: beyond, the rule and not the exception is unsure, and what moves together with
@@ -249,8 +249,13 @@ def _facing(view: RayImage) -> tuple[Array, Array]:
     """Return some surface points (n, 3) of a view that face its camera, and their normals (n, 3)."""
     some = slice(None, None, max(len(view.points_m) // _MAX_POINTS, 1))
     points_m, normals = view.points_m[some], view.normals[some]
-    faces = -np.sum(points_m * normals, axis=1) >= _MIN_COSINE * np.linalg.norm(points_m, axis=1)
+    faces = _face_camera(points_m, normals)
     return points_m[faces], normals[faces]
+
+
+def _face_camera(points_m: Array, normals: Array) -> BoolArray:
+    """Return which (n,) points (n, 3) in camera coordinates with normals (n, 3) face the camera."""
+    return -np.sum(points_m * normals, axis=1) >= _MIN_COSINE * np.linalg.norm(points_m, axis=1)
 
 
 def _nearest_around(view: RayImage) -> Array:
@@ -271,8 +276,7 @@ def _beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> A
         normals: (n, 3) unit.
     """
     camera, depth_m = view.frame.camera, points_m[:, 2]
-    faces = -np.sum(points_m * normals, axis=1) >= _MIN_COSINE * np.linalg.norm(points_m, axis=1)
-    ahead = np.flatnonzero(faces & (depth_m > 0.0))
+    ahead = np.flatnonzero(_face_camera(points_m, normals) & (depth_m > 0.0))
     columns = np.rint(camera.fx * points_m[ahead, 0] / depth_m[ahead] + camera.cx)
     rows = np.rint(camera.fy * points_m[ahead, 1] / depth_m[ahead] + camera.cy)
     height, width = near_m.shape

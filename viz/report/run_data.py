@@ -192,10 +192,10 @@ def write_steps(recording: Path, out: BinaryIO) -> None:
     for elapsed, step in read_steps(recording).items():
         for path, values in step.rows.items():
             for component, value in values.items():
-                row = pa.record_batch([value], names=["value"])
-                said = {"elapsed": str(elapsed), "frame": str(step.frame), "path": path, "component": component}
-                with pa.ipc.new_stream(out, row.schema.with_metadata(said)) as stream:
-                    stream.write_batch(row.replace_schema_metadata(said))
+                key = {"elapsed": str(elapsed), "frame": str(step.frame), "path": path, "component": component}
+                row = pa.record_batch([value], schema=pa.schema([pa.field("value", value.type)], metadata=key))
+                with pa.ipc.new_stream(out, row.schema) as stream:
+                    stream.write_batch(row)
 
 
 def read_steps(recording: Path) -> dict[int, _Step]:
