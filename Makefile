@@ -3,6 +3,7 @@
 # make test       the whole gate: format, lint, types, layers, tests
 # make test-slow  the tests that take long, which make test leaves out
 # make calibrate  whether stated uncertainties are true, on rendered pairs (many minutes)
+# make trust      whether status 0 can be trusted: 150 rendered runs, half with a fault (some 20 minutes a core)
 # make ablation   what each stage and each constant of the default registration is worth (many hours)
 # make bench      speed, against Open3D and the committed baseline
 # make same       COMMIT=…: whether the results are those of another commit, byte by byte
@@ -11,7 +12,7 @@
 BIN := .venv/bin
 TWO := -n 2 --dist loadfile  # processes; kernels have threads of their own
 
-.PHONY: setup demo test test-slow calibrate ablation bench same audit
+.PHONY: setup demo test test-slow calibrate trust ablation bench same audit
 
 setup: .venv/.installed
 
@@ -40,6 +41,9 @@ test-slow: setup
 
 calibrate: setup
 	PYTHONPATH=tests $(BIN)/python -m calibration
+
+trust: setup
+	PYTHONPATH=tests $(BIN)/python -m trust --jobs 2
 
 ablation: setup
 	PYTHONPATH=tests $(BIN)/python -m ablation

@@ -1,0 +1,79 @@
+"""Build sound sequences and sequences with one fault each, and count wrong models that end with 0: `make trust`.
+
+Shapes and draws are split into two halves: limits may be settled on the tuning half; the other is there to be looked at
+once, at the end. Every run is written as it ends (HALF.jsonl), and a study that was stopped goes on where it was. The
+table goes to stdout, progress to stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+from trust.plan import HALVES, Half, Plan
+from trust.study import Outcome, outcome
+from trust.tables import text
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(prog="trust", description=__doc__)
+    parser.add_argument("--half", choices=HALVES, default="tuning", help="which shapes and draws")
+    parser.add_argument("--runs", type=int, default=150, metavar="N", help="of the half, every other one sound")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs side by side")
+    parser.add_argument("--out", type=Path, default=Path("runs/trust"), help="folder of the results")
+    options = parser.parse_args(arguments)
+    if options.runs < 1 or options.jobs < 1:
+        parser.error("--runs and --jobs take whole numbers from 1 on")
+    options.out.mkdir(parents=True, exist_ok=True)
+    outcomes = run(options.half, options.runs, options.jobs, options.out / f"{options.half}.jsonl")
+    print(text(outcomes))
+    return 0
+
+
+def run(half: Half, runs: int, jobs: int, path: Path) -> list[Outcome]:
+    """Build what has not been built yet, append it to a file, and return all outcomes by number."""
+    lines = path.read_text().splitlines() if path.exists() else []
+    done = {one.number: one for one in (Outcome.of(json.loads(line)) for line in lines) if one.number < runs}
+    began = time.perf_counter()
+    with path.open("a") as stream:
+        for one in _outcomes([Plan(half, number) for number in range(runs) if number not in done], jobs):
+            done[one.number] = one
+            print(json.dumps(one.values()), file=stream, flush=True)
+            ended = f"{'wrong' if one.wrong else 'right'} with {one.status}"
+            print(
+                f"{len(done)} of {runs}: {one.number} {one.fault}, {one.shape}: {ended}, "
+                f"{time.perf_counter() - began:.0f} s",
+                file=sys.stderr,
+                flush=True,
+            )
+    return [done[number] for number in sorted(done)]
+
+
+def _outcomes(plans: Sequence[Plan], jobs: int) -> Iterator[Outcome]:
+    """Yield the outcomes of plans as they come."""
+    if jobs == 1:
+        _single_threaded()
+        yield from map(outcome, plans)
+        return
+    context = multiprocessing.get_context("spawn")  # kernels' threads do not survive a fork
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_single_threaded) as pool:
+        for future in as_completed([pool.submit(outcome, plan) for plan in plans]):
+            yield future.result()
+
+
+def _single_threaded() -> None:
+    """Leave the cores to runs side by side."""
+    import numba
+
+    numba.set_num_threads(1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

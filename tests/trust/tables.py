@@ -1,0 +1,33 @@
+"""The table of the study: right and wrong models by fault and exit status."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from trust.study import Outcome
+
+_WIDTHS = (26, 6, 14, 14, 14, 14)
+_HEADS = ("", "runs", "wrong with 0", "wrong with 3", "right with 0", "right with 3")
+
+
+def text(outcomes: Sequence[Outcome]) -> str:
+    """Return the table of one half or both: a line for sound runs, one for every fault, one for all faults."""
+    names = sorted(dict.fromkeys(one.fault for one in outcomes), key=lambda name: (name != "sound", name))
+    lines = [_row(_HEADS), *(_line(name, [one for one in outcomes if one.fault == name]) for name in names)]
+    faulty = [one for one in outcomes if one.fault != "sound"]
+    lines += [_line("all faults", faulty), _line("all", outcomes)]
+    return "\n".join(lines)
+
+
+def _line(name: str, outcomes: Sequence[Outcome]) -> str:
+    """Return one line; an input that was refused counts as not trusted."""
+    counts = [
+        sum(one.wrong is wrong and (one.status == 0) is trusted for one in outcomes)
+        for wrong, trusted in ((True, True), (True, False), (False, True), (False, False))
+    ]
+    return _row((name, str(len(outcomes)), *map(str, counts)))
+
+
+def _row(cells: Sequence[str]) -> str:
+    (first, *others), (width, *widths) = cells, _WIDTHS
+    return first.ljust(width) + "".join(cell.rjust(size) for cell, size in zip(others, widths, strict=True))
