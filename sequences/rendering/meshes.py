@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, final
@@ -35,6 +35,10 @@ class Mesh:
     """(t, 3) RGB of the triangles."""
     part: IntArray
     """(t,) number of the closed part that each triangle belongs to."""
+    uv: Array | None = None
+    """(t, 3, 2) texture coordinates of the triangles' corners, v upwards; NaN for those without, None without any."""
+    picture: npt.NDArray[np.uint8] | None = None
+    """(h, w, 3) RGB image that came with the mesh."""
 
     @staticmethod
     def single(vertices_m: Array, triangles: IntArray) -> Mesh:
@@ -53,21 +57,22 @@ class Mesh:
             np.concatenate([mesh.triangles + first for mesh, first in zip(meshes, first_vertex, strict=False)]),
             np.concatenate([mesh.albedo for mesh in meshes]),
             np.concatenate([mesh.part + first for mesh, first in zip(meshes, first_part, strict=False)]),
+            _joined_uv(meshes),
+            next((mesh.picture for mesh in meshes if mesh.picture is not None), None),
         )
 
     def moved(self, target_from_source: Array) -> Mesh:
         """Return the mesh after a rigid motion (4, 4)."""
-        vertices_m = se3.transform(target_from_source, self.vertices_m)
-        return Mesh(vertices_m, self.triangles, self.albedo, self.part)
+        return replace(self, vertices_m=se3.transform(target_from_source, self.vertices_m))
 
     def scaled(self, factors: tuple[float, float, float]) -> Mesh:
         """Return the mesh stretched along its axes by positive factors."""
-        return Mesh(self.vertices_m * np.array(factors), self.triangles, self.albedo, self.part)
+        return replace(self, vertices_m=self.vertices_m * np.array(factors))
 
     def painted(self, rgb: tuple[int, int, int]) -> Mesh:
         """Return the mesh in one colour."""
         albedo = np.broadcast_to(np.array(rgb, np.uint8), self.albedo.shape).copy()
-        return Mesh(self.vertices_m, self.triangles, albedo, self.part)
+        return replace(self, albedo=albedo)
 
     def corners(self) -> Array:
         """Return the corners (t, 3, 3) of the triangles."""
@@ -77,6 +82,15 @@ class Mesh:
         """Return the triangles where `keep` (t,) holds, without unused vertices."""
         used, triangles = np.unique(self.triangles[keep], return_inverse=True)
         return Mesh(self.vertices_m[used], triangles.reshape(-1, 3), self.albedo[keep], self.part[keep])
+
+
+def _joined_uv(meshes: list[Mesh]) -> Array | None:
+    """Return the texture coordinates (t, 3, 2) of several meshes; None where no mesh has any."""
+    if all(mesh.uv is None for mesh in meshes):
+        return None
+    return np.concatenate(
+        [np.full((len(mesh.triangles), 3, 2), np.nan) if mesh.uv is None else mesh.uv for mesh in meshes]
+    )
 
 
 def ply_bytes(mesh: Mesh) -> bytes:
@@ -109,7 +123,22 @@ def read_mesh(path: Path, scale: float) -> Mesh:
         raise InputError(f"{path}: cannot be read as a mesh ({why}); convert it to PLY.") from None
     if len(triangles) == 0 or not np.isfinite(vertices).all():
         raise InputError(f"{path}: holds no triangles with finite corners; give a triangle mesh.")
-    return Mesh.single(vertices * scale, triangles)
+    mesh = Mesh.single(vertices * scale, triangles)
+    uv = getattr(loaded.visual, "uv", None)
+    if uv is None or np.shape(uv) != (len(vertices), 2):
+        return mesh
+    return replace(
+        mesh, uv=np.asarray(uv, np.float64)[triangles], picture=_own_picture(getattr(loaded.visual, "material", None))
+    )
+
+
+def _own_picture(material: object) -> npt.NDArray[np.uint8] | None:
+    """Return the image (h, w, 3) of a mesh file's material; None where it has none."""
+    for name in ("baseColorTexture", "image"):
+        image = getattr(material, name, None)
+        if image is not None:
+            return np.asarray(image.convert("RGB"), np.uint8)
+    return None
 
 
 _SHORT = 1.0 - 2e-3
@@ -129,6 +158,10 @@ class Hits:
     """(h, w, 3) camera coordinates of what was met; NaN where nothing was."""
     albedo: npt.NDArray[np.uint8]
     """(h, w, 3) RGB of what was met."""
+    triangle: IntArray
+    """(h, w) number of the triangle that was met; 0 where nothing was."""
+    weights: Array
+    """(h, w, 3) barycentric coordinates in it."""
 
     def over(self, other: Hits, first: BoolArray) -> Hits:
         """Return these hits where `first` (h, w) holds, the others elsewhere."""
@@ -138,6 +171,8 @@ class Hits:
             np.where(first, self.incidence_rad, other.incidence_rad),
             np.where(wide, self.points_m, other.points_m),
             np.where(wide, self.albedo, other.albedo),
+            np.where(first, self.triangle, other.triangle),
+            np.where(wide, self.weights, other.weights),
         )
 
 
@@ -158,7 +193,8 @@ class Caster:
         shape = rays.shape[:2]
         if not len(self.mesh.triangles):
             missed = np.full(shape, np.nan)
-            return Hits(missed, missed, np.full((*shape, 3), np.nan), np.zeros((*shape, 3), np.uint8))
+            nowhere = np.full((*shape, 3), np.nan)
+            return Hits(missed, missed, nowhere, np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.int64), nowhere)
         mesh_from_camera = se3.inverse(camera_from_mesh)
         turned = rays @ mesh_from_camera[:3, :3].T
         origins = np.broadcast_to(mesh_from_camera[:3, 3], turned.shape)
@@ -168,8 +204,10 @@ class Caster:
         depth_m = np.where(met, depth_m, np.nan)
         facing = np.abs(np.sum(found["primitive_normals"].numpy() * turned, axis=-1)) / np.linalg.norm(turned, axis=-1)
         incidence_rad = np.where(met, np.arccos(np.clip(facing, 0.0, 1.0)), np.nan)
-        triangle = np.where(met, found["primitive_ids"].numpy(), 0)
-        return Hits(depth_m, incidence_rad, rays * depth_m[..., None], self.mesh.albedo[triangle])
+        triangle = np.where(met, found["primitive_ids"].numpy(), 0).astype(np.int64)
+        second, third = np.moveaxis(found["primitive_uvs"].numpy().astype(np.float64), -1, 0)
+        weights = np.stack([1.0 - second - third, second, third], axis=-1)
+        return Hits(depth_m, incidence_rad, rays * depth_m[..., None], self.mesh.albedo[triangle], triangle, weights)
 
     def blocks(self, lamp_m: Array, points_m: Array, camera_from_mesh: Array) -> BoolArray:
         """Return where (h, w) the mesh stands between a lamp (3,) and points (h, w, 3), all in camera coordinates."""

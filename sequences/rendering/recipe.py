@@ -14,6 +14,8 @@ import numpy as np
 from modeler.types import Array, Camera, InputError
 from sequences.input_files import Node, read_tree
 from sequences.rendering.depth_sensor import DepthSensor
+from sequences.rendering.labels import Label
+from sequences.rendering.photography import Photography
 from sequences.rendering.shapes import AnyShape
 from sequences.rendering.trajectory import AnyTrajectory, Tabletop
 
@@ -215,6 +217,10 @@ class Recipe:
     """Whether and how colour images are written."""
     pattern: Mosaic | None = None
     """What is painted on the object."""
+    label: Label | None = None
+    """What is printed around the object; needs photography."""
+    photography: Photography | None = None
+    """Lamps and the colour camera; null for light from the camera itself, without noise."""
     masks: bool = True
     """Whether the object's masks are written."""
     period_s: float = 0.5
@@ -226,6 +232,8 @@ class Recipe:
         """Check the sizes."""
         if self.seed < 0 or self.period_s <= 0.0 or not 1e-3 <= self.depth_unit_mm <= 10.0:
             raise ValueError("seed must not be negative, period_s positive, depth_unit_mm from 0.001 to 10")
+        if self.label is not None and self.photography is None:
+            raise ValueError('label needs photography; write "photography": {} for its defaults')
 
 
 def load_recipe(recipe: str | Path) -> Recipe:

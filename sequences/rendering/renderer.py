@@ -17,7 +17,9 @@ from modeler.types import Array, Camera, Frame, InputError
 from sequences.base import AbstractSequence, span
 from sequences.bop import write_bop
 from sequences.rendering.depth_sensor import EXACT, DepthSensor, Exposure
+from sequences.rendering.labels import LabelledMesh
 from sequences.rendering.meshes import Caster, Hits, Mesh, outer_surface, ply_bytes
+from sequences.rendering.photography import LitMesh, Photography
 from sequences.rendering.recipe import Mosaic, Recipe
 from sequences.rendering.shapes import Box, placement
 from sequences.rendering.trajectory import Hand
@@ -48,7 +50,7 @@ def mosaic_shade(points_m: Array, mosaic: Mosaic) -> Array:
     return 1.0 - mosaic.contrast * (code >> np.uint64(40)).astype(np.float64) / 2.0**24
 
 
-_MOTION, _READINGS, _FRAMES = range(3)  # keys of the seed's branches
+_MOTION, _READINGS, _FRAMES, _PHOTOGRAPHS = range(4)  # keys of the seed's branches
 
 
 @final
@@ -79,7 +81,7 @@ class RenderedSequence(AbstractSequence):
         looked, on_object = self._look(index, self._jittered(nominal, camera, jitter_rng))
         exposure = Exposure(looked.depth_m, looked.incidence_rad, self._shadowed(index, looked))
         depth_m = self._sensor.measure(exposure, recipe.view.focal_px, sensor_rng)
-        colour = None if recipe.colour == "none" else self._painted(index, nominal)
+        colour = None if recipe.colour == "none" else self._coloured(index, nominal)
         mask = on_object if recipe.masks else None
         return Frame(index, index * recipe.period_s, depth_m, camera, mask, colour)
 
@@ -125,6 +127,18 @@ class RenderedSequence(AbstractSequence):
         return Caster(self._mesh), Caster(surroundings(self.recipe).moved(self.recipe.view.camera_from_table()))
 
     @cached_property
+    def _lit(self) -> tuple[LitMesh, LitMesh]:
+        """Return the object in its model frame, and what surrounds it in the camera frame."""
+        thing, around = self._casters
+        label = self.recipe.label
+        if label is None:
+            return LitMesh(thing.mesh), LitMesh(around.mesh)
+        view, photography = self.recipe.view, self.recipe.photography
+        assert photography is not None
+        sample_m = view.distance_m / view.focal_px / photography.samples
+        return LitMesh(thing.mesh, LabelledMesh(label, thing.mesh, sample_m)), LitMesh(around.mesh)
+
+    @cached_property
     def _camera_from_model(self) -> Array:
         resting = self._mesh.moved(placement((0.0, 0.0, 0.0), self.recipe.rest_rotation_deg)).vertices_m
         low, high = resting.min(axis=0), resting.max(axis=0)
@@ -142,10 +156,15 @@ class RenderedSequence(AbstractSequence):
 
     def _look(self, index: int, rays: Array) -> tuple[Hits, npt.NDArray[np.bool_]]:
         """Return what rays (h, w, 3) from the camera meet first, and where that is the object."""
+        on_thing, behind, first = self._met(index, rays)
+        return on_thing.over(behind, first), first
+
+    def _met(self, index: int, rays: Array) -> tuple[Hits, Hits, npt.NDArray[np.bool_]]:
+        """Return what rays (h, w, 3) meet of the object and of what surrounds it, and where the object is first."""
         thing, around = self._casters
         on_thing, behind = thing.cast(rays, self._camera_from_model[index]), around.cast(rays, np.eye(4))
         first = on_thing.depth_m < np.where(np.isnan(behind.depth_m), np.inf, behind.depth_m)
-        return on_thing.over(behind, first), first
+        return on_thing, behind, first
 
     def _shadowed(self, index: int, looked: Hits) -> npt.NDArray[np.bool_]:
         if not self._sensor.shadow:
@@ -154,6 +173,28 @@ class RenderedSequence(AbstractSequence):
         thing, around = self._casters
         by_thing = thing.blocks(projector_m, looked.points_m, self._camera_from_model[index])
         return by_thing | around.blocks(projector_m, looked.points_m, np.eye(4))
+
+    def _coloured(self, index: int, rays: Array) -> npt.NDArray[np.uint8]:
+        """Return the colour image (h, w, 3) seen along rays (h, w, 3) through the pixels' middles."""
+        photography = self.recipe.photography
+        if photography is None:
+            return self._painted(index, rays)
+        steps = ((np.arange(photography.samples) + 0.5) / photography.samples - 0.5) / self.recipe.view.focal_px
+        offsets = [np.array([along_w, along_h, 0.0]) for along_w in steps for along_h in steps]
+        light = sum((self._light(index, rays + offset, photography) for offset in offsets), np.zeros_like(rays))
+        return photography.image(light / len(offsets), self._rng(_PHOTOGRAPHS, index))
+
+    def _light(self, index: int, rays: Array, photography: Photography) -> Array:
+        """Return the light (h, w, 3) that comes along rays (h, w, 3)."""
+        on_thing, behind, first = self._met(index, rays)
+        light = np.zeros_like(rays)
+        thing, around = self._lit
+        for lit, hits, seen, camera_from_mesh in (
+            (thing, on_thing, first, self._camera_from_model[index]),
+            (around, behind, ~first & np.isfinite(behind.depth_m), np.eye(4)),
+        ):
+            light[seen] = lit.light(photography, hits, seen, camera_from_mesh)
+        return light
 
     def _painted(self, index: int, rays: Array) -> npt.NDArray[np.uint8]:
         """Return the colour image (h, w, 3), lit from the camera."""

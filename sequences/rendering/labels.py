@@ -1,0 +1,248 @@
+"""What is printed on objects: made-up prints and image files, laid around the body."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from modeler.types import Array, BoolArray, Float32Array, InputError
+from sequences.image_files import read_colour
+from sequences.rendering.charts import AnyWrap, Chart, Cylindrical, Surfels
+from sequences.rendering.meshes import Mesh
+
+Rgb = npt.NDArray[np.uint8]
+
+_FINE = 2
+"""Prints are drawn with so many pixels a texel along each side."""
+LARGEST_PX = 4096
+"""Images are at most this wide and high."""
+
+
+def linear_light(srgb: npt.NDArray[np.floating]) -> Array:
+    """Return sRGB values, 0 to 1, in proportion to light (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.0) + 0.055) / 1.055) ** 2.4)
+
+
+def gamma_coded(light: Array) -> Array:
+    """Return light, 0 to 1, as sRGB values."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0) ** (1.0 / 2.4) - 0.055)
+
+
+@final
+@dataclass(frozen=True)
+class Print:
+    """A made-up label: patches, bands, bar codes and lines of letter-like blocks, from the large to the small."""
+
+    seed: int = 0
+    """Decides what is printed; faces of one body differ."""
+    contrast: float = 1.0
+    """How far colours are from the paper's: 1 for strong, 0.1 for faint, 0 for plain."""
+    rgb: tuple[int, int, int] = (206, 200, 186)
+    """Colour of the paper."""
+    items: int = 60
+    """How many things are printed on a chart."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if self.seed < 0 or not 0.0 <= self.contrast <= 1.0 or not 0 <= self.items <= 1000:
+            raise ValueError("seed must not be negative, contrast from 0 to 1, items from 0 to 1000")
+        if not all(0 <= value <= 255 for value in self.rgb):
+            raise ValueError("rgb must hold numbers from 0 to 255")
+
+    def image(self, mesh: Mesh, chart: Chart, number: int, texel_m: float) -> Float32Array:
+        """Return what is printed on a chart (h, w, 3), in sRGB, 0 to 1."""
+        rng = np.random.default_rng((self.seed, number))
+        paper = np.array(self.rgb) / 255.0
+        inks = rng.uniform(0.0, 1.0, (5, 3)) * np.linspace(0.15, 1.0, 5)[:, None]
+        height, width = (_FINE * px for px in _size_px(chart, texel_m))
+        canvas = _Canvas(chart, np.broadcast_to(paper, (height, width, 3)).astype(np.float32))
+        smallest_m, largest_m = 0.002, 0.5 * min(chart.width_m, chart.height_m)
+        sizes_m = np.sort(np.exp(rng.uniform(np.log(smallest_m), np.log(max(largest_m, smallest_m)), self.items)))
+        for size_m in sizes_m[::-1]:
+            canvas.draw(_ITEMS[rng.integers(len(_ITEMS))], size_m, inks[rng.integers(len(inks))], rng)
+        inked = paper + self.contrast * (canvas.pixels - paper)
+        return inked.reshape(height // _FINE, _FINE, width // _FINE, _FINE, 3).mean(axis=(1, 3)).astype(np.float32)
+
+
+@final
+@dataclass(eq=False)
+class _Canvas:
+    """A chart that things are drawn on."""
+
+    chart: Chart
+    pixels: Float32Array
+    """(h, w, 3)."""
+
+    def draw(self, item: _Item, size_m: float, ink: Array, rng: np.random.Generator) -> None:
+        """Draw an item of a size somewhere, upright or turned."""
+        height, width = self.pixels.shape[:2]
+        # On a sphere the sine spreads places evenly over the surface.
+        v0 = np.arccos(rng.uniform(-1.0, 1.0)) / np.pi if self.chart.polar else rng.uniform(0.0, 1.0)
+        u0, turn_rad = rng.uniform(0.0, 1.0), rng.choice([0.0, rng.uniform(-np.pi / 2.0, np.pi / 2.0)], p=[0.7, 0.3])
+        v = (np.arange(height) + 0.5) / height
+        rows = np.flatnonzero(np.abs(v - v0) * self.chart.height_m <= 2.2 * size_m)
+        if len(rows) == 0:
+            return
+        u = (np.arange(width) + 0.5) / width - u0
+        u = (u + 0.5) % 1.0 - 0.5 if self.chart.closed else u
+        x_m = u * self.chart.row_lengths_m(v[rows])[:, None]
+        y_m = np.broadcast_to(((v[rows] - v0) * self.chart.height_m)[:, None], x_m.shape)
+        sin, cos = np.sin(turn_rad), np.cos(turn_rad)
+        inked = item((cos * x_m + sin * y_m) / size_m, (cos * y_m - sin * x_m) / size_m, rng)
+        self.pixels[rows[0] : rows[0] + len(rows)][inked] = ink
+
+
+def _patch(x: Array, y: Array, rng: np.random.Generator) -> BoolArray:
+    """An ellipse with a wavy border."""
+    along, across, lobes = rng.uniform(0.4, 1.0), rng.uniform(0.3, 1.0), rng.integers(2, 7)
+    border = 1.0 + 0.25 * np.sin(lobes * np.arctan2(y, x) + rng.uniform(0.0, 2.0 * np.pi))
+    return (x / along) ** 2 + (y / across) ** 2 <= border**2
+
+
+def _band(x: Array, y: Array, rng: np.random.Generator) -> BoolArray:
+    """A bar of limited length."""
+    return (np.abs(x) <= 1.4) & (np.abs(y) <= rng.uniform(0.08, 0.3))
+
+
+def _bar_code(x: Array, y: Array, rng: np.random.Generator) -> BoolArray:
+    """Parallel bars of different widths."""
+    bars = rng.random(24) < 0.5
+    inside = (np.abs(x) < 1.0) & (np.abs(y) < rng.uniform(0.3, 0.8))
+    return inside & bars[np.clip(((x + 1.0) * 12.0).astype(np.int64), 0, 23)]
+
+
+def _letters(x: Array, y: Array, rng: np.random.Generator) -> BoolArray:
+    """Lines of letter-like blocks: cells of 4 by 6, with a free column and a free row."""
+    lines, columns = rng.integers(1, 5), rng.integers(3, 9)
+    cells = rng.random((lines, 7, columns, 5)) < 0.6
+    cells[:, -1], cells[..., -1] = False, False
+    cells = cells.reshape(7 * lines, 5 * columns)
+    side = 2.0 / cells.shape[1]
+    column = np.floor((x + 1.0) / side).astype(np.int64)
+    row = np.floor(y / side + 0.5 * len(cells)).astype(np.int64)
+    inside = (column >= 0) & (column < cells.shape[1]) & (row >= 0) & (row < len(cells))
+    return inside & cells[np.where(inside, row, 0), np.where(inside, column, 0)]
+
+
+_Item = Callable[[Array, Array, np.random.Generator], BoolArray]
+_ITEMS: tuple[_Item, ...] = (_patch, _band, _bar_code, _letters, _letters)
+
+
+@final
+@dataclass(frozen=True)
+class Picture:
+    """Image files."""
+
+    paths: tuple[Path, ...]
+    """PNG, JPEG or TIFF, relative to the recipe: one for every face, or one for all."""
+
+    def image(self, mesh: Mesh, chart: Chart, number: int, texel_m: float) -> Float32Array:
+        """Return what is printed on a chart (h, w, 3), in sRGB, 0 to 1."""
+        return _fitted(read_colour(self.paths[number % len(self.paths)]), chart, texel_m)
+
+
+@final
+@dataclass(frozen=True)
+class Embedded:
+    """The image in the object's own mesh file."""
+
+    def image(self, mesh: Mesh, chart: Chart, number: int, texel_m: float) -> Float32Array:
+        """Return what is printed on a chart (h, w, 3), in sRGB, 0 to 1.
+
+        Raises:
+            InputError: where the mesh has none.
+        """
+        if mesh.picture is None:
+            raise InputError("the object's file holds no image; give a GLB file with one, or a picture.")
+        return _fitted(mesh.picture, chart, texel_m)
+
+
+@final
+@dataclass(frozen=True)
+class Label:
+    """An image, or one for every face, laid around the object; it replaces the shape's colour where it lies."""
+
+    image: Print | Picture | Embedded = Print()
+    """What is printed."""
+    wrap: AnyWrap = field(default_factory=Cylindrical)
+    """How it is laid around the object."""
+
+    def __post_init__(self) -> None:
+        """Check the number of images."""
+        if isinstance(self.image, Picture) and len(self.image.paths) not in (1, self.wrap.count):
+            raise ValueError(f"paths must hold one image or {self.wrap.count}")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class LabelledMesh:
+    """A mesh and its label, made ready for looking colours up."""
+
+    label: Label
+    mesh: Mesh
+    """In its model frame."""
+    texel_m: float
+    """Side of an image's pixel on the body: what one sample of the camera sees, so that nothing finer aliases."""
+
+    @cached_property
+    def _textures(self) -> tuple[Texture, ...]:
+        charts = self.label.wrap.charts(self.mesh)
+        return tuple(
+            Texture(linear_light(self.label.image.image(self.mesh, chart, number, self.texel_m)), chart.closed)
+            for number, chart in enumerate(charts)
+        )
+
+    def albedo(self, surfels: Surfels) -> Array:
+        """Return the linear RGB (n, 3), 0 to 1, of points of the mesh; NaN where there is no label."""
+        textures, places = self._textures, self.label.wrap.places(self.mesh, surfels)
+        found = np.full((len(places.chart), 3), np.nan)
+        for number, texture in enumerate(textures):
+            here = places.chart == number
+            found[here] = texture.at(places.u[here], places.v[here])
+        return found
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """An image that is looked up between its pixels."""
+
+    linear: Array
+    """(h, w, 3) linear RGB, 0 to 1."""
+    closed: bool
+    """Whether rows meet their own beginning."""
+
+    def at(self, u: Array, v: Array) -> Array:
+        """Return colours (n, 3) at places, 0 to 1, bilinearly."""
+        height, width = self.linear.shape[:2]
+        column, row = u * width - 0.5, np.clip(v * height - 0.5, 0.0, height - 1.0)
+        column = column if self.closed else np.clip(column, 0.0, width - 1.0)
+        left, up = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
+        right, down = (
+            (left + 1) % width if self.closed else np.minimum(left + 1, width - 1),
+            np.minimum(up + 1, height - 1),
+        )
+        s, t = (column - left)[:, None], (row - up)[:, None]
+        upper = (1.0 - s) * self.linear[up, left % width] + s * self.linear[up, right]
+        lower = (1.0 - s) * self.linear[down, left % width] + s * self.linear[down, right]
+        return (1.0 - t) * upper + t * lower
+
+
+def _size_px(chart: Chart, texel_m: float) -> tuple[int, int]:
+    """Return height and width of a chart's image."""
+    height, width = (int(np.clip(np.ceil(m / texel_m), 1, LARGEST_PX)) for m in (chart.height_m, chart.width_m))
+    return height, width
+
+
+def _fitted(pixels: Rgb, chart: Chart, texel_m: float) -> Float32Array:
+    """Return an image (h, w, 3), 0 to 1, no finer than texels, which would alias."""
+    height, width = (min(have, want) for have, want in zip(pixels.shape, _size_px(chart, texel_m), strict=False))
+    shrunk = Image.fromarray(np.ascontiguousarray(pixels)).resize((width, height), Image.Resampling.BOX)
+    return np.asarray(shrunk, np.float32) / np.float32(255.0)

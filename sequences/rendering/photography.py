@@ -1,0 +1,129 @@
+"""Colour images: lamps that stay with the camera while the object turns under them, and a camera that drifts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.types import Array, BoolArray
+from sequences.rendering.charts import Surfels
+from sequences.rendering.labels import LabelledMesh, gamma_coded, linear_light
+from sequences.rendering.meshes import Hits, Mesh
+from sequences.rendering.normals import SmoothNormals
+
+
+@final
+@dataclass(frozen=True)
+class Lamp:
+    """Parallel light, fixed to the camera."""
+
+    direction: tuple[float, float, float]
+    """Where it comes from, in the camera frame (x right, y down, z forward); of any length."""
+    strength: float
+    """What a white surface that faces it sends to the camera; 1 is as bright as an image can be."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not np.linalg.norm(self.direction) > 0.0 or self.strength < 0.0:
+            raise ValueError("direction must not be zero, strength not negative")
+
+
+@final
+@dataclass(frozen=True)
+class Photography:
+    """How colour comes about: Lambert's law, Blinn's and Phong's highlights, exposure, noise and sRGB's gamma.
+
+    Lamps cast no shadows.
+    """
+
+    ambient: float = 0.3
+    """Light from all sides: what a white surface sends to the camera by it."""
+    lamps: tuple[Lamp, ...] = (Lamp((-0.7, -0.8, -0.5), 0.45), Lamp((0.6, 0.5, -0.8), 0.3))
+    """Lamps, fixed to the camera."""
+    highlight: float = 0.2
+    """Strength of a lamp's highlight, as a share of the lamp's; 0 for a matt surface."""
+    highlight_exponent: float = 30.0
+    """How narrow highlights are."""
+    exposure_sigma: float = 0.05
+    """Standard deviation of a frame's exposure, in natural logarithm."""
+    white_balance_sigma: float = 0.02
+    """Standard deviation of each colour's gain in a frame, in natural logarithm."""
+    noise_levels: float = 1.5
+    """Standard deviation of the noise of each colour of a pixel, in 8-bit levels."""
+    samples: int = 3
+    """Rays a pixel along each side; their mean is what it sees."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        sizes = (self.ambient, self.highlight, self.exposure_sigma, self.white_balance_sigma, self.noise_levels)
+        if min(sizes) < 0.0 or self.highlight_exponent <= 0.0 or not 1 <= self.samples <= 16:
+            raise ValueError(
+                "ambient, highlight and standard deviations must not be negative, highlight_exponent positive, samples "
+                "from 1 to 16"
+            )
+
+    def radiance(self, albedo: Array, normals: Array, points_m: Array) -> Array:
+        """Return the light (n, 3) that surfaces send to the camera.
+
+        Args:
+            albedo: (n, 3) linear RGB, 0 to 1.
+            normals: (n, 3) unit normals in the camera frame; surfaces are lit and seen from the side that faces it.
+            points_m: (n, 3) where they are, in the camera frame.
+        """
+        back = -points_m / np.linalg.norm(points_m, axis=-1, keepdims=True)
+        facing = np.where(np.sum(normals * back, axis=-1, keepdims=True) < 0.0, -normals, normals)
+        diffuse, glare = np.full(len(albedo), self.ambient), np.zeros(len(albedo))
+        for lamp in self.lamps:
+            towards = np.array(lamp.direction) / np.linalg.norm(lamp.direction)
+            between = towards + back
+            between /= np.maximum(np.linalg.norm(between, axis=-1, keepdims=True), 1e-12)
+            lit = facing @ towards
+            diffuse += lamp.strength * np.maximum(lit, 0.0)
+            shine = np.maximum(np.sum(facing * between, axis=-1), 0.0) ** self.highlight_exponent
+            glare += np.where(lit > 0.0, self.highlight * lamp.strength * shine, 0.0)
+        return albedo * diffuse[:, None] + glare[:, None]
+
+    def image(self, light: Array, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+        """Return the image (h, w, 3) that a frame makes of light (h, w, 3)."""
+        exposure_rng, balance_rng, noise_rng = rng.spawn(3)
+        balance = self.white_balance_sigma * balance_rng.normal(size=3)
+        gain = np.exp(self.exposure_sigma * exposure_rng.normal() + balance - balance.mean())
+        levels = 255.0 * gamma_coded(np.clip(gain * light, 0.0, 1.0))
+        noisy = levels + self.noise_levels * noise_rng.normal(size=light.shape)
+        return np.rint(np.clip(noisy, 0.0, 255.0)).astype(np.uint8)
+
+
+_LINEAR = linear_light(np.arange(256) / 255.0)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class LitMesh:
+    """A mesh under the lamps."""
+
+    mesh: Mesh
+    labelled: LabelledMesh | None = None
+    """Its label; without one, triangles have their own colours."""
+
+    @cached_property
+    def _smooth(self) -> SmoothNormals:
+        return SmoothNormals(self.mesh)
+
+    def light(self, photography: Photography, hits: Hits, seen: BoolArray, camera_from_mesh: Array) -> Array:
+        """Return the light (n, 3) that the mesh sends to the camera from the hits (h, w) that are seen."""
+        if not seen.any():
+            return np.zeros((0, 3))
+        triangle, weights, points_m = hits.triangle[seen], hits.weights[seen], hits.points_m[seen]
+        albedo = _LINEAR[hits.albedo[seen]]
+        if self.labelled is not None:
+            in_mesh_m = se3.transform(se3.inverse(camera_from_mesh), points_m)
+            surfels = Surfels(in_mesh_m, self._smooth.flat[triangle], triangle, weights)
+            printed = self.labelled.albedo(surfels)
+            albedo = np.where(np.isnan(printed), albedo, printed)
+        normals = self._smooth.at(triangle, weights) @ camera_from_mesh[:3, :3].T
+        return photography.radiance(albedo, normals, points_m)
