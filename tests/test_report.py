@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import re
 import shutil
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from turning_box import CENTRE_M, COUNT, HALF_M, LOST, object_from_camera, steps
 
 from modeler import se3
@@ -21,6 +23,7 @@ from modeler.export.formats import mesh_ply
 from modeler.export.mesh import MADE_UP_RGB
 from modeler.types import Array, InputError
 from sequences import bundled
+from viz import entities
 from viz.report import run_data, write_page
 from viz.report.mesh import read_mesh, scene
 from viz.report.run_data import Result, recorded, surfaces
@@ -118,9 +121,43 @@ def test_every_pair_is_told_with_its_pictures(page: str, run: Path) -> None:
     for edge in result.edges:
         (words,) = [text for text in headings if text.startswith(f"{edge.source} → {edge.target}:")]
         assert ("rejected" in words) == (not edge.accepted)
-    assert page.count("data:image/jpeg") - 1 == 3 * sum(edge.kind == "odometry" for edge in result.edges)
+    assert page.count("data:image/jpeg") - 1 - COUNT == 3 * sum(edge.kind == "odometry" for edge in result.edges)
     assert "5 of 6" in page
     assert f"frame {LOST} was left out" in page
+
+
+def test_the_worst_pairs_come_first(run: Path, tmp_path: Path) -> None:
+    report = json.loads((run / "report.json").read_bytes())
+    placed = {pose["id"] for pose in report["poses"]}
+    joined = [edge for edge in report["edges"] if {edge["source"], edge["target"]} <= placed]
+    turned = se3.exp(np.array([0.0, 0.2, 0.0, 0.0, 0.0, 0.0]))
+    wrong = joined[2]
+    wrong["target_from_source"] = (np.array(wrong["target_from_source"]).reshape(4, 4) @ turned).ravel().tolist()
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    write_page(tmp_path, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    pairs = [text for text in Elements(page).headings if " → " in text]
+    lost = sum(not {edge["source"], edge["target"]} <= placed for edge in report["edges"])
+    assert all(str(LOST) in text.partition(":")[0] for text in pairs[:lost])
+    assert pairs[lost].startswith(f"{wrong['source']} → {wrong['target']}:")
+    sds = [float(words) for words in re.findall(r"([\d.]+) sd from the poses", page)]
+    assert sds == sorted(sds, reverse=True)
+    assert sds[0] > 3.0
+
+
+def test_the_mask_of_every_frame_is_shown(run: Path, page: str) -> None:
+    masks = page.partition("<h2>Masks</h2>")[2].partition("<h2>")[0]
+    assert re.findall(r"<p>([^<]*)</p>", masks) == [f"{k}, left out" if k == LOST else str(k) for k in range(COUNT)]
+    pictures = [base64.b64decode(found) for found in re.findall(r"base64,([^']*)'", masks)]
+    rows = recorded(run / "recording.rrd")
+    for frame, picture in enumerate(pictures):
+        shown = np.asarray(Image.open(io.BytesIO(picture)).convert("L"), dtype=float)
+        (blob,) = rows[entities.MASK][frame]["blob"]
+        mask = Image.open(io.BytesIO(bytes(blob.as_py()[0] if isinstance(blob.as_py()[0], list) else blob.as_py())))
+        on = np.asarray(mask.resize(shown.shape[::-1])) > 0
+        assert on.any()
+        if frame != LOST:
+            assert shown[on].mean() > 1.5 * shown[~on].mean()
 
 
 def test_merged_points_are_those_of_the_views(run: Path) -> None:

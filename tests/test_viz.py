@@ -95,7 +95,7 @@ def test_a_recording_opens_with_a_layout(tmp_path: Path, run: list[Step]) -> Non
     reader = rerun.chunk.RrdReader(tmp_path / "r.rrd")
     waiting, knowing = sorted((list(reader.stream(store=entry)) for entry in reader.blueprints()), key=len)
     views = [sum(str(chunk.entity_path).endswith("/ViewContents") for chunk in layout) for layout in (waiting, knowing)]
-    assert views == [21, 21]
+    assert views == [22, 22]
     eyes = [c.to_record_batch() for c in knowing if str(c.entity_path).endswith("/EyeControls3D")]
     targets = np.array([batch["EyeControls3D:look_target"][0].as_py()[0] for batch in eyes])
     assert len(targets) == 9
@@ -143,10 +143,12 @@ def test_large_images_are_shown_smaller(run: list[Step]) -> None:
     assert isinstance(depth, rr.EncodedDepthImage)
     assert depth.blob is not None
     assert decoded(depth.blob.as_arrow_array().to_pylist()).shape == (240, 320)
-    (mask,) = [archetype for path, archetype in images.draw_frame(step) if path == entities.MASK]
-    assert isinstance(mask, rr.SegmentationImage)
-    assert mask.buffer is not None
-    assert len(mask.buffer.as_arrow_array().to_pylist()[0]) == 480 * 640
+    coloured = replace(step, frame=replace(frame, colour=np.zeros((960, 1280, 3), dtype=np.uint8)))
+    for shown, size in ((step, 240 * 320), (coloured, 480 * 640)):  # laid over the depth, or over the colours
+        (mask,) = [archetype for path, archetype in images.draw_frame(shown) if path == entities.MASK]
+        assert isinstance(mask, rr.SegmentationImage)
+        assert mask.buffer is not None
+        assert len(mask.buffer.as_arrow_array().to_pylist()[0]) == size
 
 
 def test_the_depth_view_opens_around_the_object_at_any_size(run: list[Step]) -> None:

@@ -13,7 +13,7 @@ from streamed import Recording, drawn
 from turning_box import CENTRE_M, COUNT, COVARIANCE, HALF_M, LOST, object_from_camera
 
 from modeler import se3
-from modeler.types import Mode, PoseGaussian, Step
+from modeler.types import Mode, PoseGaussian, Step, loop_opening
 from viz import entities, images, pair_view, readings
 
 
@@ -158,6 +158,8 @@ def test_readings_are_those_of_the_posterior(run: list[Step], recording: Recordi
     assert values[entities.EFFECTIVE_SAMPLES] == pytest.approx(posterior.effective_samples)
     assert values[entities.OVERLAP] == pytest.approx(100 * posterior.overlap)
     assert values[entities.SECONDS] == pytest.approx(posterior.seconds)
+    assert values[entities.TURNED] == pytest.approx(np.degrees(se3.rotation_angle(posterior.pose.mean)))
+    assert f"turned by {values[entities.TURNED]:.1f}°" in recording[entities.NOW][1]["text"][0]
     samples = np.random.default_rng(0).multivariate_normal(np.zeros(6), posterior.pose.covariance, 50_000)
     turned = np.linalg.eigvalsh(np.cov(samples[:, :3].T))[-1] ** 0.5
     assert values[entities.ROTATION_SD] == pytest.approx(np.rad2deg(turned), rel=0.02)
@@ -179,6 +181,15 @@ def test_every_pair_is_put_into_words(run: list[Step], recording: Recording) -> 
                 other.posterior.outcome is edge.posterior.outcome for other in step.edges
             )
     assert "nan" not in " ".join(row["text"][0] for row in recording[entities.NOW].values())
+
+
+def test_the_last_words_tell_by_how_much_the_loop_was_open(run: list[Step], recording: Recording) -> None:
+    last = run[-1]
+    centroids_m = {frame: view.centroid_m for frame, view in last.views.items()}
+    opening = loop_opening(last.edges_so_far, last.solution, centroids_m)
+    assert opening is not None
+    words = f"was open by {np.degrees(opening.rotation_rad):.1f}° and {1000.0 * opening.translation_m:.1f} mm"
+    assert words in recording[entities.NOW][last.frame.index]["text"][0]
 
 
 def test_what_the_graph_leaves_to_the_modes_of_a_pair_is_told(run: list[Step]) -> None:

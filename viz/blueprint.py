@@ -41,8 +41,12 @@ def layout(first: RayImage | None) -> rrb.Blueprint:
 def _images(first: RayImage | None) -> rrb.Container:
     """Return the camera's images, without colour where the first frame has none, and the picture of visibility."""
     near = None if first is None else around(first)
+    coloured = first is None or first.frame.colour is not None
     depth = rrb.Spatial2DView(
-        origin=entities.CAMERA, contents=[entities.DEPTH], name="Depth of the frame", visual_bounds=near
+        origin=entities.CAMERA,
+        contents=[entities.DEPTH] if coloured else [entities.DEPTH, entities.MASK],
+        name="Depth of the frame" if coloured else "Depth of the frame, object bright",
+        visual_bounds=near,
     )
     seen = rrb.Spatial2DView(
         origin=entities.VISIBILITY,
@@ -50,7 +54,7 @@ def _images(first: RayImage | None) -> rrb.Container:
         name="New points in previous view",
         visual_bounds=near,
     )
-    if first is not None and first.frame.colour is None:
+    if not coloured:
         return rrb.Vertical(depth, seen)
     colour = rrb.Spatial2DView(
         origin=entities.CAMERA, contents=[entities.COLOUR, entities.MASK], name="Frame, object bright"
@@ -111,6 +115,7 @@ def _words() -> rrb.Container:
 def _readings() -> rrb.Container:
     """Return one plot for each reading."""
     titles = {
+        entities.TURNED: "Turned by [°]",
         entities.ROTATION_SD: "Rotation sd [°]",
         entities.TRANSLATION_SD: "Translation sd [mm]",
         entities.EFFECTIVE_SAMPLES: "Effective samples",

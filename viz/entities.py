@@ -69,7 +69,8 @@ TRANSLATION_SD: Final = "readings/translation_sd_mm"
 EFFECTIVE_SAMPLES: Final = "readings/effective_samples"
 OVERLAP: Final = "readings/overlap_percent"
 SECONDS: Final = "readings/seconds_per_pair"
-READINGS: Final = (ROTATION_SD, TRANSLATION_SD, EFFECTIVE_SAMPLES, OVERLAP, SECONDS)
+TURNED: Final = "readings/turned_deg"
+READINGS: Final = (TURNED, ROTATION_SD, TRANSLATION_SD, EFFECTIVE_SAMPLES, OVERLAP, SECONDS)
 SERIES: Final = ("odometry", "closure", "pose")
 POSE_READINGS: Final = (ROTATION_SD, TRANSLATION_SD)
 
@@ -117,6 +118,6 @@ closures green, rejected red; the ellipsoid on an edge is the 1 sd region of its
 and 3 sd (wire) regions of camera positions; discs at the tips of the axes: 1 sd of rotation. All are magnified by
 the factor written below the graph.
 
-**Plots** (bottom). White: odometry; green: closure; yellow: the newest pose after optimisation. The sd is that
-along the least certain axis; translation is that of the object's centre.
+**Plots** (bottom). Left: the angle by which a pair turned. White: odometry; green: closure; yellow: the newest pose
+after optimisation. The sd is that along the least certain axis; translation is that of the object's centre.
 """

@@ -43,6 +43,7 @@ def draw_frame(step: Step) -> Drawing:
     else:
         yield entities.COLOUR, _jpeg(step.frame.colour[::stride, ::stride])
     yield entities.DEPTH, _depth_png(step.frame.depth_m[::coarse, ::coarse], mask[::coarse, ::coarse])
+    stride = coarse if step.frame.colour is None else stride  # it is laid over the colours, else over the depth
     shown = mask[::stride, ::stride].astype(np.uint8)
     yield entities.MASK, rr.SegmentationImage(shown, opacity=_DIMMED, draw_order=1.0)
 

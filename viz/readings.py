@@ -11,7 +11,7 @@ import rerun as rr
 
 from modeler import se3
 from modeler.export.report import undetermined
-from modeler.types import ACCEPTED, Array, Edge, PoseGaussian, Posterior, Step, explain
+from modeler.types import ACCEPTED, Array, Edge, PoseGaussian, Posterior, Step, explain, loop_opening
 from viz import entities
 from viz.drawings import Drawing
 
@@ -137,7 +137,9 @@ def pair_words(edge: Edge, step: Step) -> str:
     verdict = edge.kind if edge.accepted else f"{edge.kind} rejected"
     if not edge.accepted and posterior.usable:  # else the outcome is the reason
         verdict += f" ({explain(edge.reason)})"
-    known = ", ".join(certainty_words(posterior, _centre_m(step)))
+    turned_deg = _turned_deg(posterior)
+    turned = [f"turned by {turned_deg:.1f}°"] if math.isfinite(turned_deg) else []
+    known = ", ".join([*turned, *certainty_words(posterior, _centre_m(step))])
     return f"{edge.source} → {edge.target} {verdict}: {posterior.outcome.label}; {known}"
 
 
@@ -157,6 +159,7 @@ def now_words(step: Step) -> str:
     kinds = [edge.kind for edge in step.edges_so_far if step.solution.takes_part(edge)]
     for edge in step.solution.outliers:
         lines.append(f"- {edge.source} → {edge.target} {edge.kind} is left out: the other edges contradict it.")
+    lines += [f"- {words}." for words in loop_words(step)] if step.last else []
     rejected = len(step.edges_so_far) - len(kinds)
     points = 0 if step.model is None else len(step.model.points_m)
     lines.append(
@@ -167,13 +170,32 @@ def now_words(step: Step) -> str:
     return "\n".join(lines)
 
 
+def loop_words(step: Step) -> list[str]:
+    """Return in words by how much the loop was open before the optimisation; nothing without a loop."""
+    centroids_m = {frame: view.centroid_m for frame, view in step.views.items()}
+    opening = loop_opening(step.edges_so_far, step.solution, centroids_m)
+    if opening is None or not math.isfinite(opening.sigmas):
+        return []
+    return [
+        f"the loop from frame {opening.target} to {opening.source} was open by "
+        f"{math.degrees(opening.rotation_rad):.1f}° and {1000.0 * opening.translation_m:.1f} mm, "
+        f"{opening.sigmas:.1f} times what its edges state"
+    ]
+
+
 def _readings(posterior: Posterior, step: Step) -> dict[str, float]:
     """Return the readings of a pair by entity path, NaN where a method does not give one."""
     return _sds(posterior.pose, _centre_m(step)) | {
+        entities.TURNED: _turned_deg(posterior),
         entities.EFFECTIVE_SAMPLES: posterior.effective_samples,
         entities.OVERLAP: 100.0 * posterior.overlap,
         entities.SECONDS: posterior.seconds,
     }
+
+
+def _turned_deg(posterior: Posterior) -> float:
+    """Return the angle between two views."""
+    return math.degrees(float(se3.rotation_angle(posterior.pose.mean)))
 
 
 def _sds(pose: PoseGaussian, centre_m: Array) -> dict[str, float]:

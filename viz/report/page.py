@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -14,20 +12,17 @@ from string import Template
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
 from modeler import evaluation, se3
 from modeler.export import write_atomically
 from modeler.export.mesh import MOST_SIGMA_M
 from modeler.export.standing import model_upright
-from modeler.types import ACCEPTED, Array, Edge, Outcome, explain, loops_closed
-from viz import entities
-from viz.blueprint import FROM_THE_SIDE
-from viz.readings import certainty_words
+from modeler.types import ACCEPTED, Array, Outcome, loops_closed
 from viz.report import plots
+from viz.report.cards import data_address, mask_cards, pair_cards, thumbnails
 from viz.report.mesh import Mesh, look_at, read_mesh, scene, shade
-from viz.report.run_data import FRAME_PATHS, Result, Row, cloud, recorded, surfaces
+from viz.report.run_data import Result, Row, recorded, surfaces
 
 _SHAPE_POINTS: Final = 6_000
 _CAMERA_SHARE: Final = 0.12  # length of a drawn camera, as a share of its distance
@@ -50,7 +45,8 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
     centre_m = se3.transform(result.poses[result.first].mean, np.zeros((1, 3)))[0] if mesh is None else mesh.centre_m
     rows = recorded(run / "recording.rrd")
     parts = [_head(result, mesh), *_model(result, mesh), *_trajectory(result, mesh, centre_m)]
-    parts += [*_closure(result, rows), *_accuracy(result, centre_m), *pair_cards(result, thumbnails(rows), centre_m)]
+    parts += [*_closure(result, rows), *_accuracy(result, centre_m), *mask_cards(result, pictures := thumbnails(rows))]
+    parts += pair_cards(result, pictures, centre_m)
     parts.append(_settings(result))
     page = Template(_asset("page.html")).substitute(
         title=escape(f"{_name(result)}: model report"), body="\n".join(parts)
@@ -276,142 +272,6 @@ def _asset(name: str) -> str:
     return (resources.files("viz.report") / name).read_text(encoding="utf-8")
 
 
-def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Array) -> Sequence[str]:
-    """Return every pair with its pictures, its outcome and why it was or was not joined, as HTML.
-
-    Args:
-        result: the run.
-        pictures: by frame number.
-        centre_m: (3,) the object's centre, in the object frame.
-    """
-    note = (
-        "From left: the frame; its surface (<span class='orange'>orange</span>) and that of the view it is registered "
-        "to (<span class='teal'>teal</span>) before and after alignment."
-        if pictures
-        else "There are no pictures because recording.rrd is missing."
-    )
-    cards = [
-        _pair_card(result, edge, record, pictures.get(edge.source), centre_m)
-        for edge, record in zip(result.edges, result.report["edges"], strict=True)
-    ]
-    return [f"<h2>Pairs</h2><p class='quiet'>{note}</p><div class='pairs'>{''.join(cards)}</div>"]
-
-
-def _mode_words(modes: Sequence[Mapping[str, Any]]) -> str:
-    """Return how the probability is shared among the modes of an edge, where there are several."""
-    if len(modes) < 2:
-        return ""
-    shares = [f"{100.0 * mode['weight']:.0f} %" for mode in modes]
-    left = [f"{100.0 * mode['weight_in_graph']:.0f} %" for mode in modes if mode.get("weight_in_graph") is not None]
-    graph = f"; in the pose graph {', '.join(left)}" if left else ""
-    return f"<p>{len(modes)} modes: {', '.join(shares)}{graph}.</p>"
-
-
-def _pair_card(
-    result: Result, edge: Edge, record: Mapping[str, Any], pictures: Thumbnails | None, centre_m: Array
-) -> str:
-    posterior = edge.posterior
-    shown = ""
-    if pictures is not None and edge.kind == "odometry":
-        images = [image for image in (pictures.colour, pictures.before, pictures.after) if image is not None]
-        shown = "".join(f"<img src='{data_address(image, 'jpeg')}' alt=''>" for image in images)
-        shown = f"<div class='pictures'>{shown}</div>"
-    seen_m = centre_m
-    if edge.source in result.poses:
-        seen_m = se3.transform(se3.inverse(result.poses[edge.source].mean), centre_m[None])[0]
-    facts = [
-        f"turned by {np.degrees(se3.rotation_angle(posterior.pose.mean)):.1f}°",
-        *certainty_words(posterior, seen_m),
-    ]
-    truth = result.true_motion(edge)
-    if truth is not None:
-        facts += [
-            f"rotation error {evaluation.rotation_error_deg(posterior.pose.mean, truth):.2f}°",
-            f"translation error {1000.0 * evaluation.translation_error_m(posterior.pose.mean, truth, seen_m):.1f} mm",
-        ]
-    words = escape(", ".join(facts))
-    open_words = _mode_words(record.get("modes", [])) + "".join(
-        f"<p>{escape(words)}.</p>" for words in record.get("undetermined", [])
-    )
-    verdict = edge.kind if edge.accepted else f"{edge.kind}, rejected"
-    return (
-        f"<div class='pair{'' if edge.accepted else ' no'}'><h3>{edge.source} → {edge.target}: {verdict}, "
-        f"{posterior.outcome.label}</h3>{shown}<p>{words}.</p>{open_words}"
-        f"<p class='quiet'>{escape(explain(edge.reason))}</p></div>"
-    )
-
-
-_SIZE: Final = (150, 200)  # height and width in px
-_JPEG_QUALITY: Final = 82
-_BACKGROUND: Final = 250
-_DOT: Final = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])  # pixels of a point
-
-
-@dataclass(frozen=True)
-class Thumbnails:
-    """Small pictures of a frame as JPEG; None where there is nothing to show."""
-
-    colour: bytes | None
-    """What the camera saw."""
-    before: bytes | None
-    """The frame's surface and that of the view it was registered to, both in their own camera's coordinates."""
-    after: bytes | None
-    """The same under the mean of the posterior."""
-
-
-def thumbnails(rows: Mapping[str, Mapping[int, Row]]) -> dict[int, Thumbnails]:
-    """Return the pictures by frame number.
-
-    Args:
-        rows: what the recording holds, as `recorded` returns it.
-    """
-    frames = sorted({frame for entity in rows.values() for frame in entity})
-    return {frame: _of_frame({path: rows[path].get(frame, {}) for path in FRAME_PATHS}) for frame in frames}
-
-
-def _of_frame(rows: Mapping[str, Row]) -> Thumbnails:
-    blob = rows[entities.COLOUR].get("blob")
-    colour = None if blob is None else _small(bytes(blob.values[0].values.to_numpy()))
-    target, before, after = (cloud(rows[path]) for path in FRAME_PATHS[1:])
-    if target is None or before is None or after is None:
-        return Thumbnails(colour, None, None)
-    return Thumbnails(colour, _pair_picture(target, before), _pair_picture(target, after))
-
-
-def _pair_picture(*clouds: tuple[Array, npt.NDArray[np.uint8]]) -> bytes:
-    """Return two clouds seen from the side, nearer points over farther ones; the first says where to look."""
-    points = np.concatenate([cloud for cloud, _ in clouds])
-    colours = np.concatenate([colour for _, colour in clouds])
-    forward = -FROM_THE_SIDE / np.linalg.norm(FROM_THE_SIDE)
-    right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(forward, right), forward])
-    centre = clouds[0][0].mean(axis=0)
-    seen = (points - centre) @ axes.T
-    reach_m = float(np.percentile(np.abs((clouds[0][0] - centre) @ axes.T), 99.5))
-    height, width = _SIZE
-    places = np.rint(seen[:, :2] * (0.40 * height / max(reach_m, 1e-9)) + 0.5 * np.array([width, height]))
-    order = np.repeat(np.argsort(-seen[:, 2], kind="stable"), len(_DOT))
-    picture = np.full((height, width, 3), _BACKGROUND, dtype=np.uint8)
-    columns, rows = (places[order] + np.tile(_DOT, (len(points), 1))).astype(np.int64).T
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    picture[rows[inside], columns[inside]] = colours[order][inside]
-    return _jpeg(Image.fromarray(picture))
-
-
-def _small(jpeg: bytes) -> bytes:
-    picture = Image.open(io.BytesIO(jpeg))
-    height, width = _SIZE
-    picture.thumbnail((width, height))
-    return _jpeg(picture)
-
-
-def _jpeg(picture: Image.Image) -> bytes:
-    content = io.BytesIO()
-    picture.save(content, "JPEG", quality=_JPEG_QUALITY)
-    return content.getvalue()
-
-
 def figure(picture: bytes, caption: str, *, style: str = "", kind: str = "svg+xml") -> str:
     """Return a picture with a caption.
 
@@ -423,8 +283,3 @@ def figure(picture: bytes, caption: str, *, style: str = "", kind: str = "svg+xm
     """
     image = f"<img class='{style}' src='{data_address(picture, kind)}' alt=''>"
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
-
-
-def data_address(content: bytes, kind: str) -> str:
-    """Return an address that is the picture itself, whose media type is `image/` and `kind`."""
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

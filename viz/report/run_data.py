@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import subprocess
@@ -16,6 +17,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+from PIL import Image
 
 from modeler import se3
 from modeler.export import RunFolder, edges_of, poses_of
@@ -82,9 +84,16 @@ class Result:
         return self.truth[edge.target] @ se3.inverse(self.truth[edge.source])
 
 
-FRAME_PATHS: Final = (entities.COLOUR, entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER)
+FRAME_PATHS: Final = (
+    entities.COLOUR,
+    entities.DEPTH,
+    entities.MASK,
+    entities.PAIR_TARGET,
+    entities.PAIR_BEFORE,
+    entities.PAIR_AFTER,
+)
 """Entities that are shown."""
-_COMPONENTS: Final = ("blob", "positions", "colors", "labels")
+_COMPONENTS: Final = ("blob", "buffer", "format", "positions", "colors", "labels")
 _READ: Final = (*FRAME_PATHS, entities.PAIR_CAPTION)
 
 Row = Mapping[str, Any]
@@ -219,4 +228,19 @@ def read_steps(recording: Path) -> dict[int, _Step]:
                     if batch[name][place].is_valid:
                         step = steps.setdefault(elapsed.value, _Step(frame))
                         step.rows.setdefault(path, {})[component] = batch[name].take([place])
+    for step in steps.values():
+        if {"buffer", "format"} <= step.rows.get(entities.MASK, {}).keys():
+            step.rows[entities.MASK] = {"blob": pa.array([[_packed(step.rows[entities.MASK])]], _BLOB)}
     return steps
+
+
+_BLOB: Final = pa.list_(pa.list_(pa.uint8()))
+
+
+def _packed(row: Row) -> npt.NDArray[np.uint8]:
+    """Return a mask as the bytes (n,) of a PNG, a hundredth of its size, as colour and depth are recorded."""
+    shape = row["format"][0].as_py()[0]
+    pixels = row["buffer"][0].values[0].values.to_numpy().reshape(shape["height"], shape["width"])
+    content = io.BytesIO()
+    Image.fromarray(pixels > 0).save(content, "PNG")
+    return np.frombuffer(content.getvalue(), np.uint8)

@@ -1,0 +1,237 @@
+"""Masks and pairs of a run as parts of its page, with small pictures from its recording."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from modeler import evaluation, se3
+from modeler.types import ACCEPTED, Array, Edge, Outcome, explain
+from viz import entities
+from viz.blueprint import FROM_THE_SIDE
+from viz.readings import certainty_words
+from viz.report.run_data import FRAME_PATHS, Result, Row, cloud
+
+
+def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Array) -> Sequence[str]:
+    """Return every pair with its pictures, its outcome and why it was or was not joined, as HTML.
+
+    Args:
+        result: the run.
+        pictures: by frame number.
+        centre_m: (3,) the object's centre, in the object frame.
+    """
+    note = (
+        "From left: the frame, all but the object dimmed; its surface (<span class='orange'>orange</span>) and that of "
+        "the view it is registered to (<span class='teal'>teal</span>) before and after alignment."
+        if pictures
+        else "There are no pictures because recording.rrd is missing."
+    )
+    note = (
+        "The worst first: pairs of frames that were lost, then by distance from the poses in standard deviations (sd). "
+        f"{note}"
+    )
+    told = zip(result.edges, result.report["edges"], strict=True)
+    cards = [
+        _pair_card(result, edge, record, pictures.get(edge.source), centre_m)
+        for edge, record in sorted(told, key=lambda pair: _badness(result, pair[0]), reverse=True)
+    ]
+    return [f"<h2>Pairs</h2><p class='quiet'>{note}</p><div class='pairs'>{''.join(cards)}</div>"]
+
+
+def mask_cards(result: Result, pictures: Mapping[int, Thumbnails]) -> Sequence[str]:
+    """Return every frame with its mask as HTML, nothing where there are no pictures.
+
+    Args:
+        result: the run.
+        pictures: by frame number.
+    """
+    cards = []
+    for frame in result.report["frames"]:
+        shown = pictures.get(frame["id"])
+        if shown is not None and shown.masked is not None:
+            unsure = frame.get("mask") == Outcome.UNSURE_MASK.label
+            words = [str(frame["id"]), *(["unsure"] if unsure else [])]
+            words += [] if frame["outcome"] == ACCEPTED else ["left out"]
+            cards.append(
+                f"<div class='mask{' no' if len(words) > 1 else ''}'><img src='{data_address(shown.masked, 'jpeg')}' "
+                f"alt=''><p>{', '.join(words)}</p></div>"
+            )
+    note = "What was taken for the object in each frame; the rest is dimmed."
+    return [f"<h2>Masks</h2><p class='quiet'>{note}</p><div class='masks'>{''.join(cards)}</div>"] if cards else []
+
+
+def _apart_sds(result: Result, edge: Edge) -> float | None:
+    """Return how far an edge is from the poses, as root mean square in its standard deviations; None if not known."""
+    pose = edge.posterior.pose
+    if edge.source not in result.poses or edge.target not in result.poses or not np.isfinite(pose.covariance).all():
+        return None
+    relative = se3.inverse(result.poses[edge.target].mean) @ result.poses[edge.source].mean
+    return math.sqrt(evaluation.nees(pose, relative) / 6.0)
+
+
+def _badness(result: Result, edge: Edge) -> tuple[bool, float, float]:
+    """Return what pairs are sorted by: whether a frame of it was lost, its distance from the poses, little overlap."""
+    apart_sds = _apart_sds(result, edge)
+    distance = 0.0 if apart_sds is None or not math.isfinite(apart_sds) else round(apart_sds, 1)
+    overlap = edge.posterior.overlap
+    return apart_sds is None, distance, -overlap if math.isfinite(overlap) else 1.0
+
+
+def _mode_words(modes: Sequence[Mapping[str, Any]]) -> str:
+    """Return how the probability is shared among the modes of an edge, where there are several."""
+    if len(modes) < 2:
+        return ""
+    shares = [f"{100.0 * mode['weight']:.0f} %" for mode in modes]
+    left = [f"{100.0 * mode['weight_in_graph']:.0f} %" for mode in modes if mode.get("weight_in_graph") is not None]
+    graph = f"; in the pose graph {', '.join(left)}" if left else ""
+    return f"<p>{len(modes)} modes: {', '.join(shares)}{graph}.</p>"
+
+
+def _pair_card(
+    result: Result,
+    edge: Edge,
+    record: Mapping[str, Any],
+    pictures: Thumbnails | None,
+    centre_m: Array,
+) -> str:
+    posterior = edge.posterior
+    shown = ""
+    if pictures is not None and edge.kind == "odometry":
+        images = [image for image in (pictures.masked, pictures.before, pictures.after) if image is not None]
+        shown = "".join(f"<img src='{data_address(image, 'jpeg')}' alt=''>" for image in images)
+        shown = f"<div class='pictures'>{shown}</div>"
+    seen_m = centre_m
+    if edge.source in result.poses:
+        seen_m = se3.transform(se3.inverse(result.poses[edge.source].mean), centre_m[None])[0]
+    facts = [
+        f"turned by {np.degrees(se3.rotation_angle(posterior.pose.mean)):.1f}°",
+        *certainty_words(posterior, seen_m),
+        *([] if (apart_sds := _apart_sds(result, edge)) is None else [f"{apart_sds:.1f} sd from the poses"]),
+    ]
+    truth = result.true_motion(edge)
+    if truth is not None:
+        facts += [
+            f"rotation error {evaluation.rotation_error_deg(posterior.pose.mean, truth):.2f}°",
+            f"translation error {1000.0 * evaluation.translation_error_m(posterior.pose.mean, truth, seen_m):.1f} mm",
+        ]
+    words = escape(", ".join(facts))
+    open_words = _mode_words(record.get("modes", [])) + "".join(
+        f"<p>{escape(words)}.</p>" for words in record.get("undetermined", [])
+    )
+    verdict = edge.kind if edge.accepted else f"{edge.kind}, rejected"
+    return (
+        f"<div class='pair{'' if edge.accepted else ' no'}'><h3>{edge.source} → {edge.target}: {verdict}, "
+        f"{posterior.outcome.label}</h3>{shown}<p>{words}.</p>{open_words}"
+        f"<p class='quiet'>{escape(explain(edge.reason))}</p></div>"
+    )
+
+
+_SIZE: Final = (150, 200)  # height and width in px
+_JPEG_QUALITY: Final = 82
+_BACKGROUND: Final = 250
+_DIM: Final = 0.35  # brightness of what is not the object
+_DOT: Final = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])  # pixels of a point
+
+
+@dataclass(frozen=True)
+class Thumbnails:
+    """Small pictures of a frame as JPEG; None where there is nothing to show."""
+
+    masked: bytes | None
+    """What the camera saw, in colour or else its depth, all but the object dimmed."""
+    before: bytes | None
+    """The frame's surface and that of the view it was registered to, both in their own camera's coordinates."""
+    after: bytes | None
+    """The same under the mean of the posterior."""
+
+
+def thumbnails(rows: Mapping[str, Mapping[int, Row]]) -> dict[int, Thumbnails]:
+    """Return the pictures by frame number.
+
+    Args:
+        rows: what the recording holds, as `recorded` returns it.
+    """
+    frames = sorted({frame for entity in rows.values() for frame in entity})
+    return {frame: _of_frame({path: rows[path].get(frame, {}) for path in FRAME_PATHS}) for frame in frames}
+
+
+def _of_frame(rows: Mapping[str, Row]) -> Thumbnails:
+    seen, depth, mask = (_picture(rows[path]) for path in (entities.COLOUR, entities.DEPTH, entities.MASK))
+    masked = _masked(depth if seen is None else seen, mask)
+    target, before, after = (cloud(rows[p]) for p in (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER))
+    if target is None or before is None or after is None:
+        return Thumbnails(masked, None, None)
+    return Thumbnails(masked, _pair_picture(target, before), _pair_picture(target, after))
+
+
+def _picture(row: Row) -> Image.Image | None:
+    """Return the picture of a row, small; None where it has none."""
+    blob = row.get("blob")
+    if blob is None:
+        return None
+    picture = Image.open(io.BytesIO(bytes(blob.values[0].values.to_numpy())))
+    height, width = _SIZE
+    picture.thumbnail((width, height), Image.Resampling.NEAREST if picture.mode != "RGB" else Image.Resampling.BICUBIC)
+    return picture
+
+
+def _masked(picture: Image.Image | None, mask: Image.Image | None) -> bytes | None:
+    """Return a picture in colour or of depth with all but the object dimmed; None without a picture."""
+    if picture is None:
+        return None
+    pixels = np.asarray(picture, dtype=np.float64)
+    on = np.ones(pixels.shape[:2], bool) if mask is None else np.asarray(mask.resize(picture.size)) > 0
+    if pixels.ndim == 2:
+        pixels = _grey(pixels, on)
+    return _jpeg(Image.fromarray(np.where(on[..., None], pixels, _DIM * pixels).astype(np.uint8)))
+
+
+def _grey(depth: Array, on: npt.NDArray[np.bool_]) -> Array:
+    """Return depth (h, w) as a picture (h, w, 3), near bright, its shades spread over where `on` (h, w) holds."""
+    measured = depth > 0.0
+    chosen = depth[on & measured] if (on & measured).any() else depth[measured]
+    near, far = np.percentile(chosen, (1, 99)) if chosen.size else (0.0, 1.0)
+    share = np.clip((depth - near) / max(2.0 * (far - near), 1.0), 0.0, 1.0)
+    return np.repeat(np.where(measured, 255.0 * (1.0 - share), 0.0)[..., None], 3, axis=2)
+
+
+def _pair_picture(*clouds: tuple[Array, npt.NDArray[np.uint8]]) -> bytes:
+    """Return two clouds seen from the side, nearer points over farther ones; the first says where to look."""
+    points = np.concatenate([cloud for cloud, _ in clouds])
+    colours = np.concatenate([colour for _, colour in clouds])
+    forward = -FROM_THE_SIDE / np.linalg.norm(FROM_THE_SIDE)
+    right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(forward, right), forward])
+    centre = clouds[0][0].mean(axis=0)
+    seen = (points - centre) @ axes.T
+    reach_m = float(np.percentile(np.abs((clouds[0][0] - centre) @ axes.T), 99.5))
+    height, width = _SIZE
+    places = np.rint(seen[:, :2] * (0.40 * height / max(reach_m, 1e-9)) + 0.5 * np.array([width, height]))
+    order = np.repeat(np.argsort(-seen[:, 2], kind="stable"), len(_DOT))
+    picture = np.full((height, width, 3), _BACKGROUND, dtype=np.uint8)
+    columns, rows = (places[order] + np.tile(_DOT, (len(points), 1))).astype(np.int64).T
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    picture[rows[inside], columns[inside]] = colours[order][inside]
+    return _jpeg(Image.fromarray(picture))
+
+
+def _jpeg(picture: Image.Image) -> bytes:
+    content = io.BytesIO()
+    picture.save(content, "JPEG", quality=_JPEG_QUALITY)
+    return content.getvalue()
+
+
+def data_address(content: bytes, kind: str) -> str:
+    """Return an address that is the picture itself, whose media type is `image/` and `kind`."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
