@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import small_gicp
 import tabletop
+from refusal import refused
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -16,7 +17,7 @@ from modeler import se3
 from modeler.experiment import sparse_view
 from modeler.features import kabsch, mutual_matches
 from modeler.priors import GeneralPrior
-from modeler.registration import FpfhIcpRegistrar, FpfhRegistrar, GicpRegistrar, IcpRegistrar
+from modeler.registration import ColouredIcpRegistrar, FpfhIcpRegistrar, FpfhRegistrar, GicpRegistrar, IcpRegistrar
 from modeler.registration.baselines.clouds import (
     Cloud,
     Fit,
@@ -28,6 +29,7 @@ from modeler.registration.baselines.clouds import (
     start,
     whitened_jacobian,
 )
+from modeler.registration.baselines.coloured_icp import intensity_gradients
 from modeler.types import AbstractPoseDensity, Array, Outcome, RayImage
 
 BODY = tabletop.Box((0.05, 0.08, 0.035))
@@ -213,6 +215,79 @@ def test_icp_stops_where_open3d_would(pair: Pair, rng: np.random.Generator) -> N
     )
     assert degrees_between(theirs.transformation, fit.target_from_source) < 0.01
     assert theirs.fitness == pytest.approx(fit.fitness, abs=0.005)
+
+
+def printed_ball(turn_deg: float, seed: int) -> RayImage:
+    """Return a ball with a smooth print, turned about its vertical axis: all that depth shows is where it is."""
+    turn = se3.exp(np.array([0.0, 0.0, np.radians(turn_deg), 0.0, 0.0, 0.0]))
+    seen = tabletop.view(tabletop.BALL, POSES[0] @ turn, seed, rng=np.random.default_rng(seed), table=False)
+    assert seen.frame.colour is not None
+    on_ball = se3.transform(se3.inverse(POSES[0] @ turn), seen.points_m)
+    grey = 128.0 + 90.0 * np.sin(90.0 * on_ball[:, 0]) * np.cos(70.0 * on_ball[:, 1] + 40.0 * on_ball[:, 2])
+    colour = seen.frame.colour.copy()
+    colour[seen.pixels[:, 0], seen.pixels[:, 1]] = np.rint(grey)[:, None]
+    return replace(seen, frame=replace(seen.frame, colour=colour))
+
+
+def test_coloured_icp_sees_a_printed_ball_turn(rng: np.random.Generator) -> None:
+    source, target = printed_ball(0.0, 0), printed_ball(8.0, 1)
+    truth = POSES[0] @ se3.exp(np.array([0.0, 0.0, np.radians(8.0), 0.0, 0.0, 0.0])) @ se3.inverse(POSES[0])
+    density = Normal(np.eye(4), source.centroid_m, 0.1, 0.005)
+    found, blind = (m.register(source, target, density, rng=rng) for m in (ColouredIcpRegistrar(), IcpRegistrar()))
+    assert degrees_between(found.pose.mean, truth) < 0.5
+    assert degrees_between(blind.pose.mean, truth) > 4.0
+
+
+def test_coloured_icp_stops_where_open3d_would() -> None:
+    import open3d as o3d
+
+    method = ColouredIcpRegistrar()
+    source, target = (Cloud.coloured(printed_ball(turn_deg, seed)) for turn_deg, seed in ((0.0, 0), (3.0, 1)))
+    voxel_m = 0.004
+    thin = source.thinned(voxel_m), target.thinned(voxel_m)
+    reach_m = method.reach * voxel_m
+    clouds = []
+    for cloud in thin:
+        assert cloud.intensity is not None
+        points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m))
+        points.normals = o3d.utility.Vector3dVector(cloud.normals)
+        points.colors = o3d.utility.Vector3dVector(np.repeat(cloud.intensity[:, None], 3, axis=1))
+        clouds.append(points)
+    library = o3d.pipelines.registration
+    theirs = library.registration_colored_icp(
+        clouds[0],
+        clouds[1],
+        reach_m,
+        np.eye(4),
+        library.TransformationEstimationForColoredICP(lambda_geometric=method.geometry),
+        library.ICPConvergenceCriteria(1e-9, 1e-9, 60),
+    )
+    ours = method.level(*thin, np.eye(4), voxel_m)
+    assert degrees_between(np.eye(4), ours.target_from_source) > 2.0
+    assert degrees_between(theirs.transformation, ours.target_from_source) < 0.02
+    assert theirs.fitness == pytest.approx(ours.fitness, abs=0.005)
+
+
+def test_intensity_gradients_are_those_of_the_print(rng: np.random.Generator) -> None:
+    across = rng.uniform(-0.05, 0.05, (3000, 2))
+    normal = np.array([0.6, 0.0, -0.8])
+    along = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0]])
+    cloud = Cloud(across @ along, np.tile(normal, (3000, 1)), 0.5 + across @ [3.0, -2.0])
+    gradients = intensity_gradients(cloud, KDTree(cloud.points_m), 0.01, 30)
+    np.testing.assert_allclose(gradients, np.tile(np.array([3.0, -2.0]) @ along, (3000, 1)), atol=1e-6)
+
+
+def test_a_lonely_point_has_no_intensity_gradient() -> None:
+    cloud = Cloud(np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0]]), np.tile([0.0, 0.0, -1.0], (2, 1)), np.array([0.1, 0.9]))
+    np.testing.assert_array_equal(intensity_gradients(cloud, KDTree(cloud.points_m), 0.1, 30), 0.0)
+
+
+def test_coloured_icp_refuses_views_without_colour(pair: Pair, rng: np.random.Generator) -> None:
+    source, target = pair
+    density = Normal(np.eye(4), source.centroid_m, 0.05, 0.005)
+    colourless = replace(target, frame=replace(target.frame, colour=None))
+    with refused("frame 1", "colour"):
+        ColouredIcpRegistrar().register(source, colourless, density, rng=rng)
 
 
 def test_gicp_states_its_hessian_in_our_tangent(pair: Pair, rng: np.random.Generator) -> None:

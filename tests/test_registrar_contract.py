@@ -32,6 +32,7 @@ CLOUD_METHODS: list[AbstractRegistrar] = [
     registration.GicpRegistrar(),
     registration.FpfhRegistrar(),
     registration.FpfhIcpRegistrar(),
+    registration.ColouredIcpRegistrar(),
 ]
 IMAGE_METHODS: list[AbstractRegistrar] = [
     registration.VisibilityRegistrar(),

@@ -120,6 +120,8 @@ def registrar(method: Method) -> AbstractRegistrar:
             return registration.IcpRegistrar()
         case "gicp":
             return registration.GicpRegistrar()
+        case "coloured-icp":
+            return registration.ColouredIcpRegistrar()
         case "fpfh":
             return registration.FpfhRegistrar()
         case "fpfh-icp":

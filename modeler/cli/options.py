@@ -171,7 +171,7 @@ class PriorOptions:
         return {name: value for name, value in values.items() if value is not None}
 
 
-Method = Literal["visibility", "paper", "icp", "gicp", "fpfh", "fpfh-icp"]
+Method = Literal["visibility", "paper", "icp", "gicp", "coloured-icp", "fpfh", "fpfh-icp"]
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Registration methods behind `AbstractRegistrar`: the visibility method and its baselines."""
 
+from modeler.registration.baselines.coloured_icp import ColouredIcpRegistrar as ColouredIcpRegistrar
 from modeler.registration.baselines.fpfh import FpfhIcpRegistrar as FpfhIcpRegistrar
 from modeler.registration.baselines.fpfh import FpfhRegistrar as FpfhRegistrar
 from modeler.registration.baselines.icp import GicpRegistrar as GicpRegistrar

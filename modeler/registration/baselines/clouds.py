@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import solve_triangular
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.types import AbstractPoseDensity, Array, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import AbstractPoseDensity, Array, BoolArray, InputError, Outcome, PoseGaussian, Posterior, RayImage
 
 _START_SAMPLES = 1000
 _SPACING_POINTS = 400
@@ -33,11 +34,29 @@ class Cloud:
     """(n, 3)."""
     normals: Array
     """(n, 3) unit normals, towards the camera."""
+    intensity: Array | None = None
+    """(n,) mean of red, green and blue, 0 to 1; None where colour is not asked for."""
 
     @staticmethod
     def of(view: RayImage) -> Cloud:
         """Return the surface points of a view."""
         return Cloud(view.points_m, view.normals)
+
+    @staticmethod
+    def coloured(view: RayImage) -> Cloud:
+        """Return the surface points of a view with their intensity.
+
+        Raises:
+            InputError: where the view has points, but no colour.
+        """
+        colour, (row, column) = view.frame.colour, view.pixels.T
+        if colour is None and len(view.points_m):
+            raise InputError(
+                f"frame {view.index}: has no colour, which coloured ICP compares; give colour aligned to depth,"
+                " or another --method."
+            )
+        intensity = np.zeros(0) if colour is None else colour[row, column].mean(axis=1) / 255.0
+        return Cloud(view.points_m, view.normals, intensity)
 
     @property
     def size_m(self) -> float:
@@ -61,7 +80,8 @@ class Cloud:
         np.add.at(points, cube, self.points_m)
         np.add.at(normals, cube, self.normals)
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        return Cloud(points / count[:, None], normals / np.maximum(lengths, np.finfo(float).tiny))
+        intensity = None if self.intensity is None else np.bincount(cube, self.intensity) / count
+        return Cloud(points / count[:, None], normals / np.maximum(lengths, np.finfo(float).tiny), intensity)
 
 
 def cube_edges_m(source: Cloud, target: Cloud, shares: Sequence[float]) -> list[float]:
@@ -135,10 +155,15 @@ class Matches:
 
 def matched(source_m: Array, target: Cloud, tree: KDTree, pose: Array, reach_m: float) -> Matches:
     """Match points (n, 3), carried by `pose`, with their nearest in `target`, which `tree` holds, within `reach_m`."""
+    near, partner = nearest(source_m, tree, pose, reach_m)
+    return Matches(source_m[near], Cloud(target.points_m[partner], target.normals[partner]), float(np.mean(near)))
+
+
+def nearest(source_m: Array, tree: KDTree, pose: Array, reach_m: float) -> tuple[BoolArray, npt.NDArray[np.intp]]:
+    """Return which points (n,), carried by `pose`, have a nearest point of `tree` within `reach_m`, and which it is."""
     distances, indices = tree.query(se3.transform(pose, source_m), distance_upper_bound=reach_m)
-    near, indices = np.isfinite(distances), np.asarray(indices)
-    partners = Cloud(target.points_m[indices[near]], target.normals[indices[near]])
-    return Matches(source_m[near], partners, float(np.mean(near)))
+    near = np.isfinite(distances)
+    return near, np.asarray(indices)[near]
 
 
 def plane_residuals(matches: Matches, pose: Array) -> tuple[Array, Array]:

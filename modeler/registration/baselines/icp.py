@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -55,39 +56,90 @@ class IcpRegistrar(AbstractRegistrar):
         )
 
     def refine(self, source: Cloud, target: Cloud, target_from_source: Array) -> Fit | None:
-        """Return the local optimum nearest to a pose (4, 4); None where too few points are left to match.
+        """Return the local optimum nearest to a pose (4, 4); None where too few points are left to match."""
+        return by_levels(
+            (source, target), target_from_source, voxels=self.voxels, min_points=self.min_points, level=self._level
+        )
 
-        Levels that thinning leaves with too few points are passed over.
-        """
-        fit = None
-        if min(len(source.points_m), len(target.points_m)) < self.min_points:
-            return None
-        for voxel_m in cube_edges_m(source, target, self.voxels):
-            thin = source.thinned(voxel_m), target.thinned(voxel_m)
-            if min(len(cloud.points_m) for cloud in thin) >= self.min_points:
-                pose = target_from_source if fit is None else fit.target_from_source
-                fit = self._level(*thin, pose, self.reach * voxel_m)
-        return fit
+    def _level(self, source: Cloud, target: Cloud, pose: Array, voxel_m: float) -> Fit:
+        tree, reach_m = KDTree(target.points_m), self.reach * voxel_m
 
-    def _level(self, source: Cloud, target: Cloud, pose: Array, reach_m: float) -> Fit:
-        tree = KDTree(target.points_m)
-        # About the centroid, rotation and translation hardly mix, and damping favours neither.
-        source_from_centred = se3.translation(source.points_m.mean(axis=0))
-        points = source.points_m - source_from_centred[:3, 3]
-        pose = pose @ source_from_centred
-        for _ in range(self.iterations):
-            residuals, jacobian = plane_residuals(matched(points, target, tree, pose, reach_m), pose)
-            weights = _tukey(residuals / reach_m)
-            hessian = (jacobian.T * weights) @ jacobian
-            damping = (_DAMPING * np.trace(hessian) + np.finfo(float).tiny) * np.eye(6)
-            step = np.linalg.solve(hessian + damping, -jacobian.T @ (weights * residuals))
-            pose = pose @ se3.exp(step)
-            if np.max(np.abs(step)) < _STEP:
-                break
-        pose = pose @ se3.inverse(source_from_centred)
-        matches = matched(source.points_m, target, tree, pose, reach_m)
-        residuals, jacobian = plane_residuals(matches, pose)
-        return Fit(pose, whitened_jacobian(residuals, _tukey(residuals / reach_m), jacobian), matches.fitness)
+        def linearised(points_m: Array, pose: Array) -> Linearised:
+            matches = matched(points_m, target, tree, pose, reach_m)
+            residuals, jacobian = plane_residuals(matches, pose)
+            return Linearised(residuals, _tukey(residuals / reach_m), jacobian, matches.fitness)
+
+        return descended(source, pose, self.iterations, linearised)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A sum of squares at a pose."""
+
+    residuals: Array
+    """(n,)."""
+    weights: Array
+    """(n,) between 0 and 1."""
+    jacobian: Array
+    """(n, 6) by the ξ of `pose @ exp(ξ)`."""
+    fitness: float
+    """Share of the source's points that have a partner."""
+
+
+def by_levels(
+    clouds: tuple[Cloud, Cloud],
+    target_from_source: Array,
+    *,
+    voxels: Sequence[float],
+    min_points: int,
+    level: Callable[[Cloud, Cloud, Array, float], Fit],
+) -> Fit | None:
+    """Return the fit of the finest level, each begun where the coarser one ended.
+
+    Levels that thinning leaves with too few points are passed over.
+
+    Args:
+        clouds: points to carry, and those to lay them on.
+        target_from_source: (4, 4) where to begin.
+        voxels: edge of the thinning cubes at each level, coarse to fine, as a share of the object's size.
+        min_points: fewest points a side; None is returned where there are fewer.
+        level: fits thinned clouds from a pose (4, 4), given the edge of the cubes in m.
+    """
+    fit = None
+    if min(len(cloud.points_m) for cloud in clouds) < min_points:
+        return None
+    for voxel_m in cube_edges_m(*clouds, voxels):
+        thin = clouds[0].thinned(voxel_m), clouds[1].thinned(voxel_m)
+        if min(len(cloud.points_m) for cloud in thin) >= min_points:
+            fit = level(*thin, target_from_source if fit is None else fit.target_from_source, voxel_m)
+    return fit
+
+
+def descended(source: Cloud, pose: Array, iterations: int, linearised: Callable[[Array, Array], Linearised]) -> Fit:
+    """Return where steps of Gauss and Newton end.
+
+    Args:
+        source: points to carry.
+        pose: (4, 4) where to begin.
+        iterations: largest number of steps.
+        linearised: the sum of squares for points (n, 3) of the source at a pose (4, 4).
+    """
+    # About the centroid, rotation and translation hardly mix, and damping favours neither.
+    source_from_centred = se3.translation(source.points_m.mean(axis=0))
+    points = source.points_m - source_from_centred[:3, 3]
+    pose = pose @ source_from_centred
+    for _ in range(iterations):
+        at = linearised(points, pose)
+        hessian = (at.jacobian.T * at.weights) @ at.jacobian
+        damping = (_DAMPING * np.trace(hessian) + np.finfo(float).tiny) * np.eye(6)
+        step = np.linalg.solve(hessian + damping, -at.jacobian.T @ (at.weights * at.residuals))
+        pose = pose @ se3.exp(step)
+        if np.max(np.abs(step)) < _STEP:
+            break
+    pose = pose @ se3.inverse(source_from_centred)
+    at = linearised(source.points_m, pose)
+    return Fit(pose, whitened_jacobian(at.residuals, at.weights, at.jacobian), at.fitness)
 
 
 def _tukey(ratios: Array) -> Array:
