@@ -2,15 +2,16 @@
 
 import csv
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from calibration.__main__ import panels, run
-from calibration.specimens import SPECIMENS, Specimen, load_specimen, recipe_names
+from calibration.specimens import PRINTED, SPECIMENS, Specimen, load_specimen, recipe_names
 from calibration.study import CONTROL, MEASURES, OURS, OUTSIDE, Condition, Study, Trial, judged, staged
 from calibration.tables import rows, text
+from scipy.ndimage import binary_erosion
 from scipy.spatial import KDTree
 from slow import sampled
 
@@ -20,7 +21,7 @@ from modeler.priors import TablePrior
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.registration.visibility.sampling import AdaptiveSampler
-from modeler.types import Outcome, PoseGaussian, Posterior
+from modeler.types import AbstractPoseDensity, AbstractRegistrar, Outcome, PoseGaussian, Posterior, RayImage
 from sequences.rendering.renderer import RenderedSequence
 from viz.figures import coverage_curves
 
@@ -58,6 +59,68 @@ def test_the_design_is_as_wide_as_promised() -> None:
             assert replace(study, specimens=alike).pairs >= 60
     for values in zip(*((c.distance_m, c.noise, c.step_deg) for c in study.conditions), strict=True):
         assert len(set(values)) >= 3
+
+
+def test_every_printed_shape_has_all_finishes_in_one_half() -> None:
+    halves: dict[str, set[str]] = {}
+    for half in ("tuning", "held-out"):
+        members = [specimen for specimen in PRINTED if specimen.half == half]
+        assert replace(Study(), specimens=tuple(members)).pairs >= 250
+        finishes: dict[str, list[str]] = {}
+        for specimen in members:
+            shape, finish = specimen.recipe.split("+")
+            finishes.setdefault(shape, []).append(finish)
+            assert specimen.symmetry in (f"n-fold, {finish}", f"revolution, {finish}")
+        assert all(sorted(found) == ["faint", "labelled", "plain"] for found in finishes.values())
+        halves[half] = set(finishes)
+    assert not halves["tuning"] & halves["held-out"]
+    for bare in SPECIMENS:
+        assert bare.recipe not in halves["held-out" if bare.half == "tuning" else "tuning"]
+
+
+def test_finishes_of_a_shape_differ_in_print_alone() -> None:
+    """Depth, motion and lamps are the same; print spreads the colours, and without any there are none."""
+    recipes = []
+    for finish in ("plain", "faint", "labelled"):
+        recipe = staged(load_specimen(f"can+{finish}"), Condition(), frames=2, seed=3)
+        assert recipe.photography is not None
+        view = replace(recipe.view, width=160, height=120, focal_px=143.75)
+        recipes.append(replace(recipe, view=view, photography=replace(recipe.photography, noise_levels=0.0)))
+    plain, faint, labelled = (RenderedSequence(recipe).frame(1) for recipe in recipes)
+    colours = []
+    for frame in (plain, faint, labelled):
+        np.testing.assert_array_equal(frame.depth_m, plain.depth_m)
+        assert frame.colour is not None
+        assert frame.mask is not None
+        inside = np.asarray(binary_erosion(frame.mask, iterations=2), bool)
+        chroma = np.log(np.maximum(frame.colour[inside], 1.0))
+        colours.append(float((chroma - chroma.mean(axis=1, keepdims=True)).std(axis=0).max()))
+    assert colours[0] < 0.5 * colours[1] < 0.25 * colours[2]
+
+
+@dataclass(frozen=True)
+class Looking(AbstractRegistrar):
+    """Keeps the source views that it is given."""
+
+    seen: list[RayImage]
+
+    def register(
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+    ) -> Posterior:
+        self.seen.append(source)
+        return _posterior(PoseGaussian(np.eye(4), np.eye(6)))
+
+
+def test_a_blind_study_leaves_out_colour_alone() -> None:
+    seen: list[RayImage] = []
+    study = Study(conditions=(Condition(),), priors={"table": TablePrior()}, methods={OURS: Looking(seen)})
+    specimen = next(specimen for specimen in PRINTED if specimen.recipe == "can+labelled")
+    for blind in (False, True):
+        assert len(list(replace(study, blind=blind).trials(specimen))) == 1
+    sighted, blind_view = seen
+    assert sighted.frame.colour is not None
+    assert blind_view.frame.colour is None
+    np.testing.assert_array_equal(sighted.points_m, blind_view.points_m)
 
 
 @pytest.mark.parametrize("specimen", sampled(SPECIMENS, every=12), ids=lambda specimen: specimen.recipe)

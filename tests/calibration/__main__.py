@@ -1,5 +1,9 @@
 """Render pairs, register them, and report how true the posteriors' covariances are: `make calibrate`.
 
+Shapes have no colour, unless printed ones are asked for (`--colour`): bodies of revolution and n-fold shapes with a
+strong print, with a faint one and with none, under lamps that stay with the camera. With `--blind` as well, the same
+pairs are registered without their colour.
+
 The shapes are split: methods may be tuned on one half; the other is there to be looked at once, at the end, and only
 where it is asked for (`--half held-out`). The tables go to stdout, progress to stderr, and calibration.json,
 calibration.csv and coverage.png into a folder.
@@ -14,12 +18,14 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from calibration.specimens import SPECIMENS
+from calibration.specimens import PRINTED, SPECIMENS
 from calibration.study import CONTROL, MEASURES, OURS, Study, Trial
 from calibration.tables import degrees, results_csv, results_json, rows, text
 from modeler.export import write_atomically
+from modeler.registration import ColouredIcpRegistrar
 from modeler.types import InputError
 from viz.figures import Curve, Panel, coverage_curves
 
@@ -30,6 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(prog="calibration", description=__doc__)
     parser.add_argument("--half", choices=("tuning", "held-out", "both"), default="tuning", help="which shapes")
+    parser.add_argument("--colour", action="store_true", help="printed shapes under lamps, instead of bare ones")
+    parser.add_argument("--blind", action="store_true", help="leave their colour out")
     parser.add_argument("--shapes", nargs="+", metavar="NAME", help="only these of them")
     parser.add_argument(
         "--frames",
@@ -43,14 +51,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     chosen = tuple(
         specimen
-        for specimen in SPECIMENS
+        for specimen in (PRINTED if options.colour else SPECIMENS)
         if options.half in ("both", specimen.half) and (not options.shapes or specimen.recipe in options.shapes)
     )
     if not chosen or options.frames < 2 or options.seed < 0:
         parser.error("no pair is left; check --shapes, --half, --frames (2 or more) and --seed (not negative)")
     try:
         options.out.mkdir(parents=True, exist_ok=True)
-        trials = run(Study(specimens=chosen, frames=options.frames, seed=options.seed), options.out)
+        study = Study(specimens=chosen, frames=options.frames, seed=options.seed, blind=options.blind)
+        if options.colour and not options.blind:
+            study = replace(study, methods={**study.methods, "coloured-icp": ColouredIcpRegistrar()})
+        trials = run(study, options.out)
     except (InputError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

@@ -3,14 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, final
 
+import numpy as np
+
+from sequences.rendering.charts import Faces
+from sequences.rendering.labels import Label, Print
+from sequences.rendering.photography import Lamp, Photography
 from sequences.rendering.recipe import Recipe, builtin_recipes, load_recipe
 
 Half = Literal["tuning", "held-out"]
-Symmetry = Literal["asymmetric", "near-symmetric", "n-fold", "revolution"]
+Symmetry = Literal[
+    "asymmetric",
+    "near-symmetric",
+    "n-fold",
+    "revolution",
+    "n-fold, labelled",
+    "n-fold, faint",
+    "n-fold, plain",
+    "revolution, labelled",
+    "revolution, faint",
+    "revolution, plain",
+]
 
 
 @final
@@ -19,7 +35,7 @@ class Specimen:
     """One shape of the study."""
 
     recipe: str
-    """Name of its recipe, of this folder or built in."""
+    """Name of its recipe, of this folder or built in; `can+faint` is the can with a faint print."""
     symmetry: Symmetry
     """Its class; a near-symmetric shape is a body of revolution but for something small."""
     half: Half
@@ -35,9 +51,37 @@ def recipe_names() -> tuple[str, ...]:
 
 
 def load_specimen(name: str) -> Recipe:
-    """Return the recipe of a name, from this folder or built in."""
-    path = _FOLDER / f"{name}.json"
-    return load_recipe(path if path.is_file() else name)
+    """Return the recipe of a name, from this folder or built in; with a finish after a plus sign, printed and lit."""
+    shape, _, finish = name.partition("+")
+    path = _FOLDER / f"{shape}.json"
+    recipe = load_recipe(path if path.is_file() else shape)
+    return printed(recipe, CONTRASTS[finish]) if finish else recipe
+
+
+CONTRASTS: Final[Mapping[str, float]] = {"labelled": 1.0, "faint": 0.1, "plain": 0.0}
+"""How strong the print is, by finish."""
+
+
+def printed(recipe: Recipe, contrast: float) -> Recipe:
+    """Return a recipe printed on all sides, under lamps of its own.
+
+    Print and lamps are drawn by the recipe's seed: the finishes of one shape differ in contrast alone.
+    """
+    rng = np.random.default_rng(recipe.seed)
+    lamps = []
+    for strength in rng.uniform(0.1, 0.4, rng.integers(2, 4)):
+        # From above or from a window, never from behind the object, where it would be in the picture.
+        across, down, towards = rng.uniform((-1.0, -1.0, 0.4), (1.0, 0.5, 1.0))
+        lamps.append(Lamp((float(across), float(down), float(-towards)), float(strength)))
+    photography = Photography(
+        ambient=float(rng.uniform(0.2, 0.4)),
+        lamps=tuple(lamps),
+        highlight=float(rng.uniform(0.0, 1.0)),
+        highlight_exponent=float(np.exp(rng.uniform(np.log(8.0), np.log(60.0)))),
+        samples=2,
+    )
+    label = Label(Print(seed=recipe.seed, contrast=contrast), Faces(lids=True))
+    return replace(recipe, label=label, photography=photography, colour="png")
 
 
 FRAMES: Final = 2
@@ -258,3 +302,32 @@ SPECIMENS: Final = tuple(
     for recipe in recipes
 )
 """All of them."""
+
+_PRINTED: Final[Mapping[Half, Mapping[Literal["n-fold", "revolution"], tuple[str, ...]]]] = {
+    "tuning": {
+        "n-fold": ("tea_box", "box", "two_fold", "four_fold", "square_bottle", "toolbox", "lantern", "table_lamp"),
+        "revolution": ("orange", "can", "bottle", "tube", "bowl", "vase", "jar", "soup_plate"),
+    },
+    "held-out": {
+        "n-fold": ("carton", "pencil_holder", "pagoda", "rocket", "water_tower", "gear_wheel"),
+        "revolution": ("beach_ball", "ramekin", "decanter", "lampshade", "insulator", "inkwell"),
+    },
+}
+# Written out, for a type checker does not compose literals.
+_CLASSES: Final[Mapping[tuple[str, str], Symmetry]] = {
+    ("n-fold", "labelled"): "n-fold, labelled",
+    ("n-fold", "faint"): "n-fold, faint",
+    ("n-fold", "plain"): "n-fold, plain",
+    ("revolution", "labelled"): "revolution, labelled",
+    ("revolution", "faint"): "revolution, faint",
+    ("revolution", "plain"): "revolution, plain",
+}
+
+PRINTED: Final = tuple(
+    Specimen(f"{recipe}+{finish}", _CLASSES[symmetry, finish], half)
+    for half, classes in _PRINTED.items()
+    for symmetry, recipes in classes.items()
+    for finish in CONTRASTS
+    for recipe in recipes
+)
+"""Shapes whose depth leaves turns open, with a strong print, with a faint one, and with none, under lamps."""

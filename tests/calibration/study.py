@@ -90,7 +90,10 @@ OUTSIDE = "outside the prior"
 
 
 def staged(recipe: Recipe, condition: Condition, *, frames: int, seed: int) -> Recipe:
-    """Return a recipe under a condition, the object turned to where the seed has it, with noise of its own."""
+    """Return a recipe under a condition, the object turned to where the seed has it, with noise of its own.
+
+    Only what is lit by lamps has colour.
+    """
     rng = np.random.default_rng(seed)
     x_deg, y_deg, z_deg = recipe.rest_rotation_deg
     trajectory, sensor = recipe.trajectory, recipe.sensor
@@ -113,7 +116,7 @@ def staged(recipe: Recipe, condition: Condition, *, frames: int, seed: int) -> R
         view=replace(recipe.view, distance_m=condition.distance_m),
         trajectory=replace(wobble, frames=frames, step_deg=condition.step_deg),
         sensor=replace(sensor, disparity=disparity, jitter=jitter),
-        colour="none",
+        colour="none" if recipe.photography is None else "png",
     )
 
 
@@ -138,6 +141,8 @@ class Study:
         default_factory=lambda: {OURS: VisibilityRegistrar(), CONTROL: IcpRegistrar()}
     )
     """By name: the one under test, and the negative control with its residual-scaled Hessian."""
+    blind: bool = False
+    """Whether colour is left out."""
 
     @property
     def pairs(self) -> int:
@@ -149,7 +154,8 @@ class Study:
         recipe = load_specimen(specimen.recipe)
         for number, condition in enumerate(self.conditions):
             seed = int(np.random.SeedSequence([self.seed, recipe.seed, number]).generate_state(1)[0])
-            sequence = RenderedSequence(staged(recipe, condition, frames=self.frames, seed=seed))
+            under = staged(recipe, condition, frames=self.frames, seed=seed)
+            sequence = RenderedSequence(replace(under, colour="none") if self.blind else under)
             views, truth = rendered_views(sequence), sequence.truth()
             for source, target in zip(sequence.indices[1:], sequence.indices[:-1], strict=True):
                 motion = true_motion(truth, target, source)
