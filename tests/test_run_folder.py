@@ -273,6 +273,14 @@ def _an_edge_to_itself(report: dict[str, Any]) -> None:
         _an_edge_to_itself,
         lambda report: report.update(sequence="\ud800"),
         lambda report: report.update(sequence="a\0b"),
+        lambda report: report.update(prior="\ud800"),
+        lambda report: report["versions"].update(numpy="\ud800"),
+        lambda report: report["versions"].update({"\ud800": "1"}),
+        _settings(prior_args=["angle=\ud800"]),
+        _settings(**{"\ud800": {"a": ["b"]}}),
+        lambda report: report["reasons"].append("\ud800"),
+        lambda report: report["frames"][0].update(cause="\ud800"),
+        lambda report: report["edges"][0].update(reason="\ud800"),
     ],
 )
 def test_a_report_that_cannot_be_true_is_refused(run: Run, folder: Path, damage: Callable[[dict], None]) -> None:

@@ -6,7 +6,7 @@ import io
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +112,7 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
-_LATER = frozenset({"modes", "cause", "mask"})  # reports of earlier versions have none
+_LATER = frozenset({"modes", "cause", "mask", "reason"})  # reports of earlier versions have none
 
 
 def fault(report: Mapping[str, Any]) -> str | None:
@@ -123,6 +123,9 @@ def fault(report: Mapping[str, Any]) -> str | None:
     for name, test in _WHOLE.items():
         if not test(report.get(name)):
             return f"{name!r} is missing or is not what it should be"
+    for name, value in report.items():
+        if name not in ("frames", "edges", "poses") and not all(map(_is_text, (name, *_texts(value)))):
+            return f"{name!r} holds text that no file can hold"
     for name, tests in (("frames", _FRAME), ("edges", _EDGE), ("poses", _POSE)):
         for place, record in enumerate(report[name]):
             wrong = _wrong(record, tests) or _impossible(record)
@@ -205,6 +208,16 @@ def _is_text(value: Any) -> bool:
         return False
 
 
+def _texts(tree: Any) -> Iterator[str]:
+    """Yield every text in a tree of JSON, names too."""
+    if isinstance(tree, str):
+        yield tree
+    elif isinstance(tree, dict):
+        yield from tree
+    for part in tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ():
+        yield from _texts(part)
+
+
 def _numbers(count: int) -> Test:
     return lambda value: isinstance(value, list) and len(value) == count and all(map(_is_number_or_null, value))
 
@@ -251,8 +264,8 @@ _FRAME: dict[str, Test] = {
     "timestamp": _is_number,
     "points": _is_whole,
     "outcome": _is_text,
-    "cause": _null_or(_is(str)),
-    "mask": _null_or(_is(str)),
+    "cause": _null_or(_is_text),
+    "mask": _null_or(_is_text),
 }
 _POSE: dict[str, Test] = {"id": _is_whole, "object_from_camera": _numbers(16), "covariance": _numbers(36)}
 _MODE: dict[str, Test] = {"weight": _is_number_or_null, "target_from_source": _numbers(16), "covariance": _numbers(36)}
@@ -261,6 +274,7 @@ _EDGE: dict[str, Test] = {
     "target": _is_whole,
     "kind": lambda value: value in ("odometry", "closure"),
     "accepted": _is(bool),
+    "reason": _is_text,
     "outcome": lambda value: value in [outcome.label for outcome in Outcome],
     "target_from_source": _numbers(16),
     "covariance": _numbers(36),
