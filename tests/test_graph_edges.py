@@ -29,6 +29,7 @@ from modeler.types import (
     loop_opening,
     loops_closed,
 )
+from modeler.types.chains import Chains
 from viz.report.run_data import Result
 
 COUNT = 8
@@ -134,6 +135,35 @@ def test_the_opening_of_a_loop_is_what_a_closure_was_turned_by() -> None:
     refused = edge(0, 7, closure.posterior.pose, "closure", accepted=False)
     assert loop_opening([*exact, refused], Solution(), centroid_m) is None
     assert loop_opening([*exact[1:], closure], Solution(), centroid_m) is None, "no chain joins its ends"
+
+
+def test_motions_along_chains_are_those_composed_edge_by_edge() -> None:
+    """In two trees of many branches, with edges taken along and against their direction."""
+    rng = np.random.default_rng(7)
+    parents = {frame: int(rng.integers(max(frame - 4, 0), frame)) for frame in range(1, 40) if frame != 20}
+    motions = {frame: PoseGaussian(spin(rng.normal(size=3)), covariance(rng)) for frame in parents}
+    told = [(parents[k], k, pose) if k % 3 else (k, parents[k], pose.inverse()) for k, pose in motions.items()]
+    chains = Chains.of([told[k] for k in rng.permutation(len(told))])
+
+    def to_root(frame: int) -> list[int]:
+        return [frame, *(to_root(parents[frame]) if frame in parents else ())]
+
+    pairs = [(target, source) for target in range(40) for source in range(40) if target != source]
+    joined = [(target, source) for target, source in pairs if to_root(target)[-1] == to_root(source)[-1]]
+    assert [pair for pair in pairs if chains.joined(*pair)] == joined
+    assert not chains.joined(0, 40)
+    assert 40 < len(joined) < len(pairs)
+    for (target, source), found, length in zip(joined, *chains.motions(joined), strict=True):
+        up, down = (
+            [k for k in to_root(one) if k not in to_root(other)] for one, other in ((target, source), (source, target))
+        )
+        steps = [motions[k].inverse() for k in up] + [motions[k] for k in reversed(down)]
+        mean, spread = np.eye(4), np.zeros((6, 6))
+        for step in steps:
+            mean, spread = mean @ step.mean, se3.composed_covariance(spread, step.mean, step.covariance)
+        assert length == len(steps)
+        np.testing.assert_allclose(found.mean, mean, atol=1e-12)
+        np.testing.assert_allclose(found.covariance, spread, rtol=1e-9, atol=1e-12 * np.abs(spread).max())
 
 
 def _true(truth: Mapping[int, Array], target: int, source: int) -> Array:

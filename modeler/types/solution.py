@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from modeler import se3
 from modeler.types.base import Array
+from modeler.types.chains import Chains
 from modeler.types.posteriors import PoseGaussian, Posterior
 from modeler.types.reasons import Reason
 
@@ -157,16 +158,14 @@ def loop_openings(edges: Sequence[Edge], solution: Solution, centroids_m: Mappin
         centroids_m: (3,) of the object in camera coordinates by frame number, for the translation; 0 where unknown.
     """
     used = [edge for edge in edges if solution.takes_part(edge)]
-    neighbours: dict[int, list[tuple[int, PoseGaussian]]] = {}
-    for edge in used:
-        if edge.kind == "odometry":
-            pose = solution.pose_of(edge)
-            neighbours.setdefault(edge.target, []).append((edge.source, pose))
-            neighbours.setdefault(edge.source, []).append((edge.target, pose.inverse()))
+    chains = Chains.of([(e.target, e.source, solution.pose_of(e)) for e in used if e.kind == "odometry"])
+    loops = [edge for edge in used if edge.kind == "closure" and chains.joined(edge.target, edge.source)]
+    if not loops:
+        return []
+    motions, counts = chains.motions([(edge.target, edge.source) for edge in loops])
     return [
-        _opening(edge, solution.pose_of(edge), *chain, centroids_m.get(edge.source, np.zeros(3)))
-        for edge in used
-        if edge.kind == "closure" and (chain := _chain(neighbours, edge.target, edge.source)) is not None
+        _opening(edge, solution.pose_of(edge), motion, int(count), centroids_m.get(edge.source, np.zeros(3)))
+        for edge, motion, count in zip(loops, motions, counts, strict=True)
     ]
 
 
@@ -174,22 +173,6 @@ def loop_opening(edges: Sequence[Edge], solution: Solution, centroids_m: Mapping
     """Return the opening of the loop of most edges, of several the widest; None without a loop."""
     openings = loop_openings(edges, solution, centroids_m)
     return max(openings, key=lambda opening: (opening.edges, opening.sigmas), default=None)
-
-
-def _chain(
-    neighbours: Mapping[int, Sequence[tuple[int, PoseGaussian]]], target: int, source: int
-) -> tuple[PoseGaussian, int] | None:
-    """Return target_from_source along odometry edges and their number; None where they do not join the frames."""
-    reached = {target: (PoseGaussian(np.eye(4), np.zeros((6, 6))), 0)}
-    waiting = [target]
-    for frame in waiting:
-        before, count = reached[frame]
-        for neighbour, pose in neighbours.get(frame, []):
-            if neighbour not in reached:
-                covariance = se3.composed_covariance(before.covariance, pose.mean, pose.covariance)
-                reached[neighbour] = PoseGaussian(before.mean @ pose.mean, covariance), count + 1
-                waiting.append(neighbour)
-    return reached.get(source)
 
 
 def _opening(edge: Edge, closure: PoseGaussian, chain: PoseGaussian, count: int, centroid_m: Array) -> LoopOpening:

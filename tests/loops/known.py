@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
@@ -18,7 +18,7 @@ from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Outcome
 class Known(AbstractRegistrar):
     """The true motion, but for an error as large as it says."""
 
-    camera_from_model: Mapping[int, Array]
+    camera_from_model: Mapping[int, Array] = field(repr=False)
     """(4, 4) by frame number."""
     sigma_deg: float = 0.3
     """Standard deviation of the rotation about each axis."""

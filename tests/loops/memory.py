@@ -1,0 +1,100 @@
+"""How much memory and time `modeler build` takes over thousands of frames.
+
+`PYTHONPATH=tests python -m loops.memory --frames 5000 --out runs/memory` renders an object of 320 x 240 pixels that
+turns by 3° a frame, a folder of pictures that is kept for the next time, and builds it as the command does: with pairs
+kept, recording and report. With --told-truth pairs are registered by the truth, to see what everything else takes.
+stdout has a line for every --every steps: resident memory as the system counts it (what the program allocated, and
+what it read of mapped files), and the most so far.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any, ClassVar
+
+from loops.cases import turned
+from loops.known import Known
+from modeler.cli import build, compose, main
+from modeler.cli.console import Console
+from modeler.types import Step
+from sequences import open_sequence, write_bop
+
+_FIELDS = ("RssAnon", "RssFile", "VmRSS", "VmHWM")
+
+
+def memory_mib() -> dict[str, float]:
+    """Return the resident memory of this process: allocated, of files, both, and the most of both so far."""
+    lines = (line.partition(":") for line in Path("/proc/self/status").read_text().splitlines())
+    return {name: int(value.split()[0]) / 1024.0 for name, _, value in lines if name in _FIELDS}
+
+
+def write_sequence(folder: Path, frames: int, *, shape: str) -> None:
+    """Render frames at 3° each into a folder, one after the other."""
+    sequence = turned([3.0 * frame for frame in range(frames)], shape=shape, width=320)
+    sigma_wh, sigma_r_m = sequence.sensor() or (0.0, 0.0)
+    sensor = {"sigma_wh": sigma_wh, "sigma_r_m": sigma_r_m}
+    write_bop(folder, sequence, sequence.truth(), {"name": folder.name, "sensor": sensor})
+
+
+class Meter(Console):
+    """The terminal's sink of steps, which also notes time and memory."""
+
+    every: ClassVar = 250
+    costs: ClassVar[list[dict[str, Any]]] = []
+
+    def __call__(self, event: Any) -> None:
+        """Note a step."""
+        super().__call__(event)
+        if not isinstance(event, Step):
+            return
+        now = {"s": time.monotonic(), "cpu_s": time.process_time(), "views": len(event.views)}
+        self.costs.append({**now, "edges": len(event.edges_so_far), "last": event.last, **memory_mib()})
+        if event.last or len(self.costs) % self.every == 0:
+            print(_row(self.costs, self.every), flush=True)
+
+
+def _row(costs: list[dict[str, Any]], every: int) -> str:
+    """Return a line on the newest step, with the time a frame since so many before."""
+    new, old = costs[-1], costs[max(len(costs) - 1 - every, 0)]
+    count = max(min(every, len(costs) - 1), 1)
+    spent = ((new[name] - old[name]) / count for name in ("s", "cpu_s"))
+    numbers = "  ".join(f"{new[name]:7.0f}" for name in _FIELDS)
+    step = "end" if new["last"] else str(len(costs))
+    return (
+        f"{step:>6}  {numbers} MiB   {new['edges']:6d} edges   " + "  ".join(f"{s:.3f}" for s in spent) + " s a frame"
+    )
+
+
+def run() -> int:
+    """Run the study and return the status of the command."""
+    parser = argparse.ArgumentParser(prog="loops.memory", description=__doc__)
+    parser.add_argument("--frames", type=int, default=1000)
+    parser.add_argument("--every", type=int, default=250, help="steps between lines")
+    parser.add_argument("--shape", default="figurine", help="recipe of the rendered object")
+    parser.add_argument("--out", type=Path, default=Path("runs/memory"), help="folder of the sequence and the run")
+    parser.add_argument("--told-truth", action="store_true", help="register by the truth")
+    parser.add_argument("options", nargs="*", default=["--prior", "table"], help="of modeler build, after --")
+    options = parser.parse_args()
+    sequence = options.out / f"{options.shape}-{options.frames}"
+    if not sequence.exists():
+        write_sequence(sequence, options.frames, shape=options.shape)
+    Meter.every = options.every
+    build.Console = Meter
+    if options.told_truth:
+        truth = open_sequence(sequence).truth() or {}
+        compose.registrar = lambda _: Known(truth)
+    print("  step  " + "  ".join(f"{name:>7}" for name in _FIELDS) + "             edges      wall   processor")
+    kind = "-told" if options.told_truth else ""
+    run_folder = options.out / f"run-{options.frames}{kind}"
+    status = main(["build", str(sequence), "--out", str(run_folder), "--overwrite", *options.options])
+    (options.out / f"costs-{options.frames}{kind}.json").write_text(json.dumps(Meter.costs) + "\n")
+    print(f"status {status}; at the end of the program: {memory_mib()['VmHWM']:.0f} MiB at most")
+    return 0 if status in (0, 3) else status
+
+
+if __name__ == "__main__":
+    sys.exit(run())
