@@ -183,7 +183,7 @@ def test_the_border_of_a_closed_label_does_not_show() -> None:
 
 
 def test_exposure_and_white_balance_drift_and_pixels_are_noisy() -> None:
-    grey = np.full((100, 100, 3), 0.3)
+    grey = np.full((30, 30, 3), 0.3)
     drifting = Photography(exposure_sigma=0.1, white_balance_sigma=0.05, noise_levels=2.0)
     images = np.array([drifting.image(grey, np.random.default_rng(k)) for k in range(400)]).astype(np.float64)
     level = 255.0 * gamma_coded(np.array(0.3))
@@ -197,7 +197,7 @@ def test_exposure_and_white_balance_drift_and_pixels_are_noisy() -> None:
 
 
 def test_a_seed_decides_photographs_and_the_order_of_reading_nothing() -> None:
-    recipe = replace(load_recipe("tin"), view=VIEW)
+    recipe = replace(load_recipe("tin"), view=replace(VIEW, width=80, height=60))
     forwards = [RenderedSequence(recipe).frame(index).colour for index in (0, 3)]
     sequence = RenderedSequence(recipe)
     backwards = [sequence.frame(index).colour for index in (3, 0)][::-1]
@@ -282,6 +282,14 @@ def test_meshes_show_their_own_texture(tmp_path: Path, kind: str) -> None:
     mesh = unwrapped_square(tmp_path / f"square.{kind}", picture)
     image = Embedded() if kind == "glb" else Picture((picture,))
     assert quarters_of(side_view(MeshFile(mesh), Label(image, Unwrapped()), 0.0)) == QUARTERS
+
+
+def test_a_broken_image_in_a_mesh_file_is_one_line(tmp_path: Path) -> None:
+    whole = unwrapped_square(tmp_path / "square.glb", write_quarters(tmp_path / "q.png")).read_bytes()
+    at = whole.index(b"IDAT")
+    (tmp_path / "broken.glb").write_bytes(whole[: at + 8] + bytes(20) + whole[at + 28 :])
+    with refused("broken.glb", "cannot be read as a mesh"):
+        MeshFile(tmp_path / "broken.glb").mesh()
 
 
 def test_pictures_finer_than_a_pixel_look_grey(tmp_path: Path) -> None:

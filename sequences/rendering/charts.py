@@ -171,11 +171,10 @@ class Unwrapped:
         """
         if mesh.uv is None:
             raise InputError("the object has no texture coordinates; give a mesh file that has, or another wrap.")
-        first, second = (np.moveaxis(mesh.uv[:, 1:] - mesh.uv[:, :1], 1, 0)[k] for k in (0, 1))
-        in_image = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]).sum()
-        corners = mesh.corners()
-        doubled_m2 = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        side_m = float(np.sqrt(doubled_m2.sum() / max(in_image, 1e-12)))
+        there = np.isfinite(mesh.uv).all(axis=(1, 2))
+        in_image = _doubled_areas(np.pad(mesh.uv[there], ((0, 0), (0, 0), (0, 1)))).sum()
+        on_body_m2 = _doubled_areas(mesh.corners()[there]).sum()
+        side_m = float(np.sqrt(on_body_m2 / max(in_image, 1e-12)))
         return (Chart(side_m, side_m),)
 
     def places(self, mesh: Mesh, surfels: Surfels) -> Places:
@@ -188,6 +187,11 @@ class Unwrapped:
 
 
 AnyWrap = Cylindrical | Spherical | Faces | Unwrapped
+
+
+def _doubled_areas(corners: Array) -> Array:
+    """Return twice the areas (t,) of triangles (t, 3, 3)."""
+    return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
 def _turn(x: Array, y: Array) -> Array:

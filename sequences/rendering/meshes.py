@@ -14,6 +14,7 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.regular_files import read_regular
 from modeler.types import Array, BoolArray, InputError
+from sequences.image_files import MAX_PIXELS
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -38,7 +39,7 @@ class Mesh:
     uv: Array | None = None
     """(t, 3, 2) texture coordinates of the triangles' corners, v upwards; NaN for those without, None without any."""
     picture: npt.NDArray[np.uint8] | None = None
-    """(h, w, 3) RGB image that came with the mesh."""
+    """(h, w, 3) RGB image that came with the mesh; of several meshes, the first that has one."""
 
     @staticmethod
     def single(vertices_m: Array, triangles: IntArray) -> Mesh:
@@ -106,8 +107,13 @@ def ply_bytes(mesh: Mesh) -> bytes:
     return header.encode() + mesh.vertices_m.astype("<f4").tobytes() + faces.tobytes()
 
 
-def read_mesh(path: Path, scale: float) -> Mesh:
+def read_mesh(path: Path, scale: float, *, textured: bool = False) -> Mesh:
     """Return the triangles of a mesh file (PLY, OBJ, STL, GLB, ...), its lengths times `scale` in m.
+
+    Args:
+        path: the file.
+        scale: metres per unit of the file.
+        textured: whether its texture coordinates and the image in it are wanted.
 
     Raises:
         InputError: where the file is missing, cannot be read or holds no triangle.
@@ -118,27 +124,29 @@ def read_mesh(path: Path, scale: float) -> Mesh:
     try:
         loaded = trimesh.load_mesh(io.BytesIO(content), file_type=path.suffix[1:].lower(), process=True)
         vertices, triangles = np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces, np.int64)
+        uv, picture = _texture(loaded.visual) if textured else (None, None)
     except Exception as error:  # trimesh's readers raise whatever their parsers raise
         why = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: cannot be read as a mesh ({why}); convert it to PLY.") from None
     if len(triangles) == 0 or not np.isfinite(vertices).all():
         raise InputError(f"{path}: holds no triangles with finite corners; give a triangle mesh.")
     mesh = Mesh.single(vertices * scale, triangles)
-    uv = getattr(loaded.visual, "uv", None)
-    if uv is None or np.shape(uv) != (len(vertices), 2):
-        return mesh
-    return replace(
-        mesh, uv=np.asarray(uv, np.float64)[triangles], picture=_own_picture(getattr(loaded.visual, "material", None))
-    )
+    return mesh if uv is None or len(uv) != len(vertices) else replace(mesh, uv=uv[triangles], picture=picture)
 
 
-def _own_picture(material: object) -> npt.NDArray[np.uint8] | None:
-    """Return the image (h, w, 3) of a mesh file's material; None where it has none."""
-    for name in ("baseColorTexture", "image"):
-        image = getattr(material, name, None)
-        if image is not None:
-            return np.asarray(image.convert("RGB"), np.uint8)
-    return None
+def _texture(visual: object) -> tuple[Array | None, npt.NDArray[np.uint8] | None]:
+    """Return the texture coordinates (v, 2) and the image (h, w, 3) of what trimesh read; None for what is not there.
+
+    Raises:
+        ValueError: where the image has too many pixels.
+    """
+    uv, material = getattr(visual, "uv", None), getattr(visual, "material", None)
+    images = [getattr(material, name, None) for name in ("baseColorTexture", "image")]
+    image = next((image for image in images if image is not None), None)
+    if image is not None and image.width * image.height > MAX_PIXELS:
+        raise ValueError(f"its image has more than {MAX_PIXELS // 1_000_000} million pixels")
+    coordinates = None if uv is None else np.asarray(uv, np.float64).reshape(-1, 2)
+    return coordinates, None if image is None else np.asarray(image.convert("RGB"), np.uint8)
 
 
 _SHORT = 1.0 - 2e-3

@@ -307,7 +307,7 @@ class MeshFile:
 
     def mesh(self) -> Mesh:
         """Return the surface."""
-        return read_mesh(self.path, self.scale)
+        return read_mesh(self.path, self.scale, textured=True)
 
 
 @final
