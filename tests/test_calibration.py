@@ -220,7 +220,7 @@ def test_only_answers_that_are_given_are_judged() -> None:
 
 
 def test_a_study_runs_and_repeats_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    quick = AdaptiveSampler(enough=200.0, kept=300)
+    quick = AdaptiveSampler(samples=250)
     box = Specimen("box", "n-fold", "tuning")
     small = Study(
         specimens=(box,),

@@ -234,7 +234,7 @@ def test_ripples_on_one_peak_are_one_gaussian_and_cost_loops_nothing(monkeypatch
 
 
 VARIANCE = 0.02e-2  # the check of the design, in units of a tenth of a radian and of a metre
-SAMPLER = AdaptiveSampler(enough=1000.0, kept=2000)
+SAMPLER = AdaptiveSampler(samples=1500)
 CENTRE = se3.translation(OBJECT_M)
 ABOUT = se3.adjoint(CENTRE)
 SPREAD = VARIANCE * ABOUT @ ABOUT.T  # the variance in all directions, about the object

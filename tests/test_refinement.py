@@ -104,7 +104,7 @@ def test_the_roll_of_a_tube_is_not(rng):
 def test_too_few_matches_leave_the_samples_alone(rng):
     pair, truth, centre_m = bundled_pair("box")
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
-    refined = Refiner(min_patches=10_000).refine(pair, poses, np.ones(len(poses)), rng, fine_m=0.001)
+    refined = Refiner(min_matches=10_000.0).refine(pair, poses, np.ones(len(poses)), rng, fine_m=0.001)
     np.testing.assert_allclose(refined, poses, atol=1e-9)
 
 

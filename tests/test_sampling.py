@@ -53,7 +53,7 @@ def test_samples_are_those_of_prior_times_likelihood(narrower: float) -> None:
     """However little of the prior the likelihood leaves: mean, covariance and evidence are the product's."""
     shift = narrower * SIGMAS * np.array([1.0, -1.0, 0.5, 0.5, -1.0, 1.0])
     images = gaussian(away(shift), narrower * SIGMAS)
-    found = AdaptiveSampler(enough=4000.0, kept=8000).run(
+    found = AdaptiveSampler(samples=6000).run(
         Around(SIGMAS), images.log_density, CENTRE_M, np.random.default_rng(1)
     )
     assert found.weights.sum() == pytest.approx(1.0)
@@ -83,9 +83,9 @@ def test_two_modes_and_a_curved_ridge_keep_their_shares() -> None:
     shares, slopes = [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        one = AdaptiveSampler(kept=3000, enough=1500.0).run(wide, heaps.log_density, CENTRE_M, rng)
+        one = AdaptiveSampler(samples=2000).run(wide, heaps.log_density, CENTRE_M, rng)
         shares.append(one.weights[se3.difference(ABOUT, one.poses, CENTRE_M)[:, 0] > 0.0].sum())
-        other = AdaptiveSampler(kept=3000, enough=1500.0).run(wide, bent, CENTRE_M, rng)
+        other = AdaptiveSampler(samples=2000).run(wide, bent, CENTRE_M, rng)
         xi = se3.difference(ABOUT, other.poses, CENTRE_M)
         slopes.append(other.weights @ (xi[:, 4] * xi[:, 0] ** 2) / (other.weights @ xi[:, 0] ** 4))
         assert min(one.effective_samples, other.effective_samples) > 500.0
@@ -96,7 +96,7 @@ def test_two_modes_and_a_curved_ridge_keep_their_shares() -> None:
 def test_a_poor_proposal_costs_samples_and_not_correctness() -> None:
     """What only proposes is divided out: the result is the likelihood's own Gaussian."""
     images = gaussian(away(3.0 * SIGMAS), SIGMAS)
-    found = AdaptiveSampler(enough=2000.0, kept=4000).run(
+    found = AdaptiveSampler(samples=3000).run(
         Around(SIGMAS, evidence=False), images.log_density, CENTRE_M, np.random.default_rng(3)
     )
     mean, covariance = se3.mean(found.poses, found.weights, about_m=CENTRE_M)

@@ -15,6 +15,7 @@ from modeler.types import Outcome
 from sequences import bundled, open_sequence
 from sequences.rendering.renderer import RenderedSequence
 
+MIN_OVERLAP = VisibilityRegistrar().min_overlap
 WIDE = GeneralPrior(max_rotation_deg=95.0, max_offset_m=0.08)  # the other way round a box is beyond
 
 
@@ -44,7 +45,7 @@ def test_the_search_finds_the_motion_in_a_wide_prior(name, rng):
     source, target, truth = views(name, source=2, target=0)
     density = GeneralPrior(max_rotation_deg=110.0, max_offset_m=0.08).between(source, target)
     pair = VisibilityLikelihood().between(source, target, rng)
-    found = Search().run(pair, density, rng)
+    found = Search().run(pair, density, rng, min_overlap=MIN_OVERLAP)
     assert np.isfinite(density.log_density(found.poses)).all()
     assert (np.diff(found.scores) <= 0).all()
     rolled_deg = min(rotation_error_deg(pose, truth) for pose in found.poses)
@@ -56,9 +57,9 @@ def test_a_turn_beyond_the_prior_shows(rng):
     pair = VisibilityLikelihood().between(source, target, rng)
     narrow = GeneralPrior(max_rotation_deg=12.0).between(source, target)
     assert not np.isfinite(narrow.log_density(truth[None]))[0]
-    assert Search().run(pair, narrow, rng).beyond_gain > VisibilityRegistrar().max_beyond_gain
+    assert Search().run(pair, narrow, rng, min_overlap=MIN_OVERLAP).beyond_gain > 5.0
     wide = GeneralPrior(max_rotation_deg=60.0, max_offset_m=0.08).between(source, target)
-    assert Search().run(pair, wide, rng).beyond_gain < VisibilityRegistrar().max_beyond_gain
+    assert Search().run(pair, wide, rng, min_overlap=MIN_OVERLAP).beyond_gain < 5.0
     assert VisibilityRegistrar().register(source, target, narrow, rng=rng).outcome is Outcome.AT_LIMIT
 
 
@@ -71,7 +72,9 @@ def test_a_stool_may_have_turned_either_way():
     density = GeneralPrior().between(source, target)
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        found = Search().run(VisibilityLikelihood().between(source, target, rng), density, rng)
+        found = Search().run(
+            VisibilityLikelihood().between(source, target, rng), density, rng, min_overlap=MIN_OVERLAP
+        )
         turned_deg = np.array([rotation_error_deg(pose, right) for pose in found.poses])
         assert (turned_deg < 3.0).any()
         assert (np.abs(turned_deg - 90.0) < 3.0).any()
@@ -115,5 +118,5 @@ def box():
 def test_a_uniform_prior_does_not_pull_to_its_mean(box):
     """Where little surface matches, the mean of the prior is no better than its limits."""
     pair, density, truth = box
-    found = Search().run(pair, density, np.random.default_rng(1))
+    found = Search().run(pair, density, np.random.default_rng(1), min_overlap=MIN_OVERLAP)
     assert rotation_error_deg(found.poses[0], truth) < 5.0

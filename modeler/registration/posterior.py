@@ -7,6 +7,8 @@ from modeler.types import AbstractPoseDensity, Array, Outcome, PoseGaussian, Pos
 
 FLOOR = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
 """Added to sample covariances (6, 6) of ξ (rad, m), so that they are positive definite."""
+MIN_MODE_SHARE = 0.005
+"""Modes of less posterior probability are negligible."""
 PRIOR_SAMPLES = 500
 """Samples of a prior, for its mean and covariance."""
 

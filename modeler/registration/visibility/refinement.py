@@ -30,8 +30,6 @@ class Refiner:
     """The surface is bisected this many times: 2⁵ patches, whose errors are taken to be independent."""
     min_matches: float = 6.0
     """Least number of matches in a patch; with fewer in all, there are fewer patches."""
-    min_patches: int = 16
-    """With fewer patches nothing is refined: the scatter of six equations would not be determined."""
 
     def refine(
         self, pair: PairLikelihood, poses: Array, weights: Array, rng: np.random.Generator, *, fine_m: float
@@ -69,7 +67,7 @@ class Refiner:
         """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) in it (method.md, eq. 14)."""
         arms, by_own, by_other, residuals, weights = _equations(pair, mode, noise_m, centre_m)
         halvings = min(self.halvings, int(np.log2(max(len(arms) / self.min_matches, 1.0))))
-        if 2**halvings < self.min_patches:
+        if 2**halvings <= len(spread):  # the scatter of six equations would be singular
             return spread, np.zeros((6, 6))
         by_own, by_other = by_own @ spread, by_other @ spread
         # The noise of either surface's normals would add up in its own square; in their product it averages out.

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from modeler.registration.posterior import failed, share_at_limit, weighted_gaussian
+from modeler.registration.posterior import MIN_MODE_SHARE, failed, share_at_limit, weighted_gaussian
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.registration.visibility.refinement import Refiner
 from modeler.registration.visibility.sampling import (
@@ -76,10 +76,6 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Least share of the surface that both views should see and do."""
     max_at_limit: float = 0.2
     """Largest share of the samples at the limit of the prior."""
-    max_beyond_gain: float = 5.0
-    """Largest gain (nats) of a pose beyond the prior's support."""
-    min_effective: float = 100.0
-    """Least effective sample size."""
     max_sigma_deg: float = 10.0
     """Largest standard deviation of a rotation that is not ambiguous."""
 
@@ -91,7 +87,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         pair = self.likelihood.between(source, target, rng)
-        found = self.search.run(pair, density, rng)
+        found = self.search.run(pair, density, rng, min_overlap=self.min_overlap)
         modes_found = found.modes(pair.centre_m, self.search.extent(pair))[: self.max_modes]
         sampled = [self._sampled(pair, density, mode, rng) for mode in modes_found]
         reference = min(sampled, key=lambda mode: mode.noise_m)
@@ -135,7 +131,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         rng: np.random.Generator,
     ) -> float:
         """Return the share of the heaviest mode at the limit of the prior; 1 where surface leads beyond it."""
-        if found.beyond_gain > self.max_beyond_gain:
+        if found.beyond_gain > -np.log(MIN_MODE_SHARE):  # beside it the best inside would be negligible
             return 1.0
         return share_at_limit(density, heaviest.poses, heaviest.weights, pair.centre_m, rng)
 
@@ -173,7 +169,7 @@ class VisibilityRegistrar(AbstractRegistrar):
             return Outcome.AT_LIMIT
         if overlap < self.min_overlap:
             return Outcome.NO_OVERLAP
-        if effective_samples < self.min_effective:
+        if effective_samples < self.sampler.min_effective:
             return Outcome.DEGENERATE
         sigma_rad = np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])
         return Outcome.AMBIGUOUS if sigma_rad > np.deg2rad(self.max_sigma_deg) else Outcome.CONVERGED

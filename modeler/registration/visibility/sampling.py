@@ -11,12 +11,11 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.kernels import mixture
-from modeler.registration.posterior import FLOOR, effective_samples, normalised, pareto_tail
+from modeler.registration.posterior import FLOOR, MIN_MODE_SHARE, effective_samples, normalised, pareto_tail
 from modeler.se3 import rows
 from modeler.types import AbstractPoseDensity, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
-_MIN_MODE_SHARE = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +123,7 @@ def weigh_modes(modes: Sequence[WeightedSamples]) -> list[tuple[float, WeightedS
     log_mass = np.array([mode.log_evidence for mode in modes])
     mass = np.exp(log_mass - log_mass.max())
     mass /= mass.sum()
-    kept = [number for number in np.argsort(-mass, kind="stable") if mass[number] >= _MIN_MODE_SHARE]
+    kept = [number for number in np.argsort(-mass, kind="stable") if mass[number] >= MIN_MODE_SHARE]
     return [(float(mass[number] / mass[kept].sum()), modes[number]) for number in kept]
 
 
@@ -171,14 +170,12 @@ class AdaptiveSampler:
 
     draws: int = 400
     """Samples of a round; regions that the first misses altogether, later ones may miss too."""
-    enough: float = 580.0
-    """Effective sample size at which the rounds end."""
+    samples: int = 600
+    """Effective sample size at which the rounds end, and largest number of samples in the result."""
     max_draws: int = 8000
     """No further round begins after this many samples."""
-    min_fitted: float = 80.0
-    """Least effective size of the samples to which a Gaussian is fitted."""
-    kept: int = 750
-    """Largest number of samples in the result."""
+    min_effective: float = 100.0
+    """Least effective size of samples whose covariance counts: of a proposal, and of a usable result."""
 
     def run(
         self, proposal: AbstractPoseDensity, log_likelihood: LogLikelihood, centre_m: Array, rng: np.random.Generator
@@ -204,15 +201,15 @@ class AdaptiveSampler:
 
         drawn, fitted = weighed(first, log_count + proposal.log_density(first)), None
         log_weights = drawn.log_weights
-        while (effective := effective_samples(log_weights)) < self.enough and len(drawn.poses) < self.max_draws:
-            power = 1.0 if effective >= self.min_fitted else _power(log_weights, self.min_fitted)
+        while (effective := effective_samples(log_weights)) < self.samples and len(drawn.poses) < self.max_draws:
+            power = 1.0 if effective >= self.min_effective else _power(log_weights, self.min_effective)
             new = _fitted(drawn.poses, normalised(power * log_weights), centre_m).times(self.draws)
             fitted = new if fitted is None else fitted.plus(new)
             poses = new.sample(self.draws, rng)
             log_density = np.logaddexp(log_count + proposal.log_density(poses), fitted.log_density(poses))
             drawn = drawn.reweighted(new).plus(weighed(poses, log_density))
             log_weights = drawn.log_weights
-        chosen, weights = thinned(normalised(log_weights), self.kept, rng)
+        chosen, weights = thinned(normalised(log_weights), self.samples, rng)
         return WeightedSamples(
             drawn.poses[chosen],
             weights,

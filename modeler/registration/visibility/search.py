@@ -10,7 +10,7 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.kernels import mixture
 from modeler.kernels.point_to_plane import Regulariser
-from modeler.registration.posterior import PRIOR_SAMPLES
+from modeler.registration.posterior import MIN_MODE_SHARE, PRIOR_SAMPLES
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 
@@ -80,11 +80,6 @@ class Search:
     """Blur of the surfaces in each stage of the descent, as shares of the object's size."""
     steps: int = 4
     """Gauss-Newton steps at each blur."""
-    negligible: float = 10.0
-    """A candidate this many nats below the best is dropped."""
-    enough_overlap: float = 0.5
-    """Where the best pose inside the prior's support shows more of the surface than this, poses beyond it count only
-    within a basin of the support."""
 
     def scaled(self, effort: float) -> Search:
         """Return a search with `effort` times the starts."""
@@ -105,13 +100,17 @@ class Search:
         basins = np.sqrt(np.prod(np.maximum(variances, 1.0)))
         return int(np.clip(self.per_basin * basins, self.min_starts, self.max_starts))
 
-    def run(self, pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator) -> Candidates:
+    def run(
+        self, pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator, *, min_overlap: float
+    ) -> Candidates:
         """Return candidates, best first; always one at least.
 
         Args:
             pair: the two views.
             density: the prior.
             rng: source of all randomness.
+            min_overlap: where the best pose inside the prior's support shows more of the surface, poses beyond it
+                count only within a basin of the support.
         """
         prior, fine_m = _moments(pair, density, rng), self.fine_m(pair)
         started = self._drawn(pair, density, self.starts(pair, prior), rng)
@@ -123,9 +122,11 @@ class Search:
         poses = poses[inside] if inside.any() else started
         scores = pair.tempered(poses, fine_m)
         order = np.argsort(-scores, kind="stable")
-        order = order[scores[order] > scores.max() - self.negligible]
+        # The volumes of two modes may outweigh their likelihoods as much as a negligible mode is outweighed.
+        order = order[scores[order] > scores.max() + 2.0 * np.log(MIN_MODE_SHARE)]
         found = Candidates(poses[order], scores[order], _spreads(pair, prior, poses[order], fine_m))
-        outside = self._signs(pair, prior, density, outside, found.poses[0])
+        if pair.overlap(found.poses[0]) > min_overlap:
+            outside = self._near_support(pair, prior, density, outside)
         gain = pair.tempered(outside, fine_m).max() - found.scores[0] if len(outside) else -np.inf
         return replace(found.distinct(pair.centre_m), beyond_gain=float(gain))
 
@@ -147,15 +148,15 @@ class Search:
         damping = 0.0025 * pair.points / self.extent(pair) ** 2
         return Regulariser(se3.rows(prior.mean), precision, damping, self.basin)
 
-    def _signs(
-        self, pair: PairLikelihood, prior: PoseGaussian, density: AbstractPoseDensity, poses: Array, best: Array
+    def _near_support(
+        self, pair: PairLikelihood, prior: PoseGaussian, density: AbstractPoseDensity, poses: Array
     ) -> Array:
-        """Return those of poses (n, 4, 4) outside the prior's support that may show that its limits exclude the motion.
+        """Return those of poses (n, 4, 4) outside the prior's support that lie within a basin of it.
 
         Surface leads a quarter turn round a carton, where other sides of it may match better than the right ones; that
-        is no sign. `best` (4, 4) is the best pose inside.
+        is no sign that the prior's limits exclude the motion.
         """
-        if not (len(poses) and pair.overlap(best) > self.enough_overlap):
+        if not len(poses):
             return poses
         back = se3.difference(poses, prior.mean, pair.centre_m)
         basins = np.linalg.norm(back / self.extent(pair), axis=1, keepdims=True)
