@@ -76,8 +76,10 @@ class Search:
     """and no more,"""
     proposals: int = 15
     """each the best of so many samples of the prior on average."""
-    blurs: tuple[float, ...] = (0.12, 0.06, 0.03, 0.015)
-    """Blur of the surfaces in each stage of the descent, as shares of the object's size."""
+    finest: float = 0.015
+    """Blur of the surfaces in the last stage of the descent, as a share of the object's size."""
+    stages: int = 4
+    """Stages of the descent, each with half the blur of the one before."""
     steps: int = 4
     """Gauss-Newton steps at each blur."""
 
@@ -85,9 +87,13 @@ class Search:
         """Return a search with `effort` times the starts."""
         return replace(self, max_starts=int(effort * self.max_starts), per_basin=effort * self.per_basin)
 
+    def blurs_m(self, pair: PairLikelihood) -> Array:
+        """Return the blur in m of each stage of the descent."""
+        return np.ldexp(self.finest * pair.size_m, np.arange(self.stages - 1, -1, -1))
+
     def fine_m(self, pair: PairLikelihood) -> float:
         """Return the smallest blur in m."""
-        return self.blurs[-1] * pair.size_m
+        return self.finest * pair.size_m
 
     def extent(self, pair: PairLikelihood) -> Array:
         """Return the extent (6,) of a basin in rad and m."""
@@ -115,8 +121,8 @@ class Search:
         prior, fine_m = _moments(pair, density, rng), self.fine_m(pair)
         started = self._drawn(pair, density, self.starts(pair, prior), rng)
         poses, regulariser = started, self._regulariser(pair, prior)
-        for blur in self.blurs:
-            poses = pair.descend(poses, blur * pair.size_m, regulariser, steps=self.steps)
+        for blur_m in self.blurs_m(pair):
+            poses = pair.descend(poses, blur_m, regulariser, steps=self.steps)
         inside = np.isfinite(density.log_evidence(poses))
         outside = poses[~inside]
         poses = poses[inside] if inside.any() else started
@@ -132,7 +138,7 @@ class Search:
 
     def _drawn(self, pair: PairLikelihood, density: AbstractPoseDensity, count: int, rng: np.random.Generator) -> Array:
         """Return starting poses (n, 4, 4): samples of the prior that match best at twice the coarsest blur."""
-        poses, blur = density.sample(self.proposals * count, rng), 2.0 * self.blurs[0]
+        poses, blur = density.sample(self.proposals * count, rng), self.finest * 2.0**self.stages
         plain, share = pair.log_likelihoods(poses, blur * pair.size_m, stride=8)
         # Coarse surface matches easily: a match counts as the range that it determines, relative to a guess.
         scores = plain - np.log(blur) * share * pair.points
