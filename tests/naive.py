@@ -51,7 +51,7 @@ def visibility(pose, projection, parameters):
     fx, fy, cx, cy, width, height = projection.camera.astype(np.float64)
     low, high, flat, steep = projection.cosines.astype(np.float64)
     cells, points = projection.cells.reshape(int(height), int(width), -1), projection.points.T.astype(np.float64)
-    blur, silhouette_px, dead_band_px, clearance_m, max_point_cost, normal_cost, unmeasured_gain, typical_misfit = map(
+    blur, silhouette_px, clearance_m, max_point_cost, normal_cost, unmeasured_gain, typical_misfit = map(
         np.float64, parameters[:-1]
     )
     hidden = np.exp(np.float64(parameters.table[0]))
@@ -69,7 +69,7 @@ def visibility(pose, projection, parameters):
             continue
         cell = cells[row, column].astype(np.float64)
         if cell[planes.KIND] == planes.BACKGROUND:
-            beyond = max(cell[planes.SILHOUETTE] - dead_band_px, 0.0) / silhouette_px
+            beyond = cell[planes.SILHOUETTE] / silhouette_px
             if position[2] < cell[planes.DEPTH] - clearance_m:
                 total -= min(0.5 * beyond**2, max_point_cost)
         if cell[planes.KIND] != planes.SURFACE:

@@ -99,7 +99,7 @@ HIDDEN = 0.3
 
 
 def parameters(blur_m=0.004):
-    numbers = [np.float32(value) for value in (blur_m, 1.5, 1.5, 0.006, 10.0, 2.0, -1.2, 0.4)]
+    numbers = [np.float32(value) for value in (blur_m, 1.5, 0.006, 10.0, 2.0, -1.2, 0.4)]
     return point_likelihood.LikelihoodParameters(*numbers, table=point_likelihood.match_table(HIDDEN))
 
 

@@ -157,8 +157,6 @@ class LikelihoodParameters(NamedTuple):
     """Noise b of the surfaces."""
     silhouette_px: np.float32
     """Standard deviation of the silhouette."""
-    dead_band_px: np.float32
-    """Width of the dead band around the silhouette."""
     clearance_m: np.float32
     """A point this far in front of the background contradicts it."""
     max_point_cost: np.float32
@@ -234,7 +232,7 @@ def sum_over_points(points, transformed, looked_up, parameters):
         # Nothing hides a point in front of the measured surface.
         seen = max(match, -max_point_cost) if (in_front > ZERO) & (match < log_hidden) else seen
         on_surface = faces * seen - ((ONE - faces) * min(half_square, max_point_cost) if in_front > ZERO else ZERO)
-        beyond = max((looked_up[SILHOUETTE, j] - parameters.dead_band_px) / parameters.silhouette_px, ZERO)
+        beyond = looked_up[SILHOUETTE, j] / parameters.silhouette_px
         contradicts = transformed[Z, j] < looked_up[DEPTH, j] - parameters.clearance_m
         on_background = -min(HALF * beyond * beyond, max_point_cost) if contradicts else ZERO
         gain = on_surface if kind == _OF_SURFACE else ZERO
@@ -295,10 +293,7 @@ def classify(pose, projection, parameters):
     classes = np.zeros(pixels.shape[0], dtype=np.int8)
     for j in range(pixels.shape[0]):
         if looked_up[KIND, j] == BACKGROUND:
-            if (
-                looked_up[SILHOUETTE, j] > parameters.dead_band_px
-                and transformed[Z, j] < looked_up[DEPTH, j] - parameters.clearance_m
-            ):
+            if transformed[Z, j] < looked_up[DEPTH, j] - parameters.clearance_m:
                 classes[j] = IN_EMPTY_SPACE
         elif looked_up[KIND, j] == SURFACE:
             in_front = plane_distance(transformed, looked_up, j)

@@ -16,7 +16,6 @@ from modeler.types import Array, RayImage
 
 _MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
 _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a share of its pixels' lateral noise: they err independently
-_DEAD_BAND = 0.25  # around the silhouette, relative to the same noise: points lie inside, as the rim has no plane
 _COSINES = np.array([0.1, 0.35, 0.35, 0.6], dtype=np.float32)  # see `Projection`
 _DESCENT_STRIDE, _STRIDE = 4, 2  # every fourth point is used for descent, every second for scores
 _STATED_MISFIT = 0.5  # mean of r² / 2τ² if variances are as stated
@@ -103,7 +102,6 @@ class DirectedLikelihood:
         return LikelihoodParameters(
             blur_m=np.float32(np.hypot(blur_m, self._min_blur_m)),
             silhouette_px=np.float32(_SILHOUETTE_NOISE * lateral_px + blur_m * fx / self._distance_m),
-            dead_band_px=np.float32(_DEAD_BAND * lateral_px),
             clearance_m=np.float32(3.0 * self.image.sigma_r_m),
             max_point_cost=np.float32(self.model.max_point_cost),
             normal_cost=np.float32(self.model.normal_cost),
