@@ -43,7 +43,7 @@ def sigmas_about(poses, centre_m):
 def test_normal_equations_are_those_of_the_matching_points(rng):
     pair, truth, centre_m = bundled_pair("box")
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng, count=5)
-    gradients, matrices = pair.normal_equations(poses, 0.001)
+    gradients, matrices = pair.normal_equations(poses, 0.001, stride=1)
     for pose, gradient, matrix in zip(poses, gradients, matrices, strict=True):
         want = np.zeros(6), np.zeros((6, 6))
         for directed, carried, sign in ((pair.forward, pose, 1.0), (pair.backward, se3.inverse(pose), -1.0)):

@@ -16,7 +16,8 @@ from modeler.types import Array, RayImage
 
 _MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
 _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a share of its pixels' lateral noise: they err independently
-_COSINES = np.array([0.1, 0.35, 0.35, 0.6], dtype=np.float32)  # see `Projection`
+_RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; how far f and g rise beside it
+_COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).astype(np.float32)  # see `Projection`
 _DESCENT_STRIDE, _STRIDE = 4, 2  # every fourth point is used for descent, every second for scores
 _STATED_MISFIT = 0.5  # mean of r² / 2τ² if variances are as stated
 
@@ -70,11 +71,11 @@ class DirectedLikelihood:
 
     def classify(self, pose: Array) -> np.ndarray:
         """Return the class (n,) of each point under one pose (12,): `point_likelihood.classify`."""
-        return point_likelihood.classify(pose, self.projection(), self.parameters(0.0))
+        return point_likelihood.classify(pose, self.projection(1), self.parameters(0.0))
 
     def residual_excess(self, pose: Array, blur_m: float) -> tuple[float, int]:
         """Return Σ (r² - s² - v) in m² over the matches under a pose (12,), and their number (method.md, eq. 8)."""
-        return point_likelihood.residual_excess(pose, self.projection(), float(np.hypot(blur_m, self._min_blur_m)))
+        return point_likelihood.residual_excess(pose, self.projection(1), float(np.hypot(blur_m, self._min_blur_m)))
 
     def misfits(self, pose: Array, blur_m: float) -> Array:
         """Return the loss (k,) in nats of each match under one pose (12,) to its distance and normals."""
@@ -86,9 +87,9 @@ class DirectedLikelihood:
 
     def matches(self, pose: Array, blur_m: float) -> Array:
         """Return the match of each point under one pose (12,): `point_to_plane.matches`."""
-        return point_to_plane.matches(pose, self.projection(), blur_m)
+        return point_to_plane.matches(pose, self.projection(1), blur_m)
 
-    def projection(self, stride: int = 1) -> Projection:
+    def projection(self, stride: int) -> Projection:
         """Return every `stride`-th point and the other view's cells, as kernels take them."""
         if stride not in self._projections:
             columns = np.ascontiguousarray(self._columns[:, ::stride])
@@ -190,7 +191,7 @@ class PairLikelihood:
         return 1.0 / (1.0 / self.forward.model.max_independent + 1.0 / self.patches) / self.points
 
     def log_likelihoods(
-        self, poses: Array, blur_m: float, *, stride: int = 1, typical_misfit: float = _STATED_MISFIT
+        self, poses: Array, blur_m: float, *, stride: int, typical_misfit: float = _STATED_MISFIT
     ) -> tuple[Array, Array]:
         """Return log-likelihoods (n,), not tempered, and the shares (n,) of points that matching surface explains.
 
@@ -267,7 +268,7 @@ class PairLikelihood:
         matched = (classes == point_likelihood.MATCHED).sum()
         return float(matched / max(matched + wrong, 1))
 
-    def normal_equations(self, poses: Array, blur_m: float, *, stride: int = 1) -> tuple[Array, Array]:
+    def normal_equations(self, poses: Array, blur_m: float, *, stride: int) -> tuple[Array, Array]:
         """Return gradients (n, 6) and matrices (n, 6, 6) of the matches for ξ of poses (n, 4, 4) about the centre."""
         projections = self.forward.projection(stride), self.backward.projection(stride)
         gradients, equations = point_to_plane.normal_equations(rows(poses), *projections, self.centre_m, blur_m)
@@ -275,7 +276,7 @@ class PairLikelihood:
 
     def normal_equation(self, pose: Array, blur_m: float) -> tuple[Array, Array]:
         """Return gradient (6,) and matrix (6, 6) of one pose (4, 4), see `normal_equations`."""
-        projections = self.forward.projection(), self.backward.projection()
+        projections = self.forward.projection(1), self.backward.projection(1)
         return point_to_plane.normal_equation(rows(pose), *projections, self.centre_m, blur_m)
 
     def descend(self, poses: Array, blur_m: float, regulariser: Regulariser, *, steps: int) -> Array:
