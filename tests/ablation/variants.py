@@ -111,46 +111,41 @@ def _times(value: Any, factor: float) -> Any:
 
 REMOVED: Final = (
     Variant("choice of starts among samples", "removed", _with(search__proposals=1)),
-    Variant("refinement", "removed", _with(refiner__min_patches=_NEVER)),
+    Variant("refinement", "removed", _with(refiner__min_matches=_NEVER)),
     Variant("estimated misfit μ", "removed", _of(_StatedMisfit)),
     Variant("estimated noise b", "removed", _of(_StatedNoise)),
     Variant("patches (fewer independent points when small)", "removed", _of(_NoPatches)),
     Variant("cost of no overlap", "removed", _with(likelihood__no_overlap_cost=0.0)),
     Variant("cost of normals", "removed", _with(likelihood__normal_cost=0.0)),
     Variant("all modes but the best", "removed", _with(max_modes=1)),
-    Variant("dead band beside silhouettes", "removed", patched=_module(likelihood, _DEAD_BAND=0.0)),
 )
 
 
 def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
     """Return registrations with groups of constants times a factor, the most telling first."""
     hidden = 0.25 if factor < 1.0 else 0.75
-    silhouette = _module(likelihood, _SILHOUETTE_NOISE=0.5 * factor, _DEAD_BAND=0.25 * factor)
+    silhouette = _module(likelihood, _SILHOUETTE_NOISE=0.5 * factor)
     cosines = _module(likelihood, _COSINES=(factor * np.array([0.1, 0.35, 0.35, 0.6])).astype(np.float32))
     plain = {
         "independent points (70)": _scaled(factor, "likelihood.max_independent"),
         "cost of no overlap (50 nats)": _scaled(factor, "likelihood.no_overlap_cost"),
         "scale of overlap (0.1)": _scaled(factor, "likelihood.overlap_scale"),
-        "blurs (0.12 to 0.015)": _scaled(factor, "search.blurs"),
+        "blurs (0.12 to 0.015)": _scaled(factor, "search.finest"),
         "starts (400, 60, 3 a basin)": _scaled(factor, "search.max_starts", "search.min_starts", "search.per_basin"),
         "hidden share η (0.5; 0.25 and 0.75)": _with(likelihood__hidden_share=hidden),
         "cost of one point K (10 nats)": _scaled(factor, "likelihood.max_point_cost"),
         "cost of normals κ (2 nats)": _scaled(factor, "likelihood.normal_cost"),
-        "silhouette noise and dead band (0.5, 0.25)": silhouette,
+        "silhouette noise (0.5)": silhouette,
         "surface noise (0.1)": _scaled(factor, "likelihood.surface_noise"),
         "surface detail (0.003)": _scaled(factor, "likelihood.surface_detail"),
-        "sampler's sizes (400, 580, 750)": _scaled(
-            factor, *(f"sampler.{name}" for name in ("draws", "enough", "kept"))
-        ),
+        "sampler's sizes (400, 600)": _scaled(factor, "sampler.draws", "sampler.samples"),
         "patches of the refinement (2⁵)": _with(refiner__halvings=4 if factor < 1.0 else 6),
-        "least patches (16)": _scaled(factor, "refiner.min_patches"),
         "points (600)": _scaled(factor, "likelihood.points"),
         "samples for each start (15)": _scaled(factor, "search.proposals"),
         "size of a basin (0.2)": _scaled(factor, "search.basin"),
         "iterations of the descent (4)": _scaled(factor, "search.steps"),
-        "negligible (10 nats)": _scaled(factor, "search.negligible"),
         "modes (4)": _scaled(factor, "max_modes"),
-        "sampler: effective size for a fit (80)": _scaled(factor, "sampler.min_fitted"),
+        "sampler: least effective size (100)": _scaled(factor, "sampler.min_effective"),
         "sampler: draws at most (8000)": _scaled(factor, "sampler.max_draws"),
         "refinement: matches of a patch (6)": _scaled(factor, "refiner.min_matches"),
         "cosines of visibility (0.1 to 0.6)": cosines,
