@@ -126,7 +126,7 @@ def build(
     meta = RunMeta(
         sequence=frames.name if isinstance(sequence, AbstractSequence) else str(sequence),
         seed=seed,
-        prior=type(prior).__name__ if isinstance(prior, AbstractPrior) else compose.told(options, frames)[0],
+        prior=type(prior).__name__ if isinstance(prior, AbstractPrior) else compose.resolved_prior(options, frames)[0],
         known=modeler.prior,
         closure_expected=comes_back(frames, modeler.prior, modeler.closer.max_angle_deg),
     )

@@ -2,8 +2,8 @@
 
 A surface at angle θ to the image plane, seen with a focal length too short by a factor c, appears at atan(c tan θ), so
 that turns come out too small or too large, and the turns of a closed loop do not sum up to 360°. Every edge is
-registered again under a few focal lengths, which gives its mean as a function of log c; the focal length that the run
-tells is the one of least graph error (method.md, eq. S1 to S3).
+registered again under a few focal lengths, which gives its mean as a function of log c; the estimate is the
+focal length of least graph error (method.md, eq. S1 to S3).
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ _CONVERGED = 0.25  # standard deviations by which the last round moved the estim
 @final
 @dataclass(frozen=True)
 class FocalLength:
-    """What a run tells of the focal length."""
+    """The estimate of a focal length from a run."""
 
     factor: float
     """True focal length relative to the one that the run was made with."""
     sigma: float
     """Standard deviation of the factor's logarithm."""
     told_by: Literal["loop", "prior"]
-    """Whether loops tell it, or nothing does: then it is the prior's."""
+    """Whether loops determine it; otherwise it is the prior's."""
     sigmas_before: float
     """Root mean square of the loops' normalised residuals with the focal length that was given: 1 where all is true."""
     sigmas_after: float

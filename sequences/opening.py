@@ -45,7 +45,7 @@ def open_sequence(path: str | Path, overrides: Overrides | None = None) -> Abstr
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
 
 
-def _meant(path: Path) -> str:
+def _suggestion(path: Path) -> str:
     """Return a suggestion of a similar name in the same folder, "" if there is none."""
     with contextlib.suppress(OSError):  # the error about the path itself follows
         siblings = [other.name for other in path.parent.iterdir()]
@@ -56,7 +56,7 @@ def _meant(path: Path) -> str:
 
 def _open(path: Path, overrides: Overrides) -> AbstractSequence:
     if not path.exists():
-        raise InputError(f"{path}: no such folder or file; {_meant(path)}give {FORMATS}.")
+        raise InputError(f"{path}: no such folder or file; {_suggestion(path)}give {FORMATS}.")
     if not path.is_dir():
         check_regular(path)
     if path.suffix.lower() in BAGS or is_there(path / "metadata.yaml"):

@@ -277,10 +277,10 @@ def test_a_rendered_sequence_can_be_opened(cli: Run, tmp_path: Path) -> None:
 
 def test_a_step_between_numbers_that_leave_some_out_is_told_as_a_step_between_frames() -> None:
     options, whole = PriorOptions(prior="turntable", step_deg=-10.0), open_sequence(BOX)
-    assert compose.told(options, whole) == ("turntable", "")
-    _, remark = compose.told(options, whole.select(every=3))
+    assert compose.resolved_prior(options, whole) == ("turntable", "")
+    _, remark = compose.resolved_prior(options, whole.select(every=3))
     assert [words for words in ("by 3", "-10°", "-30°") if words not in remark] == []
-    assert compose.told(PriorOptions(prior="table"), whole.select(every=3)) == ("table", "")
+    assert compose.resolved_prior(PriorOptions(prior="table"), whole.select(every=3)) == ("table", "")
 
 
 @pytest.mark.parametrize(

@@ -53,9 +53,7 @@ def test_samples_are_those_of_prior_times_likelihood(narrower: float) -> None:
     """However little of the prior the likelihood leaves: mean, covariance and evidence are the product's."""
     shift = narrower * SIGMAS * np.array([1.0, -1.0, 0.5, 0.5, -1.0, 1.0])
     images = gaussian(away(shift), narrower * SIGMAS)
-    found = AdaptiveSampler(samples=6000).run(
-        Around(SIGMAS), images.log_density, CENTRE_M, np.random.default_rng(1)
-    )
+    found = AdaptiveSampler(samples=6000).run(Around(SIGMAS), images.log_density, CENTRE_M, np.random.default_rng(1))
     assert found.weights.sum() == pytest.approx(1.0)
     assert found.effective_samples > 3500.0
     mean, covariance = se3.mean(found.poses, found.weights, about_m=CENTRE_M)

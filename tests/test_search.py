@@ -72,9 +72,7 @@ def test_a_stool_may_have_turned_either_way():
     density = GeneralPrior().between(source, target)
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        found = Search().run(
-            VisibilityLikelihood().between(source, target, rng), density, rng, min_overlap=MIN_OVERLAP
-        )
+        found = Search().run(VisibilityLikelihood().between(source, target, rng), density, rng, min_overlap=MIN_OVERLAP)
         turned_deg = np.array([rotation_error_deg(pose, right) for pose in found.poses])
         assert (turned_deg < 3.0).any()
         assert (np.abs(turned_deg - 90.0) < 3.0).any()

@@ -15,7 +15,7 @@ from modeler import se3
 from modeler.closure import Closer
 from modeler.pipeline import glancing
 from modeler.pipeline.state import State
-from modeler.pipeline.tracking import Tracker, believed
+from modeler.pipeline.tracking import Tracker, preferred
 from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
@@ -133,18 +133,18 @@ def of_modes(*modes: tuple[float, float]) -> Posterior:
 def test_modes_beyond_the_limits_count_as_little_as_motions_beyond_do() -> None:
     """Whatever loops say later, they cannot choose a mode that is not there."""
     cut_off = Posterior(1, 0, PoseGaussian(turned(50.0), COVARIANCE), Outcome.NO_OVERLAP, overlap=0.0)
-    both = believed(cut_off, of_modes((0.6, -65.0), (0.4, 25.0)), Limited(LIMIT_DEG))
+    both = preferred(cut_off, of_modes((0.6, -65.0), (0.4, 25.0)), Limited(LIMIT_DEG))
     assert both.modes == ()
     np.testing.assert_allclose(both.pose.mean, turned(25.0), atol=1e-12)
     np.testing.assert_allclose(both.pose.covariance, COVARIANCE, atol=1e-12)
     np.testing.assert_array_equal(both.samples, turned(25.0)[None])
     assert both.weights.sum() == pytest.approx(1.0)
-    three = believed(cut_off, of_modes((0.6, -65.0), (0.3, 25.0), (0.1, -20.0)), Limited(LIMIT_DEG))
+    three = preferred(cut_off, of_modes((0.6, -65.0), (0.3, 25.0), (0.1, -20.0)), Limited(LIMIT_DEG))
     assert [mode.weight for mode in three.modes] == pytest.approx([0.75, 0.25])
-    far = believed(cut_off, of_modes((0.9997, -65.0), (0.0003, 25.0)), Limited(LIMIT_DEG))
+    far = preferred(cut_off, of_modes((0.9997, -65.0), (0.0003, 25.0)), Limited(LIMIT_DEG))
     assert [mode.weight for mode in far.modes] == pytest.approx([0.752, 0.248], abs=1e-3)
     for wide in (of_modes((0.6, -65.0), (0.4, 65.0)), of_modes((0.6, 25.0), (0.4, -40.0)), of_modes((1.0, -65.0))):
-        assert believed(cut_off, wide, Limited(LIMIT_DEG)) is wide
+        assert preferred(cut_off, wide, Limited(LIMIT_DEG)) is wide
 
 
 # Frames in which something hides the object: what is spent on them, and that those after them join as ever.

@@ -13,9 +13,9 @@ from modeler.priors import GeneralPrior, TablePrior, TurntablePrior
 from modeler.types import AbstractPrior, Failed, Outcome, Reason, advice
 from sequences import AbstractSequence
 
-_SURE_STEPS: Final = 3  # pairs that tell a step
-_FAR_SDS: Final = 3.0  # of the told step, from which on another one is meant
-_ROUGH: Final = 0.25  # of a step: how unevenly an object is turned by hand (11° to 37° where 18° were meant)
+_SURE_STEPS: Final = 3  # pairs whose median rotation counts as the step
+_FAR_SDS: Final = 3.0  # of the stated step, beyond which the measured one contradicts it
+_ROUGH: Final = 0.25  # of a step: how unevenly an object is turned by hand (11° to 37° where 18° were intended)
 _NEAR_LIMIT_DEG: Final = 15.0  # from the limit: the search follows poses beyond it so far (docs/method.md)
 _BY_OPTIONS: Final = {
     Outcome.AT_LIMIT: (
@@ -40,10 +40,10 @@ def reason_advice(reason: Reason) -> str:
 
 
 def comes_back(frames: AbstractSequence, prior: AbstractPrior, reach_deg: float) -> bool:
-    """Return whether the object is said to turn as far as its first view, or nearly.
+    """Return whether the stated rotations bring the object back to its first view, or nearly.
 
     Args:
-        frames: the sequence, which may tell the turn from frame to frame.
+        frames: the sequence, which may state the rotation from frame to frame.
         prior: of the run, whose turntable counts more.
         reach_deg: how near to a view another must look for them to be registered.
     """
@@ -64,7 +64,7 @@ def turntable(prior: AbstractPrior) -> TurntablePrior | None:
 
 
 def sense_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
-    """Return whether views overlap so little that a table may turn the other way round than its prior takes for known.
+    """Return whether views overlap so little that a table may turn in the other direction than its prior assumes.
 
     Args:
         report: of the run.
@@ -77,7 +77,7 @@ def sense_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
 
 
 def other_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
-    """Return in words by what step the views turned where that is not the one that the prior was told, else "".
+    """Return in words by what step the views turned where that contradicts the prior's, else "".
 
     Args:
         edges: of the report.
@@ -86,14 +86,14 @@ def other_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
     table, turns = turntable(prior), step_angles_deg(edges)
     if table is None or len(turns) < _SURE_STEPS:
         return ""
-    found_deg, told_deg = float(np.median(turns)), abs(table.step_deg)
-    if abs(found_deg - told_deg) <= _FAR_SDS * table.step_sigma_deg:
+    found_deg, stated_deg = float(np.median(turns)), abs(table.step_deg)
+    if abs(found_deg - stated_deg) <= _FAR_SDS * table.step_sigma_deg:
         return ""
-    meant_deg = round(float(np.copysign(found_deg, table.step_deg)), 1)
+    signed_deg = round(float(np.copysign(found_deg, table.step_deg)), 1)
     return (
-        f"the views turned by {found_deg:.1f}° from one frame number to the next, not by the {told_deg:g}° ± "
-        f"{table.step_sigma_deg:g}° that was told; "
-        + (f"is --step-deg {meant_deg:.1f} meant?" if meant_deg else "did the table turn?")
+        f"the views turned by {found_deg:.1f}° from one frame number to the next, not by the stated "
+        f"{stated_deg:g}° ± {table.step_sigma_deg:g}°; "
+        + (f"try --step-deg {signed_deg:.1f}" if signed_deg else "did the table turn?")
     )
 
 
@@ -151,7 +151,7 @@ def _region(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
 
 
 def _camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
-    """Return how a focal length is estimated, where a loop tells it."""
+    """Return how a focal length is estimated, where a loop determines it."""
     if not any(edge["kind"] == "closure" for edge in report["edges"]):
         return _more_known(report, prior)
     first = "modeler calibrate-camera {run} --out camera.json"
@@ -159,7 +159,7 @@ def _camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
 
 
 def _without_prior(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
-    """Return which prior holds less; None where the step that the images show is told anyway."""
+    """Return a weaker prior; None where the measured step is reported anyway."""
     if other_step(report["edges"], prior):
         return None
     if isinstance(prior, TurntablePrior):
@@ -168,7 +168,7 @@ def _without_prior(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | 
 
 
 def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
-    """Return which prior holds more."""
+    """Return a stronger prior."""
     if turntable(prior) is not None:
         return None
     turns = step_angles_deg(report["edges"])

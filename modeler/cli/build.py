@@ -78,7 +78,7 @@ class Build:
         whole, frames = _opened(self)
         modeler = compose.modeler(whole, self.prior, self.method, self.where)
         modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=self.voxel_m))
-        prior, remark = compose.told(self.prior, whole)
+        prior, remark = compose.resolved_prior(self.prior, whole)
         meta = RunMeta(
             sequence=str(self.sequence),
             seed=self.method.seed,
@@ -90,7 +90,7 @@ class Build:
         if self.resume and RunFolder(self.out).finished(meta):
             RunFolder(self.out).pairs.drop()  # what a kill at the very end left of them
             say("the run had come to its end; --overwrite makes it anew")
-            return _told(RunFolder(self.out).report(), self, modeler.prior)
+            return _summarise(RunFolder(self.out).report(), self, modeler.prior)
         scene = compose.scene(modeler, whole)
         with alone(self.out):
             before = RunFolder(self.out).changed_versions(meta) if self.resume else ()
@@ -107,7 +107,7 @@ class Build:
         recording = folder.path / "recording.rrd"
         if not ends_whole(recording):
             say(f"{recording}: is cut off (is the disk full?); the rest is whole")
-        return _told(report, self, modeler.prior)
+        return _summarise(report, self, modeler.prior)
 
     def settings(self) -> dict[str, object]:
         """Return what the results depend on besides sequence, seed and the prior's name, as report.json records it."""
@@ -231,8 +231,8 @@ def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt) -> Iterator
     yield from run.finish()
 
 
-def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
-    """Say on stderr what came out, and return the exit status."""
+def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
+    """Write a summary of the run to stderr, and return the exit status."""
     from modeler.cli.advice import ends_without, other_step, remedy, sense_in_doubt
     from modeler.types import ACCEPTED
 
@@ -252,7 +252,7 @@ def _told(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> in
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
         say(f"not to be trusted: {first}{more}")
         if sense_in_doubt(report, prior):
-            say("that the table turns the way round that was told is taken for granted; else give --step-sign unknown")
+            say("the stated direction of rotation is assumed; if it may be the other, give --step-sign unknown")
     for remark in (other_step(report["edges"], prior), ends_without(report["frames"])):
         if remark:
             say(remark)

@@ -1,4 +1,4 @@
-"""`modeler calibrate-camera`: the focal length that a run's loops tell."""
+"""`modeler calibrate-camera`: the focal length from the loops of a run."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class CalibrateCamera:
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:
-        """Estimate the focal length and store it; status 3 where nothing tells it.
+        """Estimate the focal length and store it; status 3 where no loop determines it.
 
         Raises:
             InputError: where the run cannot be used or the file cannot be written.
@@ -65,7 +65,7 @@ class CalibrateCamera:
 
 def _said(found: FocalLength, used_px: float) -> str:
     if found.told_by == "prior":
-        return "no loop tells the focal length; turn the object fully, with steps that overlap"
+        return "no loop determines the focal length; turn the object fully, with steps that overlap"
     focal_px, sigma_px = used_px * found.factor, used_px * found.factor * found.sigma
     loops = "1 loop" if found.loops == 1 else f"{found.loops} loops"
     return (

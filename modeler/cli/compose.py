@@ -158,7 +158,7 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
     if {"table", "turntable"} <= set(known):  # the axis is the table's normal: to multiply would count the table twice
         if "max_rotation_deg" in given:
             raise InputError(
-                "--max-rotation-deg is no parameter of a turntable on its table; --step-deg tells the turn."
+                "--max-rotation-deg is no parameter of a turntable on its table; --step-deg gives the rotation."
             )
         known.remove("table")
         of["turntable"]["needs_table"] = True
@@ -195,22 +195,22 @@ def prior_name(options: PriorOptions, sequence: AbstractSequence | None) -> str:
     return kind if fits and kind in enough and enough[kind]() else "general"
 
 
-def told(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
-    """Return the name of the prior, and in words what was chosen or assumed without being asked for."""
-    name, said = prior_name(options, sequence), []
+def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
+    """Return the name of the prior, and in words what was assumed because no option states it."""
+    name, assumed = prior_name(options, sequence), []
     if options.prior is None and name != "general":
-        said.append(f"prior {name}, as sequence.json says")
+        assumed.append(f"prior {name}, as sequence.json says")
     step_deg = _number((sequence.motion or {}).get("step_deg"))
     if "turntable" in name.split("+") and options.step_deg is None and step_deg is not None:
-        said.append(f"step {step_deg:g}°, as sequence.json says")
+        assumed.append(f"step {step_deg:g}°, as sequence.json says")
     step_deg = step_deg if options.step_deg is None else options.step_deg
     apart = min((late - early for early, late in itertools.pairwise(sequence.indices)), default=1)
     if "turntable" in name.split("+") and step_deg is not None and apart > 1:
-        said.append(
+        assumed.append(
             f"frame numbers go up by {apart}: {step_deg:g}° from one number to the next is {apart * step_deg:g}° from "
             "frame to frame"
         )
-    return name, "; ".join((*said, *sequence.notes))
+    return name, "; ".join((*assumed, *sequence.notes))
 
 
 def _known(name: str, given: dict[str, Any], sequence: AbstractSequence | None) -> AbstractPrior:
@@ -293,8 +293,8 @@ def _turntable(given: dict[str, Any], motion: Mapping[str, object]) -> Turntable
         if sigma_deg is not None and sigma_deg > 0.0:
             given.setdefault("step_sigma_deg", sigma_deg)
     agreed = step_deg is not None and step_deg * given["step_deg"] > 0.0
-    meant = given["step_deg"] < 0.0 or "axis_direction" in given or agreed
-    given.setdefault("step_sign", "known" if meant else "unknown")
+    signed = given["step_deg"] < 0.0 or "axis_direction" in given or agreed
+    given.setdefault("step_sign", "known" if signed else "unknown")
     return TurntablePrior(**given)
 
 

@@ -108,7 +108,7 @@ class PriorOptions:
         Literal["known", "unknown"] | None,
         default("known if the step is negative, or the axis or sequence.json given"),
     ] = None
-    """Whether the sign of the step is meant, or the table may turn either way (turntable)."""
+    """Whether the sign of the step is known, or the table may turn in either direction (turntable)."""
     axis_direction: Annotated[
         _Three | None, tyro.conf.arg(metavar="X Y Z"), default("normal to the table where one is seen, else about up")
     ] = None

@@ -54,7 +54,7 @@ class Register:
         edge = Edge(posterior, "odometry", posterior.usable, Stated(outcome_advice(posterior.outcome)))
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}
         print(json.dumps(record, allow_nan=False))
-        _, remark = compose.told(self.prior, sequence)
-        said = [f"{posterior.outcome.label} after {posterior.seconds:.2f} s", *([remark] if remark else [])]
-        say("; ".join(said))
+        _, remark = compose.resolved_prior(self.prior, sequence)
+        summary = [f"{posterior.outcome.label} after {posterior.seconds:.2f} s", *([remark] if remark else [])]
+        say("; ".join(summary))
         return 0 if posterior.usable else 3

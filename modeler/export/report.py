@@ -216,7 +216,7 @@ def _json(value: Any) -> Any:
 def undetermined(posterior: Posterior, view: RayImage | None = None) -> list[str]:
     """Name the directions of a motion that the data do not determine, the freest first; none where all are.
 
-    Of a posterior with several modes the heaviest is meant, and where the others lie is named after.
+    Of a posterior with several modes the heaviest is described first, then where the others lie.
 
     Args:
         posterior: of target_from_source.

@@ -1,7 +1,7 @@
 """Which pairs of views a run registers, with which prior, and which of two registrations counts.
 
 An object with sides alike matches as well a quarter turn on. That a mode lies beyond the prior's limits is no reason to
-believe that the object turned so far: it must match better by as much as motions beyond the limits are rare.
+accept that the object turned so far: it must match better by as much as motions beyond the limits are rare.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ class Tracker:
             wider = self._pair(view, odometry.target, relaxed)
             seconds = odometry.seconds + wider.seconds
             known = prior.between(view, self.state.views[odometry.target])
-            odometry = replace(believed(odometry, wider, known), seconds=seconds)
+            odometry = replace(preferred(odometry, wider, known), seconds=seconds)
         posteriors = (odometry,)
         while not again and not self._placed(posteriors):
             target = self.closer.relocalisation_target(posteriors, self.state.map_view)
@@ -216,15 +216,15 @@ class Tracker:
 
 
 def _promising(glance: Posterior) -> bool:
-    """Return whether a search may place a frame that was glanced at; a match cut off by the limits tells nothing."""
+    """Return whether a search may place a frame that was glanced at; a match cut off by the limits does not."""
     return glance.matches and glance.outcome is not Outcome.AT_LIMIT
 
 
 def glancing(registrar: AbstractRegistrar) -> AbstractRegistrar | None:
     """Return a registrar that gives up a hopeless pair at a small part of the cost; None where its method has none.
 
-    Views without common surface cost most of all: every place that the search finds is sampled. A glance follows the
-    best place alone.
+    Views without common surface cost most of all: every mode that the search finds is sampled. A glance samples the
+    best mode alone.
     """
     if not isinstance(registrar, VisibilityRegistrar):
         return None
@@ -232,8 +232,8 @@ def glancing(registrar: AbstractRegistrar) -> AbstractRegistrar | None:
     return replace(registrar, search=registrar.search.scaled(_GLANCE_SHARE), sampler=sampler, max_modes=1)
 
 
-def believed(within: Posterior, wider: Posterior, known: AbstractPoseDensity) -> Posterior:
-    """Return what is believed of a view that a prior's limits seemed to cut off.
+def preferred(within: Posterior, wider: Posterior, known: AbstractPoseDensity) -> Posterior:
+    """Return which registration counts for a view that a prior's limits seemed to cut off.
 
     Args:
         within: its registration in the limits.
@@ -242,7 +242,7 @@ def believed(within: Posterior, wider: Posterior, known: AbstractPoseDensity) ->
     """
     if within.outcome is Outcome.AT_LIMIT and within.matches and wider.usable:
         elsewhere = se3.rotation_angle(se3.inverse(within.pose.mean) @ wider.pose.mean) > _ELSEWHERE_RAD
-        # Unless it is one bump: a mean between places may lie inside, and is at none of them.
+        # Unless it has one mode: a mean between modes may lie inside, and is at none of them.
         possible = wider.outcome is Outcome.CONVERGED and _inside(known, wider.pose.mean[None])[0]
         better_nats = wider.log_evidence - within.log_evidence
         alike = wider.overlap < within.overlap + _MORE_OVERLAP

@@ -13,7 +13,7 @@ from modeler.priors.general import GeneralPrior, reach_deg, relaxed_limits, turn
 from modeler.priors.mixtures import KernelMixture, defensive_mixture
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, Frame, InputError, RayImage, Solution
 
-_STEP_DEG = 25.0  # step for which `max_offset_m` is meant
+_STEP_DEG = 25.0  # step to which `max_offset_m` refers
 _SAME_TIME_S = 1e-3  # poses and frames at most so far apart count as simultaneous
 
 

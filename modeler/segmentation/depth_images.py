@@ -109,14 +109,14 @@ def separate_layers(depths_m: Sequence[Float32Array], camera: Camera, noise: Dep
     agreeing = agree.sum(axis=0)
     back = np.where(agree, stack, np.float32(0.0)).sum(axis=0) / np.maximum(agreeing, 1).astype(np.float32)
     back[agreeing == 0] = np.nan
-    believed = 2 if frames > _FEW_FRAMES else 1
+    enough = 2 if frames > _FEW_FRAMES else 1
     nearer = (stack < back - noise.tolerance_m(back)).sum(axis=0)
     share = (nearer / np.maximum(readings, 1)).astype(np.float32)
-    often = (share >= _MOVED_SHARE) & (nearer >= believed)
+    often = (share >= _MOVED_SHARE) & (nearer >= enough)
     moved: BoolArray = np.asarray(ndimage.binary_opening(often, np.ones((3, 3))), dtype=np.bool_)
     front = np.where(moved, np.take_along_axis(stack, (nearer // 2)[None], axis=0)[0], back)
     back[agreeing < min(2, frames - 1)] = np.nan
-    still = (agreeing >= np.maximum(believed, _STILL_SHARE * readings)) & ~moved
+    still = (agreeing >= np.maximum(enough, _STILL_SHARE * readings)) & ~moved
     back, front, rays = (point_image(depth, camera, stride=stride) for depth in (back, front, np.ones_like(back)))
     return Layers(back, front, rays, moved, still, share)
 

@@ -283,7 +283,7 @@ def _little_overlap(edges: Sequence[Edge]) -> list[Shortcoming]:
 
 
 def _unsure(solution: Solution) -> list[Shortcoming]:
-    """Return which frames nobody knows how to turn: where the graph is not sure of it, nor is the model."""
+    """Return which frames have an uncertain rotation in the optimised graph: there the model is uncertain, too."""
     sigmas_deg = {
         frame: float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])))
         for frame, covariance in solution.covariances.items()

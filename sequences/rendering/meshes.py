@@ -26,7 +26,7 @@ IntArray = npt.NDArray[np.int64]
 @final
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles of one or several closed parts, which may overlap; their union is meant."""
+    """Triangles of one or several closed parts, which may overlap and stand for their union."""
 
     vertices_m: Array
     """(v, 3)."""
