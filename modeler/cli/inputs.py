@@ -252,7 +252,7 @@ class Reopened:
     """What it was made of: one sequence, or of joined runs all of theirs."""
 
     def volume(self, fuser: Fuser) -> FusionVolume:
-        """Return the views laid together as `modeler build` lays them."""
+        """Return the views fused as `modeler build` fuses them."""
         return fuser.volume(self.views, self.solution.trajectory, conditional_covariances(self.solution, self.edges))
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from modeler.graph import PoseGraph
     from modeler.types import Array, Edge, Posterior, RayImage, Solution, Step
 
-_SIGMA_RAD, _SIGMA_M = 0.12, 0.01  # how far off the laid models may be
+_SIGMA_RAD, _SIGMA_M = 0.12, 0.01  # error of the models' alignment
 _LEAST = 0.15  # score of models that fit each other at all
 _RIVAL = 0.97  # of the best match's score: one that is as good and lies elsewhere leaves the choice open
 _FARTHEST_RAD = 0.5  # a posterior farther from the match than this is another place
@@ -31,7 +31,7 @@ _FARTHEST_RAD = 0.5  # a posterior farther from the match than this is another p
 class Join:
     """Join two runs of the same object in different postures, so that the model has what each of them hides.
 
-    The models are laid on each other from every side, pairs of their views registered as in a build, and the frames of
+    The models are aligned from every side, pairs of their views registered as in a build, and the frames of
     both fused into one model in the object frame of RUN_A.
     """
 
@@ -67,10 +67,10 @@ class Join:
         matches = _matches(first, second)
         if matches[0].score < _LEAST:
             raise InputError(
-                f"{self.run_a} and {self.run_b}: the models do not fit each other however they are laid; are they of "
+                f"{self.run_a} and {self.run_b}: no alignment of the models fits; are they of "
                 "the same object, and do they share enough surface?"
             )
-        say(f"laid on each other, {100.0 * matches[0].score:.0f} % of the surface agree")
+        say(f"models aligned: {100.0 * matches[0].score:.0f} % of the surface agrees")
         edges = _edges(first, second, matches[0], self)
         count = sum(edge.accepted for edge in edges)
         if not count:
@@ -124,7 +124,7 @@ def _check(options: Join) -> None:
 
 
 def _matches(first: Reopened, second: Reopened) -> list[Match]:
-    """Return the ways to lay the second model on the first, best first.
+    """Return alignments of the second model with the first, best first.
 
     Raises:
         InputError: where there is none.
@@ -136,7 +136,7 @@ def _matches(first: Reopened, second: Reopened) -> list[Match]:
     models = volumes[0].model(), volumes[1].model()
     found = Matcher().matches(*volumes, models) if all(len(model.points_m) for model in models) else []
     if not found:
-        raise InputError("the models cannot be laid on each other; build both runs from more views")
+        raise InputError("the models cannot be aligned; build both runs from more views")
     return found
 
 
@@ -149,7 +149,7 @@ def _doubts(matches: list[Match]) -> list[str]:
         return []
     angle = float(se3.rotation_angle(se3.inverse(matches[0].target_from_source) @ rivals[0].target_from_source))
     return [
-        f"the models can be laid on each other as well another way, turned by {math.degrees(angle):.0f}°: the object "
+        f"another alignment of the models fits as well, turned by {math.degrees(angle):.0f}°: the object "
         "looks the same from several sides"
     ]
 
@@ -193,7 +193,7 @@ def _judged(posterior: Posterior, guess: Array) -> Edge:
     if not posterior.usable:
         return Edge(lasting, "closure", False, Failed(posterior.outcome))
     if away:
-        return Edge(lasting, "closure", False, Stated("lies elsewhere than the models laid on each other"))
+        return Edge(lasting, "closure", False, Stated("contradicts the alignment of the models"))
     return Edge(lasting, "closure", True, Stated("joins the runs"))
 
 

@@ -35,7 +35,7 @@ class ModelScore:
     frames: int
     """Number of views with a true pose."""
     rotation_error_deg: float
-    """Largest rotation error of a pose, the object laid on the true model by all frames together."""
+    """Largest rotation error of a pose, after the object is aligned with the true model by all frames together."""
     accuracy_mm: float
     """Mean distance from the model to the true surface."""
     completeness_mm: float
@@ -83,7 +83,7 @@ class _Candidate:
     model: ObjectModel
     """As it is made, in its object frame."""
     model_from_object: Array
-    """(4, 4) lays it on the true model."""
+    """(4, 4) aligns it with the true model."""
     model_from_camera: Mapping[int, Array]
     """Its poses (4, 4), so align_to_model, by frame number."""
 
