@@ -11,6 +11,7 @@ from calibration.specimens import SPECIMENS, Symmetry, load_specimen
 
 from modeler.cli.options import PriorOptions
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
+from sequences.rendering.depth_sensor import DepthSensor
 from sequences.rendering.recipe import Recipe
 from sequences.rendering.trajectory import Places, Tabletop, Turntable
 from trust.faults import FAULTS, Fault
@@ -71,11 +72,12 @@ class Plan:
 def viewed(recipe: Recipe, rng: np.random.Generator, seed: int) -> Recipe:
     """Return a recipe turned at random and seen by a small camera from a random height and distance."""
     x_deg, y_deg, z_deg = recipe.rest_rotation_deg
+    share = WIDTH_PX / recipe.view.width
     view = replace(
         recipe.view,
         width=WIDTH_PX,
         height=WIDTH_PX * 3 // 4,
-        focal_px=recipe.view.focal_px * WIDTH_PX / recipe.view.width,
+        focal_px=share * recipe.view.focal_px,
         distance_m=float(rng.uniform(0.6, 0.75)),
         elevation_deg=float(rng.uniform(25.0, 45.0)),
     )
@@ -84,9 +86,22 @@ def viewed(recipe: Recipe, rng: np.random.Generator, seed: int) -> Recipe:
         seed=seed,
         rest_rotation_deg=(x_deg, y_deg, z_deg + float(rng.uniform(0.0, 360.0))),
         view=view,
+        sensor=coarser(recipe.sensor, share),
         colour="none",
         pattern=None,
         masks=True,
+    )
+
+
+def coarser(sensor: DepthSensor | None, share: float) -> DepthSensor | None:
+    """Return a sensor whose errors in m and rad are the same where images have fewer pixels."""
+    if sensor is None or sensor.disparity is None or sensor.jitter is None:
+        return sensor
+    disparity, jitter = sensor.disparity, sensor.jitter
+    return replace(
+        sensor,
+        disparity=replace(disparity, sigma_px=share * disparity.sigma_px, quantum_px=share * disparity.quantum_px),
+        jitter=replace(jitter, sigma_px=share * jitter.sigma_px),
     )
 
 
