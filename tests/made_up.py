@@ -41,9 +41,9 @@ def ball(*, coloured: bool = True) -> ObjectModel:
 
 
 def an_edge(target: int, source: int, rng: np.random.Generator, kind: EdgeKind = "odometry", **changes: Any) -> Edge:
-    step = np.array([0.02, 0.4 * (source - target), 0.01, -0.3 * (source - target), 0.0, 0.05])
-    factor = rng.normal(size=(6, 6)) * 0.003 + 0.004 * np.eye(6)
-    pose = PoseGaussian(se3.exp(step + 0.005 * rng.normal(size=6)), factor @ factor.T)
+    step = (source - target) * np.array([0.01, 0.4, 0.005, -0.3, 0.0, 0.025])
+    factor = rng.normal(size=(6, 6)) * 0.0002 + 0.0003 * np.eye(6)
+    pose = PoseGaussian(se3.exp(step + 0.0002 * rng.normal(size=6)), factor @ factor.T)
     posterior = Posterior(source, target, pose, Outcome.CONVERGED, overlap=0.81, effective_samples=1234.5)
     return Edge(replace(posterior, **changes), kind, True, Stated("made up"))
 

@@ -130,6 +130,8 @@ def test_report_doubts_a_model_some_of_whose_frames_may_be_turned(tmp_path: Path
     def vague(*frames: int) -> Callable[[Step], Step]:
         def change(step: Step) -> Step:
             spread = np.diag([0.0, np.radians(9.0) ** 2, 0.0, 0.0, 0.0, 0.0])
+            about_object = se3.adjoint(se3.translation(np.ones(3)))  # where the views of this run have their points
+            spread = about_object @ spread @ about_object.T
             sure = step.solution.covariances
             covariances = {frame: sure[frame] + spread * (frame in frames) for frame in step.solution.trajectory}
             return replace(step, solution=replace(step.solution, covariances=covariances))
@@ -139,8 +141,8 @@ def test_report_doubts_a_model_some_of_whose_frames_may_be_turned(tmp_path: Path
     assert _spoilt(vague(), META, tmp_path)["reasons"] == []
     one, some = (_spoilt(vague(*frames), META, tmp_path) for frames in ((7,), (5, 7, 9)))
     assert (one["closed"], one["trustworthy"]) == (True, False)
-    assert one["reasons"] == ["frame 7 may be turned by 9° (one standard deviation)"]
-    assert some["reasons"][0].endswith("(one standard deviation), 2 more by over 5°")
+    assert one["reasons"] == ["frame 7 may be turned by 9.0° (one standard deviation)"]
+    assert some["reasons"][0].endswith("(one standard deviation), 2 more by over 1.5°")
 
 
 def test_report_in_the_middle_of_a_run_says_so(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from refusal import refused
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from worlds import CAMERA, OBJECT, World, iou
 
@@ -198,6 +199,17 @@ def test_masks_that_hold_the_table_as_well_are_unsure(rng):
         told = [Segmenter().segment(replace(frame, mask=one), Scene()) for one in (mask, box)]
         assert [one.outcome for one in told] == [Outcome.CONVERGED, Outcome.UNSURE_MASK]
         np.testing.assert_array_equal(told[1].mask, box)  # it is kept all the same
+
+
+def test_masks_that_leave_the_rim_out_are_unsure(rng):
+    frames, masks = turned(2, rng)
+    for frame, mask in zip(frames, masks, strict=True):
+        off_by = {0: Outcome.CONVERGED, 1: Outcome.CONVERGED, 3: Outcome.UNSURE_MASK, 6: Outcome.UNSURE_MASK}
+        for pixels, outcome in off_by.items():
+            thin = ndimage.binary_erosion(mask, iterations=pixels) if pixels else mask
+            one = Segmenter().segment(replace(frame, mask=thin), Scene())
+            assert one.outcome is outcome
+            np.testing.assert_array_equal(one.mask, thin)
 
 
 def test_a_masked_object_before_nothing_has_no_plane(rng):

@@ -41,14 +41,18 @@ from modeler.verdict.evidence import (
     free_space,
     graph_figure,
     loop_figure,
+    misfit,
     other_modes,
+    spread_of_places,
+    spread_of_rotations,
 )
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
 AXES_M = np.array([0.09, 0.05, 0.03])
 MIDDLE = se3.translation(np.array([0.0, 0.0, 0.6]))
 UP = (0.0, -1.0, 0.0)
-COVARIANCE = np.diag(np.repeat([np.radians(0.3), 0.0005], 3) ** 2)
+ABOUT_OBJECT = np.diag(np.repeat([np.radians(0.3), 0.0005], 3) ** 2)
+COVARIANCE = se3.adjoint(MIDDLE) @ ABOUT_OBJECT @ se3.adjoint(MIDDLE).T
 
 
 def turned(angle_deg: float) -> Array:
@@ -226,7 +230,10 @@ def test_edges_that_contradict_each_other_speak_against_a_model() -> None:
     figure = graph_figure(spoilt_edges, solution)
     assert figure is not None
     assert not figure.holds
+    assert misfit(spoilt_edges, solution) == pytest.approx(np.sqrt(figure.value))
+    assert misfit(edges, solution) >= 1.0
     assert graph_figure(edges[:-1], solution) is None  # a tree contradicts nothing
+    assert misfit(edges[:-1], solution) == 1.0
 
 
 def test_modes_that_the_graph_leaves_open_speak_against_a_model() -> None:
@@ -241,6 +248,32 @@ def test_modes_that_the_graph_leaves_open_speak_against_a_model() -> None:
         assert figure.holds is holds
         assert figure.value == pytest.approx(weights[2])
     assert other_modes([edge], Solution(poses), views).value == 0.0
+
+
+def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model() -> None:
+    """At the limit 95 % of poses are right; the place is that of the object, not that of the camera."""
+    views, poses = views_of(STEPS_DEG), poses_of(STEPS_DEG)
+    rng = np.random.default_rng(0)
+    for sigma_deg, sigma_m, turn_holds, place_holds in ((1.4, 0.002, True, True), (1.6, 0.003, False, False)):
+        spread = ABOUT_OBJECT + np.diag([0.0, np.radians(sigma_deg) ** 2, 0.0, 0.0, 0.0, sigma_m**2])
+        away = {frame: se3.adjoint(se3.translation(view.centroid_m)) for frame, view in views.items()}
+        solution = Solution(
+            poses,
+            {frame: away[frame] @ (spread if frame == 2 else ABOUT_OBJECT) @ away[frame].T for frame in poses},
+        )
+        turn, place = spread_of_rotations(solution), spread_of_places(views, solution)
+        assert turn is not None
+        assert place is not None
+        assert (turn.frame, turn.figure.holds) == (2, turn_holds)
+        assert (place.frame, place.figure.holds) == (2, place_holds)
+        assert place.figure.value == pytest.approx(np.hypot(sigma_m, 0.0005))
+        drawn_deg = np.abs(turn.figure.value * rng.normal(size=20_000))
+        assert bool(np.mean(drawn_deg > 3.0) < 0.05) is turn_holds
+    wider = spread_of_rotations(solution, 2.0)
+    assert wider is not None
+    assert wider.figure.value == pytest.approx(2.0 * turn.figure.value)
+    assert spread_of_rotations(Solution()) is None
+    assert spread_of_places(views, Solution()) is None
 
 
 def whole_run(
@@ -283,7 +316,8 @@ def test_a_sound_run_is_trusted_and_shows_its_evidence() -> None:
     codes, holds = whole_run(STEPS_DEG, prior=TurntablePrior(-25.0))
     assert codes == []
     assert holds == dict.fromkeys(
-        ("unsure_masks", "motion_m", "prior_sds", "seen_through", "absent", "other_modes"), True
+        ("unsure_masks", "motion_m", "prior_sds", "seen_through", "absent", "other_modes", "pose_sd_deg", "pose_sd_m"),
+        True,
     )
 
 

@@ -139,7 +139,8 @@ def remedy(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
         **dict.fromkeys(("unsure_masks", "no_motion"), _region),
         **dict.fromkeys(("loop_open", "edges_disagree"), _camera),
         "closures_refused": _camera,
-        **dict.fromkeys(("seen_through", "absent", "little_overlap", "other_modes", "unsure_rotation"), _more_known),
+        **dict.fromkeys(("seen_through", "absent", "little_overlap", "other_modes"), _more_known),
+        **dict.fromkeys(("unsure_rotation", "unsure_place"), _more_known),
     }
     found = (by_code[code](report, prior) for code in codes if code in by_code)
     return next((each for each in found if each is not None), None)

@@ -41,6 +41,9 @@ _AGREEING_SHARE = 0.5  # share of the static background that must agree for the 
 _NOISIEST = 3.0  # largest ratio to the expected noise; where depth changes more from frame to frame, the camera moves
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
+_RING_PX = (1.5, 2.5)  # distance from a mask at which nothing of the object is left, where it is right to a pixel
+_THIN_SHARE = 0.5  # share of that ring on the object's surface: beyond, most of the rim is missing
+_STEEPEST_SLOPE = np.tan(np.radians(70.0))  # of surfaces that depth cameras measure
 
 
 @final
@@ -242,14 +245,16 @@ class Segmenter:
     def segment(self, frame: Frame, scene: Scene) -> Segmentation:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
 
-        A frame's own mask is kept, within region and largest depth; it is UNSURE_MASK if it covers much of the support.
+        A frame's own mask is kept, within region and largest depth; it is UNSURE_MASK if it covers much of the support,
+        or if the object's surface goes on beyond most of its rim.
         """
         if frame.mask is not None:
             mask = frame.mask & self._allowed(frame.depth_m)
             few = np.count_nonzero(mask & (frame.depth_m > 0.0)) < self.min_points
             plane = None if few else self._plane_beside(frame, mask)
             loose = plane is not None and self._share_on(plane, frame, mask) > _LOOSE_SHARE
-            outcome = Outcome.UNSURE_MASK if loose else Outcome.CONVERGED
+            thin = not few and self._share_beyond(plane, frame, mask) > _THIN_SHARE
+            outcome = Outcome.UNSURE_MASK if loose or thin else Outcome.CONVERGED
             return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome)
         if scene.alone:
             mask = clean(self._kept(frame), frame.camera, self.noise)
@@ -320,6 +325,24 @@ class Segmenter:
         points = _points(frame, stride)
         points = points[mask[::stride, ::stride] & np.isfinite(points[..., 2])].astype(np.float64)
         return float(np.mean(np.abs(plane.height_m(points)) < self.noise.tolerance_m(points[:, 2])))
+
+    def _share_beyond(self, plane: Plane | None, frame: Frame, mask: BoolArray) -> float:
+        """Return the share of the pixels around a mask where its surface goes on: no depth step, and no support."""
+        rows, columns = _window(mask, margin=int(np.ceil(_RING_PX[1])))
+        inside, depth_m = mask[rows, columns], _measured(frame)[rows, columns]
+        outside = ~(inside & np.isfinite(depth_m))
+        away_px = np.asarray(ndimage.distance_transform_edt(outside))
+        nearest = np.asarray(ndimage.distance_transform_edt(outside, return_distances=False, return_indices=True))
+        ring = (away_px > _RING_PX[0]) & (away_px <= _RING_PX[1]) & ~inside
+        if not ring.any():
+            return 0.0
+        rim_m = depth_m[tuple(nearest)][ring]
+        step_m = np.abs(depth_m[ring] - rim_m)
+        goes_on = step_m < self.noise.tolerance_m(rim_m) + away_px[ring] * rim_m / frame.camera.fx * _STEEPEST_SLOPE
+        if plane is not None:
+            points = point_image(depth_m, frame.camera, row=rows.start, column=columns.start)[ring].astype(np.float64)
+            goes_on &= plane.height_m(points) > self.noise.tolerance_m(points[:, 2])
+        return float(goes_on.mean())
 
     def _plane_beside(self, frame: Frame, mask: BoolArray) -> Plane | None:
         """Return the support plane around a masked object, if one is seen."""

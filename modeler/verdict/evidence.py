@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 from scipy import ndimage
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from modeler import se3
 from modeler.types import AbstractPrior, Array, BoolArray, Edge, InputError, LoopOpening, RayImage, Solution
@@ -32,6 +32,8 @@ WRONG_M: Final = 0.005
 """Error of a surface from which on it is called wrong."""
 WRONG_RAD: Final = np.radians(3.0)
 """Error of a rotation from which on it is called wrong."""
+WRONG_SHARE: Final = 0.05
+"""Probability that a pose is wrong, beyond which it is not to be relied on: what regions of 95 % leave out."""
 MAX_OTHER_MODE: Final = 0.05
 """Probability that some pair is at another of its modes: what confidence regions of 95 % leave out."""
 
@@ -187,6 +189,69 @@ def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, R
         ]
         settled *= float(np.sum(np.asarray(weights)[alike]) / np.sum(weights))
     return Figure(1.0 - settled, MAX_OTHER_MODE)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The frame of whose pose least is known."""
+
+    frame: int
+    """Frame number."""
+    figure: Figure
+    """Standard deviation along the least certain axis. At the limit a Gaussian is wrong with `WRONG_SHARE`."""
+    count: int
+    """Number of frames beyond the limit."""
+
+
+def misfit(edges: Sequence[Edge], solution: Solution) -> float:
+    """Return by what factor edges err by more than they state, as their residuals tell; 1 where by no more.
+
+    Args:
+        edges: those that take part.
+        solution: the poses.
+    """
+    fit = graph_figure(edges, solution)
+    return 1.0 if fit is None else float(np.sqrt(max(fit.value, 1.0)))
+
+
+def spread_of_rotations(solution: Solution, factor: float = 1.0) -> Spread | None:
+    """Return how uncertain the rotations of the poses are at worst, in degrees; None without a pose.
+
+    Args:
+        solution: the poses.
+        factor: of the standard deviations that are stated: `misfit`.
+    """
+    sigmas_deg = {
+        frame: factor * float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])))
+        for frame, covariance in solution.covariances.items()
+    }
+    return _widest(sigmas_deg, float(np.degrees(WRONG_RAD)))
+
+
+def spread_of_places(views: Mapping[int, RayImage], solution: Solution, factor: float = 1.0) -> Spread | None:
+    """Return how uncertain the places of the surface in the poses are at worst, in m; None without a pose.
+
+    Args:
+        views: by frame number; the place is that of a view's centroid.
+        solution: the poses.
+        factor: of the standard deviations that are stated: `misfit`.
+    """
+    sigmas_m = {
+        frame: factor
+        * float(np.sqrt(np.linalg.eigvalsh(se3.covariance_about(covariance, views[frame].centroid_m)[3:, 3:])[-1]))
+        for frame, covariance in solution.covariances.items()
+        if frame in views and len(views[frame].points_m)
+    }
+    return _widest(sigmas_m, WRONG_M)
+
+
+def _widest(sigmas: Mapping[int, float], wrong: float) -> Spread | None:
+    """Return the largest standard deviation by frame number; `wrong` is the error from which on a pose is wrong."""
+    limit = wrong / float(norm.isf(WRONG_SHARE / 2.0))
+    worst = max(sigmas, key=lambda frame: sigmas[frame], default=None)
+    if worst is None:
+        return None
+    return Spread(worst, Figure(sigmas[worst], limit), sum(sigma > limit for sigma in sigmas.values()))
 
 
 @dataclass(frozen=True)

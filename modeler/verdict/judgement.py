@@ -36,11 +36,13 @@ from modeler.verdict.evidence import (
     free_space,
     graph_figure,
     loop_figure,
+    misfit,
     other_modes,
+    spread_of_places,
+    spread_of_rotations,
 )
 
 _LITTLE_OVERLAP: Final = 0.5  # views farther apart are registered wrongly now and then, and surely so
-_UNSURE_DEG: Final = 5.0  # standard deviation of a frame's turn beyond which the model shows a surface several times
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,8 @@ class Shortcoming:
     code: str
     """For programs: `doubt`, `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
     `prior_contradicted`, `loop_open`, `edges_disagree`, `closures_refused`, `unconfirmed`, `never_came_back`,
-    `not_tried`, `seen_through`, `absent`, `little_overlap`, `other_modes` or `unsure_rotation`."""
+    `not_tried`, `seen_through`, `absent`, `little_overlap`, `other_modes`, `unsure_rotation` or
+    `unsure_place`."""
     words: str
     """For people."""
 
@@ -86,7 +89,7 @@ class Verdict:
     """Why not; empty where it can be."""
     evidence: Mapping[str, Figure] = field(default_factory=dict)
     """Figures by name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `loop_sigmas`, `graph_chi2`,
-    `seen_through`, `absent` and `other_modes`, those that the run has."""
+    `seen_through`, `absent`, `other_modes`, `pose_sd_deg` and `pose_sd_m`, those that the run has."""
 
     @property
     def trustworthy(self) -> bool:
@@ -124,11 +127,12 @@ def judged(
         reasons.append(Shortcoming("too_few_frames", words))
     edges = [edge for edge in step.edges_so_far if step.solution.takes_part(edge)]
     found = _found(step, frames, edges, prior) if step.last else []
-    reasons += [Shortcoming(finding.code, finding.words) for finding in found if not finding.figure.holds]
+    reasons += _against(found)
     reasons += _open_loop(step, edges, closure_expected=closure_expected)
     reasons += _little_overlap(edges)
-    reasons += _unsure(step.solution)
-    return Verdict(tuple(reasons), {finding.name: finding.figure for finding in found})
+    spreads = _spreads(step, edges) if step.last else []
+    reasons += _against(spreads)
+    return Verdict(tuple(reasons), {finding.name: finding.figure for finding in (*found, *spreads)})
 
 
 @dataclass(frozen=True)
@@ -139,6 +143,11 @@ class _Finding:
     figure: Figure
     code: str
     words: str
+
+
+def _against(found: Sequence[_Finding]) -> list[Shortcoming]:
+    """Return which findings speak against a model."""
+    return [Shortcoming(finding.code, finding.words) for finding in found if not finding.figure.holds]
 
 
 def _found(
@@ -199,6 +208,21 @@ def _found(
     others = other_modes(edges, solution, views)
     words = f"with a probability of {100.0 * others.value:.0f} % some pair is at another of its modes"
     found.append(_Finding("other_modes", others, "other_modes", words))
+    return found
+
+
+def _spreads(step: Step, edges: Sequence[Edge]) -> list[_Finding]:
+    """Return how uncertain the poses of a whole run are."""
+    found, factor = [], misfit(edges, step.solution)
+    if (turn := spread_of_rotations(step.solution, factor)) is not None:
+        words = f"frame {turn.frame} may be turned by {turn.figure.value:.1f}° (one standard deviation)"
+        words += f", {turn.count - 1} more by over {turn.figure.limit:.1f}°" if turn.count > 1 else ""
+        found.append(_Finding("pose_sd_deg", turn.figure, "unsure_rotation", words))
+    if (place := spread_of_places(step.views, step.solution, factor)) is not None:
+        value_mm, limit_mm = 1000.0 * place.figure.value, 1000.0 * place.figure.limit
+        words = f"frame {place.frame} may be {value_mm:.1f} mm from its place (one standard deviation)"
+        words += f", {place.count - 1} more over {limit_mm:.1f} mm" if place.count > 1 else ""
+        found.append(_Finding("pose_sd_m", place.figure, "unsure_place", words))
     return found
 
 
@@ -280,18 +304,3 @@ def _little_overlap(edges: Sequence[Edge]) -> list[Shortcoming]:
         for edge in edges
         if edge.posterior.overlap < _LITTLE_OVERLAP and not joined_without(edge, edges)
     ]
-
-
-def _unsure(solution: Solution) -> list[Shortcoming]:
-    """Return which frames have an uncertain rotation in the optimised graph: there the model is uncertain, too."""
-    sigmas_deg = {
-        frame: float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])))
-        for frame, covariance in solution.covariances.items()
-    }
-    worst = max(sigmas_deg, key=lambda frame: sigmas_deg[frame], default=None)
-    if worst is None or sigmas_deg[worst] <= _UNSURE_DEG:
-        return []
-    count = sum(sigma_deg > _UNSURE_DEG for sigma_deg in sigmas_deg.values())
-    others = f", {count - 1} more by over {_UNSURE_DEG:.0f}°" if count > 1 else ""
-    words = f"frame {worst} may be turned by {sigmas_deg[worst]:.0f}° (one standard deviation){others}"
-    return [Shortcoming("unsure_rotation", words)]

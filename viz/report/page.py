@@ -99,6 +99,8 @@ _CHECKS: Final = {
     "graph_chi2": ("squared residuals of the edges over their covariances", 1.0, ""),
     "seen_through": ("surface of a frame that others see through", 100.0, " %"),
     "absent": ("surface of a frame that most others that look see through", 100.0, " %"),
+    "pose_sd_deg": ("largest standard deviation of a pose's rotation", 1.0, "°"),
+    "pose_sd_m": ("largest standard deviation of a pose's place", 1000.0, " mm"),
     "other_modes": ("probability of another mode", 100.0, " %"),
 }
 """Figures of the evidence in words, each with the factor to its unit."""
