@@ -43,6 +43,8 @@ from modeler.verdict.evidence import (
     loop_figure,
     misfit,
     other_modes,
+    prior_distances,
+    prior_figure,
     spread_of_places,
     spread_of_rotations,
 )
@@ -170,7 +172,7 @@ TABLE = Plane(np.array([0.0, -1.0, 0.0]), 0.1, np.radians(0.3), 0.001)
 def test_pairs_are_compared_with_their_prior(prior: AbstractPrior, found_deg: float, contradicted: bool) -> None:
     views = views_of([0.0, -found_deg], plane=TABLE if isinstance(prior, TablePrior) else None)
     poses = poses_of([0.0, -found_deg])  # turned left-handed about y, which points down: right-handed about up
-    against = contradiction([joined(1, 0, poses)], views, Solution(poses), prior)
+    against = contradiction(prior_distances([joined(1, 0, poses)], views, prior))
     assert against is not None
     assert against.figure.holds is not contradicted
     assert (against.source, against.target) == (1, 0)
@@ -183,9 +185,23 @@ def test_a_tilted_object_contradicts_its_table() -> None:
     right = se3.inverse(poses_of([0.0, 25.0])[1])
     for motion, holds in ((right, True), (tilt @ right, False)):
         poses = {0: np.eye(4), 1: se3.inverse(motion)}
-        against = contradiction([joined(1, 0, poses)], views, Solution(poses), TablePrior())
+        against = contradiction(prior_distances([joined(1, 0, poses)], views, TablePrior()))
         assert against is not None
         assert against.figure.holds is holds
+
+
+@pytest.mark.parametrize(("step_deg", "alone", "together"), [(25.3, True, True), (28.5, True, False)])
+def test_a_step_told_wrongly_shows_in_all_pairs_together(step_deg: float, alone: bool, together: bool) -> None:
+    angles_deg = [-step_deg * k for k in range(13)]
+    views, poses = views_of(angles_deg), poses_of(angles_deg)
+    edges = [joined(k, k - 1, poses) for k in range(1, 13)]
+    distances = prior_distances(edges, views, TurntablePrior(25.0))
+    against, figure = contradiction(distances), prior_figure(distances)
+    assert against is not None
+    assert figure is not None
+    assert against.figure.holds is alone
+    assert figure.holds is together
+    assert prior_figure(prior_distances([joined(5, 1, poses, kind="closure")], views, TurntablePrior(25.0))) is None
 
 
 def ring(off_deg: float, *, count: int = 15) -> tuple[list[Edge], Solution]:
@@ -316,7 +332,17 @@ def test_a_sound_run_is_trusted_and_shows_its_evidence() -> None:
     codes, holds = whole_run(STEPS_DEG, prior=TurntablePrior(-25.0))
     assert codes == []
     assert holds == dict.fromkeys(
-        ("unsure_masks", "motion_m", "prior_sds", "seen_through", "absent", "other_modes", "pose_sd_deg", "pose_sd_m"),
+        (
+            "unsure_masks",
+            "motion_m",
+            "prior_sds",
+            "prior_chi2",
+            "seen_through",
+            "absent",
+            "other_modes",
+            "pose_sd_deg",
+            "pose_sd_m",
+        ),
         True,
     )
 

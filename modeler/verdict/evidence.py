@@ -95,22 +95,20 @@ class Contradiction:
     posterior's mean. Of other densities the same, whatever their shape."""
 
 
-def contradiction(
-    edges: Sequence[Edge], views: Mapping[int, RayImage], solution: Solution, prior: AbstractPrior
-) -> Contradiction | None:
-    """Return the edge whose posterior contradicts the independent knowledge most; None where nothing can be compared.
+def prior_distances(
+    edges: Sequence[Edge], views: Mapping[int, RayImage], prior: AbstractPrior
+) -> list[tuple[Edge, float]]:
+    """Return edges with the distances Δ, in nats, from the prior's mode to the means of their posteriors.
 
     Limits of a search, outside of which a density is zero, are those for several steps: motions beyond the limits of
-    one are looked for there.
+    one are looked for there. Edges to which the prior does not apply are left out.
 
     Args:
         edges: those that take part.
         views: by frame number.
-        solution: the poses.
         prior: what was known of motions before the images were compared.
     """
-    limit = float(np.sqrt(chi2.isf(TAIL, 6)))
-    worst: Contradiction | None = None
+    found = []
     for edge in edges:
         if edge.source not in views or edge.target not in views:
             continue
@@ -123,12 +121,39 @@ def contradiction(
         means = np.stack([mode.pose.mean for mode in posterior.modes] or [posterior.pose.mean])
         usual = density.log_evidence(density.sample(_DRAWS, np.random.default_rng(0)))
         here = float(density.log_evidence(means).max())
-        if not np.isfinite(here):  # at a limit of the search, where the posterior is cut off
-            continue
-        sds = float(np.sqrt(2.0 * max(float(usual.max()) - here, 0.0)))
-        if worst is None or sds > worst.figure.value:
-            worst = Contradiction(edge.source, edge.target, Figure(sds, limit))
-    return worst
+        if np.isfinite(here):  # not at a limit of the search, where the posterior is cut off
+            found.append((edge, max(float(usual.max()) - here, 0.0)))
+    return found
+
+
+def contradiction(distances: Sequence[tuple[Edge, float]]) -> Contradiction | None:
+    """Return the edge whose posterior contradicts the independent knowledge most; None where nothing can be compared.
+
+    Args:
+        distances: as `prior_distances` returns them.
+    """
+    if not distances:
+        return None
+    edge, nats = max(distances, key=lambda found: found[1])
+    return Contradiction(
+        edge.source, edge.target, Figure(float(np.sqrt(2.0 * nats)), float(np.sqrt(chi2.isf(TAIL, 6))))
+    )
+
+
+def prior_figure(distances: Sequence[tuple[Edge, float]]) -> Figure | None:
+    """Return the squared distances of the odometry edges from a Gaussian prior together, a degree of freedom.
+
+    A step told wrongly shows in every pair a little. Under a true prior a posterior's mean is nearer to the mode than
+    the motion, whose squared distance follows χ² of six degrees of freedom. None where nothing can be compared.
+
+    Args:
+        distances: as `prior_distances` returns them.
+    """
+    squared = [2.0 * nats for edge, nats in distances if edge.kind == "odometry"]
+    if not squared:
+        return None
+    freedom = 6 * len(squared)
+    return Figure(sum(squared) / freedom, float(chi2.isf(LOOP_TAIL, freedom)) / freedom)
 
 
 def loop_figure(openings: Sequence[LoopOpening]) -> tuple[LoopOpening, Figure] | None:

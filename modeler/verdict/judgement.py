@@ -38,6 +38,8 @@ from modeler.verdict.evidence import (
     loop_figure,
     misfit,
     other_modes,
+    prior_distances,
+    prior_figure,
     spread_of_places,
     spread_of_rotations,
 )
@@ -88,8 +90,8 @@ class Verdict:
     shortcomings: tuple[Shortcoming, ...] = ()
     """Why not; empty where it can be."""
     evidence: Mapping[str, Figure] = field(default_factory=dict)
-    """Figures by name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `loop_sigmas`, `graph_chi2`,
-    `seen_through`, `absent`, `other_modes`, `pose_sd_deg` and `pose_sd_m`, those that the run has."""
+    """Figures by name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `prior_chi2`, `loop_sigmas`,
+    `graph_chi2`, `seen_through`, `absent`, `other_modes`, `pose_sd_deg` and `pose_sd_m`, those that the run has."""
 
     @property
     def trustworthy(self) -> bool:
@@ -146,8 +148,10 @@ class _Finding:
 
 
 def _against(found: Sequence[_Finding]) -> list[Shortcoming]:
-    """Return which findings speak against a model."""
-    return [Shortcoming(finding.code, finding.words) for finding in found if not finding.figure.holds]
+    """Return which findings speak against a model, of those with one code the first."""
+    against = [finding for finding in found if not finding.figure.holds]
+    words = {finding.code: finding.words for finding in reversed(against)}
+    return [Shortcoming(code, words[code]) for code in dict.fromkeys(finding.code for finding in against)]
 
 
 def _found(
@@ -173,12 +177,19 @@ def _found(
             f"camera's noise hides (up to {1000.0 * moved_m.limit:.1f} mm)"
         )
         found.append(_Finding("motion_m", moved_m, "no_motion", words))
-    if prior is not None and (against := contradiction(edges, views, solution, prior)) is not None:
+    distances = [] if prior is None else prior_distances(edges, views, prior)
+    if (against := contradiction(distances)) is not None:
         words = (
             f"the images contradict the prior: from frame {against.target} to {against.source} the object moved "
             f"{against.figure.value:.0f} standard deviations from what the prior expects"
         )
         found.append(_Finding("prior_sds", against.figure, "prior_contradicted", words))
+    if (together := prior_figure(distances)) is not None:
+        words = (
+            f"the images contradict the prior in all pairs together: squared distances from what it expects are "
+            f"{together.value:.1f} times those of its standard deviations (up to {together.limit:.1f} by chance)"
+        )
+        found.append(_Finding("prior_chi2", together, "prior_contradicted", words))
     centroids_m = {frame: view.centroid_m for frame, view in views.items()}
     if (loop := loop_figure(loop_openings(step.edges_so_far, solution, centroids_m))) is not None:
         opening, figure = loop

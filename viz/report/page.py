@@ -95,6 +95,7 @@ _CHECKS: Final = {
     "unsure_masks": ("frames with an unsure mask", 100.0, " %"),
     "motion_m": ("largest motion of the surface", 1000.0, " mm"),
     "prior_sds": ("farthest pair from what the prior expects", 1.0, " sd"),
+    "prior_chi2": ("squared distances from the prior over its variances, all pairs", 1.0, ""),
     "loop_sigmas": ("widest open loop, before optimisation", 1.0, " sd"),
     "graph_chi2": ("squared residuals of the edges over their covariances", 1.0, ""),
     "seen_through": ("surface of a frame that others see through", 100.0, " %"),
