@@ -72,7 +72,7 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Largest number of modes that are sampled."""
     min_points: int = 60
     """Views with fewer surface points are not registered."""
-    min_overlap: float = 0.35
+    min_overlap: float = 0.5
     """Least share of the surface that both views should see and do."""
     max_at_limit: float = 0.2
     """Largest share of the samples at the limit of the prior."""
