@@ -23,8 +23,9 @@ from modeler.cli.console import Interrupt
 from modeler.cli.options import PriorOptions
 from modeler.export import RunFolder, model_upright
 from modeler.types import ACCEPTED, Outcome
-from sequences import open_sequence
+from sequences import bundled, open_sequence
 
+TUBE = bundled("tube")
 QUICK = ("--prior", "table", "--voxel-m", "0.004", "--frames", "0:3")
 
 
@@ -231,6 +232,19 @@ def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(cli: Run, tmp_p
     (lost,) = (reason for code, reason in zip(told["reason_codes"], told["reasons"], strict=True) if code == "left_out")
     assert lost.startswith("frames 0 to 2 ")
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"model.ply", "cloud.ply"}
+
+
+@pytest.mark.parametrize(
+    "arguments", [("register", TUBE, 1, 0), ("build", TUBE), ("evaluate", TUBE, "--frames", "0:2", "--prior", "table")]
+)
+def test_coloured_icp_refuses_what_has_no_colour(cli: Run, tmp_path: Path, arguments: tuple[object, ...]) -> None:
+    named = ("--methods" if arguments[0] == "evaluate" else "--method", "coloured-icp")
+    out = () if arguments[0] == "register" else ("--out", tmp_path / "out")
+    ended = cli(*arguments, *named, *out)
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err.count("\n") == 1
+    assert "has no colour" in ended.err
+    assert not (tmp_path / "out" / "report.json").exists()
 
 
 def test_evaluate_writes_errors_and_prints_a_table(cli: Run, tmp_path: Path) -> None:

@@ -159,6 +159,7 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
         InputError: where something cannot be read.
     """
     from modeler.cli.inputs import calibrated, watched
+    from modeler.types import InputError
     from sequences import frame_range, open_sequence, survey
 
     path = options.sequence
@@ -166,7 +167,10 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
     whole = calibrated(whole, options.sensor, options.camera)
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     if not frames.live:
-        for doubt in survey(frames, truth=False).doubts:
+        found = survey(frames, truth=False)
+        if options.method.method == "coloured-icp" and found.colours == 0:
+            raise InputError(f"{path}: has no colour, which coloured ICP compares; give another --method")
+        for doubt in found.doubts:
             say(doubt)
     return whole, frames
 
