@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -27,6 +28,26 @@ class AbstractProposal(AbstractPrior):
 
     known: AbstractPrior = field(default_factory=GeneralPrior)
     """The independent knowledge."""
+
+    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
+        """Return the density of target_from_source; the independent knowledge alone where there is no proposal.
+
+        Raises:
+            InputError: where the views lack what `known` needs.
+        """
+        known = self.known.between(source, target)
+        proposal = self.proposal(source, target, known)
+        return known if proposal is None else defensive_mixture(known, [proposal])
+
+    @abstractmethod
+    def proposal(self, source: RayImage, target: RayImage, known: AbstractPoseDensity) -> AbstractPoseDensity | None:
+        """Return the proposed density of target_from_source; None where the views or the graph yield none.
+
+        Args:
+            source: first view.
+            target: second view.
+            known: the independent knowledge of their motion.
+        """
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
         """Return the prior with what its independent part learned."""
@@ -90,23 +111,18 @@ class VelocityPrior(AbstractProposal):
         """Check the parameters."""
         check_parameters(self)
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source; the independent knowledge alone until two frames define a velocity.
-
-        Raises:
-            InputError: where the views lack what `known` needs.
-        """
-        known = self.known.between(source, target)
+    def proposal(self, source: RayImage, target: RayImage, known: AbstractPoseDensity) -> KernelMixture | None:
+        """Return the prediction; None until two frames define a velocity."""
         poses = dict(self.trajectory)
         if len(poses) < 2 or target.index not in poses or source.index in poses:
-            return known
+            return None
         (before, object_from_before), (last, object_from_last) = self.trajectory[-2:]
         pace = (source.index - last) / (last - before)
         if not 0.0 < pace <= _MOST_STEPS:
-            return known
+            return None
         twist = se3.log(se3.inverse(object_from_before) @ object_from_last)
         predicted = se3.inverse(poses[target.index]) @ object_from_last @ se3.exp(pace * twist)
-        guess = KernelMixture(
+        return KernelMixture(
             predicted[None],
             np.ones(1),
             centre_m=source.centroid_m,
@@ -114,7 +130,6 @@ class VelocityPrior(AbstractProposal):
             sigma_m=self.velocity_sigma_m * max(pace, 1.0),
             evidence=False,
         )
-        return defensive_mixture(known, [guess])
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> VelocityPrior:
         """Return the prior with the poses so far."""
@@ -140,17 +155,12 @@ class AxesPrior(AbstractProposal):
         """Check the parameters."""
         check_parameters(self)
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source; the independent knowledge alone unless both surfaces are elongated.
-
-        Raises:
-            InputError: where the views lack what `known` needs.
-        """
-        known = self.known.between(source, target)
+    def proposal(self, source: RayImage, target: RayImage, known: AbstractPoseDensity) -> AlignedAxes | None:
+        """Return the density of aligned axes; None unless both surfaces are elongated."""
         first, second = (long_axis(view.points_m, self.min_elongation) for view in (source, target))
         if first is None or second is None:
-            return known
-        aligned = AlignedAxes(
+            return None
+        return AlignedAxes(
             first,
             second,
             source_centroid_m=source.centroid_m,
@@ -158,7 +168,6 @@ class AxesPrior(AbstractProposal):
             sigma_rad=float(np.radians(self.axes_sigma_deg)),
             sigma_m=self.axes_sigma_m,
         )
-        return defensive_mixture(known, [aligned])
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,25 +256,20 @@ class FeaturesPrior(AbstractProposal):
         """Check the parameters."""
         check_parameters(self)
 
-    def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source; the independent knowledge alone where no three matches agree.
-
-        Raises:
-            InputError: where the views lack what `known` needs.
-        """
-        known = self.known.between(source, target)
+    def proposal(self, source: RayImage, target: RayImage, known: AbstractPoseDensity) -> KernelMixture | None:
+        """Return kernels about the poses that most matches agree with; None where no three matches agree."""
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
-            return known
+            return None
         sizes_m = [2.0 * float(np.sqrt(np.sum(np.var(view.points_m, axis=0)))) for view in (source, target)]
         voxel_m = self.voxel * max(sizes_m)
         (first_m, first), (second_m, second) = (self._features(view, voxel_m) for view in (source, target))
         if min(len(first_m), len(second_m)) < self.min_points:
-            return known
+            return None
         pairs = mutual_matches(first, second)
         motions, votes = self._motions(first_m[pairs[:, 0]], second_m[pairs[:, 1]], known, self.agreement * voxel_m)
         if not len(motions):
-            return known
-        guess = KernelMixture(
+            return None
+        return KernelMixture(
             motions,
             votes**2 / np.sum(votes**2),
             centre_m=source.centroid_m,
@@ -273,7 +277,6 @@ class FeaturesPrior(AbstractProposal):
             sigma_m=self.features_sigma_m,
             evidence=False,
         )
-        return defensive_mixture(known, [guess])
 
     def _features(self, view: RayImage, voxel_m: float) -> tuple[Array, Array]:
         """Return the points (n, 3) of a downsampled surface and their features (n, 33)."""
