@@ -259,14 +259,29 @@ def test_a_region_may_be_the_whole_image() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux has them")
-@pytest.mark.parametrize("limit_mb", [200, 400])
-def test_memory_that_does_not_suffice_for_imports_is_said_in_one_line(limit_mb: int) -> None:
+@pytest.mark.parametrize("limit_mb", [200, 450, 600])
+def test_memory_that_does_not_suffice_for_libraries_is_said_in_one_line(limit_mb: int) -> None:
     limited = f'ulimit -v {1024 * limit_mb}; exec "$@"'
     ended = subprocess.run(
-        ["sh", "-c", limited, "sh", *COMMAND, "info", BOX], capture_output=True, text=True, check=False
+        ["sh", "-c", limited, "sh", *COMMAND, "register", BOX, "0", "1"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
     )
     assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
     assert "memory or threads" in ended.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux has them")
+@pytest.mark.parametrize("limit_mb", [1500, pytest.param(3500, marks=pytest.mark.slow)])
+def test_memory_that_does_not_suffice_for_the_recording_is_said_in_one_line(limit_mb: int, tmp_path: Path) -> None:
+    limited = f'ulimit -v {1024 * limit_mb}; exec "$@"'
+    build = ["build", BOX, "--out", str(tmp_path / "run"), "--prior", "table", "--frames", "0:3"]
+    ended = subprocess.run(["sh", "-c", limited, "sh", *COMMAND, *build], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
+    assert "memory or threads" in ended.stderr
+    assert main([*build, "--resume", "--method", "icp"]) in (0, 3)
 
 
 @pytest.mark.parametrize("name", ["\ud800", "a\0b"])

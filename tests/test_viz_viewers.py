@@ -15,6 +15,7 @@ import urllib.error
 import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import unquote
 
@@ -139,10 +140,31 @@ class SlowDisk:
 def test_a_recording_is_waited_for_as_long_as_it_grows(
     watched: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("viz.stream._PATIENCE_S", 0.2)
+    monkeypatch.setattr(f"viz.stream.{'_PATIENCE_S' if watched else '_DISK_PATIENCE_S'}", 0.2)
     recording: Any = SlowDisk(tmp_path / "r.rrd")
     RerunStream(recording, (), 0.0, recording.file, watched=watched).close()
     assert recording.file.read_bytes() == b"whole"
+
+
+def test_a_disk_that_hangs_does_not_hold_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("viz.stream._DISK_PATIENCE_S", 0.2)
+    released = threading.Event()
+    recording: Any = SimpleNamespace(disconnect=released.wait)
+    (tmp_path / "r.rrd").write_bytes(b"half")
+    closing = threading.Thread(target=RerunStream(recording, (), 0.0, tmp_path / "r.rrd").close, daemon=True)
+    closing.start()
+    closing.join(10.0)
+    assert not closing.is_alive()
+    released.set()
+
+
+def test_a_disk_that_fills_before_the_recording_begins_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise RuntimeError("Failed to encode LogMsg: Failed to write: No space left on device (os error 28)")
+
+    monkeypatch.setattr("rerun.RecordingStream.set_sinks", full)
+    with pytest.raises(viewer.InputError, match=r"r\.rrd: cannot write the recording .*No space left on device"):
+        open_stream("box", save=tmp_path / "r.rrd")
 
 
 def closed_port() -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import os
+import sys
 import threading
 import time
 from collections.abc import Mapping
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from modeler.address_space import check_room
 from modeler.regular_files import create_regular, open_regular
 from modeler.types import InputError, Step
 from viz import entities, viewer
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _PATIENCE_S: Final = 5.0  # with a viewer, at the end, until it has taken what it was sent
+_DISK_PATIENCE_S: Final = 60.0  # with a disk that takes nothing
+_ROOM: Final = 9 * 2**29  # bytes of addresses that a run with a recording takes, most of them Rerun's and never used
 _GRAPH_DRAWN: Final = 50  # times at most while the number of views doubles: drawing it takes time for each of them
 
 
@@ -96,13 +100,11 @@ class RerunStream:
         self._wait(leave)
 
     def _wait(self, leave: threading.Thread) -> None:
-        """Wait until the recording is complete; where a viewer may have frozen, no longer than the file grows."""
-        if not self.watched:
-            leave.join()
+        """Wait until the recording is complete, but no longer than the file grows: a viewer or a disk may hang."""
         size = -1
         while leave.is_alive() and (grown := self._size()) != size:
             size = grown
-            leave.join(_PATIENCE_S)
+            leave.join(_PATIENCE_S if self.watched else _DISK_PATIENCE_S)
 
     def _size(self) -> int:
         """Return the size of the file in bytes; 0 where there is none."""
@@ -138,7 +140,10 @@ def open_stream(
 
     Raises:
         InputError: where `save` cannot be written, or `connect` is not an address.
+        OSError: where memory does not suffice.
     """
+    if "rerun" not in sys.modules:
+        check_room(_ROOM)
     import rerun as rr
 
     from viz import blueprint, drawings, images, readings
@@ -153,7 +158,10 @@ def open_stream(
         _log.warning("--connect %s: no viewer listens there; the run goes on without it", connect)
     recording = rr.RecordingStream(entities.APPLICATION, default_enabled=bool(sinks))
     if sinks:
-        recording.set_sinks(*sinks)
+        try:
+            recording.set_sinks(*sinks)
+        except RuntimeError as error:  # the disk has become full since
+            raise InputError(f"{save}: cannot write the recording ({error}); choose another folder") from error
         recording.send_recording_name(name)
         recording.send_blueprint(blueprint.layout(None))
         for path, archetype in itertools.chain(

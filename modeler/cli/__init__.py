@@ -21,6 +21,7 @@ from typing import Annotated, Any, Union
 
 import tyro
 
+from modeler.address_space import check_room
 from modeler.cli.build import Build
 from modeler.cli.calibrate_camera import CalibrateCamera
 from modeler.cli.calibrate_sensor import CalibrateSensor
@@ -74,6 +75,7 @@ _DESCRIPTION = (
     "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr. "
     "--version prints the version."
 )
+_ROOM = 7 * 2**27  # bytes of addresses that registering two frames takes, a third of them used
 _HELP_INDENT = " " * 8  # of an option's description in the parser's error box
 
 
@@ -181,6 +183,7 @@ def _one_line(box: str) -> str:
 def _run(command: Command) -> int:
     """Run a command and return its exit status; what cannot be used is said in one line."""
     _check_environment()
+    check_room(_ROOM)
     with interruptible_at_once():
         importlib.import_module("viz.viewer" if isinstance(command, View) else "modeler.cli.inputs")
         from modeler.types import InputError
