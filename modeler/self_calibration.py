@@ -19,11 +19,12 @@ from modeler import se3
 from modeler.graph import Smoother
 from modeler.graph.optimise import optimise
 from modeler.graph.pose_graph import Factor, SpanningTree, chain, collapse_modes
+from modeler.priors.proposals import PredictedProposal
 from modeler.rays import Sensor
-from modeler.types import Array, Edge, Plane, PoseGaussian, Posterior, RayImage
+from modeler.types import AbstractPrior, Array, Edge, Plane, PoseGaussian, Posterior, RayImage
 
-Register = Callable[[RayImage, RayImage], Posterior]
-"""Returns the posterior of target_from_source of a source and a target view."""
+Register = Callable[[RayImage, RayImage, AbstractPrior], Posterior]
+"""Returns the posterior of target_from_source of a source and a target view under a prior."""
 
 _STEP = 0.002  # of log c, for the curvature of the graph's error: half a standard error of a good loop
 _MAX_ROUNDS = 5  # of registering the edges again about the estimate; on captures two to four are enough
@@ -65,7 +66,12 @@ class FocalCalibrator:
     """Mahalanobis distance beyond which a loop is an outlier."""
 
     def estimate(
-        self, views: Mapping[int, RayImage], edges: Sequence[Edge], sensor: Sensor, register: Register
+        self,
+        views: Mapping[int, RayImage],
+        edges: Sequence[Edge],
+        sensor: Sensor,
+        register: Register,
+        prior: AbstractPrior,
     ) -> FocalLength:
         """Return the focal length of least graph error.
 
@@ -73,7 +79,8 @@ class FocalCalibrator:
             views: by frame number, made with the focal length that was given.
             edges: of the run. Closures take part also where they were refused because the chain contradicts them.
             sensor: that made the views.
-            register: as the run did, with its prior.
+            register: as the run did.
+            prior: of the run.
         """
         taking_part = [edge for edge in edges if {edge.source, edge.target} <= views.keys() and _counts(edge)]
 
@@ -82,7 +89,11 @@ class FocalCalibrator:
                 {frame: _with_focal(view, centre + shift, sensor) for frame, view in views.items()}
                 for shift in (0.0, -self.node, self.node)
             ]
-            found = [self._moving(edge, centre, nodes, register) for edge in taking_part]
+            found = [
+                # The solution of the run proposes where to search: another focal length changes it by a few degrees.
+                self._moving(edge, centre, nodes, register, PredictedProposal(prior, collapse_modes(edge.posterior)))
+                for edge in taking_part
+            ]
             return _Graph([edge for edge in found if edge is not None], min(views), 0.5 * self.outlier_distance**2)
 
         graph = solved(0.0)
@@ -126,7 +137,12 @@ class FocalCalibrator:
         return best, curvature
 
     def _moving(
-        self, edge: Edge, centre: float, nodes: Sequence[Mapping[int, RayImage]], register: Register
+        self,
+        edge: Edge,
+        centre: float,
+        nodes: Sequence[Mapping[int, RayImage]],
+        register: Register,
+        prior: AbstractPrior,
     ) -> _MovingEdge | None:
         """Return an edge as a function of log c; None where it cannot be registered.
 
@@ -135,8 +151,9 @@ class FocalCalibrator:
             centre: log c of the first node.
             nodes: the views at the centre, and at less and more by `node`.
             register: see `estimate`.
+            prior: of the motion, and where to search.
         """
-        middle, *others = (register(made[edge.source], made[edge.target]) for made in nodes)
+        middle, *others = (register(made[edge.source], made[edge.target], prior) for made in nodes)
         if not middle.usable:
             return None
         pose = collapse_modes(middle)

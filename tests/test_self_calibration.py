@@ -42,7 +42,8 @@ def seen(stated: float) -> tuple[dict[int, RayImage], tuple[Edge, ...]]:
 
 def estimate(stated: float, *, closed: bool = True) -> FocalLength:
     views, edges = seen(stated)
-    return FocalCalibrator().estimate(views, edges if closed else edges[:-1], SENSOR, MODELER.register)
+    chain = edges if closed else edges[:-1]
+    return FocalCalibrator().estimate(views, chain, SENSOR, MODELER.register, MODELER.prior)
 
 
 @pytest.mark.parametrize("stated", [0.93, 1.0, 1.06])

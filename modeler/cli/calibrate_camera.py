@@ -50,8 +50,8 @@ class CalibrateCamera:
         part, *others = run.parts
         if others:
             raise InputError(f"{self.run_folder}: joins several runs; calibrate with one of them")
-        register = part.modeler().register
-        found = FocalCalibrator().estimate(run.views, run.edges, run.sensor, register)
+        modeler = part.modeler()
+        found = FocalCalibrator().estimate(run.views, run.edges, run.sensor, modeler.register, modeler.prior)
         used_px = run.views[min(run.views)].frame.camera.fx
         file = run.report["settings"].get("camera")
         factor = found.factor * (1.0 if file is None else read_focal_factor(Path(file)).factor)

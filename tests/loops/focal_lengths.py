@@ -41,7 +41,7 @@ def row(shape: str, error: float, options: argparse.Namespace) -> dict[str, Any]
     scene = maker.segmenter.scene([stated.frame(index) for index in telling(stated.indices)])
     *_, last = maker.run(case.frames(), scene)
     assert isinstance(last, Step)
-    found = FocalCalibrator().estimate(last.views, last.edges_so_far, maker.sensor, maker.register)
+    found = FocalCalibrator().estimate(last.views, last.edges_so_far, maker.sensor, maker.register, maker.prior)
     return {"shape": shape, "stated": 1.0 + error, **asdict(found), "found": found.factor * (1.0 + error)}
 
 
