@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from math import isfinite
 from pathlib import Path
 from typing import final
 
@@ -26,9 +27,10 @@ class FocalFactor:
     """fx as the sequence states it."""
 
     def text(self, facts: Mapping[str, object]) -> str:
-        """Return the file of the factor, with what else is known."""
+        """Return the file of the factor, with what else is known; null for numbers that are not."""
         said = {"schema": 1, "focal_factor": self.factor, "stated_fx_px": self.stated_px}
-        return json.dumps(said | dict(facts), indent=1, allow_nan=False) + "\n"
+        known = {name: None if isinstance(fact, float) and not isfinite(fact) else fact for name, fact in facts.items()}
+        return json.dumps(said | known, indent=1, allow_nan=False) + "\n"
 
 
 def read_focal_factor(path: Path) -> FocalFactor:

@@ -61,6 +61,14 @@ def test_an_open_chain_tells_nothing() -> None:
     assert (found.factor, found.sigma, found.told_by) == (1.0, FocalCalibrator().prior_sigma, "prior")
 
 
+def test_a_run_without_a_loop_is_calibrated_with_what_was_given(scene: Path, tmp_path: Path) -> None:
+    run, file = tmp_path / "run", tmp_path / "camera.json"
+    assert main(["build", str(scene), "--out", str(run), "--prior", "table", "--method", "icp", "--frames", "0:2"]) == 0
+    assert main(["calibrate-camera", str(run), "--out", str(file)]) == 3
+    assert read_focal_factor(file).factor == 1.0
+    assert json.loads(file.read_bytes())["sigmas_after"] is None
+
+
 def test_the_file_of_a_focal_length_is_read_as_it_was_written(tmp_path: Path) -> None:
     focal = FocalFactor(1.0 / 3.0 + 0.5, 597.522)
     (tmp_path / "camera.json").write_text(focal.text({"sigma": 0.01}))
