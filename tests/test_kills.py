@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kills.commands import COMMANDS, CommandTrials, write_inputs
 from kills.trials import KINDS, SAME, Trials
 
 from modeler.cli import build, main
@@ -305,3 +306,23 @@ def test_killed_at_random_moments(tmp_path: Path, rng: np.random.Generator) -> N
     whole = trials.undisturbed()
     for kind in KINDS:
         assert trials.fault(whole, kind, kind, rng)[1] in ("", "it had ended before it was to be killed")
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("commands") / "inputs"
+    folder.mkdir()
+    write_inputs(folder)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_that_was_killed_is_given_again(inputs: Path, name: str) -> None:
+    """Before the first change of the disk, one in the middle, and the last."""
+    trials = CommandTrials(inputs, name)
+    whole, changes = trials.undisturbed()
+    assert whole
+    moments = sorted({1, (changes + 1) // 2, changes})
+    assert {change: trials.fault(change, whole) for change in moments} == dict.fromkeys(moments, "")
