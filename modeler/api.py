@@ -18,6 +18,7 @@ from modeler.cli.outputs import check_run_folder
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.pipeline import Modeler
 from modeler.rays import Sensor
+from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.types import AbstractPrior, Camera, Frame, InputError, ObjectModel, Posterior, Solution, Step
 from sequences import AbstractSequence
 from sequences import open_sequence as opened
@@ -54,6 +55,7 @@ def register(
     *,
     prior: AbstractPrior | None = None,
     masks: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+    colours: tuple[np.ndarray, np.ndarray] | None = None,
     sensor: Sensor | None = None,
     seed: int = 0,
 ) -> Posterior:
@@ -65,6 +67,7 @@ def register(
         intrinsics: a `Camera`, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix.
         prior: what is known of the motion; None: rotations up to 50° and shifts of up to 4 cm, as `GeneralPrior`.
         masks: (h, w) of source and target, true on the object; None: the object is segmented.
+        colours: (h, w, 3) 8-bit RGB of source and target, aligned to depth; None: only depth is compared.
         sensor: noise of the camera; None: the first Kinect's.
         seed: of the samples; the same seed gives the same posterior.
 
@@ -78,12 +81,19 @@ def register(
     given = [None, None] if masks is None else [np.asarray(mask, dtype=bool) for mask in masks]
     if any(mask is not None and mask.shape != pictures[0].shape for mask in given):
         raise InputError(f"the masks have another shape than the depth images, {pictures[0].shape}; give the same")
+    painted = [None, None] if colours is None else [np.asarray(colour) for colour in colours]
+    for colour in painted:
+        if colour is not None and (colour.shape != (*pictures[0].shape, 3) or colour.dtype != np.uint8):
+            raise InputError(
+                f"colours have shape {colour.shape} of {colour.dtype}; give 8-bit RGB of depth's {pictures[0].shape}"
+            )
     camera = _camera(intrinsics, pictures[0].shape)
     frames = []
-    for index, (depth_m, mask) in enumerate(zip(pictures, given, strict=True)):
+    for index, (depth_m, mask, colour) in enumerate(zip(pictures, given, painted, strict=True)):
         depth_m[~(depth_m > 0.0) | np.isinf(depth_m)] = np.nan
-        frames.append(Frame(index, float(index), depth_m, camera, mask=mask))
-    modeler = Modeler(sensor=sensor or Sensor(), seed=seed)
+        frames.append(Frame(index, float(index), depth_m, camera, mask=mask, colour=colour))
+    registrar = VisibilityRegistrar(VisibilityLikelihood(colour=colours is not None))
+    modeler = Modeler(sensor=sensor or Sensor(), registrar=registrar, seed=seed)
     scene = modeler.segmenter.scene(frames)
     views = []
     for name, frame in zip(("source", "target"), frames, strict=True):

@@ -110,7 +110,7 @@ def silhouette_distance(mask):
 
 
 def point_to_plane_equations(found, centre_m):
-    """Twin of `point_to_plane.normal_equations` for the rows of `point_to_plane.matches` under one pose."""
+    """Twin of `gauss_newton.normal_equations` for the rows of `point_to_plane.matches` under one pose."""
     gradient, matrix = np.zeros(6), np.zeros((6, 6))
     for row in found:
         position, own, other, residual, weight = row[:3], row[3:6], row[6:9], row[9], row[10]

@@ -11,6 +11,7 @@ from modeler.kernels import point_to_plane
 from modeler.rays import Sensor
 from modeler.registration.posterior import weighted_gaussian
 from modeler.registration.visibility import VisibilityLikelihood
+from modeler.registration.visibility.likelihood import MatchNoise
 from modeler.registration.visibility.refinement import Refiner, shrunk, visible_share
 from modeler.se3 import rows
 from sequences import bundled, open_sequence
@@ -43,7 +44,7 @@ def sigmas_about(poses, centre_m):
 def test_normal_equations_are_those_of_the_matching_points(rng):
     pair, truth, centre_m = bundled_pair("box")
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng, count=5)
-    gradients, matrices = pair.normal_equations(poses, 0.001, stride=1)
+    gradients, matrices = pair.normal_equations(poses, MatchNoise(0.001), stride=1)
     for pose, gradient, matrix in zip(poses, gradients, matrices, strict=True):
         want = np.zeros(6), np.zeros((6, 6))
         for directed, carried, sign in ((pair.forward, pose, 1.0), (pair.backward, se3.inverse(pose), -1.0)):

@@ -121,7 +121,7 @@ class Build:
     def command(self, changes: Mapping[str, str]) -> str:
         """Return the command line that replaces the run by one with other options, by name without dashes."""
         given = {"prior": self.prior.prior, **self.settings(), "seed": self.method.seed}
-        usual = {"every": 1, "frames": ":", "method": "visibility", "seed": 0}
+        usual = {"every": 1, "frames": ":", "method": "visibility", "colour": False, "seed": 0}
         words = {
             name.replace("_", "-"): shlex.join(map(str, value if isinstance(value, tuple) else (value,)))
             for name, value in given.items()
@@ -129,7 +129,9 @@ class Build:
         }
         if changes.get("prior", words.get("prior")) != words.get("prior"):  # whose parameters are its own
             words = {name: value for name, value in words.items() if name.replace("-", "_") not in vars(self.prior)}
-        options = " ".join(f"--{name} {value}" for name, value in {**words, **changes}.items())
+        if "colour" in words:
+            words["colour"] = ""  # a flag
+        options = " ".join(f"--{name} {value}".rstrip() for name, value in {**words, **changes}.items())
         return (
             f"modeler build {shlex.quote(str(self.sequence))} --out {shlex.quote(str(self.out))} --overwrite {options}"
         )

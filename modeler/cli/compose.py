@@ -70,7 +70,7 @@ def modeler(
         InputError: where an option cannot be used.
     """
     check_region(where, sequence)
-    noise, chosen = sequence.sensor(), registrar(method.method)
+    noise, chosen = sequence.sensor(), registrar(method.method, colour=method.colour)
     return Modeler(
         segmenter=segmenter(where),
         sensor=Sensor() if noise is None else Sensor(*noise),
@@ -109,11 +109,11 @@ def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
     return modeler.segmenter.scene([sequence.frame(index) for index in telling(sequence.indices)])
 
 
-def registrar(method: Method) -> AbstractRegistrar:
-    """Return the registration method of a name."""
+def registrar(method: Method, *, colour: bool = False) -> AbstractRegistrar:
+    """Return the registration method of a name; `colour`: whether it may compare colours."""
     match method:
         case "visibility":
-            return registration.VisibilityRegistrar()
+            return registration.VisibilityRegistrar(registration.VisibilityLikelihood(colour=colour))
         case "paper":
             return registration.PaperRegistrar()
         case "icp":

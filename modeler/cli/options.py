@@ -180,6 +180,8 @@ class MethodOptions:
 
     method: Method = "visibility"
     """visibility: ours. paper: Wüthrich et al. 2012. The others are baselines."""
+    colour: bool = False
+    """Compare the colours of matching surface too, where frames have them: for labels on what shape leaves open."""
     seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same result, to the bit."""
 

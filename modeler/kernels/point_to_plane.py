@@ -1,13 +1,8 @@
-"""Point-to-plane equations of surface that both views measured: descent and patches of the surface."""
-
-import math
-from typing import NamedTuple
+"""Point-to-plane equations of surface that both views measured, and patches of the surface."""
 
 import numba
 import numpy as np
-import numpy.typing as npt
 
-from modeler.kernels.lie_group import difference, retract
 from modeler.kernels.planes import KIND, NORMAL_X, NORMAL_Y, NORMAL_Z, SURFACE, VARIANCE
 from modeler.kernels.point_likelihood import (
     FACING,
@@ -34,20 +29,7 @@ from modeler.kernels.point_likelihood import (
 POSITION, OWN, OTHER, RESIDUAL, WEIGHT, FACING_WEIGHT = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11
 
 _OF_SURFACE = np.float32(SURFACE)
-_ROWS = 9  # of one direction's equations: six derivatives, residual, weight, and a buffer for products
-
-
-class Regulariser(NamedTuple):
-    """Gaussian prior and damping of a descent (method.md, eq. 10)."""
-
-    mean: npt.NDArray[np.float64]
-    """(12,) rows of the prior's mean."""
-    precision: npt.NDArray[np.float64]
-    """(6, 6) Λ of ξ about the centre."""
-    damping: npt.NDArray[np.float64]
-    """(6,) diagonal of D."""
-    max_step_rad: float
-    """Largest rotation of a step."""
+EQUATION_ROWS = 9  # of one direction's equations: six derivatives, residual, weight, and a buffer for products
 
 
 @numba.njit(cache=True, inline="always")
@@ -128,7 +110,7 @@ def accumulate(rows, count, gradient, matrix):
 def new_workspace(forward, backward):
     """Return the buffers of `equations`."""
     most = max(forward.points.shape[1], backward.points.shape[1])
-    rows = np.empty((_ROWS, most), dtype=np.float32)
+    rows = np.empty((EQUATION_ROWS, most), dtype=np.float32)
     small = np.empty(12), np.empty(3), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     return buffers(forward), buffers(backward), rows, small
 
@@ -185,78 +167,6 @@ def equations(pose, forward, backward, centre, surface_m, workspace, gradient, m
         gradient[k] -= part[k]
         for m in range(6):
             matrix[k, m] += block[k, m]
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def normal_equations(poses, forward, backward, centre, surface_m):
-    """Return gradients (m, 6) and matrices (m, 6, 6) of poses (m, 12), see `equations`."""
-    group = 16  # poses per workspace
-    gradients, matrices = np.empty((poses.shape[0], 6)), np.empty((poses.shape[0], 6, 6))
-    for number in numba.prange((poses.shape[0] + group - 1) // group):
-        workspace = new_workspace(forward, backward)
-        for i in range(number * group, min((number + 1) * group, poses.shape[0])):
-            equations(poses[i], forward, backward, centre, surface_m, workspace, gradients[i], matrices[i])
-    return gradients, matrices
-
-
-@numba.njit(cache=True)
-def normal_equation(pose, forward, backward, centre, surface_m):
-    """Return the gradient (6,) and the matrix (6, 6) of one pose (12,), without the cost of waking other threads."""
-    gradient, matrix = np.empty(6), np.empty((6, 6))
-    equations(pose, forward, backward, centre, surface_m, new_workspace(forward, backward), gradient, matrix)
-    return gradient, matrix
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def descend(poses, forward, backward, centre, surface_m, regulariser, steps):
-    """Return poses (m, 12) after damped Gauss-Newton steps with a `Regulariser`; see `equations`."""
-    group = 4
-    moved = poses.copy()
-    for number in numba.prange((poses.shape[0] + group - 1) // group):
-        workspace, gradient, matrix = new_workspace(forward, backward), np.empty(6), np.empty((6, 6))
-        step, further, rotation = np.empty(6), np.empty(12), np.empty((3, 3))
-        for i in range(number * group, min((number + 1) * group, poses.shape[0])):
-            for _ in range(steps):
-                equations(moved[i], forward, backward, centre, surface_m, workspace, gradient, matrix)
-                regularised_step(moved[i], regulariser, centre, gradient, matrix, step)
-                retract(moved[i], step, centre, rotation, further)
-                moved[i] = further
-    return moved
-
-
-@numba.njit(cache=True)
-def regularised_step(pose, regulariser, centre, gradient, matrix, step):
-    """Write the Gauss-Newton step (6,) of a pose (12,) from its normal equations; overwrites the matrix."""
-    away = difference(regulariser.mean, pose, centre)
-    for k in range(6):
-        step[k] = gradient[k]
-        for m in range(6):
-            step[k] -= regulariser.precision[k, m] * away[m]
-            matrix[k, m] += regulariser.precision[k, m]
-        matrix[k, k] += regulariser.damping[k]
-    solve_positive_definite(matrix, step)
-    angle = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
-    if angle > regulariser.max_step_rad:
-        for k in range(6):
-            step[k] *= regulariser.max_step_rad / angle
-
-
-@numba.njit(cache=True)
-def solve_positive_definite(matrix, vector):
-    """Solve a positive definite system (6, 6) in place, by Cholesky factors; overwrites the matrix."""
-    for k in range(6):
-        for m in range(k + 1):
-            total = matrix[k, m]
-            for u in range(m):
-                total -= matrix[k, u] * matrix[m, u]
-            matrix[k, m] = math.sqrt(max(total, 1e-300)) if k == m else total / matrix[m, m]
-        for u in range(k):
-            vector[k] -= matrix[k, u] * vector[u]
-        vector[k] /= matrix[k, k]
-    for k in range(5, -1, -1):
-        for u in range(k + 1, 6):
-            vector[k] -= matrix[u, k] * vector[u]
-        vector[k] /= matrix[k, k]
 
 
 @numba.njit(cache=True)

@@ -14,7 +14,7 @@ from modeler.evaluation import about_point, nees, rotation_error_deg, translatio
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.rays import Sensor
-from modeler.registration import IcpRegistrar, VisibilityRegistrar
+from modeler.registration import IcpRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Segmenter, telling
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Posterior, RayImage
 from sequences.rendering.recipe import Recipe
@@ -138,7 +138,7 @@ class Study:
     )
     """By name."""
     methods: Mapping[str, AbstractRegistrar] = field(
-        default_factory=lambda: {OURS: VisibilityRegistrar(), CONTROL: IcpRegistrar()}
+        default_factory=lambda: {OURS: VisibilityRegistrar(VisibilityLikelihood(colour=True)), CONTROL: IcpRegistrar()}
     )
     """By name: the one under test, and the negative control with its residual-scaled Hessian."""
     blind: bool = False

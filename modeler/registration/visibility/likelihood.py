@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from modeler import se3
-from modeler.kernels import point_likelihood, point_to_plane
+from modeler.kernels import gauss_newton, point_likelihood, point_to_plane
+from modeler.kernels.gauss_newton import Regulariser
+from modeler.kernels.photometric import ColourProjection, no_colour
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
-from modeler.kernels.point_to_plane import Regulariser
+from modeler.registration.visibility.photometric import UNDECIDED, PairColour, weight_of
 from modeler.se3 import matrices, rows
 from modeler.types import Array, RayImage
 
@@ -18,8 +22,21 @@ _MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
 _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a share of its pixels' lateral noise: they err independently
 _RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; how far f and g rise beside it
 _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).astype(np.float32)  # see `Projection`
+IntArray = npt.NDArray[np.int64]
 _DESCENT_STRIDE, _STRIDE = 4, 2  # every fourth point is used for descent, every second for scores
+_COLOUR_STRIDE = 2  # every second of the points that are used for depth is used for colour
 _STATED_MISFIT = 0.5  # mean of r² / 2τ² if variances are as stated
+
+
+class MatchNoise(NamedTuple):
+    """How far matching surface and its colours differ."""
+
+    surface_m: float
+    """Noise b of surfaces beyond that of points and planes."""
+    correlation: float = 0.0
+    """Correlation of colours; 0 where they are not compared."""
+    band: int = 0
+    """Band in which colours are compared."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +65,21 @@ class VisibilityLikelihood:
     """Cost (nats) of a pose under which no surface matches."""
     overlap_scale: float = 0.1
     """Share of matching points at which that cost has fallen to its e-th part."""
+    colour: bool = False
+    """Whether the colours of matching surface are compared, where both frames have them.
+
+    Not by default: the error by which a camera aligns colour to depth, or takes it at another moment, is not modelled.
+    """
 
     def between(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> PairLikelihood:
         """Return the likelihood of target_from_source, at surface points drawn with `rng`."""
         size_m = 0.5 * (source.size_m + target.size_m)
-        forward = DirectedLikelihood(self, spread_points(source, self.points, rng), target, size_m)
-        backward = DirectedLikelihood(self, spread_points(target, self.points, rng), source, size_m)
-        return PairLikelihood(forward, backward, size_m)
+        chosen = spread_points(source, self.points, rng), spread_points(target, self.points, rng)
+        forward = DirectedLikelihood(self, _points(source, chosen[0]), target, size_m)
+        backward = DirectedLikelihood(self, _points(target, chosen[1]), source, size_m)
+        seen = self.colour and source.frame.colour is not None and target.frame.colour is not None
+        colour = PairColour(source, target, *chosen, (forward.projection(1), backward.projection(1)))
+        return PairLikelihood(forward, backward, size_m, colour if seen else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +190,8 @@ class PairLikelihood:
     """The target's points looked up in the source."""
     size_m: float
     """Size of the object: root mean square distance in m of the surface points from their centroid."""
+    colour: PairColour | None = None
+    """The colours of both views, where they are compared."""
 
     @property
     def centre_m(self) -> Array:
@@ -219,7 +246,38 @@ class PairLikelihood:
         """
         plain, share = self.log_likelihoods(poses, blur_m, stride=_STRIDE, typical_misfit=typical_misfit)
         model = self.forward.model
-        return self.temper * plain - model.no_overlap_cost * np.exp(-share / model.overlap_scale)  # method.md, eq. 7
+        depth = self.temper * plain - model.no_overlap_cost * np.exp(-share / model.overlap_scale)  # method.md, eq. 7
+        return depth + self.colour_gain(poses, blur_m, stride=_STRIDE)
+
+    def colour_gain(self, poses: Array, blur_m: float, *, stride: int) -> Array:
+        """Return the log-likelihood (n,) of the colours of matching surface (method.md, eq. 19); 0 without colours."""
+        if self.colour is None:
+            return np.zeros(len(poses))
+        return self.colour.log_likelihoods(
+            poses,
+            blur_m,
+            self.forward.model.max_independent,
+            surface_m=blur_m,
+            stride=_COLOUR_STRIDE * stride,
+        )
+
+    def _colours(
+        self, band: int, correlation: float, stride: int
+    ) -> tuple[ColourProjection, ColourProjection, np.float32]:
+        """Return the colours of both directions and their weight, as kernels take them; without colour, no points."""
+        if self.colour is None:
+            return no_colour(self.forward.projection(1)), no_colour(self.backward.projection(1)), np.float32(0.0)
+        projections = self.colour.projections(band, _COLOUR_STRIDE * stride)
+        return *projections, np.float32(_COLOUR_STRIDE * weight_of(correlation))
+
+    def match_noise(self, pose: Array, blur_m: float) -> MatchNoise:
+        """Return how well surfaces and colours match under a pose (4, 4), see `surface_noise_m`."""
+        surface_m = self.surface_noise_m(pose, blur_m)
+        if self.colour is None:
+            return MatchNoise(surface_m)
+        band = self.colour.band(surface_m)
+        correlation, _ = self.colour.correlations(pose[None], band, surface_m, stride=1)
+        return MatchNoise(surface_m, float(correlation[0]), band)
 
     def typical_misfit(self, pose: Array, blur_m: float) -> float:
         """Return the misfit μ at which matches under a good pose (4, 4) count 0 on average (method.md, eq. 8).
@@ -268,22 +326,35 @@ class PairLikelihood:
         matched = (classes == point_likelihood.MATCHED).sum()
         return float(matched / max(matched + wrong, 1))
 
-    def normal_equations(self, poses: Array, blur_m: float, *, stride: int) -> tuple[Array, Array]:
-        """Return gradients (n, 6) and matrices (n, 6, 6) of the matches for ξ of poses (n, 4, 4) about the centre."""
-        projections = self.forward.projection(stride), self.backward.projection(stride)
-        gradients, equations = point_to_plane.normal_equations(rows(poses), *projections, self.centre_m, blur_m)
-        return stride * gradients, stride * equations
+    def colour_matches(self, carried: Array, matches: Array, noise: MatchNoise, *, forward: bool) -> Array:
+        """Return equations of the colours of matches, as `DirectedLikelihood.matches` has those of surface."""
+        if self.colour is None:
+            return np.zeros((0, matches.shape[1]))
+        return self.colour.matches(carried, matches, noise.band, weight_of(noise.correlation), forward=forward)
 
-    def normal_equation(self, pose: Array, blur_m: float) -> tuple[Array, Array]:
-        """Return gradient (6,) and matrix (6, 6) of one pose (4, 4), see `normal_equations`."""
-        projections = self.forward.projection(1), self.backward.projection(1)
-        return point_to_plane.normal_equation(rows(pose), *projections, self.centre_m, blur_m)
+    def normal_equations(self, poses: Array, noise: MatchNoise, *, stride: int) -> tuple[Array, Array]:
+        """Return gradients (n, 6) and matrices (n, 6, 6) of the matches for ξ of poses (n, 4, 4) about the centre.
+
+        Args:
+            poses: target_from_source.
+            noise: of matching surface and colours.
+            stride: every `stride`-th point is used, and counts for as many.
+        """
+        projections = self.forward.projection(stride), self.backward.projection(stride)
+        colours = self._colours(noise.band, noise.correlation, stride)
+        gradients, equations = gauss_newton.normal_equations(
+            rows(poses), *projections, *colours, self.centre_m, noise.surface_m
+        )
+        return stride * gradients, stride * equations
 
     def descend(self, poses: Array, blur_m: float, regulariser: Regulariser, *, steps: int) -> Array:
         """Return poses (n, 4, 4) after Gauss-Newton steps on matching surface (method.md, eq. 10)."""
         projections = self.forward.projection(_DESCENT_STRIDE), self.backward.projection(_DESCENT_STRIDE)
         regulariser = _per_point(regulariser, _DESCENT_STRIDE)
-        return matrices(point_to_plane.descend(rows(poses), *projections, self.centre_m, blur_m, regulariser, steps))
+        band = 0 if self.colour is None else self.colour.band(blur_m)
+        colours = self._colours(band, UNDECIDED, _DESCENT_STRIDE)
+        moved = gauss_newton.descend(rows(poses), *projections, *colours, self.centre_m, blur_m, regulariser, steps)
+        return matrices(moved)
 
 
 def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:
@@ -291,17 +362,17 @@ def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:
     return regulariser._replace(precision=regulariser.precision / stride, damping=regulariser.damping / stride)
 
 
-def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> Array:
-    """Return `count` surface points, or all if fewer, evenly spread over the image.
-
-    Returns:
-        (n, 7): position in m, unit normal, variance along the normal in m².
-    """
+def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> IntArray:
+    """Return the numbers of `count` surface points, or of all if fewer, evenly spread over the image."""
     total = len(view.points_m)
     stride = max(total / count, 1.0)
     picks = np.arange(min(count, total)) * stride + rng.random() * stride
     chosen = np.minimum(picks.astype(np.int64), total - 1)
-    variance = np.asarray(view.layers["variance_m2"], dtype=np.float64)[chosen, None]
-    points = np.hstack([view.points_m[chosen], view.normals[chosen], variance])
     # In random order, so that every stride through them is again spread over the object.
-    return points[rng.permutation(len(points))]
+    return chosen[rng.permutation(len(chosen))]
+
+
+def _points(view: RayImage, chosen: IntArray) -> Array:
+    """Return position in m, unit normal and variance along the normal in m² (n, 7) of surface points."""
+    variance = np.asarray(view.layers["variance_m2"], dtype=np.float64)[chosen, None]
+    return np.hstack([view.points_m[chosen], view.normals[chosen], variance])

@@ -15,7 +15,7 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import point_to_plane
 from modeler.registration.posterior import FLOOR
-from modeler.registration.visibility.likelihood import DirectedLikelihood, PairLikelihood
+from modeler.registration.visibility.likelihood import DirectedLikelihood, MatchNoise, PairLikelihood
 from modeler.se3 import rows
 from modeler.types import Array
 
@@ -50,22 +50,20 @@ class Refiner:
         centre_m = pair.centre_m
         mean, covariance = se3.mean(poses, weights, about_m=centre_m)
         spread = np.asarray(np.linalg.cholesky(covariance + FLOOR), dtype=np.float64)
-        mode, noise_m = _mode(pair, mean, spread, centre_m, fine_m=fine_m)
-        basis, information = self._information(pair, mode, noise_m, spread, centre_m)
+        mode, noise = _mode(pair, mean, spread, centre_m, fine_m=fine_m)
+        basis, information = self._information(pair, mode, noise, spread)
         scales, axes = np.linalg.eigh(information)
         root = axes * np.sqrt(np.maximum(scales, 0.0))
         narrowed = np.linalg.inv(np.eye(6) + information)
         to_basis = np.linalg.inv(basis)
-        step = _steps(pair, poses, noise_m, spread, centre_m) @ to_basis.T @ information
+        step = _steps(pair, poses, noise, spread) @ to_basis.T @ information
         scatter = rng.normal(size=(len(poses), 6)) @ root.T
         moved = (step + scatter) @ narrowed.T @ basis.T  # method.md, eq. 16
         return se3.moved(poses, moved, centre_m)
 
-    def _information(
-        self, pair: PairLikelihood, mode: Array, noise_m: float, spread: Array, centre_m: Array
-    ) -> tuple[Array, Array]:
+    def _information(self, pair: PairLikelihood, mode: Array, noise: MatchNoise, spread: Array) -> tuple[Array, Array]:
         """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) in it (method.md, eq. 14)."""
-        arms, by_own, by_other, residuals, weights = _equations(pair, mode, noise_m, centre_m)
+        arms, by_own, by_other, residuals, weights = _equations(pair, mode, noise)
         halvings = min(self.halvings, int(np.log2(max(len(arms) / self.min_matches, 1.0))))
         if 2**halvings <= len(spread):  # the scatter of six equations would be singular
             return spread, np.zeros((6, 6))
@@ -118,36 +116,36 @@ def visible_share(size: float) -> float:
     return float(share**2)
 
 
-def _mode(pair: PairLikelihood, start: Array, spread: Array, centre_m: Array, *, fine_m: float) -> tuple[Array, float]:
-    """Return the mode of matching surface × a Gaussian about `start` with the root (6, 6) of its covariance, and b."""
+def _mode(
+    pair: PairLikelihood, start: Array, spread: Array, centre_m: Array, *, fine_m: float
+) -> tuple[Array, MatchNoise]:
+    """Return the mode of matching surface × a Gaussian about `start` with the root (6, 6) of its covariance."""
     precision = np.linalg.inv(spread @ spread.T)
-    pose, noise_m = start, pair.surface_noise_m(start, fine_m)
+    pose, noise = start, pair.match_noise(start, fine_m)
     for _ in range(8):
-        gradient, matrix = pair.normal_equation(pose, noise_m)
+        gradient, matrix = (part[0] for part in pair.normal_equations(pose[None], noise, stride=1))
         away = se3.difference(start, pose, centre_m)
         step = np.asarray(np.linalg.solve(matrix + precision, gradient - precision @ away), dtype=np.float64)
         pose = se3.moved(pose, step, centre_m)
-        noise_m = pair.surface_noise_m(pose, fine_m)
+        noise = noise._replace(surface_m=pair.surface_noise_m(pose, fine_m))
         if np.linalg.norm(np.linalg.solve(spread, step)) < 0.01:  # standard deviations
             break
-    return pose, noise_m
+    return pose, pair.match_noise(pose, fine_m)
 
 
-def _steps(pair: PairLikelihood, poses: Array, noise_m: float, spread: Array, centre_m: Array) -> Array:
+def _steps(pair: PairLikelihood, poses: Array, noise: MatchNoise, spread: Array) -> Array:
     """Return Gauss-Newton steps (n, 6), regularised by the samples' spread."""
-    gradient, matrix = pair.normal_equations(poses, noise_m, stride=2)
+    gradient, matrix = pair.normal_equations(poses, noise, stride=2)
     regularised = matrix + np.linalg.inv(spread @ spread.T)
     return np.asarray(np.linalg.solve(regularised, gradient[:, :, None])[:, :, 0], dtype=np.float64)
 
 
-def _equations(
-    pair: PairLikelihood, pose: Array, noise_m: float, centre_m: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the matching points' equations in the source's frame, about the centre.
+def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the equations of matching points and of their colours in the source's frame, about the centre.
 
     Returns:
         Positions (n, 3), derivatives of the residuals by ξ with the point's own normal and with the other surface's
-        (n, 6), residuals (n,) in m and weights (n,) in 1/m².
+        (n, 6), residuals (n,) in m and weights (n,) in 1/m²; of colours likewise, without units.
     """
     parts = []
     directions: list[tuple[DirectedLikelihood, Array, float]] = [
@@ -155,12 +153,13 @@ def _equations(
         (pair.backward, se3.inverse(pose), -1.0),
     ]
     for directed, carried, sign in directions:
-        found = directed.matches(rows(carried), noise_m)
-        found = found[found[:, point_to_plane.WEIGHT] > 0.0]
+        found = directed.matches(rows(carried), noise.surface_m)
         to_source = np.eye(4) if sign < 0.0 else se3.inverse(pose)
-        arms = se3.transform(to_source, found[:, point_to_plane.POSITION]) - centre_m
-        own, other = (found[:, k] @ to_source[:3, :3].T for k in (point_to_plane.OWN, point_to_plane.OTHER))
-        derivatives = [sign * np.hstack([np.cross(arms, normals), normals]) for normals in (own, other)]
-        parts.append((arms, *derivatives, found[:, point_to_plane.RESIDUAL], found[:, point_to_plane.WEIGHT]))
+        for matches in (found, pair.colour_matches(carried, found, noise, forward=sign > 0.0)):
+            used = matches[matches[:, point_to_plane.WEIGHT] > 0.0]
+            arms = se3.transform(to_source, used[:, point_to_plane.POSITION]) - pair.centre_m
+            own, other = (used[:, k] @ to_source[:3, :3].T for k in (point_to_plane.OWN, point_to_plane.OTHER))
+            derivatives = [sign * np.hstack([np.cross(arms, normals), normals]) for normals in (own, other)]
+            parts.append((arms, *derivatives, used[:, point_to_plane.RESIDUAL], used[:, point_to_plane.WEIGHT]))
     arms, by_own, by_other, residuals, weights = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return arms, by_own, by_other, residuals, weights

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.kernels import mixture
-from modeler.kernels.point_to_plane import Regulariser
+from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration.posterior import MIN_MODE_SHARE, PRIOR_SAMPLES
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
@@ -142,6 +142,7 @@ class Search:
         plain, share = pair.log_likelihoods(poses, blur * pair.size_m, stride=8)
         # Coarse surface matches easily: a match counts as the range that it determines, relative to a guess.
         scores = plain - np.log(blur) * share * pair.points
+        scores += pair.colour_gain(poses, blur * pair.size_m, stride=8) / pair.temper
         return poses[np.argsort(-scores, kind="stable")[:count]]
 
     def _regulariser(self, pair: PairLikelihood, prior: PoseGaussian) -> Regulariser:
@@ -179,6 +180,7 @@ def _moments(pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.
 
 def _spreads(pair: PairLikelihood, prior: PoseGaussian, poses: Array, blur_m: float) -> Array:
     """Return roots (n, 6, 6) of covariances from matching surface and the prior (method.md, eq. 11)."""
-    _, matrices = pair.normal_equations(poses, blur_m, stride=2)
+    noise = pair.match_noise(poses[0], blur_m)._replace(surface_m=blur_m)
+    _, matrices = pair.normal_equations(poses, noise, stride=2)
     precision = pair.temper * matrices + np.linalg.inv(prior.covariance)
     return np.asarray(np.linalg.cholesky(np.linalg.inv(precision)), dtype=np.float64)

@@ -1,0 +1,263 @@
+"""Colours of surface that both views saw: their correlation, and the equations by which they move a pose."""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from modeler.kernels.point_likelihood import (
+    FACING,
+    VECTOR_MATHS,
+    ZERO,
+    Projection,
+    X,
+    Y,
+    Z,
+    buffers,
+    invert,
+    plane_distance,
+    project,
+)
+from modeler.kernels.point_to_plane import EQUATION_ROWS, accumulate, match_weight, rotate_to_source
+
+# Columns of a cell, the 16 bytes that are read for one pixel: at a point p that projects into it, the feature is
+# gradient · p + offset to first order, as a plane's distance is.
+GRADIENT_X, GRADIENT_Y, GRADIENT_Z, OFFSET = 0, 1, 2, 3
+CELL_SIZE = 4
+
+# Columns of `moments`.
+PRODUCT, OWN_SQUARE, OTHER_SQUARE, MATCHES = 0, 1, 2, 3
+
+FloatArray = npt.NDArray[np.float32]
+
+
+class ColourProjection(NamedTuple):
+    """One direction of a comparison of colours."""
+
+    points: FloatArray
+    """As of a `Projection`, and"""
+    cells: FloatArray
+    """likewise,"""
+    camera: FloatArray
+    """likewise,"""
+    cosines: FloatArray
+    """likewise."""
+    values: FloatArray
+    """(n,) features of the points in their own view, of unit variance."""
+    colours: FloatArray
+    """(h · w, 4) cells of colour of the other view."""
+
+    def thinned(self, stride: int) -> "ColourProjection":
+        """Return every `stride`-th point."""
+        points, values = (np.ascontiguousarray(part[..., ::stride]) for part in (self.points, self.values))
+        return self._replace(points=points, values=values)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def explained(features, partners, offsets, others, share):
+    """Return features (3, n) of unit variance, less a share of those that the other image shows in the same place.
+
+    Args:
+        features: (3, n) of one view's surface points; of any variance.
+        partners: (n,) number of the other view's point in the same place; -1 for none.
+        offsets: (n, 2) columns and rows from that point's pixel to the place.
+        others: (3, m) features of the other view.
+        share: what is taken off, of features of unit variance.
+    """
+    own_scale, other_scale = deviation(features[0]), deviation(others[0])
+    left = np.empty(features.shape, dtype=np.float32)
+    for k in range(3):
+        for j in range(features.shape[1]):
+            value = features[k, j] / own_scale
+            if partners[j] >= 0:
+                other = others[k, partners[j]]
+                if k == 0:
+                    other += others[1, partners[j]] * offsets[j, 0] + others[2, partners[j]] * offsets[j, 1]
+                value -= share * other / other_scale
+            left[k, j] = value
+    left /= deviation(left[0])
+    return left
+
+
+@numba.njit(cache=True, error_model="numpy")
+def deviation(values):
+    """Return the standard deviation of values (n,); never quite 0."""
+    total, square = 0.0, 0.0
+    for value in values:
+        total += value
+        square += value * value
+    mean = total / values.shape[0]
+    return np.float32(max(np.sqrt(max(square / values.shape[0] - mean * mean, 0.0)), 1e-6))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def fill_cells(features, points_m, pixels, focal, cells):
+    """Write the cells of features (3, n): value, and derivatives by column and row in 1/px.
+
+    Along a pixel's ray the feature stays the same.
+
+    Args:
+        features: of the surface points.
+        points_m: (n, 3) the points.
+        pixels: (n,) their pixels, row by row.
+        focal: (2,) fx and fy in px.
+        cells: (h · w, 4) out; zeros, and left so where there is no point.
+    """
+    for j in range(pixels.shape[0]):
+        x, y, z = points_m[j]
+        by_x, by_y = features[1, j] * focal[0] / z, features[2, j] * focal[1] / z
+        cell = cells[pixels[j]]
+        cell[GRADIENT_X], cell[GRADIENT_Y], cell[GRADIENT_Z] = by_x, by_y, -(by_x * x + by_y * y) / z
+        cell[OFFSET] = features[0, j]
+
+
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def fetch_colours(pixels, cells, looked_up):
+    """Copy the cells of colour at `pixels` (n,) into the columns of `looked_up` (4, n)."""
+    for j in range(pixels.shape[0]):
+        cell = np.uint32(max(pixels[j], np.int32(0)))
+        for k in range(CELL_SIZE):
+            looked_up[k, j] = cells[cell, k]
+
+
+@numba.njit(cache=True, inline="always")
+def feature(transformed, colour, j):
+    """Return the other view's feature where a transformed point falls."""
+    return (
+        colour[OFFSET, j]
+        + colour[GRADIENT_X, j] * transformed[X, j]
+        + colour[GRADIENT_Y, j] * transformed[Y, j]
+        + colour[GRADIENT_Z, j] * transformed[Z, j]
+    )
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+def sum_moments(projection, transformed, looked_up, colour, surface_m2):
+    """Return Σ a b, Σ a², Σ b² and the number of matches of one direction, each weighted by f."""
+    product, own_square, other_square, count = ZERO, ZERO, ZERO, ZERO
+    points = projection.points
+    for j in range(points.shape[1]):
+        distance = plane_distance(transformed, looked_up, j)
+        matched = match_weight(points, transformed, looked_up, distance, surface_m2, j) > ZERO
+        weight = transformed[FACING, j] if matched else ZERO
+        own, other = projection.values[j], feature(transformed, colour, j)
+        product += weight * own * other
+        own_square += weight * own * own
+        other_square += weight * other * other
+        count += weight
+    return product, own_square, other_square, count
+
+
+@numba.njit(cache=True, forceinline=True)
+def colour_buffers(projection):
+    """Return buffers for one direction: those of `project`, and cells of colour (4, n)."""
+    return buffers(projection), np.empty((CELL_SIZE, projection.values.shape[0]), dtype=np.float32)
+
+
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def look_up(pose, projection, workspace):
+    """Transform the points of one direction by a pose (12,), and look up surface and colour there."""
+    (transformed, pixels, found), colour = workspace
+    project(pose, projection, transformed, pixels, found)
+    fetch_colours(pixels, projection.colours, colour)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def moments(poses, forward, backward, surface_m):
+    """Return moments (m, 4) of the features of matching surface under poses (m, 12), summed over both directions.
+
+    Args:
+        poses: rows of the 3×4 matrices of target_from_source.
+        forward: the `ColourProjection` of the source's points in the target, and
+        backward: of the target's in the source.
+        surface_m: noise of the surfaces in m beyond that of points and planes.
+    """
+    block = 16  # poses per set of buffers
+    surface_m2 = np.float32(surface_m * surface_m)
+    result = np.empty((poses.shape[0], 4))
+    for group in numba.prange((poses.shape[0] + block - 1) // block):
+        there, back, inverse = colour_buffers(forward), colour_buffers(backward), np.empty(12)
+        for i in range(group * block, min((group + 1) * block, poses.shape[0])):
+            look_up(poses[i], forward, there)
+            first = sum_moments(forward, there[0][0], there[0][2], there[1], surface_m2)
+            invert(poses[i], inverse)
+            look_up(inverse, backward, back)
+            second = sum_moments(backward, back[0][0], back[0][2], back[1], surface_m2)
+            for k in range(4):
+                result[i, k] = np.float64(first[k]) + np.float64(second[k])
+    return result
+
+
+def no_colour(projection: Projection) -> ColourProjection:
+    """Return one direction of views without colour: no points."""
+    none = projection._replace(points=np.ascontiguousarray(projection.points[:, :0]))
+    return ColourProjection(*none, np.zeros(0, dtype=np.float32), np.zeros((1, CELL_SIZE), dtype=np.float32))
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+def linearise_colour(projection, transformed, found, colour, centre, surface_m2, weight, rows):
+    """Write the equations of features into `rows` (8, n): derivatives by ζ, residual and weight.
+
+    A feature is linear in the point's position as a plane's distance is, its gradient in the place of the normal.
+    """
+    points = projection.points
+    cx, cy, cz = np.float32(centre[0]), np.float32(centre[1]), np.float32(centre[2])
+    for j in range(points.shape[1]):
+        distance = plane_distance(transformed, found, j)
+        matched = match_weight(points, transformed, found, distance, surface_m2, j) > ZERO
+        rows[6, j] = feature(transformed, colour, j) - projection.values[j]
+        rows[7, j] = weight * transformed[FACING, j] if matched else ZERO
+    for j in range(points.shape[1]):
+        x, y, z = transformed[X, j] - cx, transformed[Y, j] - cy, transformed[Z, j] - cz
+        slope_x, slope_y, slope_z = colour[GRADIENT_X, j], colour[GRADIENT_Y, j], colour[GRADIENT_Z, j]
+        rows[0, j] = y * slope_z - z * slope_y
+        rows[1, j] = z * slope_x - x * slope_z
+        rows[2, j] = x * slope_y - y * slope_x
+        rows[3, j], rows[4, j], rows[5, j] = slope_x, slope_y, slope_z
+
+
+@numba.njit(cache=True)
+def new_colour_workspace(forward, backward):
+    """Return the buffers of `add_colour_equations`."""
+    most = max(forward.values.shape[0], backward.values.shape[0])
+    rows = np.empty((EQUATION_ROWS, most), dtype=np.float32)
+    small = np.empty(12), np.empty(3), np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
+    return colour_buffers(forward), colour_buffers(backward), rows, small
+
+
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def add_colour_equations(pose, forward, backward, weight, centre, surface_m, workspace, gradient, matrix):
+    """Add the equations of features to those of `point_to_plane.equations`.
+
+    Args:
+        pose: (12,) rows of target_from_source.
+        forward: the `ColourProjection` of the source's points in the target, and
+        backward: of the target's in the source.
+        weight: inverse variance of the difference of features (method.md, eq. 20).
+        centre: (3,) point of the source in m.
+        surface_m: noise of the surfaces in m beyond that of points and planes, within which points match.
+        workspace: of `new_colour_workspace`.
+        gradient: (6,) is added to.
+        matrix: (6, 6) is added to.
+    """
+    if forward.values.shape[0] == 0:
+        return
+    there, back, rows, (inverse, transformed_centre, part, block, rotated, turned, turned_block) = workspace
+    surface_m2 = np.float32(surface_m * surface_m)
+    for k in range(3):
+        transformed_centre[k] = pose[4 * k + 3]
+        for m in range(3):
+            transformed_centre[k] += pose[4 * k + m] * centre[m]
+    look_up(pose, forward, there)
+    linearise_colour(forward, there[0][0], there[0][2], there[1], transformed_centre, surface_m2, weight, rows)
+    accumulate(rows, forward.values.shape[0], part, block)
+    rotate_to_source(pose, part, block, rotated, turned, turned_block)
+    invert(pose, inverse)
+    look_up(inverse, backward, back)
+    linearise_colour(backward, back[0][0], back[0][2], back[1], centre, surface_m2, weight, rows)
+    accumulate(rows, backward.values.shape[0], part, block)
+    for k in range(6):
+        gradient[k] += turned[k] - part[k]
+        for m in range(6):
+            matrix[k, m] += turned_block[k, m] + block[k, m]

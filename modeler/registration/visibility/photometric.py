@@ -1,0 +1,190 @@
+"""The colour of a pair: how well what is painted on matching surface agrees (method.md, eq. 17 to 20)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from modeler.kernels import photometric, point_to_plane
+from modeler.kernels.photometric import ColourProjection
+from modeler.kernels.point_likelihood import Projection
+from modeler.photometry import BANDS, BY_COLUMN, BY_ROW, FINEST_PX, VALUE, of_view
+from modeler.se3 import rows
+from modeler.types import Array, RayImage
+
+_FINEST_SCORED = 1
+"""Finest band by which samples are weighted; in the finest of all, weights are too uneven: it sharpens them."""
+UNDECIDED = 0.7
+"""Correlation that is assumed where a descent starts."""
+_MOST = 0.99  # correlation
+
+
+@dataclass(frozen=True, eq=False)
+class PairColour:
+    """Colour of two views at the points that the likelihood compares."""
+
+    source: RayImage
+    target: RayImage
+    source_points: np.ndarray
+    """(n,) numbers of the source's surface points that are compared."""
+    target_points: np.ndarray
+    """(m,) of the target's."""
+    surfaces: tuple[Projection, Projection]
+    """The source's points in the target, and the target's in the source."""
+    _unmoved: dict[int, float] = field(default_factory=dict)
+    _made: dict[tuple[int, int], tuple[ColourProjection, ColourProjection]] = field(default_factory=dict)
+
+    def band(self, blur_m: float) -> int:
+        """Return the number of the band for surfaces of that blur."""
+        blur_px = blur_m * self.target.frame.camera.fx / max(float(self.target.centroid_m[2]), 1e-3)
+        return int(np.clip(np.round(np.log2(max(blur_px / FINEST_PX, 1.0))), 0, BANDS - 1))
+
+    def correlations(self, poses: Array, band: int, surface_m: float, *, stride: int) -> tuple[Array, Array]:
+        """Return correlations (n,) of the features of matching points under poses (n, 4, 4), and the share that match.
+
+        Args:
+            poses: target_from_source.
+            band: number of the band.
+            surface_m: noise of the surfaces, within which points match.
+            stride: every `stride`-th point is used.
+        """
+        forward, backward = self.projections(band, stride)
+        found = photometric.moments(rows(poses), forward, backward, surface_m)
+        scale = np.sqrt(found[:, photometric.OWN_SQUARE] * found[:, photometric.OTHER_SQUARE])
+        share = found[:, photometric.MATCHES] / (len(forward.values) + len(backward.values))
+        return found[:, photometric.PRODUCT] / np.maximum(scale, 1e-12), share
+
+    def log_likelihoods(
+        self, poses: Array, blur_m: float, max_independent: float, *, surface_m: float, stride: int
+    ) -> Array:
+        """Return how much likelier (n,) in nats the target's colours are, given the source's (method.md, eq. 19)."""
+        band = max(self.band(blur_m), _FINEST_SCORED)
+        correlation, share = self.correlations(poses, band, surface_m, stride=stride)
+        count = share * (1.0 - self.unmoved(band) ** 2) / (1.0 / max_independent + 1.0 / self.patches(band))
+        gain = -0.5 * count * np.log1p(-(np.clip(correlation, 0.0, _MOST) ** 2))
+        return np.asarray(np.logaddexp(0.0, gain - 0.5 * np.log(np.maximum(count, 1.0))), dtype=np.float64)
+
+    def matches(self, carried: Array, matches: Array, band: int, weight: float, *, forward: bool) -> Array:
+        """Return the features of matches (n, 12) of one direction in the place of their surface, see `point_to_plane`.
+
+        The gradient of a feature is the normal, the difference of features the distance.
+
+        Args:
+            carried: (4, 4) the transform that carries the points into the other camera.
+            matches: of all points, `point_to_plane.matches`.
+            band: number of the band.
+            weight: of squared differences of features.
+            forward: whether the points are the source's.
+        """
+        projection = self.projections(band, 1)[0 if forward else 1]
+        view, chosen = (self.source, self.source_points) if forward else (self.target, self.target_points)
+        other = self.target if forward else self.source
+        position = matches[:, point_to_plane.POSITION]
+        camera = other.frame.camera
+        z = np.maximum(position[:, 2], 1e-6)
+        column = np.clip(np.round(camera.fx * position[:, 0] / z + camera.cx), 0, camera.width - 1)
+        row = np.clip(np.round(camera.fy * position[:, 1] / z + camera.cy), 0, camera.height - 1)
+        cells = projection.colours[(row * camera.width + column).astype(np.int64)].astype(np.float64)
+        pixels = view.pixels[chosen]
+        mirror = self.projections(band, 1)[1 if forward else 0]
+        own = mirror.colours[pixels[:, 0] * view.frame.camera.width + pixels[:, 1], :3].astype(np.float64)
+        normals = matches[:, point_to_plane.OWN]
+        # Along the surface a gradient turns with it; then it is taken along the other camera's rays.
+        own = own @ carried[:3, :3].T
+        own -= normals * np.sum(own * normals, axis=1, keepdims=True)
+        slope = np.sum(own * position, axis=1) / np.minimum(np.sum(normals * position, axis=1), -1e-6)
+        own -= normals * slope[:, None]
+        found = matches.copy()
+        found[:, point_to_plane.OWN], found[:, point_to_plane.OTHER] = own, cells[:, :3]
+        found[:, point_to_plane.RESIDUAL] = np.sum(cells[:, :3] * position, axis=1) + cells[:, 3] - projection.values
+        matched = matches[:, point_to_plane.WEIGHT] > 0.0
+        found[:, point_to_plane.WEIGHT] = weight * matched * matches[:, point_to_plane.FACING_WEIGHT]
+        return found
+
+    def projections(self, band: int, stride: int) -> tuple[ColourProjection, ColourProjection]:
+        """Return the two directions of a band, at every `stride`-th point."""
+        if (band, stride) not in self._made:
+            forward, backward = self._projections(band) if stride == 1 else self.projections(band, 1)
+            self._made[band, stride] = forward.thinned(stride), backward.thinned(stride)
+        return self._made[band, stride]
+
+    def _projections(self, band: int) -> tuple[ColourProjection, ColourProjection]:
+        source, target = (of_view(view)[band] for view in (self.source, self.target))
+        same = max(self.unmoved(band), 0.0)
+        left = [
+            photometric.explained(own, *partners, other, same)
+            for own, other, partners in zip((source, target), (target, source), self._partners, strict=True)
+        ]
+        forward = ColourProjection(*self.surfaces[0], left[0][VALUE, self.source_points], _cells(self.target, left[1]))
+        backward = ColourProjection(*self.surfaces[1], left[1][VALUE, self.target_points], _cells(self.source, left[0]))
+        return forward, backward
+
+    def patches(self, band: int) -> float:
+        """Return the number of patches of the surface whose features are independent; mean of both views."""
+        points = 0.5 * (len(self.source.points_m) + len(self.target.points_m))
+        return points / (4.0 * np.pi * (FINEST_PX * 2**band) ** 2)
+
+    def unmoved(self, band: int) -> float:
+        """Return the correlation of features that both views show in the same place (method.md, eq. 18).
+
+        What stays in its place while the object turns is light: highlights, shading, fixed pattern noise.
+        """
+        if band not in self._unmoved:
+            source, target = (of_view(view)[band] for view in (self.source, self.target))
+            (number, offset), _ = self._partners
+            there = number >= 0
+            self._unmoved[band] = _correlation(source[VALUE, there], _moved(target, number[there], offset[there]))
+        return self._unmoved[band]
+
+    @cached_property
+    def _partners(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        """See `_in_place`: of the source's points in the target, and vice versa."""
+        shift_m = self.target.centroid_m - self.source.centroid_m
+        return _in_place(self.source, self.target, shift_m), _in_place(self.target, self.source, -shift_m)
+
+
+def weight_of(correlation: float) -> float:
+    """Return the weight of squared differences of features of unit variance (method.md, eq. 20)."""
+    square = float(np.clip(correlation, 0.0, _MOST)) ** 2
+    return square / (1.0 - square)
+
+
+def _in_place(view: RayImage, other: RayImage, shift_m: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the points of a view fall in the other if the object only moves by a shift (3,), without a turn.
+
+    Returns:
+        Number (n,) of the other view's point there, -1 for none; and columns and rows (n, 2) from its pixel.
+    """
+    camera = other.frame.camera
+    numbers = np.full((camera.height, camera.width), -1, dtype=np.int32)
+    numbers[other.pixels[:, 0], other.pixels[:, 1]] = np.arange(len(other.pixels))
+    x, y, z = (view.points_m + shift_m).T
+    place = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    pixel = np.round(place).astype(np.int64)
+    inside = np.all((pixel >= 0) & (pixel < (camera.width, camera.height)), axis=1) & (z > 0.0)
+    column, row = np.where(inside[:, None], pixel, 0).T
+    return np.where(inside, numbers[row, column], -1), (place - pixel).astype(np.float32)
+
+
+def _moved(features: np.ndarray, numbers: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Return the values (n,) of features (3, m) at offsets (n, 2) in px from the pixels of points (n,)."""
+    value, by_column, by_row = (features[k][numbers] for k in (VALUE, BY_COLUMN, BY_ROW))
+    return np.asarray(value + by_column * offsets[:, 0] + by_row * offsets[:, 1])
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the correlation of features (n,) about 0."""
+    scale = np.sqrt(float(np.sum(a * a)) * float(np.sum(b * b)))
+    return float(np.sum(a * b)) / scale if scale > 0.0 else 0.0
+
+
+def _cells(view: RayImage, features: np.ndarray) -> np.ndarray:
+    """Return cells (h · w, 4) of a view's features (3, n), see `photometric`."""
+    camera = view.frame.camera
+    pixels = view.pixels[:, 0] * camera.width + view.pixels[:, 1]
+    # Memory that nothing is written to costs nothing.
+    cells = np.zeros((camera.height * camera.width, photometric.CELL_SIZE), dtype=np.float32)
+    photometric.fill_cells(features, view.points_m, pixels, np.array([camera.fx, camera.fy]), cells)
+    return cells

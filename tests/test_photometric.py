@@ -1,0 +1,208 @@
+"""Colour as evidence: print turns with the object and tells its spin; light stays, and says nothing."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+import modeler
+from modeler import photometry, se3
+from modeler.cli.build import Build
+from modeler.cli.options import MethodOptions
+from modeler.kernels import gauss_newton, photometric, point_to_plane
+from modeler.pipeline import Modeler
+from modeler.priors import TablePrior
+from modeler.rays import Sensor
+from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
+from modeler.se3 import rows
+from modeler.types import Array, Camera, Frame, InputError, Outcome, Posterior, RayImage
+from sequences import bundled, open_sequence
+from sequences.rendering.recipe import load_recipe
+from sequences.rendering.renderer import RenderedSequence
+from sequences.rendering.trajectory import Place, Places
+
+TURN_DEG = 24.0
+Views = tuple[RayImage, RayImage]
+
+
+def turned(name: str) -> tuple[Views, Array]:
+    """Return two views of a built-in recipe, turned about the vertical, and the true motion from first to second."""
+    recipe = load_recipe(name)
+    places = Places((Place(), Place(rotation_deg=(0.0, 0.0, TURN_DEG))))
+    sequence = RenderedSequence(replace(recipe, trajectory=places))
+    noise, truth = sequence.sensor(), sequence.truth()
+    assert noise is not None
+    assert truth is not None
+    loop, frames = Modeler(sensor=Sensor(*noise)), [sequence.frame(index) for index in (0, 1)]
+    first, second = (loop.prepare(frame, loop.segmenter.scene(frames)).view for frame in frames)
+    assert first is not None
+    assert second is not None
+    return (first, second), np.asarray(truth[1] @ se3.inverse(truth[0]))
+
+
+@pytest.fixture(scope="module")
+def printed() -> tuple[Views, Array]:
+    return turned("ball")
+
+
+def picture(rng: np.random.Generator) -> Frame:
+    """Return a frame whose colours are smooth noise."""
+    height, width = 60, 80
+    camera = Camera(width, height, 100.0, 100.0, 39.5, 29.5)
+    coarse = rng.uniform(60.0, 200.0, (height // 5, width // 5, 3))
+    colour = np.kron(coarse, np.ones((5, 5, 1))).astype(np.uint8)
+    return Frame(0, 0.0, np.full((height, width), 0.5, dtype=np.float32), camera, colour=colour)
+
+
+def everywhere(frame: Frame) -> np.ndarray:
+    return np.argwhere(np.ones(frame.depth_m.shape, dtype=bool))
+
+
+def test_exposure_does_not_change_features(rng):
+    frame = picture(rng)
+    assert frame.colour is not None
+    brighter = replace(frame, colour=(1.2 * (frame.colour.astype(float) + 4.0) - 4.0).round().astype(np.uint8))
+    features = photometry.features(frame, everywhere(frame))
+    changed = photometry.features(brighter, everywhere(frame))
+    for band in range(photometry.BANDS):
+        deviation = features[band, photometry.VALUE].std()
+        assert np.abs(changed[band, photometry.VALUE] - features[band, photometry.VALUE]).max() < 0.1 * deviation
+
+
+def test_a_plain_image_has_no_features(rng):
+    frame = replace(picture(rng), colour=np.full((60, 80, 3), 90, dtype=np.uint8))
+    np.testing.assert_allclose(photometry.features(frame, everywhere(frame)), 0.0, atol=1e-5)
+
+
+def test_bands_are_differences_of_gaussian_means(rng):
+    frame = picture(rng)
+    assert frame.colour is not None
+    image = photometry.features(frame, everywhere(frame)).reshape(photometry.BANDS, 3, 60, 80)
+    logs = np.log(frame.colour + 4.0).mean(axis=2)
+    inside = (slice(20, -20), slice(20, -20))
+    for band in range(3):
+        width_px = photometry.FINEST_PX * 2**band
+        exact = ndimage.gaussian_filter(logs, width_px) - ndimage.gaussian_filter(logs, 2.0 * width_px)
+        by_row, by_column = np.gradient(exact, axis=0), np.gradient(exact, axis=1)
+        for layer, want in ((0, exact), (photometry.BY_ROW, by_row), (photometry.BY_COLUMN, by_column)):
+            assert np.corrcoef(image[band, layer][inside].ravel(), want[inside].ravel())[0][1] > 0.95
+
+
+def test_moments_are_sums_over_matching_points(printed):
+    views, truth = printed
+    pair = VisibilityLikelihood(colour=True).between(views[0], views[1], np.random.default_rng(0))
+    assert pair.colour is not None
+    forward, backward = pair.colour.projections(1, 1)
+    found = photometric.moments(rows(truth[None]), forward, backward, 0.002)[0]
+    want = np.zeros(4)
+    carried = ((truth, forward, pair.forward), (se3.inverse(truth), backward, pair.backward))
+    for pose, projection, directed in carried:
+        matches = directed.matches(rows(pose), 0.002)
+        good = matches[:, point_to_plane.WEIGHT] > 0.0
+        camera = directed.image.frame.camera
+        x, y, z = matches[:, point_to_plane.POSITION].T
+        pixel = np.round(camera.fy * y / z + camera.cy) * camera.width + np.round(camera.fx * x / z + camera.cx)
+        cells = projection.colours[pixel.astype(int)]
+        other = np.sum(cells[:, :3] * matches[:, point_to_plane.POSITION], axis=1) + cells[:, 3]
+        weight, own = matches[:, point_to_plane.FACING_WEIGHT] * good, projection.values
+        want += [np.sum(weight * part) for part in (own * other, own * own, other * other, 1.0)]
+    np.testing.assert_allclose(found, want, rtol=0.02)
+
+
+def test_equations_of_features_are_those_of_planes_with_their_gradient(printed):
+    views, truth = printed
+    pair = VisibilityLikelihood(colour=True).between(views[0], views[1], np.random.default_rng(0))
+    assert pair.colour is not None
+    pose, weight = se3.moved(truth[None], np.full((1, 6), 0.004), pair.centre_m)[0], 3.0
+    projections = pair.forward.projection(1), pair.backward.projection(1)
+    without = photometric.no_colour(projections[0]), photometric.no_colour(projections[1])
+    of_depth = _one(
+        rows(pose[None]), projections[0], projections[1], without[0], without[1], np.float32(0.0), pair.centre_m, 0.002
+    )
+    colours = pair.colour.projections(1, 1)
+    both = _one(
+        rows(pose[None]),
+        projections[0],
+        projections[1],
+        colours[0],
+        colours[1],
+        np.float32(weight),
+        pair.centre_m,
+        0.002,
+    )
+    want = np.zeros(6), np.zeros((6, 6))
+    for directed, carried, sign in ((pair.forward, pose, 1.0), (pair.backward, se3.inverse(pose), -1.0)):
+        matches = directed.matches(rows(carried), 0.002)
+        found = pair.colour.matches(carried, matches, 1, weight, forward=sign > 0.0)
+        to_source = se3.inverse(pose) if sign > 0.0 else np.eye(4)
+        arms = se3.transform(to_source, found[:, point_to_plane.POSITION]) - pair.centre_m
+        gradients = found[:, point_to_plane.OTHER] @ to_source[:3, :3].T
+        derivatives = sign * np.hstack([np.cross(arms, gradients), gradients])
+        weighted = derivatives.T * found[:, point_to_plane.WEIGHT]
+        want = want[0] - weighted @ found[:, point_to_plane.RESIDUAL], want[1] + weighted @ derivatives
+    assert abs(want[0]).max() > 0.0
+    np.testing.assert_allclose(both[0] - of_depth[0], want[0], rtol=0.02, atol=0.02 * abs(want[0]).max())
+    np.testing.assert_allclose(both[1] - of_depth[1], want[1], rtol=0.02, atol=0.02 * abs(want[1]).max())
+
+
+def _one(*arguments: Any) -> tuple[Array, Array]:
+    """Return the normal equations of the first pose."""
+    gradients, matrices = gauss_newton.normal_equations(*arguments)
+    return gradients[0], matrices[0]
+
+
+def registered(views: Views, *, colour: bool) -> Posterior:
+    registrar = VisibilityRegistrar(VisibilityLikelihood(colour=colour))
+    density = TablePrior().between(*views)
+    return registrar.register(*views, density, rng=np.random.default_rng(0))
+
+
+def rotation_error_deg(posterior: Posterior, truth: Array) -> float:
+    return float(np.rad2deg(np.linalg.norm(se3.log(se3.inverse(truth) @ posterior.pose.mean)[:3])))
+
+
+def test_a_label_tells_the_spin_that_depth_leaves_open(printed):
+    views, truth = printed
+    depth, both = registered(views, colour=False), registered(views, colour=True)
+    assert depth.outcome is Outcome.AMBIGUOUS
+    assert both.outcome is Outcome.CONVERGED
+    sigma_deg = np.rad2deg(np.sqrt(np.trace(both.pose.covariance[:3, :3])))
+    assert sigma_deg < 5.0
+    assert rotation_error_deg(both, truth) < 3.0 * sigma_deg
+
+
+def test_light_says_nothing_of_the_spin_of_a_plain_tin():
+    views, truth = turned("tin-plain")
+    posterior = registered(views, colour=True)
+    assert posterior.outcome is Outcome.AMBIGUOUS
+    error = se3.difference(truth, posterior.pose.mean, np.zeros(3))
+    assert error @ np.linalg.solve(posterior.pose.covariance, error) / 6.0 < 6.0
+
+
+def test_without_colour_pairs_are_what_depth_says(printed):
+    views, _ = printed
+    first, second = (replace(view, frame=replace(view.frame, colour=None)) for view in views)
+    without, switched_off = registered((first, second), colour=True), registered(views, colour=False)
+    np.testing.assert_array_equal(without.pose.mean, switched_off.pose.mean)
+    np.testing.assert_array_equal(without.pose.covariance, switched_off.pose.covariance)
+
+
+def test_commands_repeat_that_colour_is_compared():
+    build = Build(Path("a"), Path("run"), method=MethodOptions(colour=True))
+    assert build.command({}).endswith("--colour")
+    assert build.settings()["colour"] is True
+    assert "colour" not in Build(Path("a"), Path("run")).command({})
+
+
+def test_two_arrays_are_registered_with_their_colours():
+    sequence = open_sequence(bundled("box"))
+    frames = [sequence.frame(index) for index in (0, 1)]
+    depths, masks, colours = (tuple(getattr(frame, name) for frame in frames) for name in ("depth_m", "mask", "colour"))
+    known = {"intrinsics": frames[0].camera, "masks": masks}
+    with pytest.raises(InputError, match="colours"):
+        modeler.register(*depths, **known, colours=(colours[0][:5], colours[1]))
+    seen, blind = modeler.register(*depths, **known, colours=colours), modeler.register(*depths, **known)
+    assert not np.array_equal(seen.pose.mean, blind.pose.mean)
