@@ -27,7 +27,18 @@ class Regulariser(NamedTuple):
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def normal_equations(poses, forward, backward, colours, colours_back, weight, centre, surface_m):
-    """Return gradients (m, 6) and matrices (m, 6, 6) of poses (m, 12), see `equations`."""
+    """Return gradients (m, 6) and matrices (m, 6, 6) of poses (m, 12), see `point_to_plane.equations`.
+
+    Args:
+        poses: rows of the 3×4 matrices of target_from_source.
+        forward: the `Projection` of the source's points in the target, and
+        backward: of the target's in the source.
+        colours: the `ColourProjection` of the source's points in the target, without points where there is none, and
+        colours_back: of the target's in the source.
+        weight: inverse variance of the difference of features (method.md, eq. 20).
+        centre: (3,) point of the source in m.
+        surface_m: noise of the surfaces in m beyond that of points and planes.
+    """
     group = 16  # poses per workspace
     gradients, matrices = np.empty((poses.shape[0], 6)), np.empty((poses.shape[0], 6, 6))
     for number in numba.prange((poses.shape[0] + group - 1) // group):
@@ -50,7 +61,7 @@ def normal_equations(poses, forward, backward, colours, colours_back, weight, ce
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def descend(poses, forward, backward, colours, colours_back, weight, centre, surface_m, regulariser, steps):
-    """Return poses (m, 12) after damped Gauss-Newton steps with a `Regulariser`; see `equations`."""
+    """Return poses (m, 12) after damped Gauss-Newton steps with a `Regulariser`; see `normal_equations`."""
     group = 4
     moved = poses.copy()
     for number in numba.prange((poses.shape[0] + group - 1) // group):

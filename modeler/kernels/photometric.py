@@ -36,13 +36,13 @@ class ColourProjection(NamedTuple):
     """One direction of a comparison of colours."""
 
     points: FloatArray
-    """As of a `Projection`, and"""
+    """(7, n) as of a `Projection`."""
     cells: FloatArray
-    """likewise,"""
+    """(h · w, 8) of the other view's surface, as of a `Projection`."""
     camera: FloatArray
-    """likewise,"""
+    """(6,) as of a `Projection`."""
     cosines: FloatArray
-    """likewise."""
+    """(4,) as of a `Projection`."""
     values: FloatArray
     """(n,) features of the points in their own view, of unit variance."""
     colours: FloatArray
@@ -93,12 +93,12 @@ def deviation(values):
 
 @numba.njit(cache=True, error_model="numpy")
 def fill_cells(features, points_m, pixels, focal, cells):
-    """Write the cells of features (3, n): value, and derivatives by column and row in 1/px.
+    """Write the cells of features: their gradients by position in 1/m, and the features themselves.
 
-    Along a pixel's ray the feature stays the same.
+    Along a pixel's ray a feature stays the same, so that its gradient there adds nothing at the pixel's own point.
 
     Args:
-        features: of the surface points.
+        features: (3, n) of the surface points: value, and derivatives by column and row in 1/px.
         points_m: (n, 3) the points.
         pixels: (n,) their pixels, row by row.
         focal: (2,) fx and fy in px.
