@@ -22,7 +22,7 @@ from modeler.kernels.point_likelihood import (
 from modeler.kernels.point_to_plane import EQUATION_ROWS, accumulate, match_weight, rotate_to_source
 
 # Columns of a cell, the 16 bytes that are read for one pixel: at a point p that projects into it, the feature is
-# gradient · p + offset to first order, as a plane's distance is.
+# gradient · p + offset to first order. They are those of a plane, so that `plane_distance` of a cell is the feature.
 GRADIENT_X, GRADIENT_Y, GRADIENT_Z, OFFSET = 0, 1, 2, 3
 CELL_SIZE = 4
 
@@ -55,43 +55,6 @@ class ColourProjection(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def explained(features, partners, offsets, others, share):
-    """Return features (3, n) of unit variance, less a share of those that the other image shows in the same place.
-
-    Args:
-        features: (3, n) of one view's surface points; of any variance.
-        partners: (n,) number of the other view's point in the same place; -1 for none.
-        offsets: (n, 2) columns and rows from that point's pixel to the place.
-        others: (3, m) features of the other view.
-        share: what is taken off, of features of unit variance.
-    """
-    own_scale, other_scale = deviation(features[0]), deviation(others[0])
-    left = np.empty(features.shape, dtype=np.float32)
-    for k in range(3):
-        for j in range(features.shape[1]):
-            value = features[k, j] / own_scale
-            if partners[j] >= 0:
-                other = others[k, partners[j]]
-                if k == 0:
-                    other += others[1, partners[j]] * offsets[j, 0] + others[2, partners[j]] * offsets[j, 1]
-                value -= share * other / other_scale
-            left[k, j] = value
-    left /= deviation(left[0])
-    return left
-
-
-@numba.njit(cache=True, error_model="numpy")
-def deviation(values):
-    """Return the standard deviation of values (n,); never quite 0."""
-    total, square = 0.0, 0.0
-    for value in values:
-        total += value
-        square += value * value
-    mean = total / values.shape[0]
-    return np.float32(max(np.sqrt(max(square / values.shape[0] - mean * mean, 0.0)), 1e-6))
-
-
-@numba.njit(cache=True, error_model="numpy")
 def fill_cells(features, points_m, pixels, focal, cells):
     """Write the cells of features: their gradients by position in 1/m, and the features themselves.
 
@@ -121,17 +84,6 @@ def fetch_colours(pixels, cells, looked_up):
             looked_up[k, j] = cells[cell, k]
 
 
-@numba.njit(cache=True, inline="always")
-def feature(transformed, colour, j):
-    """Return the other view's feature where a transformed point falls."""
-    return (
-        colour[OFFSET, j]
-        + colour[GRADIENT_X, j] * transformed[X, j]
-        + colour[GRADIENT_Y, j] * transformed[Y, j]
-        + colour[GRADIENT_Z, j] * transformed[Z, j]
-    )
-
-
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def sum_moments(projection, transformed, looked_up, colour, surface_m2):
     """Return Σ a b, Σ a², Σ b² and the number of matches of one direction, each weighted by f."""
@@ -141,7 +93,7 @@ def sum_moments(projection, transformed, looked_up, colour, surface_m2):
         distance = plane_distance(transformed, looked_up, j)
         matched = match_weight(points, transformed, looked_up, distance, surface_m2, j) > ZERO
         weight = transformed[FACING, j] if matched else ZERO
-        own, other = projection.values[j], feature(transformed, colour, j)
+        own, other = projection.values[j], plane_distance(transformed, colour, j)
         product += weight * own * other
         own_square += weight * own * own
         other_square += weight * other * other
@@ -206,7 +158,7 @@ def linearise_colour(projection, transformed, found, colour, centre, surface_m2,
     for j in range(points.shape[1]):
         distance = plane_distance(transformed, found, j)
         matched = match_weight(points, transformed, found, distance, surface_m2, j) > ZERO
-        rows[6, j] = feature(transformed, colour, j) - projection.values[j]
+        rows[6, j] = plane_distance(transformed, colour, j) - projection.values[j]
         rows[7, j] = weight * transformed[FACING, j] if matched else ZERO
     for j in range(points.shape[1]):
         x, y, z = transformed[X, j] - cx, transformed[Y, j] - cy, transformed[Z, j] - cz

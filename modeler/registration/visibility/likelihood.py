@@ -78,8 +78,10 @@ class VisibilityLikelihood:
         forward = DirectedLikelihood(self, _points(source, chosen[0]), target, size_m)
         backward = DirectedLikelihood(self, _points(target, chosen[1]), source, size_m)
         seen = self.colour and source.frame.colour is not None and target.frame.colour is not None
+        if not seen:
+            return PairLikelihood(forward, backward, size_m)
         colour = PairColour(source, target, *chosen, (forward.projection(1), backward.projection(1)))
-        return PairLikelihood(forward, backward, size_m, colour if seen else None)
+        return PairLikelihood(forward, backward, size_m, colour)
 
 
 @dataclass(frozen=True, eq=False)

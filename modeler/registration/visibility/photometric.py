@@ -112,11 +112,11 @@ class PairColour:
 
     def _projections(self, band: int) -> tuple[ColourProjection, ColourProjection]:
         source, target = (of_view(view)[band] for view in (self.source, self.target))
-        same = max(self.unmoved(band), 0.0)
-        left = [
-            photometric.explained(own, *partners, other, same)
-            for own, other, partners in zip((source, target), (target, source), self._partners, strict=True)
-        ]
+        share = max(self.unmoved(band), 0.0)
+        left = (
+            _unexplained(source, target, self._partners[0], share),
+            _unexplained(target, source, self._partners[1], share),
+        )
         forward = ColourProjection(*self.surfaces[0], left[0][VALUE, self.source_points], _cells(self.target, left[1]))
         backward = ColourProjection(*self.surfaces[1], left[1][VALUE, self.target_points], _cells(self.source, left[0]))
         return forward, backward
@@ -133,9 +133,9 @@ class PairColour:
         """
         if band not in self._unmoved:
             source, target = (of_view(view)[band] for view in (self.source, self.target))
-            (number, offset), _ = self._partners
-            there = number >= 0
-            self._unmoved[band] = _correlation(source[VALUE, there], _moved(target, number[there], offset[there]))
+            partners = self._partners[0]
+            theirs = _in_other(target, partners)
+            self._unmoved[band] = _correlation(source[VALUE] * (partners[0] >= 0), theirs[VALUE])
         return self._unmoved[band]
 
     @cached_property
@@ -168,10 +168,25 @@ def _in_place(view: RayImage, other: RayImage, shift_m: Array) -> tuple[np.ndarr
     return np.where(inside, numbers[row, column], -1), (place - pixel).astype(np.float32)
 
 
-def _moved(features: np.ndarray, numbers: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return the values (n,) of features (3, m) at offsets (n, 2) in px from the pixels of points (n,)."""
-    value, by_column, by_row = (features[k][numbers] for k in (VALUE, BY_COLUMN, BY_ROW))
-    return np.asarray(value + by_column * offsets[:, 0] + by_row * offsets[:, 1])
+def _in_other(others: np.ndarray, partners: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return what features (3, m) of the other view are in the same places, (3, n); see `_in_place`; 0 for none."""
+    numbers, offsets = partners
+    there = others[:, numbers] * (numbers >= 0)
+    there[VALUE] += there[BY_COLUMN] * offsets[:, 0] + there[BY_ROW] * offsets[:, 1]
+    return there
+
+
+def _unexplained(
+    features: np.ndarray, others: np.ndarray, partners: tuple[np.ndarray, np.ndarray], share: float
+) -> np.ndarray:
+    """Return features (3, n) of unit variance, less a share of the other view's in the same places (eq. 18)."""
+    left = features / _deviation(features) - share / _deviation(others) * _in_other(others, partners)
+    return np.asarray(left / _deviation(left), dtype=np.float32)
+
+
+def _deviation(features: np.ndarray) -> float:
+    """Return the standard deviation of features (3, n); never quite 0."""
+    return max(float(np.std(features[VALUE])), 1e-6)
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
