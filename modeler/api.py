@@ -81,15 +81,15 @@ def register(
     given = [None, None] if masks is None else [np.asarray(mask, dtype=bool) for mask in masks]
     if any(mask is not None and mask.shape != pictures[0].shape for mask in given):
         raise InputError(f"the masks have another shape than the depth images, {pictures[0].shape}; give the same")
-    painted = [None, None] if colours is None else [np.asarray(colour) for colour in colours]
-    for colour in painted:
+    rgb = [None, None] if colours is None else [np.asarray(colour) for colour in colours]
+    for colour in rgb:
         if colour is not None and (colour.shape != (*pictures[0].shape, 3) or colour.dtype != np.uint8):
             raise InputError(
                 f"colours have shape {colour.shape} of {colour.dtype}; give 8-bit RGB of depth's {pictures[0].shape}"
             )
     camera = _camera(intrinsics, pictures[0].shape)
     frames = []
-    for index, (depth_m, mask, colour) in enumerate(zip(pictures, given, painted, strict=True)):
+    for index, (depth_m, mask, colour) in enumerate(zip(pictures, given, rgb, strict=True)):
         depth_m[~(depth_m > 0.0) | np.isinf(depth_m)] = np.nan
         frames.append(Frame(index, float(index), depth_m, camera, mask=mask, colour=colour))
     registrar = VisibilityRegistrar(VisibilityLikelihood(colour=colours is not None))

@@ -24,12 +24,10 @@ VALUE, BY_COLUMN, BY_ROW = 0, 1, 2
 
 _BLACK = 4.0  # added to 8-bit values: below it noise and rounding would rule their logarithm
 _REACH = 3.0  # of a Gaussian, in standard deviations
+_KNOWN: WeakKeyDictionary[RayImage, np.ndarray] = WeakKeyDictionary()  # features of views made so far
 
 
-_KNOWN: WeakKeyDictionary[RayImage, np.ndarray] = WeakKeyDictionary()
-
-
-def of_view(view: RayImage) -> np.ndarray:
+def view_features(view: RayImage) -> np.ndarray:
     """Return the features of a view's surface points, see `features`; made once, as a view is part of several pairs."""
     if view not in _KNOWN:
         _KNOWN[view] = features(view.frame, view.pixels)

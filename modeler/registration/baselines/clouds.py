@@ -53,7 +53,7 @@ class Cloud:
         if colour is None and len(view.points_m):
             raise InputError(
                 f"frame {view.index}: has no colour, which coloured ICP compares; give colour aligned to depth,"
-                " or another --method."
+                " or take another method."
             )
         intensity = np.zeros(0) if colour is None else colour[row, column].mean(axis=1) / 255.0
         return Cloud(view.points_m, view.normals, intensity)

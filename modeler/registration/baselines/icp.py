@@ -100,7 +100,7 @@ def by_levels(
     Levels that thinning leaves with too few points are passed over.
 
     Args:
-        clouds: points to carry, and those to lay them on.
+        clouds: of source and target.
         target_from_source: (4, 4) where to begin.
         voxels: edge of the thinning cubes at each level, coarse to fine, as a share of the object's size.
         min_points: fewest points a side; None is returned where there are fewer.

@@ -10,12 +10,12 @@ import numpy as np
 from modeler.kernels import photometric, point_to_plane
 from modeler.kernels.photometric import ColourProjection
 from modeler.kernels.point_likelihood import Projection
-from modeler.photometry import BANDS, BY_COLUMN, BY_ROW, FINEST_PX, VALUE, of_view
+from modeler.photometry import BANDS, BY_COLUMN, BY_ROW, FINEST_PX, VALUE, view_features
 from modeler.se3 import rows
 from modeler.types import Array, RayImage
 
 _FINEST_SCORED = 1
-"""Finest band by which samples are weighted; in the finest of all, weights are too uneven: it sharpens them."""
+"""Finest band by which samples are weighted; weights by the finest of all are too uneven (it refines the samples)."""
 UNDECIDED = 0.7
 """Correlation that is assumed where a descent starts."""
 _MOST = 0.99  # correlation
@@ -111,7 +111,7 @@ class PairColour:
         return self._made[band, stride]
 
     def _projections(self, band: int) -> tuple[ColourProjection, ColourProjection]:
-        source, target = (of_view(view)[band] for view in (self.source, self.target))
+        source, target = (view_features(view)[band] for view in (self.source, self.target))
         share = max(self.unmoved(band), 0.0)
         left = (
             _unexplained(source, target, self._partners[0], share),
@@ -132,7 +132,7 @@ class PairColour:
         What stays in its place while the object turns is light: highlights, shading, fixed pattern noise.
         """
         if band not in self._unmoved:
-            source, target = (of_view(view)[band] for view in (self.source, self.target))
+            source, target = (view_features(view)[band] for view in (self.source, self.target))
             partners = self._partners[0]
             theirs = _in_other(target, partners)
             self._unmoved[band] = _correlation(source[VALUE] * (partners[0] >= 0), theirs[VALUE])
