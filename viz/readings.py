@@ -174,13 +174,7 @@ def loop_words(step: Step) -> list[str]:
     """Return in words by how much the loop was open before the optimisation; nothing without a loop."""
     centroids_m = {frame: view.centroid_m for frame, view in step.views.items()}
     opening = loop_opening(step.edges_so_far, step.solution, centroids_m)
-    if opening is None or not math.isfinite(opening.sigmas):
-        return []
-    return [
-        f"the loop from frame {opening.target} to {opening.source} was open by "
-        f"{math.degrees(opening.rotation_rad):.1f}° and {1000.0 * opening.translation_m:.1f} mm, "
-        f"{opening.sigmas:.1f} times what its edges state"
-    ]
+    return [] if opening is None or not math.isfinite(opening.sigmas) else [opening.words]
 
 
 def _readings(posterior: Posterior, step: Step) -> dict[str, float]:

@@ -145,6 +145,14 @@ class LoopOpening:
     sigmas: float
     """Root of NEES/6 under the stated covariances of chain and closure: about 1 where these are true."""
 
+    @property
+    def words(self) -> str:
+        """The opening in words."""
+        return (
+            f"the loop from frame {self.target} to {self.source} was open by {np.degrees(self.rotation_rad):.1f}° and "
+            f"{1000.0 * self.translation_m:.1f} mm, {self.sigmas:.1f} times what its edges state"
+        )
+
 
 def loop_openings(edges: Sequence[Edge], solution: Solution, centroids_m: Mapping[int, Array]) -> list[LoopOpening]:
     """Compare each accepted closure whose ends a chain of odometry edges joins with that chain.

@@ -193,11 +193,7 @@ def _found(
     centroids_m = {frame: view.centroid_m for frame, view in views.items()}
     if (loop := loop_figure(loop_openings(step.edges_so_far, solution, centroids_m))) is not None:
         opening, figure = loop
-        words = (
-            f"the loop from frame {opening.target} to {opening.source} was open by "
-            f"{np.degrees(opening.rotation_rad):.1f}° and {1000.0 * opening.translation_m:.1f} mm, "
-            f"{figure.value:.1f} times what its edges state: the focal length or the depth scale is wrong, or an edge"
-        )
+        words = f"{opening.words}: the focal length or the depth scale is wrong, or an edge"
         found.append(_Finding("loop_sigmas", figure, "loop_open", words))
     if (fit := graph_figure(edges, solution)) is not None:
         words = (
