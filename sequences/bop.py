@@ -29,7 +29,7 @@ from sequences.image_files import (
     read_mask,
     write_image,
 )
-from sequences.input_files import Node, entries, first_folder, frame_number, inside, is_there, read_tree
+from sequences.input_files import Node, entries, first_folder, frame_number, is_there, read_tree
 from sequences.intrinsics import RANGE, Intrinsics, Overrides, of_matrix
 from sequences.recording import AbstractRecording
 from sequences.rendering.meshes import Mesh, read_mesh
@@ -134,7 +134,7 @@ class BopSequence(AbstractRecording):
         path = self.path / "scene_gt.json"
         if not is_there(path):
             return None
-        objects = {index: node.elements() for index, node in read_tree(inside(path, self.path)).frames().items()}
+        objects = {index: node.elements() for index, node in read_tree(path).frames().items()}
         firsts = {index: objects[index][0] for index in self.indices if objects.get(index)}
         names = {
             index: json.dumps(node.items()["obj_id"].value) for index, node in firsts.items() if node.get("obj_id")
@@ -203,7 +203,7 @@ class BopSequence(AbstractRecording):
     @cached_property
     def _intrinsics(self) -> dict[int, tuple[tuple[float, float, float, float], float]]:
         path = self.path / "scene_camera.json"
-        nodes = read_tree(inside(path, self.path)).frames()
+        nodes = read_tree(path).frames()
         missing = [index for index in self.indices if index not in nodes]
         if missing:
             raise InputError(f"{path}: says nothing of frame {missing[0]}; add its cam_K and depth_scale.")
@@ -240,7 +240,7 @@ class BopSequence(AbstractRecording):
         path = self.path / MASKS / f"{self._depth_paths[index].stem}_000000.png"
         if not is_there(path):
             return None
-        mask = read_mask(inside(path, self.path))
+        mask = read_mask(path)
         check_size(path, mask.shape, size)
         return mask
 
@@ -256,13 +256,13 @@ class BopSequence(AbstractRecording):
 def _numbered(root: Path, name: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Return the images of a folder by the frame number in their name."""
     found: dict[int, Path] = {}
-    for path in entries(inside(root / name, root)):
+    for path in entries(root / name):
         number = frame_number(path.stem)
         if path.suffix.lower() not in suffixes or number is None:
             continue
         if number in found:
             raise InputError(f"{path}: is frame {number}, and so is {found[number].name}; remove one of them.")
-        found[number] = inside(path, root) if path.is_symlink() else path
+        found[number] = path
     return found
 
 

@@ -116,7 +116,7 @@ def open_clouds(path: Path, overrides: Overrides) -> CloudSequence:
     Raises:
         InputError: where it is not readable as such.
     """
-    found = list_images(path, SUFFIXES, path) if path.is_dir() else {path.stem: path}
+    found = list_images(path, SUFFIXES) if path.is_dir() else {path.stem: path}
     numbers = frame_numbers(list(found)) or {stem: place for place, stem in enumerate(found)}
     clouds = dict(sorted((numbers[stem], cloud) for stem, cloud in found.items()))
     unit_mm = 1000.0 if overrides.depth_scale_mm is None else overrides.depth_scale_mm

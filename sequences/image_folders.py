@@ -26,7 +26,7 @@ from sequences.image_files import (
     read_mask,
     resize_to_depth,
 )
-from sequences.input_files import entries, first_folder, frame_number, inside, is_there, list_images, read_text
+from sequences.input_files import check_link, entries, first_folder, frame_number, is_there, list_images, read_text
 from sequences.intrinsics import CameraFacts, Intrinsics, Overrides, find_intrinsics
 from sequences.recording import AbstractRecording, paired
 
@@ -144,7 +144,7 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
         raise InputError(f"{path / 'depth.txt'}: lists no depth image; write lines 'time path'.")
     colour = _list(path / "rgb.txt", 2) if is_there(path / "rgb.txt") else []
     folder = first_folder(path, ("mask", "masks"))
-    masks = {} if folder is None else list_images(folder, (".png",), path)
+    masks = {} if folder is None else list_images(folder, (".png",))
     pairs, remarks = paired(depth, colour)
     files: dict[int, FrameFiles] = {}
     for index, pair in pairs.items():
@@ -229,7 +229,6 @@ def _list(path: Path, words: int) -> list[tuple[float, list[str]]]:
     Raises:
         InputError: where a line has too few words or no time, or times do not grow.
     """
-    inside(path, path.parent)
     lines: list[tuple[float, list[str]]] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -252,12 +251,14 @@ def _listed(root: Path, by: str, name: str) -> Path:
     """Return an image file named in a list.
 
     Raises:
-        InputError: where there is none, or it lies elsewhere.
+        InputError: where there is none, or its name leads out of the sequence.
     """
     name = name.strip()
     if not name.isprintable():
         raise InputError(f"{root / by}: names an image with control characters; correct it there.")
-    path = inside(root / name, root)
+    path = root / name
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        check_link(path, root)
     if not is_there(path):
         raise InputError(f"{root / by}: names {name}, which is not there; add the image or remove the line.")
     return path
@@ -276,7 +277,7 @@ def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
     Raises:
         InputError: where it is not readable as such.
     """
-    depth = list_images(path / "depth", (".png", ".tif", ".tiff"), path)
+    depth = list_images(path / "depth", (".png", ".tif", ".tiff"))
     if not depth:
         raise no_depth(path / "depth", "16-bit PNG or TIFF images")
     found = find_intrinsics(path, overrides)
@@ -355,7 +356,7 @@ def _partners(
     folder = first_folder(root, names)
     if folder is None:
         return {}, []
-    found = list_images(folder, suffixes, root)
+    found = list_images(folder, suffixes)
     same = {stem: found[stem] for stem in depth if stem in found}
     ours, theirs = frame_numbers(list(depth)) or {}, frame_numbers(list(found)) or {}
     named = {number: stem for stem, number in theirs.items()}
@@ -376,12 +377,12 @@ def _posed_truth(root: Path, numbers: Mapping[str, int]) -> dict[int, Array] | N
     """Return camera_from_model by frame number from BundleSDF's or Open3D's pose files; None without."""
     posed = {path.stem: path for path in entries(root / POSES) if path.suffix == ".txt"}
     if posed:
-        found = {number: _pose(inside(posed[stem], root)) for stem, number in numbers.items() if stem in posed}
+        found = {number: _pose(posed[stem]) for stem, number in numbers.items() if stem in posed}
         return dict(sorted(found.items())) or None
     log = next((path for path in (root / "trajectory.log", root / "scene" / "trajectory.log") if is_there(path)), None)
     if log is None:
         return None
-    rows = [line.split() for line in read_text(inside(log, root)).splitlines() if line.strip()]
+    rows = [line.split() for line in read_text(log).splitlines() if line.strip()]
     heads, places = rows[::5], sorted(numbers.values())
     if len(rows) % 5 or not all(len(head) == 3 and frame_number(head[0]) is not None for head in heads):
         raise InputError(f"{log}: is no trajectory; each pose is a line 'i i n' and four rows of its matrix.")

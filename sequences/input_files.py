@@ -70,24 +70,23 @@ def is_there(path: Path) -> bool:
     return os.path.lexists(path)
 
 
-def list_images(folder: Path, suffixes: tuple[str, ...], root: Path) -> dict[str, Path]:
+def list_images(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     """Return the images of a folder by stem, without hidden files.
 
     Args:
         folder: may be missing.
         suffixes: in lower case, such as `.png`.
-        root: the sequence that the folder belongs to.
 
     Raises:
-        InputError: where the folder may not be read, two images share a name, or a link leads out of the sequence.
+        InputError: where the folder may not be read, or two images share a name.
     """
     found: dict[str, Path] = {}
-    for path in entries(inside(folder, root)):
+    for path in entries(folder):
         if path.suffix.lower() not in suffixes or path.name.startswith("."):
             continue
         if path.stem in found:
             raise InputError(f"{path}: there is {found[path.stem].name} too; remove one of them.")
-        found[path.stem] = inside(path, root) if path.is_symlink() else path
+        found[path.stem] = path
     return found
 
 
@@ -96,16 +95,32 @@ def first_folder(root: Path, names: tuple[str, ...]) -> Path | None:
     return next((root / name for name in names if (root / name).is_dir()), None)
 
 
-def inside(path: Path, root: Path) -> Path:
-    """Return the path, which must stay in its sequence.
+def check_link(path: Path, root: Path) -> None:
+    """Refuse a path that leads out of its sequence, by a link or by its name.
 
     Raises:
-        InputError: where it does not, by a link or by `..`.
+        InputError: where it does.
     """
     target, home = os.path.realpath(path), os.path.realpath(root)
     if os.path.commonpath([target, home]) != home:
         raise InputError(f"{path}: leads out of the sequence, to {target}; put the file itself there.")
-    return path
+
+
+def check_links(root: Path) -> None:
+    """Refuse a folder in which a link, at whatever depth, leads out of it, whether or not the link would be read.
+
+    Raises:
+        InputError: where one does, or a folder may not be read.
+    """
+
+    def unreadable(error: OSError) -> None:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); check its permissions.") from None
+
+    for folder, inner, names in os.walk(root, onerror=unreadable):
+        for name in sorted(inner + names):
+            path = Path(folder) / name
+            if path.is_symlink():
+                check_link(path, root)
 
 
 def frame_number(stem: str) -> int | None:

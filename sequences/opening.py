@@ -13,7 +13,7 @@ from sequences.bop import BopSequence
 from sequences.clouds import SUFFIXES as CLOUD_SUFFIXES
 from sequences.clouds import open_clouds
 from sequences.image_folders import COLOUR_FOLDERS, open_colour_depth, open_tum
-from sequences.input_files import entries, is_there
+from sequences.input_files import check_links, entries, is_there
 from sequences.intrinsics import Overrides
 from sequences.live import SCHEME, open_camera
 
@@ -32,7 +32,7 @@ def open_sequence(path: str | Path, overrides: Overrides | None = None) -> Abstr
         overrides: values that take precedence over the files.
 
     Raises:
-        InputError: where it does not hold a readable sequence.
+        InputError: where it does not hold a readable sequence, or, on request, a link leads out of it.
     """
     path, overrides = Path(path), overrides or Overrides()
     if not _is_text(path):
@@ -59,6 +59,8 @@ def _open(path: Path, overrides: Overrides) -> AbstractSequence:
         raise InputError(f"{path}: no such folder or file; {_suggestion(path)}give {FORMATS}.")
     if not path.is_dir():
         check_regular(path)
+    elif overrides.strict_paths:
+        check_links(path)
     if path.suffix.lower() in BAGS or is_there(path / "metadata.yaml"):
         from sequences.ros.sequence import open_ros
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from modeler.types import Array, Frame, InputError
 from sequences.base import AbstractSequence, span
-from sequences.input_files import Node, inside, is_there, read_tree
+from sequences.input_files import Node, is_there, read_tree
 from sequences.lens import Lens
 
 
@@ -68,9 +68,9 @@ class AbstractRecording(AbstractSequence):
         return InputError(f"{self.path}: has no frame {index}; its frames are {span(self.indices)}.")
 
     def _beside(self, name: str) -> Path | None:
-        """Return a file in the folder, where there is one; one to which a link leads out of it is refused."""
+        """Return a file in the folder, where there is one."""
         path = self.path / name
-        return inside(path, self.path) if self._is_folder and is_there(path) else None
+        return path if self._is_folder and is_there(path) else None
 
     @cached_property
     def _is_folder(self) -> bool:
@@ -78,7 +78,7 @@ class AbstractRecording(AbstractSequence):
 
     @cached_property
     def _meta(self) -> Node | None:
-        path = inside(self.path / "sequence.json", self.path) if self._is_folder else self.path.with_suffix(".json")
+        path = self.path / "sequence.json" if self._is_folder else self.path.with_suffix(".json")
         return read_tree(path) if is_there(path) else None
 
 

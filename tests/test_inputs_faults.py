@@ -120,7 +120,6 @@ PICTURES: dict[str, tuple[Damage, str]] = {
     "all zero": (pixels(D, np.zeros_like, every=True), "none of its 3 frames holds any depth, all is 0 or NaN"),
     "decompression bomb": (content(D, png_claiming(100_000, 100_000)), "million pixels"),
     "directory instead of a picture": (folder_instead(D), ".png"),
-    "link out of the folder": (link_out(D), "leads out of the sequence"),
     "no pictures": (lambda folder: [path.unlink() for path in folder.glob(D)], "depth"),
 }
 B, O, K, T = "scene_camera.json", "camera_intrinsic.json", "cam_K.txt", "depth.txt"  # noqa: E741
@@ -147,7 +146,6 @@ FAULTS: dict[str, dict[str, tuple[Damage, str]]] = {
         "two of one number": (lambda f: shutil.copy(f / "depth/000001.png", f / "depth/1.png"), "remove one"),
         "frame without camera": (entry(B, lambda c: c.pop("1")), "says nothing of frame 1"),
         "times out of order": (entry("sequence.json", lambda c: c["timestamps_s"].update({"2": -1})), "times must inc"),
-        "camera file links out": (link_out(B, place=0), "leads out of the sequence"),
     },
     "tum": {
         **PICTURES,
@@ -192,7 +190,6 @@ FAULTS: dict[str, dict[str, tuple[Damage, str]]] = {
         "intrinsics short": (text(K, lambda t: t.splitlines()[0]), "does not describe a pinhole camera"),
         "intrinsics NaN": (text(K, lambda t: t.replace("1.4375", "nan ").replace("nan 0", "nan")), K),
         "intrinsics skewed": (lambda folder: np.savetxt(folder / K, np.ones((3, 3))), "pinhole camera"),
-        "intrinsics link out": (link_out(K, place=0), "leads out of the sequence"),
         "mask of another size": (pixels(M, smaller), "160 x 113"),
         "mask broken": (cut(M), "not a readable PNG"),
         "masks empty": (pixels(M, np.zeros_like, every=True), "masks mark nothing"),
@@ -223,6 +220,43 @@ def test_every_fault_is_one_line_and_leaves_nothing(
     assert said.err.count("\n") == 1
     assert says in said.err
     assert {path.name for path in tmp_path.iterdir()} <= {"in", "outside"}
+
+
+LINKS = [
+    *((kind, D) for kind in FAULTS),
+    *((kind, "depth") for kind in FAULTS),
+    ("bop", B),
+    ("bop", "scene_gt.json"),
+    ("bop", "sequence.json"),
+    ("bop", "mask_visib/*.png"),
+    ("tum", T),
+    ("tum", "groundtruth.txt"),
+    ("tum", C),
+    ("open3d", O),
+    ("open3d", "trajectory.log"),
+    ("bundlesdf", K),
+    ("bundlesdf", "annotated_poses/*.txt"),
+]
+
+
+@pytest.mark.parametrize(("kind", "linked"), LINKS)
+def test_links_out_of_a_sequence_are_followed_unless_paths_are_strict(
+    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, linked: str
+) -> None:
+    folder = tmp_path / "in"
+    shutil.copytree(written / kind, folder)
+    assert main(["info", str(folder), "--strict-paths"]) == 0
+    intact = capsys.readouterr().out
+    link_out(linked, place=0)(folder)
+    assert main(["info", str(folder)]) == 0
+    assert capsys.readouterr().out == intact
+    for command in ("build", "convert"):
+        assert main([command, str(folder), "--out", str(tmp_path / "run"), "--strict-paths"]) == 2
+        said = capsys.readouterr()
+        assert said.out == ""
+        assert said.err.count("\n") == 1
+        assert f"leads out of the sequence, to {tmp_path / 'outside'}" in said.err
+    assert {path.name for path in tmp_path.iterdir()} == {"in", "outside"}
 
 
 @pytest.mark.parametrize("kind", FAULTS)

@@ -81,17 +81,44 @@ def test_links_in_a_run_folder_are_replaced_and_not_followed(tmp_path: Path) -> 
     assert len(list(outside.iterdir())) == 4
 
 
+def linked(tmp_path: Path, inner: str) -> tuple[Path, Path]:
+    """Return a sequence in which a file or folder is a link out of it, and what the link leads to."""
+    folder, outside = tmp_path / "in", tmp_path / "elsewhere" / Path(inner).name
+    write_bop(folder, small_frames(2), small_truth(2))
+    outside.parent.mkdir()
+    if (folder / inner).exists():
+        (folder / inner).rename(outside)
+    else:
+        outside.write_text("precious")
+    (folder / inner).symlink_to(outside)
+    return folder, outside
+
+
 @pytest.mark.parametrize("name", ["model.ply", "robot.txt", "sequence.json"])
-def test_what_lies_beside_the_frames_may_not_be_a_link_out(
+def test_what_lies_beside_the_frames_may_be_refused_where_it_is_a_link_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
-    write_bop(tmp_path / "in", small_frames(2), small_truth(2))
-    (tmp_path / "in" / name).unlink(missing_ok=True)
-    (tmp_path / "secret").write_text("secret")
-    (tmp_path / "in" / name).symlink_to(tmp_path / "secret")
-    assert main(["convert", str(tmp_path / "in"), "--out", str(tmp_path / "out")]) == 2
+    folder, _ = linked(tmp_path, name)
+    assert main(["convert", str(folder), "--out", str(tmp_path / "out"), "--strict-paths"]) == 2
     assert "leads out of the sequence" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("inner", ["depth", "depth/000000.png", "scene_camera.json"])
+def test_nothing_is_written_where_a_link_of_a_sequence_leads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], inner: str
+) -> None:
+    folder, outside = linked(tmp_path, inner)
+    assert main(["build", str(folder), "--out", str(tmp_path / "run"), *QUICK]) == 0
+    held = {path: path.read_bytes() for path in (tmp_path / "elsewhere").rglob("*") if path.is_file()}
+    capsys.readouterr()
+    out = outside / "000000.png" if outside.is_dir() else outside
+    assert main(["report", str(tmp_path / "run"), "--out", str(out), "--overwrite"]) == 2
+    assert "only read" in capsys.readouterr().err
+    if outside.is_dir():
+        assert main(["convert", str(folder), "--out", str(outside / "new")]) == 2
+        assert main(["build", str(folder), "--out", str(outside / "new"), *QUICK]) == 2
+    assert {path: path.read_bytes() for path in (tmp_path / "elsewhere").rglob("*") if path.is_file()} == held
 
 
 def test_what_is_said_does_not_steer_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

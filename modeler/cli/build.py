@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from modeler.cli.console import Console, Interrupt, say
-from modeler.cli.options import MIN_VOXEL_M, FrameOptions, MethodOptions, ObjectOptions, PriorOptions, default
+from modeler.cli.options import (
+    MIN_VOXEL_M,
+    FrameOptions,
+    MethodOptions,
+    ObjectOptions,
+    PriorOptions,
+    StrictPaths,
+    default,
+)
 
 if TYPE_CHECKING:
     from modeler.export import RunFolder, RunMeta
@@ -46,6 +54,7 @@ class Build:
     """Noise of the depth camera, as `modeler calibrate-sensor` measured it."""
     camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as SEQUENCE says")] = None
     """Focal length of the depth camera, as `modeler calibrate-camera` estimated it."""
+    strict_paths: StrictPaths = False
     view: bool = False
     """Watch in the Rerun viewer."""
     web: bool = False
@@ -162,10 +171,10 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
     """
     from modeler.cli.inputs import calibrated, watched
     from modeler.types import InputError
-    from sequences import frame_range, open_sequence, survey
+    from sequences import Overrides, frame_range, open_sequence, survey
 
-    path = options.sequence
-    whole = watched(path, options.idle_s) if options.watch else open_sequence(path)
+    path, overrides = options.sequence, Overrides(strict_paths=options.strict_paths)
+    whole = watched(path, overrides, options.idle_s) if options.watch else open_sequence(path, overrides)
     whole = calibrated(whole, options.sensor, options.camera)
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     if not frames.live:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import tyro
 
 from modeler.cli.console import bar, say
-from modeler.cli.options import SEED, FrameOptions, Method, ObjectOptions, PriorOptions, default
+from modeler.cli.options import SEED, FrameOptions, Method, ObjectOptions, PriorOptions, StrictPaths, default
 
 if TYPE_CHECKING:
     from modeler.cli.inputs import Part
@@ -57,6 +57,7 @@ class Evaluate:
     """Keep N of the object's surface points per view, drawn at random, to simulate sparse clouds."""
     seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same errors."""
+    strict_paths: StrictPaths = False
     prior: PriorOptions = field(default_factory=PriorOptions)
     selection: FrameOptions = field(default_factory=FrameOptions)
     where: ObjectOptions = field(default_factory=ObjectOptions)
@@ -96,11 +97,11 @@ def _evaluate_pairs(options: Evaluate) -> int:
     from modeler import experiment
     from modeler.cli import compose
     from modeler.experiment import Experiment, Pairing
-    from sequences import frame_range, open_sequence
+    from sequences import Overrides, frame_range, open_sequence
     from viz import figures
 
-    kept = frame_range(options.selection.frames)
-    recorded = [open_sequence(path).select(options.selection.every, kept) for path in options.sequences]
+    kept, overrides = frame_range(options.selection.frames), Overrides(strict_paths=options.strict_paths)
+    recorded = [open_sequence(path, overrides).select(options.selection.every, kept) for path in options.sequences]
     for sequence in recorded:
         compose.check_region(options.where, sequence)
     # Tables are compared with each other: all sequences have the same prior, `general` if none is asked for.

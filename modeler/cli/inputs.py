@@ -22,6 +22,7 @@ from modeler.types import ACCEPTED, Array, Edge, Frame, InputError, RayImage, So
 from sequences import (
     AbstractSequence,
     CalibratedSequence,
+    Overrides,
     RefocusedSequence,
     WatchLimits,
     open_sequence,
@@ -83,11 +84,12 @@ def reading() -> Iterator[Watched]:
         yield watched
 
 
-def watched(path: Path, idle_s: float) -> AbstractSequence:
+def watched(path: Path, overrides: Overrides, idle_s: float) -> AbstractSequence:
     """Return the sequence that another program is writing at a path, once it has begun.
 
     Args:
         path: where it writes.
+        overrides: values that take precedence over its files.
         idle_s: the sequence is over after this many seconds without a new frame.
 
     Raises:
@@ -96,7 +98,7 @@ def watched(path: Path, idle_s: float) -> AbstractSequence:
     if not 0.0 < idle_s < math.inf:
         raise InputError(f"--idle-s {idle_s:g} is out of range; give a positive number of seconds")
     say(f"waiting for frames in {path}")
-    return watch(path, patience=WatchLimits(idle_s))
+    return watch(path, overrides, WatchLimits(idle_s))
 
 
 @final

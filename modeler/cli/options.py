@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -186,6 +186,13 @@ class MethodOptions:
     """Same seed, same machine, same result, to the bit."""
 
 
+StrictPaths = Annotated[
+    bool,
+    tyro.conf.arg(help="Refuse a sequence in which a link leads out of it; else it is followed, for reading only."),
+]
+"""`--strict-paths`, of every command that opens sequences."""
+
+
 @dataclass(frozen=True)
 class InputOptions:
     """What counts more than what the input says."""
@@ -200,6 +207,7 @@ class InputOptions:
     """Topic of the depth images in a ROS bag."""
     colour_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), default("the one aligned to depth")] = None
     """Topic of the colour images in a ROS bag."""
+    strict_paths: StrictPaths = False
 
     def stated(self) -> Overrides:
         """Return them as readers take them.
@@ -209,7 +217,7 @@ class InputOptions:
         """
         from sequences import Overrides
 
-        return Overrides(self.intrinsics, self.depth_scale_mm, self.depth_topic, self.colour_topic)
+        return Overrides(**asdict(self))
 
 
 def _flag(name: str) -> str:

@@ -47,7 +47,7 @@ def check_files(outs: Sequence[Path], inputs: Sequence[Path], *, overwrite: bool
         if not out.is_file():
             what = "a folder" if out.is_dir() else "not a regular file"
             raise InputError(f"{out}: is {what}; choose another --out")
-        if out.stat().st_nlink > 1 and _identity(out) in {_identity(file) for file in _files(inputs)}:
+        if _identity(out) in {_identity(file) for file in _files(inputs)}:  # by a hard link, or by a link there
             raise InputError(f"{out}: is a file that is only read; choose another --out")
         if not overwrite:
             raise InputError(f"{out}: exists already; choose another --out, or give --overwrite")

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from modeler.cli.console import say
-from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions, StrictPaths
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class Register:
     """Number of the frame whose points are carried over."""
     target: Annotated[tyro.conf.Positional[int], tyro.conf.arg(metavar="TARGET")]
     """Number of the frame to whose camera coordinates they are carried."""
+    strict_paths: StrictPaths = False
     prior: PriorOptions = field(default_factory=PriorOptions)
     method: MethodOptions = field(default_factory=MethodOptions)
     where: ObjectOptions = field(default_factory=ObjectOptions)
@@ -36,11 +37,11 @@ class Register:
         from modeler.cli.advice import outcome_advice
         from modeler.export import edge_record
         from modeler.types import Edge, InputError, Solution, Stated
-        from sequences import open_sequence
+        from sequences import Overrides, open_sequence
 
         if self.source == self.target:
             raise InputError(f"SOURCE and TARGET are both frame {self.source}; name two frames")
-        sequence = open_sequence(self.sequence)
+        sequence = open_sequence(self.sequence, Overrides(strict_paths=self.strict_paths))
         modeler = compose.modeler(sequence, self.prior, self.method, self.where)
         scene = compose.scene(modeler, sequence)
         views = []

@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from modeler.regular_files import open_regular
 from modeler.types import InputError
-from sequences.input_files import entries, input_errors, inside, read_text
+from sequences.input_files import check_link, entries, input_errors, read_text
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -291,7 +291,8 @@ def _check_start(path: Path) -> None:
 def _ros2(path: Path) -> rosbag2.Reader:
     """Return an open reader of a bag of ROS 2."""
     for entry in entries(path):
-        check_file(inside(entry, path))
+        check_link(entry, path)
+        check_file(entry)
     reader = rosbag2.Reader(path)
     if isinstance(reader.storage, DirectoryReader):
         read_text(path / "metadata.yaml")
