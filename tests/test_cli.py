@@ -261,14 +261,29 @@ def test_evaluate_writes_errors_and_prints_a_table(cli: Run, tmp_path: Path) -> 
 def test_export_keeps_the_mesh(cli: Run, built: Path, tmp_path: Path, suffix: str) -> None:
     ended = cli("export", built, "--out", tmp_path / f"box.{suffix}")
     assert (ended.status, ended.out) == (0, "")
-    assert re.fullmatch(rf"modeler: \d+ triangles: \S+/box\.{suffix}\n", ended.err)
+    lines = ended.err.splitlines()
+    assert re.fullmatch(rf"modeler: \d+ triangles: \S+/box\.{suffix}", lines[0])
+    assert f"box.{suffix}.pose.json" in lines[1]
     mesh, original = (trimesh.load_mesh(path) for path in (tmp_path / f"box.{suffix}", built / "model.ply"))
-    if suffix == "glb":  # which stands upright, seen from the camera's side
-        turn = np.diag([1.0, -1.0, -1.0, 1.0])
-        turn[:3, :3] @= model_upright(RunFolder(built).report()).T
-        original.apply_transform(turn)
     assert len(mesh.faces) == len(original.faces)
+    up = 1 if suffix == "glb" else 2
+    assert mesh.bounds[0, up] == pytest.approx(0.0, abs=4e-3)  # on its support
+    pose = json.loads((tmp_path / f"box.{suffix}.pose.json").read_text())["object_from_mesh"]
+    mesh.apply_transform(np.reshape(pose, (4, 4)))
     assert np.allclose(mesh.bounds, original.bounds, atol=1e-5)
+
+
+def test_export_at_the_camera_keeps_the_coordinates_of_the_run(cli: Run, built: Path, tmp_path: Path) -> None:
+    assert cli("export", built, "--out", tmp_path / "box.ply", "--origin", "camera").status == 0
+    assert (tmp_path / "box.ply").read_bytes() == (built / "model.ply").read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == ["box.ply"]
+    assert cli("export", built, "--out", tmp_path / "box.glb", "--origin", "camera").status == 0
+    mesh, original = (trimesh.load_mesh(path) for path in (tmp_path / "box.glb", built / "model.ply"))
+    turn = np.diag([1.0, -1.0, -1.0, 1.0])
+    turn[:3, :3] @= model_upright(RunFolder(built).report()).T
+    original.apply_transform(turn)
+    assert np.allclose(mesh.bounds, original.bounds, atol=1e-5)
+    assert cli("export", built, "--out", tmp_path / "obj_000001.ply", "--bop", "--up", "z").status == 2
 
 
 def test_a_rendered_sequence_can_be_opened(cli: Run, tmp_path: Path) -> None:

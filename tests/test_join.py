@@ -15,7 +15,7 @@ import trimesh
 from modeler import se3
 from modeler.cli import main
 from modeler.cli.inputs import reopened
-from modeler.export import RunFolder, RunMeta, alone
+from modeler.export import RunFolder, RunMeta, alone, pose_file
 from modeler.fusion import Fuser, Matcher
 from modeler.graph import PoseGraph, solve
 from modeler.rays import Sensor
@@ -179,6 +179,7 @@ def test_sequences_of_a_joined_run_may_have_moved(
         command = ["export", str(runs[2]), "--out", str(out), "--voxel-m", "0.005"]
         assert main([*command, *options]) == 0
         out.unlink()
+        pose_file(out).unlink()
         for wrong, words in (
             ([], "say where it is with --sequence"),
             (options[:2], "--sequence is given too few times"),

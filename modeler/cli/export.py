@@ -11,6 +11,9 @@ import tyro
 from modeler.cli.console import say
 from modeler.cli.options import MIN_VOXEL_M, MovedOptions, default
 
+Origin = Literal["camera", "base", "centre", "bbox"]  # spelt out here, for help imports nothing heavy
+Up = Literal["z", "y"]
+
 if TYPE_CHECKING:
     from modeler.fusion import FusionVolume
     from modeler.types import ObjectModel
@@ -18,11 +21,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Export:
-    """Write the fused mesh of a run as PLY, OBJ, GLB or STL, in m, object frame.
+    """Write the fused mesh of a run as PLY, OBJ, GLB or STL, in m.
 
-    The axes are those of the camera at the first frame: x right, y down, z forward. A GLB's node turns them so that y
-    is up, as glTF has it, and the model stands as it stood. What --watertight, --texture and --voxel-m ask for is made
-    anew from the frames, so the sequence must be there.
+    It stands with the centre of its base at the origin and z up, in GLB y; FILE.pose.json beside it has the pose that
+    takes it back to where the first camera saw it. What --watertight, --texture and --voxel-m ask for is made anew
+    from the frames, so the sequence must be there.
     """
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
@@ -31,6 +34,11 @@ class Export:
     """File to write; its ending selects the format. STL carries no colour."""
     overwrite: bool = False
     """Replace files that are there."""
+    origin: Annotated[Origin | None, default("base")] = None
+    """Origin: the centre of the base, the centroid of the surface, the centre of its box, or the first camera, whose
+    axes (x right, y down, z forward) are then kept, as in the run's own model.ply."""
+    up: Annotated[Up | None, default("y for GLB, z otherwise")] = None
+    """Axis that is up: away from the support; where none was seen, as the ring of the cameras or the image tells."""
     watertight: bool = False
     """Fill unobserved regions with interpolated surface. In PLY its vertices have 0 `views` and a `sigma_m` of -1."""
     triangles: Annotated[int | None, tyro.conf.arg(metavar="N"), default("all")] = None
@@ -58,6 +66,10 @@ class Export:
 
         _check(self)
         outs = files.files_of(self.out, textured=self.texture)
+        origin: Origin = self.origin or "base"
+        up = self.up or files.default_up(self.out.suffix.lower(), origin)
+        as_seen = self.bop or (origin == "camera" and up is None)  # where a sidecar would say nothing
+        outs = outs if as_seen else (*outs, files.pose_file(self.out))
         check_files(outs, run_inputs([self.run_folder], self.moved.sequence), overwrite=self.overwrite)
         report = files.RunFolder(self.run_folder).result()  # a sequence may hold a model.ply as well: the true one
         if not report.get("poses"):
@@ -81,9 +93,18 @@ class Export:
             model, texture = files.textured(model, volume.texture_colours, volume.texel_m)
         if self.bop:
             files.write_bop(model, self.out)
-        else:
+            _tell(model, self)
+        elif as_seen:
             files.write_mesh(model, self.out, texture, object_from_upright=files.model_upright(report))
-        _tell(model, self)
+            _tell(model, self)
+        else:
+            place = files.placement(model, report, origin, up)
+            files.write_mesh(
+                place.placed(model), self.out, texture, object_from_upright=files.AS_GIVEN, axes=place.axes
+            )
+            place.write(self.out)
+            _tell(model, self)
+            say(f"{place.words}; the pose in the camera: {files.pose_file(self.out).name}")
         return 0
 
 
@@ -102,6 +123,10 @@ def _check(options: Export) -> None:
         raise InputError(f"{options.out}: STL carries no colour for --tint; choose another --out")
     if options.bop and suffix != ".ply":
         raise InputError(f"{options.out}: BOP models are PLY files; give --out a name such as obj_000001.ply")
+    if options.bop and (options.origin or options.up):
+        raise InputError(
+            "--bop puts the origin in the centre of the box and keeps the axes; leave out --origin and --up"
+        )
     if options.triangles is not None and options.triangles < 4:
         raise InputError(f"--triangles {options.triangles} is too few for a solid; give at least 4")
     if options.voxel_m is not None and not MIN_VOXEL_M <= options.voxel_m < 1.0:

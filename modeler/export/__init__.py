@@ -5,6 +5,7 @@ from modeler.export.files import write_atomically as write_atomically
 from modeler.export.formats import g2o_text as g2o_text
 from modeler.export.formats import ply_bytes as ply_bytes
 from modeler.export.formats import tum_text as tum_text
+from modeler.export.mesh import AS_GIVEN as AS_GIVEN
 from modeler.export.mesh import files_of as files_of
 from modeler.export.mesh import format_of as format_of
 from modeler.export.mesh import mesh_of as mesh_of
@@ -14,6 +15,12 @@ from modeler.export.mesh import write_bop as write_bop
 from modeler.export.mesh import write_mesh as write_mesh
 from modeler.export.pairs import Pairs as Pairs
 from modeler.export.pairs import Remembered as Remembered
+from modeler.export.placing import Origin as Origin
+from modeler.export.placing import Placement as Placement
+from modeler.export.placing import Up as Up
+from modeler.export.placing import default_up as default_up
+from modeler.export.placing import placement as placement
+from modeler.export.placing import pose_file as pose_file
 from modeler.export.reading import edges_of as edges_of
 from modeler.export.reading import poses_of as poses_of
 from modeler.export.reading import read_model as read_model

@@ -16,12 +16,15 @@ from scipy.spatial.distance import pdist
 
 from modeler.export.files import write_atomically
 from modeler.export.formats import mesh_ply, ply_bytes
+from modeler.export.placing import CAMERA_AXES
 from modeler.export.texture import Texture
 from modeler.regular_files import read_json
 from modeler.types import Array, InputError, ObjectModel
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 TEXTURED = (".obj", ".glb")
+AS_GIVEN: Final = np.diag([1.0, -1.0, -1.0])
+"""Of a mesh whose y axis is up already: what turns glTF's axes back."""
 MODELS_INFO = "models_info.json"
 """BOP's list of models, beside them."""
 
@@ -63,19 +66,26 @@ def files_of(out: Path, *, textured: bool = False) -> tuple[Path, ...]:
 
 
 def write_mesh(
-    model: ObjectModel, out: Path, texture: Texture | None = None, *, object_from_upright: Array | None = None
+    model: ObjectModel,
+    out: Path,
+    texture: Texture | None = None,
+    *,
+    object_from_upright: Array | None = None,
+    axes: str = CAMERA_AXES,
 ) -> None:
     """Write a mesh; the ending of `out` selects the format.
 
-    Coordinates stay as they are in every format: metres, in the object frame, x right, y down, z forward in the first
-    image. In glTF y is up, so that the node of a GLB turns the mesh: viewers show it as it stood, from the camera's
-    side. PLY, OBJ and GLB keep normals and colours, PLY alone what is known of the vertices; STL holds neither.
+    Coordinates, in m, stay as they are in every format. In glTF y is up, so that the node of a GLB turns a mesh that is
+    given in the camera's axes: viewers show it as it stood, from the camera's side. PLY, OBJ and GLB keep normals and
+    colours, PLY alone what is known of the vertices; STL holds neither.
 
     Args:
         model: the mesh.
         out: file to write; folders on the way are made. A textured OBJ has an MTL and a PNG file beside it.
         texture: for OBJ and GLB, in place of vertex colours.
-        object_from_upright: (3, 3) right, down and forward of the view in which a GLB is shown; None: the camera's own.
+        object_from_upright: (3, 3) right, down and forward of the view in which a GLB is shown; None: the camera's own;
+            `AS_GIVEN`: the node of a GLB does not turn the mesh.
+        axes: what the axes are, in words, for formats that have room for them.
 
     Raises:
         InputError: where the ending is unknown or a file cannot be written.
@@ -95,7 +105,7 @@ def write_mesh(
                 _, material, image = files_of(out, textured=True)
                 write_atomically(image, _png(texture))
                 write_atomically(material, _material(image.name))
-            write_atomically(out, _obj(model, "_".join(out.stem.split()), texture))
+            write_atomically(out, _obj(model, "_".join(out.stem.split()), texture, axes))
         case ".glb":
             write_atomically(out, _glb(model, texture, object_from_upright))
         case _:
@@ -115,9 +125,9 @@ def _material(image: str) -> str:
     return f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {image}\n"
 
 
-def _obj(model: ObjectModel, name: str, texture: Texture | None) -> str:
+def _obj(model: ObjectModel, name: str, texture: Texture | None, axes: str) -> str:
     """Return an OBJ file; colours of vertices follow their coordinates, as most programs read them."""
-    lines = [f"# metres, x right, y down, z forward in the first image\no {name}"]
+    lines = [f"# metres, {axes}\no {name}"]
     places = model.vertices_m
     if texture is None and model.vertex_colours is not None:
         places = np.concatenate([places, model.vertex_colours / 255.0], axis=1)

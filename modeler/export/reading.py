@@ -258,6 +258,7 @@ _WHOLE: dict[str, Test] = {
     "evidence": _null_or(lambda value: isinstance(value, dict) and all(map(_is_figure, value.values()))),
     "seconds": lambda value: isinstance(value, dict) and all(map(_is_number, value.values())),
     "up": _null_or(_is_direction),
+    "support_offset_m": _null_or(_is_number),  # which reports of earlier versions have not, nor `up`
 }
 _FRAME: dict[str, Test] = {
     "id": _is_whole,

@@ -19,6 +19,7 @@ from modeler.types import (
     Edge,
     Mode,
     OptimisationOutlier,
+    Plane,
     PoseGaussian,
     Posterior,
     RayImage,
@@ -96,6 +97,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         closure_expected=meta.closure_expected,
         prior=meta.known,
     )
+    support = _support(solution, views)
     report = {
         "schema": _SCHEMA,
         "sequence": meta.sequence,
@@ -119,7 +121,8 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
             }
             for name, figure in verdict.evidence.items()
         },
-        "up": _up(solution, views),
+        "up": None if support is None else support.normal,
+        "support_offset_m": None if support is None else support.offset_m,
         "frames": [vars(frame) for frame in frames],
     }
     poses = [
@@ -146,10 +149,10 @@ def _loop(
     }
 
 
-def _up(solution: Solution, views: Mapping[int, RayImage]) -> Array | None:
-    """Return the normal of what the object stood on in the first frame, whose camera frame is the object's."""
+def _support(solution: Solution, views: Mapping[int, RayImage]) -> Plane | None:
+    """Return what the object stood on in the first frame, whose camera frame is the object's; None where not seen."""
     first = views.get(min(solution.trajectory, default=-1))
-    return None if first is None or first.plane is None else first.plane.normal
+    return None if first is None else first.plane
 
 
 def _taking_part(step: Step) -> list[Edge]:

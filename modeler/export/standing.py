@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from modeler.types import Array, RayImage
 
 _LEAST_BACK = 0.3  # of the way to the camera that lies across what is up: else it looks down from right above
 _WIDE, _FLAT = 0.1, 0.3  # a ring is no line, and all but plane
+
+UpSource = Literal["support", "ring", "camera"]
+"""What tells which direction is up: the support, the ring of the cameras, or the first image."""
 
 
 def standing(up: Array) -> Array:
@@ -49,10 +52,39 @@ def model_upright(report: Mapping[str, Any]) -> Array:
     Args:
         report: of a run in which frames were accepted.
     """
+    up, source = model_up(report)
+    return np.eye(3) if source == "camera" else standing(up)
+
+
+def model_up(report: Mapping[str, Any]) -> tuple[Array, UpSource]:
+    """Return which direction (3,) is up in the object frame of a run, and what tells so.
+
+    Args:
+        report: of a run in which frames were accepted.
+    """
     up = report.get("up")  # which reports of earlier versions have not
     if up is not None:
-        return standing(np.array(up, dtype=np.float64))
-    return ring_upright(np.array([pose.mean[:3, 3] for pose in poses_of(report).values()]))
+        up = np.array(up, dtype=np.float64)
+        return up / np.linalg.norm(up), "support"
+    up = _ring_up(np.array([pose.mean[:3, 3] for pose in poses_of(report).values()]))
+    return (np.array([0.0, -1.0, 0.0]), "camera") if up is None else (up, "ring")
+
+
+def level_axes(up: Array) -> Array:
+    """Return right, forward and up (3, 3), as columns, of level axes that face as the camera does.
+
+    Forward leads away from the camera; where it looks down along `up`, towards the upper edge of the image.
+
+    Args:
+        up: (3,) unit, in camera coordinates.
+    """
+    for ahead in (np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])):
+        forward = ahead - up * (up @ ahead)
+        length = float(np.linalg.norm(forward))
+        if length >= _LEAST_BACK:
+            break
+    forward = forward / length
+    return np.stack([np.cross(forward, up), forward, up], axis=1)
 
 
 def ring_upright(centres_m: Array) -> Array:
@@ -63,8 +95,14 @@ def ring_upright(centres_m: Array) -> Array:
     Args:
         centres_m: (n, 3) where the cameras are, in the object frame.
     """
+    up = _ring_up(centres_m)
+    return np.eye(3) if up is None else standing(up)
+
+
+def _ring_up(centres_m: Array) -> Array | None:
+    """Return what is up (3,) on a ring of cameras at (n, 3); None where they make none."""
     long, wide, high = np.pad(np.linalg.svd(centres_m - centres_m.mean(axis=0), compute_uv=False), (0, 3))[:3]
-    return standing(ring_axes(centres_m)[1]) if wide > _WIDE * long and high < _FLAT * wide else np.eye(3)
+    return ring_axes(centres_m)[1] if wide > _WIDE * long and high < _FLAT * wide else None
 
 
 def ring_axes(centres_m: Array) -> tuple[Array, Array]:

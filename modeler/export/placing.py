@@ -1,0 +1,162 @@
+"""The frame that an exported mesh is given in: where its origin lies, and which axis is up."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from modeler import se3
+from modeler.export.files import write_atomically
+from modeler.export.standing import UpSource, level_axes, model_up
+from modeler.types import Array, ObjectModel
+
+Origin = Literal["camera", "base", "centre", "bbox"]
+Up = Literal["z", "y"]
+
+CAMERA_AXES: Final = "x right, y down, z forward in the first image"
+_AXES: Final[Mapping[Up, str]] = {
+    "z": "x right, y away from the first camera, z up",
+    "y": "x right, y up, z towards the first camera",
+}
+_ORIGINS: Final[Mapping[Origin, str]] = {
+    "camera": "the first camera",
+    "base": "the centre of the base",
+    "centre": "the centroid of the surface",
+    "bbox": "the centre of the bounding box",
+}
+_UP_WORDS: Final[Mapping[UpSource, str]] = {
+    "support": "the normal of the support",
+    "ring": "the axis of the cameras' ring, for no support was seen",
+    "camera": "the upper edge of the first image, for neither a support nor a ring of cameras was seen",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A frame for an exported mesh."""
+
+    object_from_mesh: Array
+    """(4, 4) takes a point of the mesh, in m, to the object frame of the run: the camera frame of its first frame."""
+    origin: Origin
+    """What lies at the origin."""
+    up: Up | None
+    """Which axis is up; None: the axes are the first camera's."""
+    up_from: UpSource | None
+    """What tells the direction that is up; None where none is used."""
+    base_from: Literal["support", "lowest vertex"] | None
+    """What tells the height of the base; None where the origin is not there."""
+
+    @property
+    def axes(self) -> str:
+        """The three axes in words."""
+        return CAMERA_AXES if self.up is None else _AXES[self.up]
+
+    @property
+    def words(self) -> str:
+        """Origin and axes in a sentence, with what they rest on."""
+        base = " at its lowest vertex" if self.base_from == "lowest vertex" else ""
+        up = "" if self.up is None or self.up_from is None else f"; up is {_UP_WORDS[self.up_from]}"
+        return f"origin at {_ORIGINS[self.origin]}{base}, {self.axes}{up}"
+
+    def placed(self, model: ObjectModel) -> ObjectModel:
+        """Return a model of the object frame in this frame."""
+        mesh_from_object = se3.inverse(self.object_from_mesh)
+        turn = mesh_from_object[:3, :3].T
+        return replace(
+            model,
+            points_m=se3.transform(mesh_from_object, model.points_m),
+            normals=model.normals @ turn,
+            vertices_m=se3.transform(mesh_from_object, model.vertices_m),
+            vertex_normals=model.vertex_normals @ turn,
+        )
+
+    def write(self, out: Path, *, unit: Literal["m", "mm"] = "m") -> None:
+        """Write the sidecar of an exported mesh, from which it can be put back where the camera saw it.
+
+        Args:
+            out: the mesh; the sidecar is `pose_file(out)`.
+            unit: in which its coordinates are written.
+
+        Raises:
+            InputError: where the file cannot be written.
+        """
+        content: dict[str, Any] = {
+            "schema": 1,
+            "mesh": out.name,
+            "unit": unit,
+            "object_from_mesh": self.object_from_mesh.ravel().tolist(),
+            "origin": self.origin,
+            "axes": self.axes,
+            "up_from": self.up_from,
+            "base_from": self.base_from,
+        }
+        write_atomically(pose_file(out), json.dumps(content, indent=1) + "\n")
+
+
+def pose_file(out: Path) -> Path:
+    """Return the sidecar of an exported mesh: `cup.obj.pose.json` of `cup.obj`."""
+    return out.with_name(f"{out.name}.pose.json")
+
+
+def default_up(suffix: str, origin: Origin) -> Up | None:
+    """Return which axis users of a format expect to be up; None at the camera's origin, where its axes are kept."""
+    if origin == "camera":
+        return None
+    return "y" if suffix == ".glb" else "z"
+
+
+def placement(model: ObjectModel, report: Mapping[str, Any], origin: Origin, up: Up | None) -> Placement:
+    """Return the frame in which the model of a run has its origin and its axes where they are asked for.
+
+    The horizontal axes are the first camera's: x is its right. The base lies on the support; where none was seen, at
+    the height of the lowest vertex. Its centre is that of the box around the model.
+
+    Args:
+        model: with a mesh, in the object frame.
+        report: of the run.
+        origin: what lies at the origin.
+        up: which axis is up; None: the camera's axes are kept.
+    """
+    object_from_mesh, up_from, base_from = np.eye(4), None, None
+    vertical = None
+    if up is not None or origin == "base":
+        direction, up_from = model_up(report)
+        right, forward, vertical = level_axes(direction).T
+        if up is not None:
+            turned = (right, forward, vertical) if up == "z" else (right, vertical, -forward)
+            object_from_mesh[:3, :3] = np.stack(turned, axis=1)
+    match origin:
+        case "camera":
+            pass
+        case "centre":
+            object_from_mesh[:3, 3] = _centroid(model)
+        case "bbox":
+            turn = object_from_mesh[:3, :3]
+            object_from_mesh[:3, 3] = turn @ _box_centre(model.vertices_m @ turn)
+        case "base":
+            assert vertical is not None
+            level = level_axes(vertical)
+            centre = _box_centre(model.vertices_m @ level)
+            offset_m = report.get("support_offset_m") if up_from == "support" else None
+            # The plane is normal · p + offset = 0, and `up` its normal.
+            centre[2] = (model.vertices_m @ vertical).min() if offset_m is None else -float(offset_m)
+            base_from = "lowest vertex" if offset_m is None else "support"
+            object_from_mesh[:3, 3] = level @ centre
+    return Placement(object_from_mesh, origin, up, up_from, base_from)
+
+
+def _box_centre(points: Array) -> Array:
+    """Return the centre (3,) of the box around points (n, 3)."""
+    return 0.5 * (points.min(axis=0) + points.max(axis=0))
+
+
+def _centroid(model: ObjectModel) -> Array:
+    """Return the centroid (3,) of the surface of a mesh."""
+    corners = model.vertices_m[model.triangles]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return np.average(corners.mean(axis=1), axis=0, weights=areas)
