@@ -18,8 +18,9 @@ from modeler.cli import main, parsed
 from modeler.cli.options import PriorOptions
 
 COMMANDS = (
-    "build register evaluate render view report export join info convert calibrate-sensor calibrate-camera".split()
-)
+    "build batch gallery register evaluate render view report export join info convert calibrate-sensor "
+    "calibrate-camera"
+).split()
 DOCUMENTED = """out prior seed resume overwrite every frames roi max-depth-m max-rotation-deg max-offset-m max-shift-m
 step-deg step-sigma-deg held-sigma-deg held-sigma-m
 method view web"""
@@ -47,7 +48,7 @@ def test_help_may_be_asked_for_in_a_word(cli: Run) -> None:
     assert cli("help", "nonsense") == cli("--help")
 
 
-@pytest.mark.parametrize("command", ["build", "register", "evaluate", "render", "join"])
+@pytest.mark.parametrize("command", ["build", "batch", "register", "evaluate", "render", "join"])
 def test_every_command_that_draws_at_random_takes_a_seed(cli: Run, command: str) -> None:
     folders = {"register": ("S", "1", "0"), "join": ("A", "B")}.get(command, ("S",))
     out = () if command == "register" else ("--out", "OUT")
@@ -61,7 +62,7 @@ def test_every_command_that_draws_at_random_takes_a_seed(cli: Run, command: str)
 
 
 @pytest.mark.parametrize(
-    "command", ["info", "convert", "calibrate-sensor", "calibrate-camera", "view", "report", "export"]
+    "command", ["info", "convert", "calibrate-sensor", "calibrate-camera", "view", "report", "export", "gallery"]
 )
 def test_commands_without_randomness_take_no_seed(cli: Run, command: str) -> None:
     assert "--seed" not in cli(command, "--help").out

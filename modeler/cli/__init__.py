@@ -22,6 +22,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from modeler.address_space import check_room
+from modeler.cli.batch import Batch
 from modeler.cli.build import Build
 from modeler.cli.calibrate_camera import CalibrateCamera
 from modeler.cli.calibrate_sensor import CalibrateSensor
@@ -29,6 +30,7 @@ from modeler.cli.console import INTERRUPTED, interruptible_at_once, say, termina
 from modeler.cli.convert import Convert
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
+from modeler.cli.gallery import Gallery
 from modeler.cli.info import Info
 from modeler.cli.join import Join
 from modeler.cli.register import Register
@@ -38,6 +40,7 @@ from modeler.cli.view import View
 
 Command = (
     Build
+    | Batch
     | Info
     | Convert
     | CalibrateSensor
@@ -49,10 +52,12 @@ Command = (
     | Report
     | Export
     | Join
+    | Gallery
 )
 
 COMMANDS: dict[str, type[Command]] = {
     "build": Build,
+    "batch": Batch,
     "info": Info,
     "convert": Convert,
     "calibrate-sensor": CalibrateSensor,
@@ -64,6 +69,7 @@ COMMANDS: dict[str, type[Command]] = {
     "report": Report,
     "export": Export,
     "join": Join,
+    "gallery": Gallery,
 }
 _STYLE = (
     tyro.conf.OmitSubcommandPrefixes,

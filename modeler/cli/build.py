@@ -16,9 +16,9 @@ from modeler.cli.options import (
     MIN_VOXEL_M,
     FrameOptions,
     MethodOptions,
+    ModelOptions,
     ObjectOptions,
     PriorOptions,
-    StrictPaths,
     default,
 )
 
@@ -50,19 +50,13 @@ class Build:
     """Another program is still writing into SEQUENCE: take the frames as they come."""
     idle_s: Annotated[float, tyro.conf.arg(metavar="S")] = 10.0
     """With --watch: the sequence is over when nothing has come for so long (or a file `done` has, or after Ctrl-C)."""
-    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as SEQUENCE says")] = None
-    """Noise of the depth camera, as `modeler calibrate-sensor` measured it."""
-    camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as SEQUENCE says")] = None
-    """Focal length of the depth camera, as `modeler calibrate-camera` estimated it."""
-    strict_paths: StrictPaths = False
     view: bool = False
     """Watch in the Rerun viewer."""
     web: bool = False
     """Watch in the browser, served on 127.0.0.1 only."""
     connect: Annotated[str | None, tyro.conf.arg(metavar="URL"), default("none")] = None
     """Watch in a Rerun viewer that is already open: rerun+http://HOST:PORT/proxy."""
-    voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("as the data")] = None
-    """Side of a voxel of the model: its detail."""
+    model: ModelOptions = field(default_factory=ModelOptions)
     prior: PriorOptions = field(default_factory=PriorOptions)
     method: MethodOptions = field(default_factory=MethodOptions)
     selection: FrameOptions = field(default_factory=FrameOptions)
@@ -82,11 +76,11 @@ class Build:
 
         began_s = time.perf_counter()
         _check(self)
-        inputs = [path for path in (self.sequence, self.sensor, self.camera) if path is not None]
+        inputs = [path for path in (self.sequence, self.model.sensor, self.model.camera) if path is not None]
         check_run_folder(self.out, inputs, overwrite=self.overwrite, resume=self.resume)
         whole, frames = _opened(self)
         modeler = compose.modeler(whole, self.prior, self.method, self.where)
-        modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=self.voxel_m))
+        modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=self.model.voxel_m))
         prior, remark = compose.resolved_prior(self.prior, whole)
         meta = RunMeta(
             sequence=str(self.sequence),
@@ -121,8 +115,9 @@ class Build:
     def settings(self) -> dict[str, object]:
         """Return what the results depend on besides sequence, seed and the prior's name, as report.json records it."""
         parts = asdict(self.prior) | asdict(self.method) | asdict(self.selection) | asdict(self.where)
-        parts["voxel_m"] = self.voxel_m
-        parts |= {name: None if (path := getattr(self, name)) is None else str(path) for name in ("sensor", "camera")}
+        parts["voxel_m"] = self.model.voxel_m
+        files = {"sensor": self.model.sensor, "camera": self.model.camera}
+        parts |= {name: None if path is None else str(path) for name, path in files.items()}
         return {
             name: value for name, value in parts.items() if name not in ("prior", "seed") and value not in (None, ())
         }
@@ -157,8 +152,9 @@ def _check(options: Build) -> None:
 
     if options.resume and options.overwrite:
         raise InputError("--resume keeps what --overwrite deletes; give one of them")
-    if options.voxel_m is not None and not MIN_VOXEL_M <= options.voxel_m < 1.0:
-        raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
+    voxel_m = options.model.voxel_m
+    if voxel_m is not None and not MIN_VOXEL_M <= voxel_m < 1.0:
+        raise InputError(f"--voxel-m {voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
     if options.connect is not None:
         reachable(options.connect)  # refuses what is no address; whether somebody listens is asked when there is news
 
@@ -173,9 +169,9 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
     from modeler.types import InputError
     from sequences import Overrides, frame_range, open_sequence, survey
 
-    path, overrides = options.sequence, Overrides(strict_paths=options.strict_paths)
+    path, overrides = options.sequence, Overrides(strict_paths=options.model.strict_paths)
     whole = watched(path, overrides, options.idle_s) if options.watch else open_sequence(path, overrides)
-    whole = calibrated(whole, options.sensor, options.camera)
+    whole = calibrated(whole, options.model.sensor, options.model.camera)
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     if not frames.live:
         found = survey(frames, truth=False)

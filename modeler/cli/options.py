@@ -52,6 +52,26 @@ class MovedOptions:
     """The sequence; of a joined run, once for each of its parts, in order."""
 
 
+StrictPaths = Annotated[
+    bool,
+    tyro.conf.arg(help="Refuse a sequence in which a link leads out of it; else it is followed, for reading only."),
+]
+"""`--strict-paths`, of every command that opens sequences."""
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """What the camera is like, and how fine the model."""
+
+    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as SEQUENCE says")] = None
+    """Noise of the depth camera, as `modeler calibrate-sensor` measured it."""
+    camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as SEQUENCE says")] = None
+    """Focal length of the depth camera, as `modeler calibrate-camera` estimated it."""
+    voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("as the data")] = None
+    """Side of a voxel of the model: its detail."""
+    strict_paths: StrictPaths = False
+
+
 @dataclass(frozen=True)
 class FrameOptions:
     """Which frames."""
@@ -72,6 +92,26 @@ class ObjectOptions:
     """Look for the object within these pixels: columns X0 to X1, rows Y0 to Y1, ends not included."""
     max_depth_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("no limit")] = None
     """Take nothing farther away than this for the object."""
+
+
+def as_arguments(options: object) -> tuple[str, ...]:
+    """Return the command line that gives a group of options the values it has; nothing for those that are the default.
+
+    Files are named by their absolute paths.
+    """
+    words: list[str] = []
+    for one in fields(options):  # pyright: ignore[reportArgumentType]
+        value = getattr(options, one.name)
+        if value == one.default:
+            continue
+        words.append(_flag(one.name))
+        if value is not True:
+            words += [str(part.absolute() if isinstance(part, Path) else part) for part in _parts(value)]
+    return tuple(words)
+
+
+def _parts(value: object) -> tuple[object, ...]:
+    return value if isinstance(value, tuple) else (value,)
 
 
 _Three = tuple[float, float, float]
@@ -184,13 +224,6 @@ class MethodOptions:
     """Compare the colours of matching surface too, where frames have them: for labels on what shape leaves open."""
     seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same result, to the bit."""
-
-
-StrictPaths = Annotated[
-    bool,
-    tyro.conf.arg(help="Refuse a sequence in which a link leads out of it; else it is followed, for reading only."),
-]
-"""`--strict-paths`, of every command that opens sequences."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from modeler.export import read_model
 from modeler.export.mesh import sigma_rgb
@@ -17,6 +19,7 @@ from modeler.types import Array, InputError
 from viz.model_view import coarsened
 
 _TRIANGLES: Final = 60_000
+_ABOVE_LEFT: Final = np.array([-0.5, -0.5, -0.75])
 _STEPS: Final = 32767  # of a coordinate from the centre to the farthest vertex: 16-bit whole numbers
 
 
@@ -159,6 +162,22 @@ def shade(
     picture[seen] = base * (0.25 + 0.75 * lit)[:, None]
     blocks = picture.reshape(size[0], samples, size[1], samples, 3)
     return np.clip(np.rint(blocks.mean(axis=(1, 3))), 0, 255).astype(np.uint8)
+
+
+def portrait(mesh: Mesh, object_from_upright: Array, size: tuple[int, int]) -> bytes:
+    """Return a picture of a model as it stands, from above on the left, as JPEG.
+
+    Args:
+        mesh: the model.
+        object_from_upright: (3, 3) right, down and forward as columns.
+        size: height and width in px.
+    """
+    away = object_from_upright @ _ABOVE_LEFT
+    camera = look_at(mesh.centre_m, away, 4.2 * mesh.radius_m, -object_from_upright[:, 1])
+    content = io.BytesIO()
+    picture = Image.fromarray(shade(mesh.vertices_m, mesh.triangles, mesh.colours, camera, size))
+    picture.save(content, "JPEG", quality=85)
+    return content.getvalue()
 
 
 def look_at(centre_m: Array, direction: Array, distance_m: float, up: Array) -> Array:

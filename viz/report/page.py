@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -12,7 +11,6 @@ from string import Template
 from typing import Any, Final
 
 import numpy as np
-from PIL import Image
 
 from modeler import evaluation, se3
 from modeler.export import write_atomically
@@ -21,12 +19,11 @@ from modeler.export.standing import model_upright
 from modeler.types import ACCEPTED, Array, Outcome, loops_closed
 from viz.report import plots
 from viz.report.cards import data_address, mask_cards, pair_cards, thumbnails
-from viz.report.mesh import Mesh, look_at, read_mesh, scene, shade
+from viz.report.mesh import Mesh, portrait, read_mesh, scene
 from viz.report.run_data import Result, Row, recorded, surfaces
 
 _SHAPE_POINTS: Final = 6_000
 _CAMERA_SHARE: Final = 0.12  # length of a drawn camera, as a share of its distance
-_ABOVE_LEFT: Final = np.array([-0.5, -0.5, -0.75])
 
 
 def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -> None:
@@ -253,12 +250,7 @@ def _pyramid(object_from_camera: Array) -> Array:
 
 def _poster(mesh: Mesh, object_from_upright: Array) -> str:
     """Return a still picture of the mesh as a data address."""
-    away = object_from_upright @ _ABOVE_LEFT
-    camera = look_at(mesh.centre_m, away, 4.2 * mesh.radius_m, -object_from_upright[:, 1])
-    picture = shade(mesh.vertices_m, mesh.triangles, mesh.colours, camera, (460, 1048))
-    content = io.BytesIO()
-    Image.fromarray(picture).save(content, "JPEG", quality=85)
-    return data_address(content.getvalue(), "jpeg")
+    return data_address(portrait(mesh, object_from_upright, (460, 1048)), "jpeg")
 
 
 def _scale() -> str:

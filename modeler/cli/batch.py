@@ -1,0 +1,236 @@
+"""`modeler batch`: many sequences to models, on whatever engine there is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from modeler.cli.console import bar, say
+from modeler.cli.options import (
+    FrameOptions,
+    MethodOptions,
+    ModelOptions,
+    ObjectOptions,
+    PriorOptions,
+    as_arguments,
+    default,
+)
+
+if TYPE_CHECKING:
+    from modeler.cli.jobs import Ended, Job
+
+_OVER = ("done", "failed")
+_TOLD = 20  # sequences without a good model that are listed one by one
+_LOSSES = 3  # how often an engine may lose a job
+_RETURNS_S = 120.0  # within which an engine that was lost is expected back
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Build models of many sequences, each into a run folder of its own below DIR, and list them in DIR/models.parquet.
+
+    The options of `modeler build` hold for every sequence. What is on the disk counts: the same command again passes
+    over what is done, resumes what was interrupted, and tries once more what failed once. Ctrl-C, or a kill, loses the
+    pair under way of each sequence and nothing else.
+
+    Exit status: 0 where every model can be trusted, 3 where some model cannot or is missing, 2 for wrong usage.
+    """
+
+    sequences: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="SEQUENCE...", help_behavior_hint="(or --manifest)"),
+    ] = ()
+    """Sequences in any format that `modeler build` takes."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = field(kw_only=True)
+    """Folder for the run folders and the list of models."""
+    manifest: Annotated[Path | None, tyro.conf.arg(metavar="FILE.csv"), default("none")] = None
+    """Table of sequences: a column `sequence`, perhaps `name` for that of the run folder, and any option of
+    `modeler build` as a column, for that row alone: prior, step-deg, frames, ..."""
+    executor: Annotated[str, tyro.conf.arg(metavar="ENGINE")] = "processes"
+    """processes: on this machine. dask:ADDRESS: on the Dask cluster of that scheduler.
+    slurm:FOLDER: jobs of Slurm, which are written to FOLDER; processes where there is no Slurm.
+    module:callable: what the callable, given --workers, returns: a concurrent.futures.Executor."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N"), default("as cores and memory allow")] = None
+    """How many sequences at a time (of Slurm: in the queue); a cluster has its own number."""
+    overwrite: bool = False
+    """Build anew what was built with other options or from other input."""
+    again: bool = False
+    """Try again what has failed twice."""
+    pages: bool = False
+    """Write the report of each model as a page, too (some 10 s each)."""
+    model: ModelOptions = field(default_factory=ModelOptions)
+    prior: PriorOptions = field(default_factory=PriorOptions)
+    method: MethodOptions = field(default_factory=MethodOptions)
+    selection: FrameOptions = field(default_factory=FrameOptions)
+    where: ObjectOptions = field(default_factory=ObjectOptions)
+
+    def run(self) -> int:
+        """Build what is not built yet, and list everything.
+
+        Raises:
+            InputError: where options, the manifest, the engine or the folder cannot be used.
+            KeyboardInterrupt: after what is done has been listed.
+        """
+        from modeler.cli.engines import check_engine
+        from modeler.cli.jobs import ended, read_note, standing
+        from modeler.cli.models import write_models
+        from modeler.cli.outputs import check_folder
+        from modeler.export import alone
+        from modeler.types import InputError
+
+        if self.workers is not None and self.workers < 1:
+            raise InputError(f"--workers {self.workers} does no work; give a whole number from 1 on")
+        check_engine(self.executor)
+        check_folder(self.out, self.sequences)
+        with alone(self.out):
+            jobs = _jobs(self)
+            check_folder(self.out, [Path(job.sequence) for job in jobs])
+            stands = {job: standing(job) for job in jobs}
+            changed = [job.name for job, how in stands.items() if how == "changed"]
+            if changed and not self.overwrite:
+                raise InputError(
+                    f"{self.out / changed[0]}: was built with other options or from other input, as were "
+                    f"{len(changed)} in all; give --overwrite to build these anew, or choose another --out"
+                )
+            ends = [ended(job.name, read_note(job.note), fresh=False) for job in jobs if stands[job] in _OVER]
+            waiting = [job for job in jobs if stands[job] not in _OVER]
+            stand = Counter(stands.values())
+            words = f"{stand['done']} done, {stand['failed']} failed twice, {stand['interrupted']} to be taken up again"
+            words = f"{len(jobs)} {_sequences(len(jobs))}: {words}, {stand['new'] + stand['changed']} to be built"
+            if not waiting:
+                say(words)
+            try:
+                with bar() as progress:
+                    task = progress.add_task("", total=len(jobs), completed=len(ends))
+                    for one in _work(self, waiting, words):
+                        ends.append(one)
+                        progress.update(task, advance=1, description=one.name)
+            finally:
+                write_models(self.out)
+        return _summarise(self, ends)
+
+
+def _sequences(count: int) -> str:
+    return "sequence" if count == 1 else "sequences"
+
+
+def _jobs(options: Batch) -> list[Job]:
+    """Return a job for each sequence, in order, each with a name of its own.
+
+    Raises:
+        InputError: where there is none, or the manifest cannot be used.
+    """
+    from modeler.cli.engines import threads_of, usual_workers
+    from modeler.cli.jobs import Job
+    from modeler.cli.manifest import Row, named, read_manifest
+    from modeler.types import InputError
+
+    groups = (options.model, options.prior, options.method, options.selection, options.where)
+    common = tuple(word for group in groups for word in as_arguments(group))
+    rows = [Row(path, f"{path}") for path in options.sequences]
+    if options.manifest is not None:
+        rows += read_manifest(options.manifest, common)
+    if not rows:
+        raise InputError("no sequence to build; name at least one, or give --manifest FILE.csv")
+    workers = options.workers or usual_workers()
+    return [
+        Job(
+            name,
+            str(row.sequence.absolute()),
+            str(options.out.absolute()),
+            (*common, *row.arguments),
+            threads=threads_of(options.executor, min(workers, len(rows))),
+            page=options.pages,
+            again=options.again,
+        )
+        for name, row in named(rows, options.out).items()
+    ]
+
+
+def _work(options: Batch, jobs: Sequence[Job], words: str) -> Iterator[Ended]:
+    """Yield how each job ended, as soon as it has; an engine that is lost is waited for.
+
+    Args:
+        options: which engine.
+        jobs: what it does.
+        words: said once it is open.
+
+    Raises:
+        InputError: where it cannot be opened, or does not come back.
+    """
+    import time
+
+    from modeler.cli.engines import engine
+    from modeler.cli.jobs import PROCESSES
+    from modeler.types import InputError
+
+    waiting, losses = {job.name: job for job in jobs}, Counter[str]()
+    given_up_s = 0.0
+    while waiting:
+        try:
+            with engine(options.executor, options.workers) as executor, PROCESSES.ended():
+                if not given_up_s:
+                    say(words)
+                yield from _until_lost(executor, waiting, losses)
+        except InputError:
+            if time.monotonic() > given_up_s:
+                raise
+            time.sleep(1.0)
+            continue
+        if waiting:
+            say("the engine was lost: waiting for it")
+            given_up_s = time.monotonic() + _RETURNS_S
+
+
+def _until_lost(executor: object, waiting: dict[str, Job], losses: Counter[str]) -> Iterator[Ended]:
+    """Yield how jobs ended, and take them off those that wait; return early where the engine is lost."""
+    from concurrent.futures import CancelledError, Executor, Future
+    from queue import SimpleQueue
+
+    from modeler.cli.jobs import TRIES, run, write_failure
+
+    assert isinstance(executor, Executor)
+    ended: SimpleQueue[tuple[Job, Future[Ended | None]]] = SimpleQueue()
+
+    def submit(job: Job) -> None:
+        executor.submit(run, job).add_done_callback(lambda future: ended.put((job, future)))
+
+    for job in waiting.values():
+        submit(job)
+    while waiting:
+        job, future = ended.get()
+        try:
+            one = future.result()
+        except (CancelledError, Exception) as error:
+            losses[job.name] += 1
+            if losses[job.name] <= _LOSSES:
+                if isinstance(error, CancelledError):
+                    return
+                submit(job)
+                continue
+            one = write_failure(job, f"the engine lost it ({type(error).__name__}: {error})")
+        if one is None:
+            continue
+        if one.status not in (0, 3) and one.tries < TRIES:
+            submit(job)
+            continue
+        del waiting[job.name]
+        yield one
+
+
+def _summarise(options: Batch, ends: Sequence[Ended]) -> int:
+    """Say what became of the sequences, and return the exit status."""
+    good = sum(one.status == 0 for one in ends)
+    doubtful = sum(one.status == 3 for one in ends)
+    others = [one for one in ends if one.status not in (0, 3)]
+    for one in others[:_TOLD]:
+        say(f"{one.name} failed: {one.line}")
+    more = f" ({len(others) - _TOLD} more are listed there)" if len(others) > _TOLD else ""
+    failed = f"{len(others)} {_sequences(len(others))} failed{more}"
+    say(f"{good} of {len(ends)} models can be trusted, {doubtful} cannot, {failed}: {options.out / 'models.parquet'}")
+    return 0 if good == len(ends) else 3

@@ -1,0 +1,173 @@
+"""What runs the jobs of a batch: anything that is a `concurrent.futures.Executor`."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import logging
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from pathlib import Path
+from threading import Lock
+from typing import Any, TypeVar, final
+
+from modeler.types import InputError
+
+T = TypeVar("T")
+
+JOB_BYTES = 3 << 29
+"""What one build may take, with its recording: most take half of it."""
+_QUEUED = 100  # jobs that a Slurm queue holds of us at a time, unless --workers says otherwise
+_PATIENCE_S = 30  # for a scheduler to answer
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def free_bytes() -> int:
+    """Return how much memory is left, for this machine and for the control group of this process."""
+    pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    with contextlib.suppress(OSError, ValueError):  # what can be had by giving up caches counts, where Linux tells
+        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        pages = int(lines["MemAvailable"].split()[0]) * 1024
+    with contextlib.suppress(OSError, ValueError):  # "max": no limit
+        group = Path("/sys/fs/cgroup")
+        pages = min(pages, int((group / "memory.max").read_text()) - int((group / "memory.current").read_text()))
+    return pages
+
+
+def usual_workers() -> int:
+    """Return how many builds fit: one a core, as long as there is memory for them."""
+    return max(1, min(cores(), free_bytes() // JOB_BYTES))
+
+
+def check_engine(name: str) -> None:
+    """Refuse the name of an engine that there is not.
+
+    Raises:
+        InputError: where it is none.
+    """
+    kind, _, what = name.partition(":")
+    if name != "processes" and not what:
+        raise InputError(
+            f"--executor {name} is none; give processes, dask:ADDRESS, slurm:FOLDER, or module:callable for your own"
+        )
+    package = {"dask": "distributed", "slurm": "submitit"}.get(kind)
+    if package is not None and importlib.util.find_spec(package) is None:
+        raise InputError(f"--executor {name}: {package} is not installed; pip install '.[{kind}]'")
+
+
+def is_here(name: str) -> bool:
+    """Return whether the engine runs jobs in threads of this process, and on this machine."""
+    return name == "processes"
+
+
+def threads_of(name: str, workers: int) -> int:
+    """Return how many threads each build gets: the machine's cores are shared out; elsewhere one is what a slot has."""
+    return max(1, cores() // workers) if is_here(name) else 1
+
+
+@contextlib.contextmanager
+def engine(name: str, workers: int | None) -> Iterator[Executor]:
+    """Open an engine, and with the block let go of it; jobs that it has not begun are then not begun any more.
+
+    Args:
+        name: `processes`, `dask:ADDRESS`, `slurm:FOLDER`, or `module:callable`, called with the number of workers.
+        workers: how many jobs at a time; None: as many as fit.
+
+    Raises:
+        InputError: where nobody answers, or the callable makes no executor.
+    """
+    kind, _, what = name.partition(":")
+    if name == "processes":
+        executor: Executor = ThreadPoolExecutor(workers or usual_workers())
+    elif kind == "dask":
+        with _dask(what) as executor:
+            yield executor
+        return
+    elif kind == "slurm":
+        executor = SubmititExecutor(_slurm(Path(what)), workers or (_QUEUED if _has_slurm() else usual_workers()))
+    else:
+        executor = _own(name, kind, what, workers)
+    try:
+        yield executor
+    finally:
+        executor.shutdown(wait=False, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _dask(address: str) -> Iterator[Executor]:
+    """Open an existing cluster through its executor interface."""
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said by us
+    try:
+        client = importlib.import_module("distributed").Client(address, timeout=_PATIENCE_S, set_as_default=False)
+    except (OSError, ValueError) as error:  # TimeoutError is an OSError
+        raise InputError(f"--executor dask:{address}: no scheduler answers there ({error}); start one") from None
+    try:
+        yield client.get_executor(pure=False)  # a job that is tried again is no result that is known
+    finally:
+        with contextlib.suppress(Exception):  # a scheduler that is gone needs no farewell
+            client.close(timeout=5)
+
+
+def _slurm(folder: Path) -> Any:
+    """Return submitit's executor, for Slurm where that is there, else for this machine."""
+    executor = importlib.import_module("submitit").AutoExecutor(
+        folder=folder, cluster="slurm" if _has_slurm() else "local"
+    )
+    executor.update_parameters(name="modeler", cpus_per_task=1, mem_gb=JOB_BYTES / 2**30, timeout_min=60)
+    return executor
+
+
+def _has_slurm() -> bool:
+    return shutil.which("srun") is not None
+
+
+@final
+class SubmititExecutor(Executor):
+    """Jobs of submitit as futures: a thread waits for each that is in the queue."""
+
+    def __init__(self, jobs: Any, queued: int) -> None:
+        """Take submitit's executor, and how many jobs may be in the queue at a time."""
+        self._jobs, self._waiting = jobs, ThreadPoolExecutor(queued)
+        self._begun: set[Any] = set()
+        self._one_by_one = Lock()
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """Queue a call once there is room."""
+        return self._waiting.submit(self._result, fn, *args, **kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Queue nothing more; take what is queued out of the queue where `cancel_futures` is set."""
+        self._waiting.shutdown(wait=False, cancel_futures=cancel_futures)
+        for job in [*self._begun] if cancel_futures else ():
+            job.cancel(check=False)
+        self._waiting.shutdown(wait=wait)
+
+    def _result(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
+        with self._one_by_one:
+            job = self._jobs.submit(fn, *args, **kwargs)
+        self._begun.add(job)
+        try:
+            return job.result()
+        finally:
+            self._begun.discard(job)
+
+
+def _own(name: str, module: str, attribute: str, workers: int | None) -> Executor:
+    """Return the executor that a callable of the user's makes."""
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        executor = getattr(importlib.import_module(module), attribute)(workers)
+    except Exception as error:  # whatever a user's module raises
+        raise InputError(f"--executor {name}: cannot be made ({type(error).__name__}: {error}); correct it") from error
+    if not isinstance(executor, Executor):
+        raise InputError(f"--executor {name}: makes no concurrent.futures.Executor; derive it from that")
+    return executor

@@ -1,0 +1,67 @@
+"""`modeler gallery`: many models on one page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from modeler.cli.console import bar, say
+from modeler.cli.options import default
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Write one HTML page about the models in a folder: pictures and figures, to sort and filter. It needs no network.
+
+    The list DIR/models.parquet is brought up to date as well.
+    """
+
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
+    """Folder of run folders, as `modeler batch` fills it."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html"), default("DIR/gallery.html")] = None
+    """Page to write."""
+    overwrite: bool = False
+    """Replace the page where there is one."""
+
+    def run(self) -> int:
+        """Write the page.
+
+        Raises:
+            InputError: where the folder holds no run, or the page cannot be written.
+        """
+        import os
+        from urllib.parse import quote
+
+        from modeler.cli.jobs import NOTES
+        from modeler.cli.models import TABLE, models_in, thumbnail_of
+        from modeler.cli.outputs import check_files
+        from modeler.export.models_table import blank, write_table
+        from modeler.regular_files import read_regular
+        from modeler.types import InputError
+        from viz.gallery import write_gallery
+
+        out = self.folder / "gallery.html" if self.out is None else self.out
+        check_files([out], [], overwrite=self.overwrite)
+        rows = models_in(self.folder)
+        if not rows:
+            raise InputError(f"{self.folder}: holds no folder of a run; give the folder that modeler batch has filled")
+        write_table(self.folder / TABLE, rows)
+        pictures, links = {}, {}
+        with bar() as progress:
+            for row in progress.track(rows):
+                name = row["name"]
+                picture = self.folder / NOTES / f"{name}.jpg"
+                if row.get("triangles") and not picture.exists():
+                    thumbnail_of(self.folder / name, picture)
+                if picture.exists():
+                    pictures[name] = read_regular(picture)
+                pages = [self.folder / name / page for page in ("report.html", "report.json")]
+                page = next((page for page in pages if page.exists()), None)
+                if page is not None:
+                    links[name] = quote(Path(os.path.relpath(page, out.parent)).as_posix())
+        write_gallery(out, self.folder.absolute().name, [blank() | row for row in rows], pictures, links)
+        say(f"open {out} in a browser")
+        return 0

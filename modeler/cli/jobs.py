@@ -1,0 +1,271 @@
+"""The jobs of a batch: one build each, in a process of its own, and what is on the disk of it.
+
+Engines run `run` wherever they like; what they carry there and back is small and plain. Nothing heavy is imported here.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+BUILDER = "modeler.cli.one_job"
+"""Module that builds the sequence of a job, in a process of its own."""
+NOTES = ".batch"
+"""Folder in that of a batch: what is known of each sequence, and what its build said."""
+TRIES = 2
+"""How often a sequence that fails is tried."""
+ENDED = (0, 3)
+"""Statuses of builds that came to their end."""
+Standing = Literal["new", "interrupted", "done", "changed", "failed"]
+_CHUNK_BYTES = 1 << 20
+_LINE = "modeler: "
+
+
+@dataclass(frozen=True)
+class Job:
+    """One sequence to build."""
+
+    name: str
+    """Of its run folder."""
+    sequence: str
+    """Absolute path."""
+    out: str
+    """Absolute path of the folder of the batch."""
+    arguments: tuple[str, ...] = ()
+    """Options of `modeler build`."""
+    threads: int = 1
+    """Threads of the process that builds it."""
+    page: bool = False
+    """Whether its report is written as a page, too."""
+    again: bool = False
+    """Whether it is tried again though it has failed before."""
+
+    @property
+    def run(self) -> Path:
+        """The run folder."""
+        return Path(self.out) / self.name
+
+    @property
+    def note(self) -> Path:
+        """The file with what is known of it."""
+        return Path(self.out) / NOTES / f"{self.name}.json"
+
+    @property
+    def log(self) -> Path:
+        """The file with what its builds said; who holds its lock works on the sequence."""
+        return Path(self.out) / NOTES / f"{self.name}.log"
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a job ended."""
+
+    name: str
+    """Of the sequence."""
+    status: int
+    """Exit status of the build: 0, 2, 3; 128 and more: it was killed."""
+    line: str = ""
+    """What it said in a line, where it failed."""
+    tries: int = 0
+    """How often it has failed."""
+    fresh: bool = True
+    """Whether it was built now, and not before."""
+
+
+def files_of(sequence: Path) -> list[Path]:
+    """Return the files that a sequence consists of, in order: those below a folder, or a file and its `.json`."""
+    if not sequence.is_dir():
+        return [path for path in (sequence, sequence.with_suffix(".json")) if path.is_file()]
+    found, seen = [], set()
+    for folder, inner, names in os.walk(sequence, followlinks=True):
+        status = os.stat(folder)
+        if (status.st_dev, status.st_ino) in seen:  # links may lead in circles
+            inner.clear()
+            continue
+        seen.add((status.st_dev, status.st_ino))
+        inner.sort()
+        found += [Path(folder) / name for name in sorted(names)]
+    return found
+
+
+def fingerprint(job: Job, *, content: bool) -> str:
+    """Return a digest of the input of a job: of names and bytes, or, at a glance, of names, sizes and times of change.
+
+    The files that options name count, too. What cannot be read counts by its name: the build will say what is wrong.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    named = [Path(value) for option, value in pairwise(job.arguments) if option in ("--sensor", "--camera")]
+    for path in (*files_of(Path(job.sequence)), *named):
+        digest.update(os.fsencode(os.path.relpath(path, job.sequence)) + b"\0")
+        try:
+            status = os.stat(path)
+            digest.update(f"{status.st_size} ".encode())
+            if not content:
+                digest.update(f"{status.st_mtime_ns} ".encode())
+            elif path.is_file():  # a FIFO might block
+                with open(path, "rb") as file:
+                    while piece := file.read(_CHUNK_BYTES):
+                        digest.update(piece)
+        except OSError as error:
+            digest.update(f"{error.errno} ".encode())
+    return digest.hexdigest()
+
+
+def read_note(path: Path) -> dict[str, Any]:
+    """Return what is known of a sequence; nothing where there is no such file, or no sense in it."""
+    try:
+        note = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return note if isinstance(note, dict) else {}
+
+
+def write_note(path: Path, note: dict[str, Any]) -> None:
+    """Replace what is known of a sequence, in one go."""
+    part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
+    try:
+        part.write_text(json.dumps(note) + "\n")
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def standing(job: Job, note: dict[str, Any] | None = None) -> Standing:
+    """Return how far a job has got, by what is on the disk.
+
+    Args:
+        job: with the settings as they are now.
+        note: what is known of it; None: as its file says.
+    """
+    note = read_note(job.note) if note is None else note
+    if not note:
+        return "new"
+    complete = note.get("status") in ENDED
+    if complete and not (job.run / "report.json").is_file():
+        return "new"  # somebody has removed the run
+    same = note.get("sequence") == job.sequence and note.get("arguments") == list(job.arguments)
+    if same and note.get("glance") != fingerprint(job, content=False):
+        same = note.get("content") == fingerprint(job, content=True)  # copied or touched, perhaps
+    if not same:
+        return "changed" if complete else "new"
+    if complete:
+        return "done"
+    return "failed" if note.get("tries", 0) >= TRIES and not job.again else "interrupted"
+
+
+class Processes:
+    """The processes that this one has started and not yet seen the end of."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._open = True
+
+    def run(self, command: list[str], environment: dict[str, str], log: int) -> int | None:
+        """Run a command and return its exit status; None where `ended` ended it.
+
+        Its standard input is a pipe that this process holds open: at the end of it the command knows that this process
+        is no more. Ctrl-C at the terminal does not reach it.
+        """
+        with self._lock:
+            if not self._open:
+                return None
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
+            )
+            self._running.add(process)
+        status = process.wait()
+        if process.stdin is not None:
+            process.stdin.close()
+        with self._lock:
+            if process not in self._running:
+                return None
+            self._running.discard(process)
+        return status
+
+    @contextmanager
+    def ended(self) -> Iterator[None]:
+        """End, with the block, what is still running then."""
+        self._open = True
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._open = False
+                running = list(self._running)
+                self._running.clear()
+            for process in running:
+                process.kill()  # a build that is killed loses the pair under way, and nothing else
+
+
+PROCESSES = Processes()
+"""Those of this process: engines run jobs in threads of it, or elsewhere."""
+
+
+def run(job: Job) -> Ended | None:
+    """Build a sequence unless that is done already; None where the process was ended from here.
+
+    Whoever else works on the same sequence is waited for. The process that builds dies with this one.
+
+    Raises:
+        OSError: where no file can be written in the folder of the batch.
+    """
+    job.log.parent.mkdir(parents=True, exist_ok=True)
+    with open(job.log, "ab") as log:
+        fcntl.flock(log, fcntl.LOCK_EX)  # shared by the process that builds, also where this one dies before it
+        now = standing(job)
+        if now in ("done", "failed"):
+            return ended(job.name, read_note(job.note), fresh=False)
+        log.truncate(0)
+        command = [sys.executable, "-m", BUILDER, json.dumps(asdict(job))]
+        status = PROCESSES.run(command, _environment(job.threads), log.fileno())
+        if status is None:
+            return None
+        note = read_note(job.note)
+        if note.get("status") == status and status in ENDED:
+            return ended(job.name, note)
+        return write_failure(job, last_line(job.log, status), 128 - status if status < 0 else status)
+
+
+def write_failure(job: Job, line: str, status: int = 2) -> Ended:
+    """Note that a job has failed, once more where it has before, and return how it ended.
+
+    Raises:
+        OSError: where the note cannot be written.
+    """
+    note = read_note(job.note)
+    tries = note.get("tries", 0) + 1
+    note |= {"sequence": job.sequence, "arguments": list(job.arguments), "status": status, "line": line}
+    write_note(job.note, note | {"tries": 1 if job.again and tries > TRIES else tries})
+    return ended(job.name, read_note(job.note))
+
+
+def ended(name: str, note: dict[str, Any], *, fresh: bool = True) -> Ended:
+    """Return how a job ended, by what is known of it."""
+    return Ended(name, int(note.get("status", 2)), str(note.get("line", "")), int(note.get("tries", 0)), fresh)
+
+
+def last_line(log: Path, status: int) -> str:
+    """Return the last line that a build said; where it was killed, by what."""
+    if status < 0:
+        return f"was killed by signal {-status}; is memory exhausted? See {log}"
+    lines = log.read_text(errors="replace").splitlines()
+    said = next((line for line in reversed(lines) if line.startswith(_LINE)), "")
+    return said.removeprefix(_LINE) or f"ended with status {status} and no message; see {log}"
+
+
+def _environment(threads: int) -> dict[str, str]:
+    """Return the environment of a process that builds, with as many threads as it may have."""
+    counts = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS"), str(threads))
+    return {**os.environ, **counts}

@@ -1,0 +1,174 @@
+"""Which sequences a batch is of: their names, and the table that lists them."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import hashlib
+import io
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cache
+from pathlib import Path
+
+from modeler.cli.jobs import NOTES, read_note
+from modeler.cli.options import (
+    FrameOptions,
+    MethodOptions,
+    ModelOptions,
+    ObjectOptions,
+    PriorOptions,
+    as_arguments,
+)
+from modeler.types import InputError
+
+_GROUPS = (ModelOptions, PriorOptions, MethodOptions, FrameOptions, ObjectOptions)
+_YES, _NO = ("yes", "true", "1"), ("no", "false", "0")
+_LONGEST = 100  # characters of a name; with an ending, a file system takes 255 bytes
+
+
+@dataclass(frozen=True)
+class Row:
+    """A sequence of a batch."""
+
+    sequence: Path
+    """Where it is."""
+    place: str
+    """Where it is named, for messages."""
+    name: str = ""
+    """Of its run folder; "": after the sequence."""
+    arguments: tuple[str, ...] = ()
+    """Options of `modeler build` for it alone."""
+
+
+def read_manifest(path: Path, common: tuple[str, ...] = ()) -> list[Row]:
+    """Return the rows of a table in CSV.
+
+    Args:
+        path: the file; paths in it are taken as on the command line.
+        common: options that hold for every row, where it says nothing else.
+
+    Raises:
+        InputError: where it cannot be read, a column is none, or a row's options cannot be used.
+    """
+    from sequences.input_files import read_text
+
+    try:
+        lines = csv.DictReader(io.StringIO(read_text(path, "CSV"), newline=""), strict=True)
+        columns = {column: column.strip().replace("_", "-") for column in lines.fieldnames or ()}
+        rows = list(lines)
+    except csv.Error as error:
+        raise InputError(f"{path}: is no table in CSV ({error}); correct it there") from None
+    flags = {one.name.replace("_", "-"): isinstance(one.default, bool) for group in _GROUPS for one in fields(group)}
+    known = ("sequence", "name", *flags)
+    if "sequence" not in columns.values():
+        raise InputError(f"{path}: has no column sequence; write one line of names, and a row for each sequence")
+    strange = [column for column in columns.values() if column not in known]
+    if strange or len(set(columns.values())) < len(columns):
+        wrong = f"column {strange[0]} is no option of modeler build" if strange else "a column is there twice"
+        raise InputError(f"{path}: {wrong}; it takes {', '.join(known)}")
+    found = []
+    for number, cells in enumerate(rows, start=2):
+        place = f"{path}: row {number}"
+        if None in cells or None in cells.values():
+            raise InputError(f"{place} has not as many cells as there are columns; correct it there")
+        values = {columns[column]: cell.strip() for column, cell in cells.items()}
+        if not values["sequence"]:
+            raise InputError(f"{place} names no sequence; correct it there")
+        options = {column: cell for column, cell in values.items() if column in flags and cell}
+        try:
+            arguments = _arguments(tuple(options.items()), common)
+        except InputError as error:
+            raise InputError(f"{place}: {error}") from None
+        found.append(Row(Path(values["sequence"]), place, values.get("name", ""), arguments))
+    return found
+
+
+@cache
+def _arguments(options: tuple[tuple[str, str], ...], common: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the options of a row as `modeler build` takes them.
+
+    Raises:
+        InputError: where it does not.
+    """
+    words: list[str] = []
+    for column, cell in options:
+        if column in ("colour", "strict-paths"):
+            if cell.lower() not in (*_YES, *_NO):
+                raise InputError(f"{column} is {cell}; write yes or no")
+            words += [f"--{column}"] * (cell.lower() in _YES)
+        else:
+            words += [f"--{column}", *([cell] if column in ("sensor", "camera") else cell.split())]
+    return _checked(tuple(words), common)
+
+
+def _checked(words: tuple[str, ...], common: tuple[str, ...]) -> tuple[str, ...]:
+    """Return options as they are once read: files by their absolute paths, and without those that say the usual."""
+    from modeler.cli import parsed
+    from modeler.cli.build import Build
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            build = parsed(("build", "SEQUENCE", "--out", "RUN", *common, *words))
+            alone = parsed(("build", "SEQUENCE", "--out", "RUN", *words)) if words else None
+    except SystemExit:
+        what = " ".join(said.getvalue().split()).removeprefix("modeler: ").removesuffix("; see modeler build --help")
+        raise InputError(what) from None
+    assert isinstance(build, Build)
+    if alone is None:
+        return ()
+    assert isinstance(alone, Build)
+    groups = (alone.model, alone.prior, alone.method, alone.selection, alone.where)
+    return tuple(word for group in groups for word in as_arguments(group))
+
+
+def named(rows: Sequence[Row], out: Path) -> Mapping[str, Row]:
+    """Return sequences by the names of their run folders, in order.
+
+    A sequence that the folder knows keeps its name. Others are called as their file or folder, and where that name is
+    taken, with a few digits more, which depend on nothing but their path.
+
+    Args:
+        rows: the sequences.
+        out: folder of the batch.
+
+    Raises:
+        InputError: where a name is given that cannot be one, or is given twice.
+    """
+    notes = sorted((out / NOTES).glob("*.json")) if (out / NOTES).is_dir() else []
+    known = {str(read_note(note).get("sequence", "")): note.stem for note in notes}
+    taken = {name.casefold() for name in known.values()}
+    given = {row.name.casefold() for row in rows if row.name}
+    found: dict[str, Row] = {}
+    used: set[str] = set()
+    paths: dict[str, str] = {}
+    for row in rows:
+        path = str(row.sequence.absolute())
+        if not row.name and path in paths:
+            raise InputError(f"{row.place}: is the same sequence as {paths[path]}; leave it out, or give both a name")
+        if not row.name:
+            paths[path] = row.place
+        name = row.name or known.get(path) or _free(row.sequence, path, taken | given | used)
+        if name != _clean(name):
+            raise InputError(f"{row.place}: {name} is no name for a folder; use letters, digits, and - _ . + within")
+        if name.casefold() in used:
+            raise InputError(f"{row.place}: the name {name} is given twice; give each its own")
+        used.add(name.casefold())
+        found[name] = row
+    return found
+
+
+def _free(sequence: Path, path: str, taken: set[str]) -> str:
+    """Return a name for a sequence that nothing else has."""
+    name = _clean(Path(path).stem if sequence.is_file() else Path(path).name) or "sequence"
+    if name.casefold() in taken:
+        name = f"{name}-{hashlib.blake2b(path.encode(errors='surrogateescape'), digest_size=4).hexdigest()}"
+    return name
+
+
+def _clean(name: str) -> str:
+    """Return what is left of a name that any file system takes, and no file of ours has."""
+    kept = re.sub(r"[^\w.+-]+", "_", name)[:_LONGEST].strip(".")
+    return f"{kept}_" if kept.casefold() in ("models.parquet", "gallery.html") else kept

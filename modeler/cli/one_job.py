@@ -1,0 +1,76 @@
+"""One job of a batch in a process of its own: `python -m modeler.cli.one_job JOB`, JOB in JSON.
+
+It ends when its standard input does, that is with the process that started it, however that ends.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from modeler.cli.jobs import Job
+
+
+def main() -> int:
+    """Build the sequence of a job, and note what became of it; the exit status is that of the build."""
+    began_s = time.perf_counter()
+    threading.Thread(target=end_with_the_parent, daemon=True).start()
+    from modeler.cli import main as command
+    from modeler.cli.jobs import ENDED, write_note
+
+    job, note = begin(sys.argv[1])
+    status = command(["build", job.sequence, "--out", str(job.run), "--resume", *job.arguments])
+    if status in ENDED:
+        from modeler.cli.models import record_of, thumbnail_of
+
+        if job.page:
+            command(["report", str(job.run), "--overwrite"])
+        thumbnail_of(job.run, job.note.with_suffix(".jpg"))
+        ended = {"status": status, "seconds": time.perf_counter() - began_s}
+        write_note(job.note, {**note, **ended, "record": record_of(job.run)})
+    return status
+
+
+def begin(words: str) -> tuple[Job, dict[str, Any]]:
+    """Return a job, and the note with which it begins, which is written; what others have built there is deleted.
+
+    Args:
+        words: the job in JSON.
+    """
+    from modeler.cli.jobs import Job, fingerprint, read_note, standing, write_note
+
+    values = json.loads(words)
+    job = Job(**{**values, "arguments": tuple(values["arguments"])})
+    before = read_note(job.note)
+    now = standing(job, before)
+    if now == "changed":
+        from modeler.export import RunFolder, alone
+
+        with alone(job.run):
+            RunFolder.open(job.run, overwrite=True)
+    note = {
+        "sequence": job.sequence,
+        "arguments": list(job.arguments),
+        "glance": fingerprint(job, content=False),
+        "content": fingerprint(job, content=True),
+        "tries": before.get("tries", 0) if now == "interrupted" else 0,
+    }
+    write_note(job.note, note)
+    return job, note
+
+
+def end_with_the_parent() -> None:
+    """End this process at the end of its standard input."""
+    while os.read(0, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGKILL)  # as if both had been killed: what is on the disk is whole
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,172 @@
+"""The list of many models as a table that analysis tools read: a row a sequence, in Parquet."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.export.files import write_atomically
+from modeler.export.standing import model_upright
+from modeler.regular_files import read_regular
+from modeler.types import ACCEPTED, Array, InputError, ObjectModel
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_COLUMNS = {
+    "name": "string",  # of the run folder
+    "sequence": "string",
+    "status": "int64",  # 0 trustworthy, 3 not; 2 and above: no model; null: not ended
+    "trustworthy": "bool",
+    "reasons": "list",  # why not
+    "failure": "string",  # what the build said, where there is no model
+    "tries": "int64",  # how often it has failed
+    "frames": "int64",
+    "accepted": "int64",
+    "closed": "bool",
+    "opening_deg": "double",  # of the loop, before the optimisation
+    "opening_m": "double",
+    "opening_sigmas": "double",
+    "rotation_error_deg": "double",  # largest over the frames, aligned at the first; where the truth is known
+    "translation_error_m": "double",
+    "width_m": "double",  # upright
+    "height_m": "double",
+    "depth_m": "double",
+    "volume_m3": "double",  # holes closed by flat fans
+    "triangles": "int64",
+    "surface_sigma_m": "double",  # median over the vertices that were seen
+    "pose_sigma_deg": "double",  # largest over the frames
+    "pose_sigma_m": "double",
+    "seconds": "double",
+    "prior": "string",
+    "seed": "int64",
+    "settings": "string",  # JSON
+    "versions": "string",  # JSON
+    "input": "string",  # digest of names and bytes
+}
+"""Columns and their types; all may be null."""
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows as a table; what a row does not say is null.
+
+    Raises:
+        InputError: where the file cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    content = io.BytesIO()
+    pq.write_table(pa.Table.from_pylist(list(rows), schema=_schema()), content)
+    write_atomically(path, content.getvalue())
+
+
+def read_table(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a table.
+
+    Raises:
+        InputError: where there is none, or it has not these columns.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(io.BytesIO(read_regular(path)))
+        return table.select(list(_COLUMNS)).cast(_schema()).to_pylist()
+    except (pa.ArrowException, KeyError) as error:
+        what = " ".join(str(error).split())
+        raise InputError(f"{path}: is no list of models ({what}); run modeler batch again") from None
+
+
+def _schema() -> pa.Schema:
+    import pyarrow as pa
+
+    kinds = {"string": pa.string(), "int64": pa.int64(), "bool": pa.bool_(), "double": pa.float64()}
+    return pa.schema([(name, kinds.get(kind) or pa.list_(pa.string())) for name, kind in _COLUMNS.items()])
+
+
+def blank() -> dict[str, Any]:
+    """Return a row that says nothing."""
+    return dict.fromkeys(_COLUMNS)
+
+
+def report_columns(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a report says in the columns of the table."""
+    loop, evidence = report.get("loop") or {}, report.get("evidence") or {}
+    return {
+        "sequence": report["sequence"],
+        "trustworthy": report["trustworthy"],
+        "reasons": list(report["reasons"]),
+        "frames": len(report["frames"]),
+        "accepted": sum(frame["outcome"] == ACCEPTED for frame in report["frames"]),
+        "closed": report["closed"],
+        **{f"opening_{unit}": loop.get(f"opening_{unit}") for unit in ("deg", "m")},
+        "opening_sigmas": loop.get("sigmas"),
+        "pose_sigma_deg": (evidence.get("pose_sd_deg") or {}).get("value"),
+        "pose_sigma_m": (evidence.get("pose_sd_m") or {}).get("value"),
+        "seconds": report["seconds"].get("total"),
+        "prior": report.get("prior"),
+        "seed": report.get("seed"),
+    }
+
+
+def model_columns(model: ObjectModel, report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a model measures in the columns of the table."""
+    upright_m = model.vertices_m @ model_upright(report)  # right, down, forward
+    width_m, height_m, depth_m = (upright_m.max(axis=0) - upright_m.min(axis=0)).tolist()
+    sigmas_m = model.vertex_sigmas_m
+    known = None if sigmas_m is None else sigmas_m[np.isfinite(sigmas_m)]
+    return {
+        "width_m": width_m,
+        "height_m": height_m,
+        "depth_m": depth_m,
+        "volume_m3": enclosed_m3(model.vertices_m, model.triangles),
+        "triangles": len(model.triangles),
+        "surface_sigma_m": None if known is None or not len(known) else float(np.median(known)),
+    }
+
+
+def enclosed_m3(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> float:
+    """Return the volume in a mesh, each of its holes closed by a fan about the mean of its rim.
+
+    Args:
+        vertices_m: (v, 3).
+        triangles: (t, 3), counter-clockwise from outside.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(vertices_m)
+    centred_m = vertices_m - vertices_m.mean(axis=0)
+    first, second, third = (centred_m[triangles[:, k]] for k in range(3))
+    volume = float(np.einsum("ij,ij->", first, np.cross(second, third)))
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    code, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
+    rim = edges[~np.isin(code, back)]
+    if not len(rim):
+        return volume / 6.0
+    corners, place = np.unique(rim, return_inverse=True)
+    place = place.reshape(-1, 2)
+    graph = coo_array((np.ones(len(rim)), (place[:, 0], place[:, 1])), shape=(len(corners), len(corners)))
+    loops, loop = connected_components(graph, directed=False)
+    sums = np.zeros((loops, 3))
+    np.add.at(sums, loop, centred_m[corners])
+    middle = sums / np.bincount(loop, minlength=loops)[:, None]
+    fan = np.cross(centred_m[rim[:, 1]], centred_m[rim[:, 0]])
+    volume += float(np.einsum("ij,ij->", middle[loop[place[:, 0]]], fan))
+    return volume / 6.0
+
+
+def finite(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values with None for numbers that are not finite, as JSON and tables have it."""
+    return {name: None if _odd(value) else value for name, value in values.items()}
+
+
+def _odd(value: object) -> bool:
+    return isinstance(value, float) and not math.isfinite(value)

@@ -1,0 +1,170 @@
+"""The page about many models, as a browser shows it."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import chromium
+import numpy as np
+import pytest
+from commanded import Run
+from PIL import Image
+
+from modeler.cli.jobs import NOTES
+from modeler.cli.models import THUMBNAIL_PX, write_models
+from modeler.export.models_table import enclosed_m3, read_table
+from sequences.rendering.meshes import Mesh
+from sequences.rendering.shapes import Box
+
+COUNT = 1000
+browser = pytest.mark.skipif(chromium.EXECUTABLE is None, reason="Chromium is not installed")
+
+
+def picture(number: int) -> bytes:
+    """Return a made-up picture of its own, as large as those of models."""
+    rng = np.random.default_rng(number)
+    coarse = Image.fromarray(rng.integers(0, 256, (20, 20, 3), dtype=np.uint8))
+    content = io.BytesIO()
+    coarse.resize((THUMBNAIL_PX, THUMBNAIL_PX), Image.Resampling.BICUBIC).save(content, "JPEG", quality=85)
+    return content.getvalue()
+
+
+def note(number: int) -> dict[str, Any]:
+    """Return what is known of a made-up model: every tenth failed, every fifth is not to be trusted."""
+    if number % 10 == 9:
+        return {"sequence": f"/s/{number}", "status": 2, "line": "no <depth> images", "tries": 2}
+    record = {
+        "trustworthy": number % 5 != 0,
+        "reasons": [] if number % 5 else ["the loop </script> is open"],
+        "frames": 14,
+        "triangles": 1,
+        "width_m": 0.001 * ((number * 37) % COUNT),
+        "seconds": None if number == 1 else 10.0,
+    }
+    return {"sequence": f"/s/{number}", "status": 0 if number % 5 else 3, "record": record}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder of a thousand made-up models."""
+    out = tmp_path_factory.mktemp("many")
+    (out / NOTES).mkdir()
+    for number in range(COUNT):
+        name = f"model-{number:04d}"
+        (out / NOTES / f"{name}.json").write_text(json.dumps(note(number)))
+        if number % 10 != 9:
+            (out / NOTES / f"{name}.jpg").write_bytes(picture(number))
+            (out / name).mkdir()
+            (out / name / "report.json").write_text("{}")
+    (out / "model-0000" / "report.html").write_text("a page")
+    return out
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[chromium.Page]:
+    with chromium.Page(tmp_path / "profile", 1400, 1000) as page:
+        yield page
+
+
+@browser
+def test_a_thousand_models_are_there_within_two_seconds(cli: Run, folder: Path, page: chromium.Page) -> None:
+    ended = cli("gallery", folder, "--overwrite")
+    assert (ended.status, ended.out) == (0, "")
+    assert {path.name for path in folder.iterdir() if path.is_file()} == {"gallery.html", "models.parquet"}
+    began_s = time.monotonic()
+    page.open((folder / "gallery.html").as_uri())
+    assert page.value("document.querySelectorAll('.model').length") == COUNT
+    page.wait_for("document.querySelector('.model img').naturalWidth == 160")
+    assert time.monotonic() - began_s < 2.0
+    decoded = page.value("[...document.images].filter((image) => image.src).length")
+    assert 20 < decoded < 200  # those near the window
+    assert page.picture()[200:, :].std() > 20.0
+    page.value("window.scrollTo(0, document.body.scrollHeight)")
+    page.wait_for("[...document.images].at(-1).naturalWidth == 160")
+    assert page.complaints == []
+    assert all(address.startswith(("file:", "data:")) for address in page.requested)
+    assert page.value("document.querySelector('a').getAttribute('href')") == "model-0000/report.html"
+    assert page.value("document.querySelectorAll('a')[1].getAttribute('href')") == "model-0001/report.json"
+
+
+@browser
+def test_models_are_sorted_and_filtered(cli: Run, folder: Path, page: chromium.Page) -> None:
+    assert cli("gallery", folder, "--overwrite").status == 0
+    page.open((folder / "gallery.html").as_uri())
+
+    def choose(**values: object) -> list[str]:
+        for name, value in values.items():
+            field = "checked" if isinstance(value, bool) else "value"
+            page.value(f"document.getElementById('{name}').{field} = {json.dumps(value)}")
+        page.value("document.getElementById('words').dispatchEvent(new Event('input'))")
+        return page.value("[...document.querySelectorAll('.model')].map((card) => card.children[1].textContent)")
+
+    def named(numbers: list[int]) -> list[str]:
+        return [f"model-{number:04d}" for number in numbers]
+
+    everyone = range(COUNT)
+    assert choose() == named([*everyone])
+    assert choose(down=True) == named([*reversed(everyone)])
+    assert choose(down=False, status="failed") == named([k for k in everyone if k % 10 == 9])
+    assert choose(status="3") == named([k for k in everyone if k % 5 == 0])
+    assert choose(status="", words="OPEN") == named([k for k in everyone if k % 5 == 0])
+    assert choose(words="0042") == ["model-0042"]
+    width = page.value("[...document.getElementById('column').options].find((one) => one.text == 'width').value")
+    known = [k for k in everyone if k % 10 != 9]
+    by_width = sorted(known, key=lambda k: ((k * 37) % COUNT, k))
+    assert choose(words="", column=width)[: len(known)] == named(by_width)
+    assert choose(least=100, most=120) == named([k for k in by_width if 100 <= (k * 37) % COUNT <= 120])
+    seconds = page.value("[...document.getElementById('column').options].find((one) => one.text == 'build time').value")
+    order = choose(least="", most="", column=seconds)
+    assert order[-101:] == named([k for k in everyone if k % 10 == 9 or k == 1])  # unknown ones last
+    assert page.complaints == []
+
+
+def test_the_list_is_brought_up_to_date_and_a_page_is_kept(cli: Run, folder: Path, tmp_path: Path) -> None:
+    (folder / "models.parquet").unlink(missing_ok=True)
+    out = tmp_path / "page.html"
+    assert cli("gallery", folder, "--out", out).status == 0
+    rows = {row["name"]: row for row in read_table(folder / "models.parquet")}
+    assert len(rows) == COUNT
+    assert rows["model-0009"]["failure"] == "no <depth> images"
+    assert rows["model-0002"]["width_m"] == pytest.approx(0.074)
+    assert out.read_text().count("</script>") == 1
+    assert cli("gallery", folder, "--out", out).status == 2
+    ended = cli("gallery", tmp_path)
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+
+
+def test_a_model_without_picture_gets_one(cli: Run, built: Path, tmp_path: Path) -> None:
+    (tmp_path / "run").symlink_to(built)
+    before = sorted(path.name for path in built.iterdir())
+    assert cli("gallery", tmp_path).status == 0
+    image = np.asarray(Image.open(tmp_path / NOTES / "run.jpg"), dtype=float)
+    assert image.shape == (THUMBNAIL_PX, THUMBNAIL_PX, 3)
+    shown = image.min(axis=2) < 240.0
+    assert 0.1 < shown.mean() < 0.7
+    assert sorted(path.name for path in built.iterdir()) == before
+    (row,) = read_table(tmp_path / "models.parquet")
+    assert (row["name"], row["status"]) == ("run", 0)
+    write_models(tmp_path)
+
+
+def opened(mesh: Mesh) -> np.ndarray:
+    """Return the triangles of a box without those of its bottom."""
+    z = mesh.vertices_m[mesh.triangles][:, :, 2]
+    return mesh.triangles[~np.all(z < mesh.vertices_m[:, 2].min() + 1e-9, axis=1)]
+
+
+def test_the_volume_of_a_mesh_with_a_plane_hole_is_that_of_the_closed_one() -> None:
+    mesh = Box((0.13, 0.075, 0.18)).mesh()
+    apart = mesh.vertices_m + 5.0  # wherever it is
+    for triangles in (mesh.triangles, opened(mesh)):
+        assert enclosed_m3(apart, triangles) == pytest.approx(0.13 * 0.075 * 0.18, rel=1e-9)
+    assert len(opened(mesh)) < len(mesh.triangles)
+    two = np.concatenate([apart, apart + 1.0])
+    holes = np.concatenate([opened(mesh), opened(mesh) + len(apart)])
+    assert enclosed_m3(two, holes) == pytest.approx(2 * 0.13 * 0.075 * 0.18, rel=1e-9)
