@@ -20,6 +20,7 @@ from typing import Any
 from urllib.parse import unquote
 
 import pytest
+import rerun.chunk
 from streamed import read, record
 from turning_box import COUNT
 
@@ -37,6 +38,20 @@ def test_a_run_that_is_killed_leaves_a_readable_recording(run: list[Step], tmp_p
     (tmp_path / "cut.rrd").write_bytes((tmp_path / "r.rrd").read_bytes())
     stream.close()
     assert set(read(tmp_path / "cut.rrd")[entities.NOW]) == {0, 1}
+
+
+@pytest.mark.parametrize("watched", [False, True])
+def test_steps_are_written_in_one_piece_unless_somebody_watches(
+    run: list[Step], tmp_path: Path, watched: bool
+) -> None:
+    """Rerun keeps metadata of each piece in memory till the file is complete, which thousands of frames exhaust."""
+    stream = open_stream("box", save=tmp_path / "r.rrd", web=watched)
+    for step in run[:3]:
+        stream(step)
+        time.sleep(0.5)  # longer than Rerun waits with what is watched
+    stream.close()
+    pieces = [chunk.entity_path for chunk in rerun.chunk.RrdReader(tmp_path / "r.rrd").stream()]
+    assert pieces.count(f"/{entities.NOW}") == (3 if watched else 1)
 
 
 def listeners(process: subprocess.Popen[bytes]) -> set[str]:

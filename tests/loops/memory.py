@@ -1,7 +1,6 @@
 """How much memory and time `modeler build` takes over thousands of frames.
 
-`PYTHONPATH=tests python -m loops.memory --frames 5000 --out runs/memory` renders an object of 320 x 240 pixels that
-turns by 3° a frame, a folder of pictures that is kept for the next time, and builds it as the command does: with pairs
+`PYTHONPATH=tests python -m loops.memory --frames 5000 --out runs/memory` renders an object that turns by 3° a frame, a folder of pictures that is kept for the next time, and builds it as the command does: with pairs
 kept, recording and report. With --told-truth pairs are registered by the truth, to see what everything else takes.
 stdout has a line for every --every steps: resident memory as the system counts it (what the program allocated, and
 what it read of mapped files), and the most so far.
@@ -32,9 +31,9 @@ def memory_mib() -> dict[str, float]:
     return {name: int(value.split()[0]) / 1024.0 for name, _, value in lines if name in _FIELDS}
 
 
-def write_sequence(folder: Path, frames: int, *, shape: str) -> None:
+def write_sequence(folder: Path, frames: int, *, shape: str, width: int) -> None:
     """Render frames at 3° each into a folder, one after the other."""
-    sequence = turned([3.0 * frame for frame in range(frames)], shape=shape, width=320)
+    sequence = turned([3.0 * frame for frame in range(frames)], shape=shape, width=width)
     sigma_wh, sigma_r_m = sequence.sensor() or (0.0, 0.0)
     sensor = {"sigma_wh": sigma_wh, "sigma_r_m": sigma_r_m}
     write_bop(folder, sequence, sequence.truth(), {"name": folder.name, "sensor": sensor})
@@ -75,23 +74,24 @@ def run() -> int:
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--every", type=int, default=250, help="steps between lines")
     parser.add_argument("--shape", default="figurine", help="recipe of the rendered object")
+    parser.add_argument("--width", type=int, default=320, help="of the images in pixels, whose height is 3/4 of it")
     parser.add_argument("--out", type=Path, default=Path("runs/memory"), help="folder of the sequence and the run")
     parser.add_argument("--told-truth", action="store_true", help="register by the truth")
     parser.add_argument("options", nargs="*", default=["--prior", "table"], help="of modeler build, after --")
     options = parser.parse_args()
-    sequence = options.out / f"{options.shape}-{options.frames}"
+    sequence = options.out / f"{options.shape}-{options.width}-{options.frames}"
     if not sequence.exists():
-        write_sequence(sequence, options.frames, shape=options.shape)
+        write_sequence(sequence, options.frames, shape=options.shape, width=options.width)
     Meter.every = options.every
     build.Console = Meter
     if options.told_truth:
         truth = open_sequence(sequence).truth() or {}
-        compose.registrar = lambda _: Known(truth)
+        compose.registrar = lambda *_, **__: Known(truth)
     print("  step  " + "  ".join(f"{name:>7}" for name in _FIELDS) + "             edges      wall   processor")
     kind = "-told" if options.told_truth else ""
-    run_folder = options.out / f"run-{options.frames}{kind}"
+    run_folder = options.out / f"run-{options.width}-{options.frames}{kind}"
     status = main(["build", str(sequence), "--out", str(run_folder), "--overwrite", *options.options])
-    (options.out / f"costs-{options.frames}{kind}.json").write_text(json.dumps(Meter.costs) + "\n")
+    (options.out / f"costs-{options.width}-{options.frames}{kind}.json").write_text(json.dumps(Meter.costs) + "\n")
     print(f"status {status}; at the end of the program: {memory_mib()['VmHWM']:.0f} MiB at most")
     return 0 if status in (0, 3) else status
 
