@@ -377,6 +377,15 @@ def test_frames_before_the_object_came_are_told() -> None:
         assert said(*whole) == ""
 
 
+@pytest.mark.parametrize(("hand", "told"), [(0, True), (1, True), (2, True), (3, False), (4, False)])
+def test_frames_without_a_hand_are_not_said_to_lack_the_object(hand: int, told: bool) -> None:
+    """Where a hand is taken for the object, its masks are unsure, and nothing is found in the frames that lack it."""
+    few = {"cause": Outcome.TOO_FEW_POINTS.label, "mask": Outcome.TOO_FEW_POINTS.label}
+    masks = [Outcome.UNSURE_MASK] * hand + [Outcome.CONVERGED] * (4 - hand)
+    frames = [few, *({"cause": "", "mask": mask.label} for mask in masks)]
+    assert bool(ends_without([frame | {"id": place} for place, frame in enumerate(frames)])) is told
+
+
 def test_ctrl_c_ends_the_frames_and_a_second_one_the_program() -> None:
     before = signal.getsignal(signal.SIGINT)
     seen = []

@@ -11,6 +11,7 @@ import numpy as np
 from modeler import se3
 from modeler.priors import GeneralPrior, TablePrior, TurntablePrior
 from modeler.types import AbstractPrior, Failed, Outcome, Reason, advice
+from modeler.verdict.evidence import MAX_UNSURE
 from sequences import AbstractSequence
 
 _SURE_STEPS: Final = 3  # pairs whose median rotation counts as the step
@@ -208,12 +209,16 @@ def _at_limit(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
 def ends_without(frames: Sequence[Mapping[str, Any]]) -> str:
     """Return in words which frames show the object, where the first or the last ones do not, else "".
 
+    Where the masks of most frames that show something are unsure, it may be a hand, and the others show the object.
+
     Args:
         frames: of the report.
     """
     ids = sorted(frame["id"] for frame in frames)
-    seen = sorted(frame["id"] for frame in frames if frame.get("cause") != Outcome.TOO_FEW_POINTS.label)
-    if len(seen) < 2 or (seen[0], seen[-1]) == (ids[0], ids[-1]):
+    shown = [frame for frame in frames if frame.get("cause") != Outcome.TOO_FEW_POINTS.label]
+    unsure = sum(frame.get("mask") == Outcome.UNSURE_MASK.label for frame in shown)
+    seen = sorted(frame["id"] for frame in shown)
+    if len(seen) < 2 or unsure > MAX_UNSURE * len(seen) or (seen[0], seen[-1]) == (ids[0], ids[-1]):
         return ""
     late, early = seen[0] > ids[0], seen[-1] < ids[-1]
     when = [f"from frame {seen[0]} on"] * late + [f"up to frame {seen[-1]}"] * early
