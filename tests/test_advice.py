@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from calibration.specimens import load_specimen
+from trust.plan import viewed
+from trust.stage import Recorded, Stage, posed
 
 from modeler import priors, se3
-from modeler.cli.advice import remedy
+from modeler.cli.advice import ends_without, remedy
 from modeler.cli.build import Build
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.segmentation import Segmenter
 from modeler.types import AbstractPrior, Outcome
+from sequences.rendering.shapes import Capsule
+from sequences.rendering.trajectory import Place, Places, Tabletop
 
 
 def untrusted(*codes: str, turn_deg: float = 40.0, outcome: Outcome = Outcome.CONVERGED, **more: Any) -> dict[str, Any]:
@@ -86,3 +93,22 @@ def test_the_command_to_try_keeps_what_was_given() -> None:
     assert build.command({"prior": "general"}) == "modeler build 'a b' --out run --overwrite --prior general"
     build = Build(Path("a"), Path("run"), where=ObjectOptions(roi=(1, 2, 3, 4)), method=MethodOptions(seed=3))
     assert build.command({}) == "modeler build a --out run --overwrite --roi 1 2 3 4 --seed 3"
+
+
+def test_a_hand_in_half_of_the_frames_does_not_make_the_others_superfluous() -> None:
+    """An arm beside the object is larger and moves more: it is segmented, and nothing where the object is alone."""
+    recipe = viewed(load_specimen("l_bracket"), np.random.default_rng(5), 5)
+    view = replace(recipe.view, width=160, height=120, focal_px=0.5 * recipe.view.focal_px)
+    turns = Places(tuple(posed(Tabletop(8, 45.0, shift_m=0.02), 1)))
+    reached = [Place((0.19, -0.05, 0.04), (0.0, 80.0 + 3.0 * k, 0.0)) for k in range(4)]
+    arm = replace(recipe, object=Capsule(0.08, 0.3), view=view, table=None, rest_rotation_deg=(0.0, 0.0, 0.0))
+    arm = replace(arm, trajectory=Places((*[Place((2.0, 0.0, 0.04))] * 4, *reached)))
+    stage = Stage(replace(recipe, view=view, trajectory=turns), PriorOptions(), others=(arm,))
+    frames, segmenter = list(Recorded(stage)), Segmenter()
+    scene = segmenter.scene(frames)
+    found = [segmenter.segment(frame, scene).outcome for frame in frames]
+    assert found == [Outcome.TOO_FEW_POINTS] * 4 + [Outcome.UNSURE_MASK] * 4
+    causes = [outcome.label if outcome is Outcome.TOO_FEW_POINTS else "" for outcome in found]
+    told = [{"id": k, "cause": causes[k], "mask": outcome.label} for k, outcome in enumerate(found)]
+    assert ends_without(told) == ""
+    assert "--frames 4:" in ends_without([frame | {"mask": Outcome.CONVERGED.label} for frame in told])
