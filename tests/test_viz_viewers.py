@@ -41,9 +41,7 @@ def test_a_run_that_is_killed_leaves_a_readable_recording(run: list[Step], tmp_p
 
 
 @pytest.mark.parametrize("watched", [False, True])
-def test_steps_are_written_in_one_piece_unless_somebody_watches(
-    run: list[Step], tmp_path: Path, watched: bool
-) -> None:
+def test_steps_are_written_in_one_piece_unless_somebody_watches(run: list[Step], tmp_path: Path, watched: bool) -> None:
     """Rerun keeps metadata of each piece in memory till the file is complete, which thousands of frames exhaust."""
     stream = open_stream("box", save=tmp_path / "r.rrd", web=watched)
     for step in run[:3]:

@@ -1,9 +1,10 @@
 """How much memory and time `modeler build` takes over thousands of frames.
 
-`PYTHONPATH=tests python -m loops.memory --frames 5000 --out runs/memory` renders an object that turns by 3° a frame, a folder of pictures that is kept for the next time, and builds it as the command does: with pairs
-kept, recording and report. With --told-truth pairs are registered by the truth, to see what everything else takes.
-stdout has a line for every --every steps: resident memory as the system counts it (what the program allocated, and
-what it read of mapped files), and the most so far.
+`PYTHONPATH=tests python -m loops.memory --frames 5000 --out runs/memory` renders an object that turns by 3° a frame, a
+folder of pictures that is kept for the next time, and builds it as the command does: with pairs kept, recording and
+report. With --told-truth pairs are registered by the truth, to see what everything else takes. Ctrl-C ends it with the
+frames so far. stdout has a line for every --every steps: resident memory as the system counts it (what the program
+allocated, and what it read of mapped files), and the most so far.
 """
 
 from __future__ import annotations
