@@ -71,7 +71,7 @@ class Convert:
         with reading() as watched:
             found = survey(watched(sequence.recorded(), "reading"))
             farthest_m = LIVE_REACH_M if sequence.live else found.farthest_m
-            unit_mm = next((unit for unit in UNITS_MM if farthest_m * 1000.0 < 65535.0 * unit), UNITS_MM[-1])
+            unit_mm = finest_unit_mm(farthest_m)
             write_bop(
                 self.out,
                 while_it_lasts(sequence) if sequence.live else watched(sequence, "writing"),
@@ -88,6 +88,11 @@ class Convert:
         for note in (*found.doubts, *sequence.notes):
             say(note)
         return 0
+
+
+def finest_unit_mm(farthest_m: float) -> float:
+    """Return the finest unit of depth, in mm, in which a depth fits into 16 bits."""
+    return next((unit for unit in UNITS_MM if farthest_m * 1000.0 < 65535.0 * unit), UNITS_MM[-1])
 
 
 def _meta(sequence: AbstractSequence) -> dict[str, object]:

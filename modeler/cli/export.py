@@ -13,6 +13,7 @@ from modeler.cli.options import MIN_VOXEL_M, MovedOptions, default
 
 Origin = Literal["camera", "base", "centre", "bbox"]  # spelt out here, for help imports nothing heavy
 Up = Literal["z", "y"]
+Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "print"]
 
 if TYPE_CHECKING:
     from modeler.fusion import FusionVolume
@@ -31,7 +32,11 @@ class Export:
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Run folder, as `modeler build` makes it."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.{ply,obj,glb,stl}")]
-    """File to write; its ending selects the format. STL carries no colour."""
+    """File to write; its ending selects the format. STL carries no colour. With --for a file or a folder."""
+    purpose: Annotated[Purpose | None, tyro.conf.arg(name="for"), default("none")] = None
+    """Write all that a program needs, read it back and say what was checked: foundationpose (FILE.obj with texture),
+    bop (FOLDER with models and onboarding_static), mujoco and urdf (FOLDER with meshes, convex parts, mass, inertia),
+    print (watertight FILE.stl in mm with a flat bottom)."""
     overwrite: bool = False
     """Replace files that are there."""
     origin: Annotated[Origin | None, default("base")] = None
@@ -51,6 +56,10 @@ class Export:
     """Colour vertices by the number of views that saw them or by their standard deviation; made-up surface is pink."""
     voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("as the data")] = None
     """Side of a voxel: detail of the mesh."""
+    density_kg_m3: Annotated[float | None, default("1000, as of water")] = None
+    """Density of the solid, with --for mujoco and urdf."""
+    mass_kg: Annotated[float | None, default("of the density")] = None
+    """Mass, where it is known, instead of a density."""
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:
@@ -59,6 +68,8 @@ class Export:
         Raises:
             InputError: where options exclude each other, or something cannot be read or written.
         """
+        if self.purpose is not None:
+            return self._for(self.purpose)
         from modeler import export as files
         from modeler.cli.outputs import check_files, run_inputs
         from modeler.export.texture import TRIANGLES
@@ -107,6 +118,17 @@ class Export:
             say(f"{place.words}; the pose in the camera: {files.pose_file(self.out).name}")
         return 0
 
+    def _for(self, purpose: Purpose) -> int:
+        """Write what a program needs.
+
+        Raises:
+            InputError: where options exclude each other, or something cannot be read or written.
+        """
+        from modeler.cli.presets import Preset
+
+        _check_numbers(self)
+        return Preset(self, purpose).run()
+
 
 def _check(options: Export) -> None:
     """Refuse options that exclude each other before anything is worked out."""
@@ -127,10 +149,24 @@ def _check(options: Export) -> None:
         raise InputError(
             "--bop puts the origin in the centre of the box and keeps the axes; leave out --origin and --up"
         )
+    if options.density_kg_m3 is not None or options.mass_kg is not None:
+        raise InputError("--density-kg-m3 and --mass-kg go with --for mujoco and --for urdf alone")
+    _check_numbers(options)
+
+
+def _check_numbers(options: Export) -> None:
+    """Refuse numbers that are out of range."""
+    from modeler.types import InputError
+
     if options.triangles is not None and options.triangles < 4:
         raise InputError(f"--triangles {options.triangles} is too few for a solid; give at least 4")
     if options.voxel_m is not None and not MIN_VOXEL_M <= options.voxel_m < 1.0:
         raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
+    for name, value in (("density-kg-m3", options.density_kg_m3), ("mass-kg", options.mass_kg)):
+        if value is not None and not 0.0 < value < 1e6:
+            raise InputError(f"--{name} {value:g} is out of range; give a positive number")
+    if options.density_kg_m3 is not None and options.mass_kg is not None:
+        raise InputError("--density-kg-m3 and --mass-kg are two ways to tell the mass; give one of them")
 
 
 def _volume(options: Export) -> FusionVolume | None:

@@ -1,5 +1,7 @@
 """A sink: what a run leaves on disk, whole at any moment."""
 
+from modeler.export.bop import scene_gt_info as scene_gt_info
+from modeler.export.bop import write_bop as write_bop
 from modeler.export.files import alone as alone
 from modeler.export.files import write_atomically as write_atomically
 from modeler.export.formats import g2o_text as g2o_text
@@ -11,7 +13,6 @@ from modeler.export.mesh import format_of as format_of
 from modeler.export.mesh import mesh_of as mesh_of
 from modeler.export.mesh import simplified as simplified
 from modeler.export.mesh import tinted as tinted
-from modeler.export.mesh import write_bop as write_bop
 from modeler.export.mesh import write_mesh as write_mesh
 from modeler.export.pairs import Pairs as Pairs
 from modeler.export.pairs import Remembered as Remembered

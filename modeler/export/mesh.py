@@ -1,32 +1,25 @@
-"""The fused mesh in the formats of other programs, simplified, coloured by what is known of it, or as a BOP model."""
+"""The fused mesh in the formats of other programs, simplified, or coloured by what is known of it."""
 
 from __future__ import annotations
 
 import io
-import json
-import os
-import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
-from scipy.spatial import ConvexHull, KDTree, QhullError
-from scipy.spatial.distance import pdist
+from scipy.spatial import KDTree
 
 from modeler.export.files import write_atomically
-from modeler.export.formats import mesh_ply, ply_bytes
+from modeler.export.formats import mesh_ply
 from modeler.export.placing import CAMERA_AXES
 from modeler.export.texture import Texture
-from modeler.regular_files import read_json
 from modeler.types import Array, InputError, ObjectModel
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 TEXTURED = (".obj", ".glb")
 AS_GIVEN: Final = np.diag([1.0, -1.0, -1.0])
 """Of a mesh whose y axis is up already: what turns glTF's axes back."""
-MODELS_INFO = "models_info.json"
-"""BOP's list of models, beside them."""
 
 Tint = Literal["views", "sigma"]
 MADE_UP_RGB: Final = (230, 90, 200)
@@ -72,10 +65,11 @@ def write_mesh(
     *,
     object_from_upright: Array | None = None,
     axes: str = CAMERA_AXES,
+    unit: Literal["m", "mm"] = "m",
 ) -> None:
     """Write a mesh; the ending of `out` selects the format.
 
-    Coordinates, in m, stay as they are in every format. In glTF y is up, so that the node of a GLB turns a mesh that is
+    Coordinates stay as they are in every format. In glTF y is up, so that the node of a GLB turns a mesh that is
     given in the camera's axes: viewers show it as it stood, from the camera's side. PLY, OBJ and GLB keep normals and
     colours, PLY alone what is known of the vertices; STL holds neither.
 
@@ -86,6 +80,7 @@ def write_mesh(
         object_from_upright: (3, 3) right, down and forward of the view in which a GLB is shown; None: the camera's own;
             `AS_GIVEN`: the node of a GLB does not turn the mesh.
         axes: what the axes are, in words, for formats that have room for them.
+        unit: of the coordinates as they are given.
 
     Raises:
         InputError: where the ending is unknown or a file cannot be written.
@@ -105,11 +100,11 @@ def write_mesh(
                 _, material, image = files_of(out, textured=True)
                 write_atomically(image, _png(texture))
                 write_atomically(material, _material(image.name))
-            write_atomically(out, _obj(model, "_".join(out.stem.split()), texture, axes))
+            write_atomically(out, _obj(model, "_".join(out.stem.split()), texture, f"{unit}, {axes}"))
         case ".glb":
             write_atomically(out, _glb(model, texture, object_from_upright))
         case _:
-            write_atomically(out, _stl(model))
+            write_atomically(out, _stl(model, unit))
 
 
 def _png(texture: Texture) -> bytes:
@@ -125,9 +120,9 @@ def _material(image: str) -> str:
     return f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {image}\n"
 
 
-def _obj(model: ObjectModel, name: str, texture: Texture | None, axes: str) -> str:
+def _obj(model: ObjectModel, name: str, texture: Texture | None, header: str) -> str:
     """Return an OBJ file; colours of vertices follow their coordinates, as most programs read them."""
-    lines = [f"# metres, {axes}\no {name}"]
+    lines = [f"# {header}\no {name}"]
     places = model.vertices_m
     if texture is None and model.vertex_colours is not None:
         places = np.concatenate([places, model.vertex_colours / 255.0], axis=1)
@@ -172,14 +167,14 @@ def _glb(model: ObjectModel, texture: Texture | None, object_from_upright: Array
     return data
 
 
-def _stl(model: ObjectModel) -> bytes:
+def _stl(model: ObjectModel, unit: str) -> bytes:
     """Return a binary STL file."""
     corners = model.vertices_m[model.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     faces = np.zeros(len(corners), dtype=[("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("spare", "<u2")])
     faces["normal"], faces["corners"] = normals, corners
-    return b"binary STL, metres".ljust(80) + np.uint32(len(corners)).tobytes() + faces.tobytes()
+    return f"binary STL, {unit}".encode().ljust(80) + np.uint32(len(corners)).tobytes() + faces.tobytes()
 
 
 def simplified(model: ObjectModel, triangles: int) -> ObjectModel:
@@ -258,61 +253,3 @@ def _scale_rgb(shares: Array) -> Array:
     from matplotlib import colormaps
 
     return 255.0 * colormaps["cividis"](np.clip(shares, 0.0, 1.0))[:, :3]
-
-
-def write_bop(model: ObjectModel, out: Path) -> None:
-    """Write a mesh in mm, its origin in the centre of its box, with its entry in `models_info.json` beside it.
-
-    The entry has the diameter and the box as BOP defines them, and `origin_m`: where in the object frame of the run the
-    model's origin lies. Entries of other objects stay.
-
-    Args:
-        model: the mesh.
-        out: PLY file whose name ends in the number of the object (`obj_000001.ply`); without a number it is object 1.
-
-    Raises:
-        InputError: where the name is not that of a PLY file, or a file cannot be read or written.
-    """
-    if out.suffix.lower() != ".ply":
-        raise InputError(f"{out}: BOP models are PLY files; choose a name such as obj_000001.ply")
-    digits = re.search(r"(\d+)$", out.stem)
-    number = str(int(digits.group(1))) if digits else "1"
-    low, high = model.vertices_m.min(axis=0), model.vertices_m.max(axis=0)
-    origin_m = 0.5 * (low + high)
-    places_mm = 1000.0 * (model.vertices_m - origin_m)
-    path = out.with_name(MODELS_INFO)
-    entries = _entries(path)
-    size_mm = 1000.0 * (high - low)
-    entries[number] = {
-        "diameter": _diameter(places_mm),
-        **{f"min_{axis}": float(value) for axis, value in zip("xyz", -0.5 * size_mm, strict=True)},
-        **{f"size_{axis}": float(value) for axis, value in zip("xyz", size_mm, strict=True)},
-        "origin_m": origin_m.tolist(),
-    }
-    write_atomically(out, ply_bytes(places_mm, model.vertex_normals, model.vertex_colours, model.triangles))
-    write_atomically(path, json.dumps(dict(sorted(entries.items(), key=lambda entry: int(entry[0]))), indent=2) + "\n")
-
-
-def _entries(path: Path) -> dict[str, Any]:
-    """Return the entries of other objects, by their numbers, in a `models_info.json` whose folder is made if need be.
-
-    Raises:
-        InputError: where it cannot be read, or is no such file.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path.parent}: cannot be used ({error.strerror}); choose another place") from error
-    entries = read_json(path) if os.path.lexists(path) else {}
-    if not isinstance(entries, dict) or not all(number.isdecimal() for number in entries):
-        raise InputError(f"{path}: lists no objects by their numbers; mend it or choose another folder")
-    return entries
-
-
-def _diameter(points: Array) -> float:
-    """Return the largest distance between two points (n, 3)."""
-    try:
-        points = points[ConvexHull(points).vertices]
-    except QhullError:  # flat
-        points = np.unique(points, axis=0)
-    return float(pdist(points).max()) if len(points) > 1 else 0.0

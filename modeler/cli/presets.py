@@ -1,0 +1,308 @@
+"""`modeler export --for`: a model as a pose estimator, a simulator or a printer takes it, and checked."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+
+from modeler import export as files
+from modeler import se3
+from modeler.cli.console import say
+from modeler.cli.convert import finest_unit_mm
+from modeler.cli.inputs import Reopened, reopened
+from modeler.cli.outputs import check_files, check_folder, run_inputs
+from modeler.export import bop, physics, solids
+from modeler.export.checks import Checks, loaded, mesh_checks
+from modeler.export.texture import TRIANGLES, Texture
+from modeler.fusion import Fuser, FusionVolume
+from modeler.types import InputError, ObjectModel
+from sequences import write_bop
+
+if TYPE_CHECKING:
+    from modeler.cli.export import Export
+
+Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "print"]
+
+_FILES: Final = {"foundationpose": ".obj", "print": ".stl"}
+_PLAIN_TRIANGLES: Final = 50_000  # of a mesh without texture, whose vertices carry the colours
+_DENSITY_KG_M3: Final = 1000.0  # of water; plastics have 900 to 1400, wood 400 to 800, most boxes are hollow
+_LEAST_FOOTPRINT: Final = 0.02  # of the box: what stands on less is not flat at the bottom
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One export for one program."""
+
+    options: Export
+    """What was asked for."""
+    purpose: Purpose
+    """Which program it is for."""
+
+    def run(self) -> int:
+        """Write the files, read them back, and say what was checked; 3 where a check fails.
+
+        Raises:
+            InputError: where options exclude each other, or something cannot be read or written.
+        """
+        options = self.options
+        self._refuse()
+        inputs = run_inputs([options.run_folder], options.moved.sequence)
+        if self.purpose in _FILES:
+            if options.out.suffix.lower() != _FILES[self.purpose]:
+                raise InputError(
+                    f"{options.out}: --for {self.purpose} writes {_FILES[self.purpose]}; give --out such a name"
+                )
+        else:
+            check_folder(options.out, inputs)
+            if os.path.lexists(options.out) and not options.out.is_dir():
+                raise InputError(f"{options.out}: is no folder; choose another --out")
+        report = files.RunFolder(options.run_folder).result()
+        if not report.get("poses"):
+            raise InputError(f"{options.run_folder}: no frame of this run was accepted; report.json says why")
+        check_files(self._outs(textured=True), inputs, overwrite=options.overwrite)
+        made = getattr(self, f"_{self.purpose}")()
+        say(made.words)
+        return 3 if made.failed else 0
+
+    def _refuse(self) -> None:
+        """Refuse options that the preset decides.
+
+        Raises:
+            InputError: where one is given.
+        """
+        given = [
+            name for name in ("origin", "up", "watertight", "texture", "bop", "tint") if getattr(self.options, name)
+        ]
+        if given:
+            raise InputError(f"--for {self.purpose} decides on --{given[0]}; leave it out")
+        of_bodies = [
+            name
+            for name, value in (("density-kg-m3", self.options.density_kg_m3), ("mass-kg", self.options.mass_kg))
+            if value is not None
+        ]
+        if of_bodies and self.purpose not in ("mujoco", "urdf"):
+            raise InputError(f"--{of_bodies[0]} goes with --for mujoco and --for urdf alone")
+
+    def _outs(self, *, textured: bool) -> tuple[Path, ...]:
+        """Return the files that are written, but for convex parts and scenes, whose number is not known before."""
+        out = self.options.out
+        if self.purpose == "bop":
+            return (self._bop_model, self._bop_model.with_name(bop.MODELS_INFO))
+        if self.purpose in _FILES:
+            meshes = files.files_of(out, textured=textured and self.purpose == "foundationpose")
+            return (*meshes, files.pose_file(out))
+        of = physics.PhysicsFiles(out, textured)
+        model = (of.mjcf, of.scene) if self.purpose == "mujoco" else (of.urdf,)
+        return (*model, *files.files_of(of.visual, textured=textured), files.pose_file(of.visual), of.part(0))
+
+    @cached_property
+    def _reopened(self) -> Reopened:
+        return reopened(self.options.run_folder, self.options.moved.sequence)
+
+    @cached_property
+    def _volume(self) -> FusionVolume:
+        run = self._reopened
+        return run.volume(Fuser(voxel_m=self.options.voxel_m or run.report["settings"].get("voxel_m")))
+
+    def _model(self, *, watertight: bool) -> ObjectModel:
+        """Return the mesh in the object frame.
+
+        Raises:
+            InputError: where the views give no surface.
+        """
+        model = self._volume.model(watertight=watertight)
+        if not len(model.triangles):
+            raise InputError(f"{self.options.run_folder}: its views give no surface; more of them are needed")
+        return model
+
+    def _coloured(self, model: ObjectModel) -> tuple[ObjectModel, Texture | None]:
+        """Return the mesh, simplified and without degenerate triangles, with its texture where frames have colour."""
+        coloured = self._volume.views.coloured
+        count = self.options.triangles or (TRIANGLES if coloured else _PLAIN_TRIANGLES)
+        model = solids.without_degenerate(files.simplified(model, count))
+        if not coloured:
+            return model, None
+        return files.textured(model, self._volume.texture_colours, self._volume.texel_m)
+
+    def _foundationpose(self) -> Checks:
+        out = self.options.out
+        model, texture = self._coloured(self._model(watertight=False))
+        place = files.placement(model, self._reopened.report, "bbox", "z")
+        files.write_mesh(place.placed(model), out, texture, axes=place.axes)
+        place.write(out)
+        self._tell(place)
+        checks = mesh_checks(out, most_triangles=physics.MOST_TRIANGLES)
+        if texture is None:
+            return checks.also(True, "no texture, for the frames have no colour")
+        mesh = loaded(out)
+        height, width = texture.image.shape[:2]
+        uv = np.asarray(mesh.visual.uv)
+        return checks.also(
+            bool(mesh.visual.material.image is not None and np.isfinite(uv).all()),
+            f"texture of {width} x {height} px",
+            "its texture cannot be read",
+        )
+
+    def _print(self) -> Checks:
+        out = self.options.out
+        model = self._model(watertight=True)
+        if self.options.triangles is not None:
+            model = files.simplified(model, self.options.triangles)
+        place = files.placement(model, self._reopened.report, "base", "z")
+        base_known = place.up_from == "support"
+        flat = solids.with_flat_bottom(place.placed(model), self._volume.grid.voxel_m if base_known else None)
+        files.write_mesh(replace(flat, vertices_m=1000.0 * flat.vertices_m), out, axes=place.axes, unit="mm")
+        place.write(out, unit="mm")
+        self._tell(place)
+        mesh = loaded(out)
+        corners_m = np.asarray(mesh.vertices, dtype=np.float64) / 1000.0
+        area_m2 = solids.bottom_area_m2(corners_m, np.asarray(mesh.faces))
+        footprint_m2 = float(np.prod(np.ptp(corners_m[:, :2], axis=0)))
+        how = "" if base_known else " (cut there, for no support was seen)"
+        size = " x ".join(f"{length:.1f}" for length in 1000.0 * np.ptp(corners_m, axis=0))
+        return (
+            Checks()
+            .also(bool(mesh.is_watertight and mesh.is_winding_consistent), "watertight")
+            .also(bool(mesh.volume > 0.0), f"{mesh.volume / 1000.0:.1f} cm³", "it encloses no volume")
+            .also(
+                area_m2 > _LEAST_FOOTPRINT * footprint_m2,
+                f"bottom flat on {1e4 * area_m2:.1f} cm²{how}",
+                f"its bottom is flat on {1e4 * area_m2:.1f} cm² alone",
+            )
+            .also(True, f"{size} mm")
+        )
+
+    def _mujoco(self) -> Checks:
+        of, body, parts = self._body()
+        physics.write_mjcf(of, body, parts)
+
+        def settles() -> tuple[bool, str]:
+            settled = physics.settled_in_mujoco(of.scene)
+            return settled.at_rest, settled.words
+
+        return self._solid_checks(of, body, parts).attempt(settles, "MuJoCo is not installed, so not loaded there")
+
+    def _urdf(self) -> Checks:
+        of, body, parts = self._body()
+        physics.write_urdf(of, body, parts)
+
+        def settles() -> tuple[bool, str]:
+            with _quiet():  # PyBullet writes to stdout by itself
+                settled = physics.settled_in_pybullet(of.urdf, physics.drop_height_m(parts))
+            return settled.at_rest, settled.words
+
+        return self._solid_checks(of, body, parts).attempt(settles, "PyBullet is not installed, so not loaded there")
+
+    def _body(self) -> tuple[physics.PhysicsFiles, solids.Body, solids.ConvexParts]:
+        """Write the visual mesh and the convex parts, and return them with mass and inertia."""
+        whole = self._model(watertight=True)
+        place = files.placement(whole, self._reopened.report, "base", "z")
+        density = self.options.density_kg_m3 or _DENSITY_KG_M3
+        body = solids.body_of(place.placed(whole), density_kg_m3=density, mass_kg=self.options.mass_kg)
+        parts = solids.convex_parts(place.placed(whole))
+        model, texture = self._coloured(whole)
+        of = physics.PhysicsFiles(self.options.out, texture is not None)
+        files.write_mesh(place.placed(model), of.visual, texture, axes=place.axes)
+        place.write(of.visual)
+        physics.write_parts(of, parts)
+        self._tell(place)
+        told = "as given" if self.options.mass_kg is not None else f"at {density:g} kg/m³"
+        say(f"{body.mass_kg:.3g} kg {told}; friction {physics.FRICTION[0]:g}, a default: neither is measured")
+        return of, body, parts
+
+    def _solid_checks(self, of: physics.PhysicsFiles, body: solids.Body, parts: solids.ConvexParts) -> Checks:
+        return (
+            mesh_checks(of.visual, most_triangles=physics.MOST_TRIANGLES)
+            .also(True, f"closed around {1e6 * body.volume_m3:.1f} cm³")
+            .also(solids.is_possible_inertia(body.inertia_kg_m2), "inertia of a real body")
+            .also(
+                all(loaded(of.part(k)).is_convex for k in range(len(parts.meshes))), parts.method, "a part not convex"
+            )
+        )
+
+    @property
+    def _bop_model(self) -> Path:
+        return self.options.out / "models" / "obj_000001.ply"
+
+    def _bop(self) -> Checks:
+        run, out = self._reopened, self.options.out
+        scenes = {
+            f"obj_000001_{side}": {frame: run.views[frame] for frame in frames}
+            for side, frames in self._sides().items()
+        }
+        for name in scenes:
+            folder = out / "onboarding_static" / name
+            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+                raise InputError(f"{folder}: exists already; remove it or give another --out")
+        model = self._model(watertight=False)
+        if self.options.triangles is not None:
+            model = files.simplified(model, self.options.triangles)
+        model = solids.without_degenerate(model)
+        place = files.placement(model, run.report, "bbox", "z")
+        files.write_bop(model, self._bop_model, place)
+        self._tell(place)
+        placed, count = place.placed(model), 0
+        for name, views in scenes.items():
+            poses = {k: se3.inverse(run.solution.trajectory[k]) @ place.object_from_mesh for k in views}
+            shots = {k: view.frame for k, view in views.items() if k in poses}
+            farthest_m = max(float(np.nanmax(frame.depth_m)) for frame in shots.values())
+            write_bop(
+                out / "onboarding_static" / name,
+                shots.values(),
+                poses,
+                {"name": run.name},
+                depth_scale_mm=finest_unit_mm(farthest_m),
+                files={"scene_gt_info.json": files.scene_gt_info(placed, shots.values(), poses).encode()},
+            )
+            count += len(shots)
+        words = f"{count} frames with masks, boxes and poses in {len(scenes)} scene{'s' if len(scenes) > 1 else ''}"
+        return mesh_checks(self._bop_model, unit_m=1e-3, most_triangles=10**7).also(self._reads_back(scenes), words)
+
+    def _sides(self) -> dict[str, list[int]]:
+        """Return the frames of each scene: BOP's static onboarding has one of the object upright, one turned over."""
+        run, sides = self._reopened, {}
+        for number, part in enumerate(run.parts):
+            side = ("up", "down")[number] if number < 2 else f"part{number + 1}"
+            own = (frame + part.offset for frame in part.accepted)
+            sides[side] = [frame for frame in own if frame in run.views and frame in run.solution.trajectory]
+        return {side: frames for side, frames in sides.items() if frames}
+
+    def _reads_back(self, scenes: dict[str, dict]) -> bool:
+        """Return whether the scenes are read with a pose and a mask for every frame."""
+        from sequences import open_sequence
+
+        for name, views in scenes.items():
+            sequence = open_sequence(self.options.out / "onboarding_static" / name)
+            truth = sequence.truth() or {}
+            if {*sequence.indices} != {*views} or {*truth} != {*views}:
+                return False
+            if any(sequence.frame(index).mask is None for index in views):
+                return False
+        return True
+
+    def _tell(self, place: files.Placement) -> None:
+        say(f"{self.options.out}: {place.words}")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what compiled code writes to stdout away from it."""
+    sys.stdout.flush()
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        ctypes.CDLL(None).fflush(None)  # what C has not written yet
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)

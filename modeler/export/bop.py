@@ -1,0 +1,136 @@
+"""BOP models: meshes in mm with their entry in `models_info.json`, and what a scene shows of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import pdist
+
+from modeler.export.files import write_atomically
+from modeler.export.formats import ply_bytes
+from modeler.export.placing import Placement
+from modeler.regular_files import read_json
+from modeler.types import Array, BoolArray, Frame, InputError, ObjectModel
+
+MODELS_INFO = "models_info.json"
+"""BOP's list of models, beside them."""
+
+
+def write_bop(
+    model: ObjectModel, out: Path, place: Placement | None = None, more: Mapping[str, Any] | None = None
+) -> None:
+    """Write a mesh in mm, its origin in the centre of its box, with its entry in `models_info.json` beside it.
+
+    The entry has the diameter and the box as BOP defines them, and `origin_m`: where in the object frame of the run the
+    model's origin lies. Entries of other objects stay.
+
+    Args:
+        model: the mesh, in the object frame.
+        place: another frame; its `object_from_mesh` (16, row by row, m) then stands in the entry.
+        more: what else the entry is to hold.
+        out: PLY file whose name ends in the number of the object (`obj_000001.ply`); without a number it is object 1.
+
+    Raises:
+        InputError: where the name is not that of a PLY file, or a file cannot be read or written.
+    """
+    if out.suffix.lower() != ".ply":
+        raise InputError(f"{out}: BOP models are PLY files; choose a name such as obj_000001.ply")
+    digits = re.search(r"(\d+)$", out.stem)
+    number = str(int(digits.group(1))) if digits else "1"
+    if place is None:
+        origin_m = 0.5 * (model.vertices_m.min(axis=0) + model.vertices_m.max(axis=0))
+        where = {"origin_m": origin_m.tolist()}
+        model = replace(model, vertices_m=model.vertices_m - origin_m)
+    else:
+        where = {"object_from_mesh": place.object_from_mesh.ravel().tolist()}
+        model = place.placed(model)
+    places_mm = 1000.0 * model.vertices_m
+    path = out.with_name(MODELS_INFO)
+    entries = _entries(path)
+    low_mm, size_mm = places_mm.min(axis=0), np.ptp(places_mm, axis=0)
+    entries[number] = {
+        "diameter": _diameter(places_mm),
+        **{f"min_{axis}": float(value) for axis, value in zip("xyz", low_mm, strict=True)},
+        **{f"size_{axis}": float(value) for axis, value in zip("xyz", size_mm, strict=True)},
+        **(more or {}),
+        **where,
+    }
+    write_atomically(out, ply_bytes(places_mm, model.vertex_normals, model.vertex_colours, model.triangles))
+    write_atomically(path, json.dumps(dict(sorted(entries.items(), key=lambda entry: int(entry[0]))), indent=2) + "\n")
+
+
+def _entries(path: Path) -> dict[str, Any]:
+    """Return the entries of other objects, by their numbers, in a `models_info.json` whose folder is made if need be.
+
+    Raises:
+        InputError: where it cannot be read, or is no such file.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path.parent}: cannot be used ({error.strerror}); choose another place") from error
+    entries = read_json(path) if os.path.lexists(path) else {}
+    if not isinstance(entries, dict) or not all(number.isdecimal() for number in entries):
+        raise InputError(f"{path}: lists no objects by their numbers; mend it or choose another folder")
+    return entries
+
+
+def _diameter(points: Array) -> float:
+    """Return the largest distance between two points (n, 3)."""
+    try:
+        points = points[ConvexHull(points).vertices]
+    except QhullError:  # flat
+        points = np.unique(points, axis=0)
+    return float(pdist(points).max()) if len(points) > 1 else 0.0
+
+
+def scene_gt_info(model: ObjectModel, frames: Iterable[Frame], camera_from_model: Mapping[int, Array]) -> str:
+    """Return `scene_gt_info.json` of frames with masks: boxes and counts of pixels, as BOP defines them.
+
+    Args:
+        model: the mesh, in m.
+        frames: with the object's visible pixels as mask.
+        camera_from_model: (4, 4), m, by frame number.
+    """
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    tensor = o3d.core.Tensor.from_numpy
+    scene.add_triangles(tensor(model.vertices_m.astype(np.float32)), tensor(model.triangles.astype(np.uint32)))
+    entries = {}
+    for frame in frames:
+        pose = camera_from_model[frame.index]
+        w, h = frame.camera.rays()
+        directions = np.stack([w, h, np.ones_like(w)], axis=-1) @ pose[:3, :3]  # rotated into the model's frame
+        origins = np.broadcast_to(-pose[:3, :3].T @ pose[:3, 3], directions.shape)
+        rays = tensor(np.concatenate([origins, directions], axis=-1).astype(np.float32))
+        silhouette = np.isfinite(scene.cast_rays(rays)["t_hit"].numpy())
+        visible = np.zeros_like(silhouette) if frame.mask is None else frame.mask
+        whole, seen = int(silhouette.sum()), int(visible.sum())
+        entries[str(frame.index)] = [
+            {
+                "bbox_obj": _box(silhouette),
+                "bbox_visib": _box(visible),
+                "px_count_all": whole,
+                "px_count_valid": int((silhouette & np.isfinite(frame.depth_m)).sum()),
+                "px_count_visib": seen,
+                "visib_fract": min(1.0, seen / whole) if whole else 0.0,
+            }
+        ]
+    return "{\n" + ",\n".join(f' "{index}": {json.dumps(entry)}' for index, entry in entries.items()) + "\n}\n"
+
+
+def _box(mask: BoolArray) -> list[int]:
+    """Return left, top, width and height in px of the pixels of a mask (h, w); -1 where there are none."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return [-1, -1, -1, -1]
+    return [int(columns[0]), int(rows[0]), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1]

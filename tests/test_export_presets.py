@@ -1,0 +1,272 @@
+"""Models for pose estimators, simulators and printers: what is written holds what the mesh holds."""
+
+import json
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from commanded import Run
+from made_up import ball
+
+from modeler import se3
+from modeler.export import physics, solids
+from modeler.export.checks import Checks, mesh_checks
+from modeler.types import Array, InputError, ObjectModel
+from sequences import open_sequence
+
+SIDES_M = np.array([0.06, 0.1, 0.2])
+
+
+def brick(pose: Array | None = None) -> ObjectModel:
+    """A solid box, at the origin unless a pose (4, 4) is given."""
+    box = trimesh.creation.box(SIDES_M)
+    pose = np.eye(4) if pose is None else pose
+    return ObjectModel(
+        points_m=np.zeros((0, 3)),
+        normals=np.zeros((0, 3)),
+        colours=None,
+        vertices_m=se3.transform(pose, np.asarray(box.vertices)),
+        triangles=np.asarray(box.faces, dtype=np.int64),
+        vertex_normals=np.asarray(box.vertex_normals) @ pose[:3, :3].T,
+        vertex_colours=None,
+    )
+
+
+def box_inertia(mass_kg: float) -> Array:
+    squares = SIDES_M**2
+    return np.diag(mass_kg / 12.0 * (squares.sum() - squares))
+
+
+def test_mass_and_inertia_of_a_box_are_those_of_the_closed_form_in_any_pose(rng: np.random.Generator) -> None:
+    for _ in range(5):
+        pose = se3.exp(rng.normal(size=6))
+        body = solids.body_of(brick(pose), density_kg_m3=700.0)
+        mass = 700.0 * SIDES_M.prod()
+        assert body.mass_kg == pytest.approx(mass, rel=1e-9)
+        assert body.volume_m3 == pytest.approx(SIDES_M.prod(), rel=1e-9)
+        np.testing.assert_allclose(body.centre_m, pose[:3, 3], atol=1e-9)
+        expected = pose[:3, :3] @ box_inertia(mass) @ pose[:3, :3].T
+        np.testing.assert_allclose(body.inertia_kg_m2, expected, atol=1e-9 * mass)
+        assert solids.is_possible_inertia(body.inertia_kg_m2)
+        known = solids.body_of(brick(pose), density_kg_m3=1.0, mass_kg=2.0)
+        np.testing.assert_allclose(known.inertia_kg_m2, expected * 2.0 / mass, atol=1e-9)
+    assert not solids.is_possible_inertia(np.diag([1.0, 1.0, 2.1]))
+    assert not solids.is_possible_inertia(np.diag([-1.0, 1.0, 1.0]))
+
+
+def test_an_open_mesh_is_no_solid() -> None:
+    opened = replace(ball(), triangles=ball().triangles[1:])
+    inside_out = replace(ball(), triangles=ball().triangles[:, ::-1])
+    for wrong in (opened, inside_out):
+        with pytest.raises(InputError, match="encloses no volume"):
+            solids.body_of(wrong, density_kg_m3=1000.0)
+
+
+def test_without_its_library_a_body_collides_as_its_convex_hull(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    parts = solids.convex_parts(ball())
+    ((vertices_m, triangles),) = parts.meshes
+    hull = trimesh.Trimesh(vertices_m, triangles)
+    assert "one convex hull" in parts.method
+    assert "not installed" in parts.method
+    assert hull.is_convex
+    assert len(triangles) <= solids.HULL_TRIANGLES
+    assert hull.volume == pytest.approx(4.0 / 3.0 * np.pi * 0.05**3, rel=0.06)
+
+
+def test_concave_bodies_become_several_convex_parts() -> None:
+    pytest.importorskip("coacd")
+    ring = trimesh.creation.torus(0.05, 0.015, 48, 24)
+    model = replace(ball(coloured=False), vertices_m=np.asarray(ring.vertices), triangles=np.asarray(ring.faces))
+    parts = solids.convex_parts(model)
+    assert len(parts.meshes) > 3
+    pieces = [trimesh.Trimesh(*mesh) for mesh in parts.meshes]
+    assert all(piece.is_convex for piece in pieces)
+    assert sum(piece.volume for piece in pieces) == pytest.approx(ring.volume, rel=0.25)
+    assert not any(piece.contains([[0.0, 0.0, 0.0]])[0] for piece in pieces)  # the hole stays open
+
+
+@pytest.mark.parametrize("laid_m", [1e-3, None])
+def test_a_print_stands_flat_and_stays_closed(laid_m: float | None) -> None:
+    fine = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
+    places_m = fine.vertices + np.array([0.0, 0.0, 0.0485])  # 1.5 mm of it below the plane
+    lifted = replace(ball(), vertices_m=places_m, triangles=np.asarray(fine.faces))
+    flat = solids.with_flat_bottom(lifted, laid_m)
+    mesh = trimesh.Trimesh(flat.vertices_m, flat.triangles)
+    assert mesh.is_watertight
+    assert flat.vertices_m[:, 2].min() == 0.0
+    assert solids.bottom_area_m2(flat.vertices_m, flat.triangles) > 3e-4
+    assert solids.bottom_area_m2(lifted.vertices_m, lifted.triangles) == 0.0
+    assert mesh.volume == pytest.approx(fine.volume, rel=0.01)
+
+
+def written(folder: Path) -> tuple[physics.PhysicsFiles, solids.Body]:
+    """A box that leans, 2 kg, written for simulators; its inertia has products of every sign."""
+    pose = se3.exp(np.array([0.3, -0.2, 0.5, 0.02, 0.01, 0.1]))
+    body = solids.body_of(brick(pose), density_kg_m3=1.0, mass_kg=2.0)
+    of, parts = (
+        physics.PhysicsFiles(folder / "a box", coloured=False),
+        solids.ConvexParts(((brick(pose).vertices_m, brick().triangles),), "itself"),
+    )
+    physics.write_parts(of, parts)
+    of.visual.write_bytes(of.part(0).read_bytes())
+    physics.write_mjcf(of, body, parts)
+    physics.write_urdf(of, body, parts)
+    return of, body
+
+
+def test_simulators_files_hold_mass_and_inertia_in_their_own_order(tmp_path: Path) -> None:
+    of, body = written(tmp_path)
+    inertial = ElementTree.parse(of.mjcf).find(".//inertial")
+    assert inertial is not None
+    xx, yy, zz, xy, xz, yz = map(float, inertial.attrib["fullinertia"].split())
+    np.testing.assert_allclose([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], body.inertia_kg_m2, rtol=1e-7)
+    tree = ElementTree.parse(of.urdf)
+    tags = {name: tree.find(f".//inertial/{name}") for name in ("inertia", "origin", "mass")}
+    found = {name: tag.attrib for name, tag in tags.items() if tag is not None}
+    for name, place in (
+        ("ixx", (0, 0)),
+        ("ixy", (0, 1)),
+        ("ixz", (0, 2)),
+        ("iyy", (1, 1)),
+        ("iyz", (1, 2)),
+        ("izz", (2, 2)),
+    ):
+        assert float(found["inertia"][name]) == pytest.approx(body.inertia_kg_m2[place], rel=1e-6)
+    assert float(found["mass"]["value"]) == pytest.approx(2.0)
+    np.testing.assert_allclose(list(map(float, found["origin"]["xyz"].split())), body.centre_m, rtol=1e-6)
+    assert of.mjcf.name == "a_box.xml"
+
+
+def test_mujoco_takes_the_body_as_it_is(tmp_path: Path) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    of, body = written(tmp_path)
+    model = mujoco.MjModel.from_xml_path(str(of.scene))
+    assert model.body_mass[1] == pytest.approx(2.0)
+    np.testing.assert_allclose(np.sort(model.body_inertia[1]), np.linalg.eigvalsh(body.inertia_kg_m2), rtol=1e-6)
+    assert physics.settled_in_mujoco(of.scene).at_rest
+
+
+def test_pybullet_takes_the_body_as_it_is(tmp_path: Path) -> None:
+    pybullet = pytest.importorskip("pybullet")
+    of, _ = written(tmp_path)
+    client = pybullet.connect(pybullet.DIRECT)
+    number = pybullet.loadURDF(str(of.urdf), flags=pybullet.URDF_USE_INERTIA_FROM_FILE)
+    dynamics = pybullet.getDynamicsInfo(number, -1)
+    pybullet.disconnect(client)
+    assert dynamics[0] == pytest.approx(2.0)
+    assert dynamics[1] == pytest.approx(physics.FRICTION[0])
+    assert physics.settled_in_pybullet(of.urdf, 0.2).at_rest
+
+
+def test_checks_tell_what_does_not_hold(tmp_path: Path) -> None:
+    path = tmp_path / "ball.ply"
+    trimesh.Trimesh(ball().vertices_m * 1000.0, [*ball().triangles, [0, 0, 1]], process=False).export(path)
+    checks = mesh_checks(path, most_triangles=10)
+    assert len(checks.failed) == 3  # size, number, degenerate
+    assert not checks.held
+    assert "FAILED" in checks.words
+    in_mm = mesh_checks(path, unit_m=1e-3, most_triangles=10**6)
+    assert [words for words in in_mm.failed if "degenerate" not in words] == []
+
+    def refuses() -> tuple[bool, str]:
+        raise ValueError("no\nsuch thing")
+
+    def is_absent() -> tuple[bool, str]:
+        raise ImportError
+
+    assert Checks().attempt(refuses, "absent").failed == ("no such thing",)
+    assert Checks().attempt(is_absent, "absent").held == ("absent",)
+
+
+@pytest.mark.parametrize(
+    ("purpose", "name", "files"),
+    [
+        ("foundationpose", "box.obj", {"box.obj", "box.obj.pose.json"}),
+        ("print", "box.stl", {"box.stl", "box.stl.pose.json"}),
+        ("mujoco", "mj", {"mj.xml", "scene.xml", "visual.obj", "visual.obj.pose.json"}),
+        ("urdf", "ur", {"ur.urdf", "visual.obj", "visual.obj.pose.json"}),
+        ("bop", "bop", {"models", "onboarding_static"}),
+    ],
+)
+def test_every_preset_ends_with_what_was_checked(
+    cli: Run, built: Path, tmp_path: Path, purpose: str, name: str, files: set[str]
+) -> None:
+    out = tmp_path / name
+    ended = cli("export", built, "--for", purpose, "--out", out)
+    last = ended.err.splitlines()[-1]
+    assert (ended.status, ended.out) == (0, ""), ended.err
+    assert last.startswith("modeler: checked: ")
+    folder = out if out.is_dir() else tmp_path
+    there = {
+        path.name
+        for path in folder.iterdir()
+        if not path.name.startswith(("part_", "box.mtl", "box.png", "visual.mtl", "visual.png"))
+    }
+    assert there == files
+    if purpose == "print":
+        mesh = trimesh.load_mesh(out)
+        assert mesh.is_watertight
+        assert 20.0 < mesh.extents.max() < 400.0  # mm
+    if purpose == "bop":
+        _check_bop(out, built)
+    again = cli("export", built, "--for", purpose, "--out", out)
+    assert (again.status, again.err.count("\n")) == (2, 1)
+    assert "exists already" in again.err
+
+
+def _check_bop(out: Path, built: Path) -> None:
+    """The poses of the scene take the model, in mm, to the depth that its frames show."""
+    (entry,) = json.loads((out / "models" / "models_info.json").read_text()).values()
+    mesh = trimesh.load_mesh(out / "models" / "obj_000001.ply", process=False)
+    np.testing.assert_allclose(mesh.bounds.sum(axis=0), 0.0, atol=1e-3)
+    assert mesh.extents[2] == pytest.approx(entry["size_z"], rel=1e-6)
+    scene = out / "onboarding_static" / "obj_000001_up"
+    sequence = open_sequence(scene)
+    truth, info = sequence.truth(), json.loads((scene / "scene_gt_info.json").read_text())
+    assert truth is not None
+    assert {str(index) for index in sequence.indices} == {*info}
+    for index in sequence.indices:
+        frame = sequence.frame(index)
+        assert frame.mask is not None
+        points = se3.transform(truth[index], np.asarray(mesh.vertices) / 1000.0)
+        column = np.rint(points[:, 0] / points[:, 2] * frame.camera.fx + frame.camera.cx).astype(int)
+        row = np.rint(points[:, 1] / points[:, 2] * frame.camera.fy + frame.camera.cy).astype(int)
+        inside = (column >= 0) & (row >= 0) & (column < frame.camera.width) & (row < frame.camera.height)
+        row, column, depth = row[inside], column[inside], points[inside, 2]
+        facing = frame.mask[row, column] & (np.abs(frame.depth_m[row, column] - depth) < 0.01)
+        assert facing.mean() > 0.2  # the side that this frame sees
+        (told,) = info[str(index)]
+        assert told["px_count_visib"] == frame.mask.sum()
+        assert 0.5 < told["visib_fract"] <= 1.0
+        left, top, width, height = told["bbox_obj"]
+        assert left - 2 <= column.min()
+        assert column.max() <= left + width + 2
+        assert top - 2 <= row.min()
+        assert row.max() <= top + height + 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--for", "print", "--out", "a.obj"), "writes .stl"),
+        (("--for", "foundationpose", "--out", "a.stl"), "writes .obj"),
+        (("--for", "print", "--out", "a.stl", "--up", "y"), "decides on --up"),
+        (("--for", "bop", "--out", "a", "--mass-kg", "1"), "goes with --for mujoco"),
+        (("--for", "urdf", "--out", "a", "--mass-kg", "0"), "out of range"),
+        (("--for", "urdf", "--out", "a", "--mass-kg", "1", "--density-kg-m3", "1"), "give one of them"),
+        (("--out", "a.ply", "--mass-kg", "1"), "go with --for mujoco"),
+    ],
+)
+def test_presets_that_cannot_be_are_said_in_one_line(
+    cli: Run, built: Path, tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
+    ended = cli(
+        "export", built, *(tmp_path / word if word in ("a", "a.stl", "a.obj", "a.ply") else word for word in arguments)
+    )
+    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
+    assert words in ended.err
+    assert not list(tmp_path.iterdir())
