@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from modeler.cli.jobs import ENDED, Job, write_note
@@ -14,6 +16,15 @@ from modeler.cli.one_job import begin, end_with_the_parent
 
 BOOK = "book.txt"
 """Lines `name pair pid`, one a registration, in the folder of the batch."""
+
+
+PATIENCE_S = 60.0
+_STARTED = """
+import sys
+from modeler.cli import jobs, main
+jobs.BUILDER = "stand_in"
+sys.exit(main(sys.argv[1:]))
+"""
 
 
 def sequence(folder: Path, *, pairs: int = 3, status: int = 0, pause_s: float = 0.0, fails: int = 0) -> Path:
@@ -36,6 +47,20 @@ def book(out: Path) -> list[tuple[str, int]]:
     """Return the registrations of a batch in order: name and pair."""
     lines = (out / BOOK).read_text().splitlines() if (out / BOOK).exists() else []
     return [(line.split()[0], int(line.split()[1])) for line in lines]
+
+
+def started(*arguments: object) -> subprocess.Popen[str]:
+    """Start a batch, whose builds this file stands in for, in a process of its own."""
+    command = [sys.executable, "-c", _STARTED, "batch", *map(str, arguments)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    """Return when a condition comes true."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def build(job: Job) -> int:

@@ -6,9 +6,7 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import sys
-import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,7 @@ from typing import Any
 import pytest
 from commanded import QUICK, Run
 from kills.trials import SAME
-from stand_in import book, sequence
+from stand_in import PATIENCE_S, book, sequence, started, wait_for
 
 from modeler.cli import engines, jobs, parsed
 from modeler.cli.batch import Batch
@@ -27,7 +25,6 @@ from modeler.export.models_table import read_table
 from modeler.types import InputError
 
 HERE = Path(__file__).parent
-PATIENCE_S = 60.0
 
 
 @pytest.fixture(autouse=True)
@@ -231,27 +228,6 @@ def test_workers_fit_into_memory_and_cores(monkeypatch: pytest.MonkeyPatch) -> N
         assert engines.usual_workers() == workers
         assert engines.threads_of("processes", workers) * workers == 8
     assert engines.threads_of("dask:x", 1) == 1
-
-
-STARTED = """
-import sys
-from modeler.cli import jobs, main
-jobs.BUILDER = "stand_in"
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-def started(*arguments: object) -> subprocess.Popen[str]:
-    """Start a batch in a process of its own."""
-    command = [sys.executable, "-c", STARTED, "batch", *map(str, arguments)]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
-
-
-def wait_for(condition: Any) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def alive(out: Path) -> set[int]:

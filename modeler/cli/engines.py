@@ -104,9 +104,13 @@ def engine(name: str, workers: int | None) -> Iterator[Executor]:
 @contextlib.contextmanager
 def _dask(address: str) -> Iterator[Executor]:
     """Open an existing cluster through its executor interface."""
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said by us
+    distributed = importlib.import_module("distributed")
+    for name in logging.root.manager.loggerDict:
+        if name.startswith("distributed"):  # each has a level of its own; what matters is said by us
+            logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
-        client = importlib.import_module("distributed").Client(address, timeout=_PATIENCE_S, set_as_default=False)
+        distributed.comm.get_address_host(address)  # a client that was begun with nonsense would linger
+        client = distributed.Client(address, timeout=_PATIENCE_S, set_as_default=False)
     except (OSError, ValueError) as error:  # TimeoutError is an OSError
         raise InputError(f"--executor dask:{address}: no scheduler answers there ({error}); start one") from None
     try:

@@ -244,6 +244,7 @@ def write_failure(job: Job, line: str, status: int = 2) -> Ended:
     Raises:
         OSError: where the note cannot be written.
     """
+    job.note.parent.mkdir(parents=True, exist_ok=True)
     note = read_note(job.note)
     tries = note.get("tries", 0) + 1
     note |= {"sequence": job.sequence, "arguments": list(job.arguments), "status": status, "line": line}
