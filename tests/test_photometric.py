@@ -96,7 +96,7 @@ def test_moments_are_sums_over_matching_points(printed):
     pair = VisibilityLikelihood(colour=True).between(views[0], views[1], np.random.default_rng(0))
     assert pair.colour is not None
     forward, backward = pair.colour.projections(1, 1)
-    found = photometric.moments(rows(truth[None]), forward, backward, 0.002)[0]
+    found = photometric.moments(rows(truth[None]), (forward, backward), 0.002)[0]
     want = np.zeros(4)
     carried = ((truth, forward, pair.forward), (se3.inverse(truth), backward, pair.backward))
     for pose, projection, directed in carried:
@@ -119,20 +119,8 @@ def test_equations_of_features_are_those_of_planes_with_their_gradient(printed):
     pose, weight = se3.moved(truth[None], np.full((1, 6), 0.004), pair.centre_m)[0], 3.0
     projections = pair.forward.projection(1), pair.backward.projection(1)
     without = photometric.no_colour(projections[0]), photometric.no_colour(projections[1])
-    of_depth = _one(
-        rows(pose[None]), projections[0], projections[1], without[0], without[1], np.float32(0.0), pair.centre_m, 0.002
-    )
-    colours = pair.colour.projections(1, 1)
-    both = _one(
-        rows(pose[None]),
-        projections[0],
-        projections[1],
-        colours[0],
-        colours[1],
-        np.float32(weight),
-        pair.centre_m,
-        0.002,
-    )
+    of_depth = _one(rows(pose[None]), projections, without, np.float32(0.0), pair.centre_m, 0.002)
+    both = _one(rows(pose[None]), projections, pair.colour.projections(1, 1), np.float32(weight), pair.centre_m, 0.002)
     want = np.zeros(6), np.zeros((6, 6))
     for directed, carried, sign in ((pair.forward, pose, 1.0), (pair.backward, se3.inverse(pose), -1.0)):
         matches = directed.matches(rows(carried), 0.002)

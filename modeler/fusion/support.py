@@ -99,8 +99,8 @@ def _observed(
     """Return what `tsdf.observe` returns for the views of a block."""
     batches = [
         tsdf.observe(
-            np.ascontiguousarray(points_m[start : start + BATCH]),
-            np.ascontiguousarray(normals[start : start + BATCH]),
+            points_m[start : start + BATCH],
+            normals[start : start + BATCH],
             near_m,
             tau_m,
             *views.lookup,

@@ -26,9 +26,9 @@ def drop_stale(folder: Path) -> None:
 
 def compiled() -> bool:
     """Return whether kernels of the registration as they stand have been compiled on this machine."""
-    from modeler.kernels.point_likelihood import log_likelihoods
+    from modeler.kernels.point_likelihood import classify
 
-    return any(Path(str(log_likelihoods.stats.cache_path)).glob("point_likelihood.log_likelihoods-*.nbi"))
+    return any(Path(str(classify.stats.cache_path)).glob("point_likelihood.classify-*.nbi"))
 
 
 drop_stale(Path(__file__).parent)

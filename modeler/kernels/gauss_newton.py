@@ -8,8 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.kernels.lie_group import difference, retract
-from modeler.kernels.photometric import add_colour_equations, new_colour_workspace
-from modeler.kernels.point_to_plane import equations, new_workspace
+from modeler.kernels.photometric import CELL_SIZE, fetch_colours, linearise_features
+from modeler.kernels.point_likelihood import VECTOR_MATHS, ZERO, Projection, buffers, invert, project
+from modeler.kernels.point_to_plane import linearise
+from modeler.kernels.threads import over_rows
+
+_ROWS = 9  # of the equations of matches: six derivatives, residual, weight, and a buffer for products
 
 
 class Regulariser(NamedTuple):
@@ -25,72 +29,165 @@ class Regulariser(NamedTuple):
     """Largest rotation of a step."""
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def normal_equations(poses, forward, backward, colours, colours_back, weight, centre, surface_m):
-    """Return gradients (m, 6) and matrices (m, 6, 6) of poses (m, 12), see `point_to_plane.equations`.
+_NO_PRIOR = Regulariser(np.eye(4)[:3].ravel(), np.zeros((6, 6)), np.zeros(6), 0.0)
+
+
+def normal_equations(poses, surfaces, colours, weight, centre, surface_m):
+    """Return gradients (m, 6) and matrices (m, 6, 6) of poses (m, 12), see `equations`.
 
     Args:
         poses: rows of the 3×4 matrices of target_from_source.
-        forward: the `Projection` of the source's points in the target, and
-        backward: of the target's in the source.
-        colours: the `ColourProjection` of the source's points in the target, without points where there is none, and
-        colours_back: of the target's in the source.
+        surfaces: the `Projection` of the source's points in the target, and that of the target's in the source.
+        colours: likewise the two `ColourProjection`, without points where colours are not compared.
         weight: inverse variance of the difference of features (method.md, eq. 20).
         centre: (3,) point of the source in m.
         surface_m: noise of the surfaces in m beyond that of points and planes.
     """
-    group = 16  # poses per workspace
-    gradients, matrices = np.empty((poses.shape[0], 6)), np.empty((poses.shape[0], 6, 6))
-    for number in numba.prange((poses.shape[0] + group - 1) // group):
-        workspace, colour_workspace = new_workspace(forward, backward), new_colour_workspace(colours, colours_back)
-        for i in range(number * group, min((number + 1) * group, poses.shape[0])):
-            equations(poses[i], forward, backward, centre, surface_m, workspace, gradients[i], matrices[i])
-            add_colour_equations(
-                poses[i],
-                colours,
-                colours_back,
-                weight,
-                centre,
-                surface_m,
-                colour_workspace,
-                gradients[i],
-                matrices[i],
-            )
+    _, gradients, matrices = over_rows(_iterate, poses, surfaces, colours, weight, centre, surface_m, _NO_PRIOR, 0)
     return gradients, matrices
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def descend(poses, forward, backward, colours, colours_back, weight, centre, surface_m, regulariser, steps):
+def descend(poses, surfaces, colours, weight, centre, surface_m, regulariser, steps):
     """Return poses (m, 12) after damped Gauss-Newton steps with a `Regulariser`; see `normal_equations`."""
-    group = 4
-    moved = poses.copy()
-    for number in numba.prange((poses.shape[0] + group - 1) // group):
-        workspace, colour_workspace = new_workspace(forward, backward), new_colour_workspace(colours, colours_back)
-        gradient, matrix = np.empty(6), np.empty((6, 6))
-        step, further, rotation = np.empty(6), np.empty(12), np.empty((3, 3))
-        for i in range(number * group, min((number + 1) * group, poses.shape[0])):
-            for _ in range(steps):
-                equations(moved[i], forward, backward, centre, surface_m, workspace, gradient, matrix)
-                add_colour_equations(
-                    moved[i], colours, colours_back, weight, centre, surface_m, colour_workspace, gradient, matrix
-                )
-                regularised_step(moved[i], regulariser, centre, gradient, matrix, step)
+    return over_rows(_iterate, poses, surfaces, colours, weight, centre, surface_m, regulariser, steps)[0]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _iterate(poses, surfaces, colours, weight, centre, surface_m, regulariser, steps):
+    """Return poses (m, 12) after some steps, or none, and the equations (m, 6) and (m, 6, 6) they were last at."""
+    moved, gradients, matrices = poses.copy(), np.empty((poses.shape[0], 6)), np.empty((poses.shape[0], 6, 6))
+    workspace = new_workspace(surfaces, colours)
+    held, step, further, rotation = np.empty((6, 6)), np.empty(6), np.empty(12), np.empty((3, 3))
+    for i in range(poses.shape[0]):
+        for _ in range(max(steps, 1)):
+            equations(moved[i], surfaces, colours, weight, centre, surface_m, workspace, gradients[i], matrices[i])
+            if steps > 0:
+                regularised_step(moved[i], regulariser, centre, gradients[i], matrices[i], held, step)
                 retract(moved[i], step, centre, rotation, further)
-                moved[i] = further
-    return moved
+                for k in range(12):
+                    moved[i, k] = further[k]
+    return moved, gradients, matrices
 
 
 @numba.njit(cache=True)
-def regularised_step(pose, regulariser, centre, gradient, matrix, step):
-    """Write the Gauss-Newton step (6,) of a pose (12,) from its normal equations; overwrites the matrix."""
+def new_workspace(surfaces, colours):
+    """Return the buffers of `equations`."""
+    wide = surfaces[0] if surfaces[0].points.shape[1] > surfaces[1].points.shape[1] else surfaces[1]
+    count = wide.points.shape[1]  # colours are compared at some of these points
+    cells, rows = np.empty((CELL_SIZE, count), dtype=np.float32), np.empty((_ROWS, count), dtype=np.float32)
+    small = np.empty(12), np.empty(3), np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
+    return buffers(wide), cells, rows, small
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gradient, matrix):
+    """Write the normal equations of matches, for ξ of a pose about the centre (method.md, eq. 10 and 20).
+
+    For small motions ζ = (ω, v) of transformed points about a point c, x → c + exp(ω)(x - c) + v, the gradient is
+    -Σ w a r and the matrix Σ w a aᵀ with a = ((x - c) × n, n), n the surface's normal or a feature's gradient. In the
+    target, a source point moves by ζ = (R ω, R v) about the transformed centre; in the source, a target point moves by
+    -ξ about the centre. One loop over directions and kinds of equations, since compiling is slow.
+
+    Args:
+        pose: (12,) rows of target_from_source.
+        surfaces: see `normal_equations`.
+        colours: likewise.
+        weight: likewise.
+        centre: likewise.
+        surface_m: likewise.
+        workspace: of `new_workspace`.
+        gradient: (6,) out.
+        matrix: (6, 6) out.
+    """
+    (transformed, pixels, found), colour, rows, small = workspace
+    carried, about, part, block, rotated, turned, turned_block = small
+    surface_m2 = np.float32(surface_m * surface_m)
+    for k in range(6):
+        gradient[k] = 0.0
+        for m in range(6):
+            matrix[k, m] = 0.0
+    for term in range(4):
+        direction, of_colour = term % 2, term >= 2
+        surface, features = surfaces[direction], colours[direction]
+        if of_colour:
+            surface = Projection(features.points, features.cells, features.camera, features.cosines)
+        count = surface.points.shape[1]
+        if count == 0:
+            continue
+        if direction == 0:
+            for k in range(12):
+                carried[k] = pose[k]
+            for k in range(3):
+                about[k] = pose[4 * k + 3]
+                for m in range(3):
+                    about[k] += pose[4 * k + m] * centre[m]
+        else:
+            invert(pose, carried)
+            for k in range(3):
+                about[k] = centre[k]
+        project(carried, surface, transformed, pixels, found)
+        if of_colour:
+            fetch_colours(count, pixels, features.colours, colour)
+            linearise_features(features, transformed, found, colour, about, surface_m2, weight, rows)
+        else:
+            linearise(surface.points, transformed, found, about, surface_m2, rows)
+        accumulate(rows, count, part, block)
+        if direction == 0:
+            rotate_to_source(pose, part, block, rotated, turned, turned_block)
+        else:
+            for k in range(6):
+                turned[k] = -part[k]
+                for m in range(6):
+                    turned_block[k, m] = block[k, m]
+        for k in range(6):
+            gradient[k] += turned[k]
+            for m in range(6):
+                matrix[k, m] += turned_block[k, m]
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+def accumulate(rows, count, gradient, matrix):
+    """Write the gradient (6,), -Σ w a r, and the matrix (6, 6), Σ w a aᵀ, of the first equations in `rows` (9, n)."""
+    for u in range(6):
+        total = ZERO
+        for j in range(count):
+            rows[8, j] = rows[u, j] * rows[7, j]
+            total += rows[8, j] * rows[6, j]
+        gradient[u] = -np.float64(total)
+        for v in range(u, 6):
+            total = ZERO
+            for j in range(count):
+                total += rows[8, j] * rows[v, j]
+            matrix[u, v] = matrix[v, u] = np.float64(total)
+
+
+@numba.njit(cache=True)
+def rotate_to_source(pose, part, block, rotated, gradient, matrix):
+    """Write Rᵀ g and Rᵀ M R, by halves and blocks of three, of a gradient (6,) and a symmetric matrix (6, 6)."""
+    for half in range(0, 6, 3):
+        for k in range(3):
+            a, b, c = pose[k], pose[4 + k], pose[8 + k]
+            gradient[half + k] = a * part[half] + b * part[half + 1] + c * part[half + 2]
+            for m in range(6):
+                rotated[half + k, m] = a * block[half, m] + b * block[half + 1, m] + c * block[half + 2, m]
+    for half in range(0, 6, 3):
+        for k in range(3):
+            a, b, c = pose[k], pose[4 + k], pose[8 + k]
+            for m in range(6):
+                matrix[m, half + k] = a * rotated[m, half] + b * rotated[m, half + 1] + c * rotated[m, half + 2]
+
+
+@numba.njit(cache=True)
+def regularised_step(pose, regulariser, centre, gradient, matrix, held, step):
+    """Write the Gauss-Newton step (6,) of a pose (12,) from its normal equations; `held` is a buffer (6, 6)."""
     away = difference(regulariser.mean, pose, centre)
     for k in range(6):
         step[k] = gradient[k]
         for m in range(6):
             step[k] -= regulariser.precision[k, m] * away[m]
-            matrix[k, m] += regulariser.precision[k, m]
-        matrix[k, k] += regulariser.damping[k]
-    solve_positive_definite(matrix, step)
+            held[k, m] = matrix[k, m] + regulariser.precision[k, m]
+        held[k, k] += regulariser.damping[k]
+    solve_positive_definite(held, step)
     angle = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
     if angle > regulariser.max_step_rad:
         for k in range(6):

@@ -61,6 +61,7 @@ def _pieces() -> np.ndarray:
 
 
 PIECES = _pieces()
+_PIECE_COUNTS = PIECES.max(axis=1).astype(np.int64) + 1
 
 
 @njit(cache=True)
@@ -96,7 +97,6 @@ def fill(values, totals, cells, least):
     return filled[:count], means[:count]
 
 
-@njit(cache=True)
 def extract(values, totals, cells):
     """Return the zero level set: vertices (v, 3) in voxels from the centre of voxel 0, and triangles (t, 3).
 
@@ -107,6 +107,7 @@ def extract(values, totals, cells):
         totals: (x, y, z) float32, 0 = unknown; the outermost voxels are unknown.
         cells: (n, 3) known voxels, in ascending order.
     """
+    cells = np.ascontiguousarray(cells)  # of one layout only: compiling is slow
     first, cases, count = _numbered(values, totals, cells)
     vertices, quads = _vertices(values, cells, first, cases, count)
     return vertices, _triangles(values, cells, first, cases, vertices, quads)
@@ -127,7 +128,7 @@ def _numbered(values, totals, cells):
         if 0 < case < 255:
             cases[i, j, k] = case
             first[i, j, k] = count
-            count += np.max(PIECES[case]) + 1
+            count += _PIECE_COUNTS[case]
     return first, cases, count
 
 
@@ -157,7 +158,8 @@ def _vertices(values, cells, first, cases, count):
             crossings[v] += 1.0
             quads += a & b
     for v in range(count):
-        vertices[v] /= crossings[v]
+        for c in range(3):  # an assignment of arrays takes seconds to compile
+            vertices[v, c] /= crossings[v]
     return vertices, quads
 
 
@@ -215,7 +217,6 @@ def _beside(i, j, k, axis, one, two):
     return i + one, j + two, k
 
 
-@njit(cache=True)
 def pinched_voxels(values, totals, cells):
     """Return the voxels (m, 3) to put inside so that no edge of the zero level set has more than two triangles.
 
@@ -228,6 +229,11 @@ def pinched_voxels(values, totals, cells):
         totals: (x, y, z) float32, 0 = unknown.
         cells: (n, 3) voxels that are the lowest corner of a cell to look at.
     """
+    return _pinched_voxels(values, totals, np.ascontiguousarray(cells))
+
+
+@njit(cache=True)
+def _pinched_voxels(values, totals, cells):
     found = np.empty((3 * len(cells), 3), dtype=np.int64)
     count = 0
     for n in range(len(cells)):

@@ -42,9 +42,10 @@ def log_densities(poses, means, roots, widths, log_weights, centre):
             bounds[k] = log_tops[k] - 0.5 * max(turned / widths[k, 0], square / widths[k, 1])
             if bounds[k] > bounds[best]:
                 best = k
-        top, total = log_density(means[best], poses[i], roots[best], log_tops[best], centre)
-        for k in range(count):
-            if k != best and bounds[k] > top - _NEGLIGIBLE:
+        top, total = -math.inf, 0.0
+        for turn in range(-1, count):  # one call of `log_density`: compiling is slow
+            k = best if turn < 0 else turn
+            if turn < 0 or (k != best and bounds[k] > top - _NEGLIGIBLE):
                 density, narrower = log_density(means[k], poses[i], roots[k], log_tops[k], centre)
                 if density > top:
                     total = total * math.exp(top - density) + narrower

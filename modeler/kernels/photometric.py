@@ -19,7 +19,8 @@ from modeler.kernels.point_likelihood import (
     plane_distance,
     project,
 )
-from modeler.kernels.point_to_plane import EQUATION_ROWS, accumulate, match_weight, rotate_to_source
+from modeler.kernels.point_to_plane import match_weight
+from modeler.kernels.threads import over_rows
 
 # Columns of a cell, the 16 bytes that are read for one pixel: at a point p that projects into it, the feature is
 # gradient · p + offset to first order. They are those of a plane, so that `plane_distance` of a cell is the feature.
@@ -76,9 +77,9 @@ def fill_cells(features, points_m, pixels, focal, cells):
 
 
 @numba.njit(cache=True, error_model="numpy", forceinline=True)
-def fetch_colours(pixels, cells, looked_up):
-    """Copy the cells of colour at `pixels` (n,) into the columns of `looked_up` (4, n)."""
-    for j in range(pixels.shape[0]):
+def fetch_colours(count, pixels, cells, looked_up):
+    """Copy the cells of colour at the first `pixels` (n,) into columns of `looked_up` (4, n)."""
+    for j in range(count):
         cell = np.uint32(max(pixels[j], np.int32(0)))
         for k in range(CELL_SIZE):
             looked_up[k, j] = cells[cell, k]
@@ -101,43 +102,36 @@ def sum_moments(projection, transformed, looked_up, colour, surface_m2):
     return product, own_square, other_square, count
 
 
-@numba.njit(cache=True, forceinline=True)
-def colour_buffers(projection):
-    """Return buffers for one direction: those of `project`, and cells of colour (4, n)."""
-    return buffers(projection), np.empty((CELL_SIZE, projection.values.shape[0]), dtype=np.float32)
-
-
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
-def look_up(pose, projection, workspace):
-    """Transform the points of one direction by a pose (12,), and look up surface and colour there."""
-    (transformed, pixels, found), colour = workspace
-    project(pose, projection, transformed, pixels, found)
-    fetch_colours(pixels, projection.colours, colour)
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def moments(poses, forward, backward, surface_m):
+def moments(poses, projections, surface_m):
     """Return moments (m, 4) of the features of matching surface under poses (m, 12), summed over both directions.
 
     Args:
         poses: rows of the 3×4 matrices of target_from_source.
-        forward: the `ColourProjection` of the source's points in the target, and
-        backward: of the target's in the source.
+        projections: the `ColourProjection` of the source's points in the target, and of the target's in the source.
         surface_m: noise of the surfaces in m beyond that of points and planes.
     """
-    block = 16  # poses per set of buffers
-    surface_m2 = np.float32(surface_m * surface_m)
-    result = np.empty((poses.shape[0], 4))
-    for group in numba.prange((poses.shape[0] + block - 1) // block):
-        there, back, inverse = colour_buffers(forward), colour_buffers(backward), np.empty(12)
-        for i in range(group * block, min((group + 1) * block, poses.shape[0])):
-            look_up(poses[i], forward, there)
-            first = sum_moments(forward, there[0][0], there[0][2], there[1], surface_m2)
-            invert(poses[i], inverse)
-            look_up(inverse, backward, back)
-            second = sum_moments(backward, back[0][0], back[0][2], back[1], surface_m2)
+    return over_rows(_moments, poses, projections, np.float32(surface_m * surface_m), least=16)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _moments(poses, projections, surface_m2):
+    result = np.zeros((poses.shape[0], 4))
+    carried = np.empty(12)
+    wide = projections[0] if projections[0].values.shape[0] > projections[1].values.shape[0] else projections[1]
+    (transformed, pixels, found), colour = buffers(wide), np.empty((CELL_SIZE, wide.values.shape[0]), dtype=np.float32)
+    for i in range(poses.shape[0]):
+        for direction in range(2):
+            projection = projections[direction]
+            if direction == 0:
+                for k in range(12):
+                    carried[k] = poses[i, k]
+            else:
+                invert(poses[i], carried)
+            project(carried, projection, transformed, pixels, found)
+            fetch_colours(projection.values.shape[0], pixels, projection.colours, colour)
+            found_moments = sum_moments(projection, transformed, found, colour, surface_m2)
             for k in range(4):
-                result[i, k] = np.float64(first[k]) + np.float64(second[k])
+                result[i, k] += found_moments[k]
     return result
 
 
@@ -148,7 +142,7 @@ def no_colour(projection: Projection) -> ColourProjection:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
-def linearise_colour(projection, transformed, found, colour, centre, surface_m2, weight, rows):
+def linearise_features(projection, transformed, found, colour, centre, surface_m2, weight, rows):
     """Write the equations of features into `rows` (8, n): derivatives by ζ, residual and weight.
 
     A feature is linear in the point's position as a plane's distance is, its gradient in the place of the normal.
@@ -167,49 +161,3 @@ def linearise_colour(projection, transformed, found, colour, centre, surface_m2,
         rows[1, j] = z * slope_x - x * slope_z
         rows[2, j] = x * slope_y - y * slope_x
         rows[3, j], rows[4, j], rows[5, j] = slope_x, slope_y, slope_z
-
-
-@numba.njit(cache=True)
-def new_colour_workspace(forward, backward):
-    """Return the buffers of `add_colour_equations`."""
-    most = max(forward.values.shape[0], backward.values.shape[0])
-    rows = np.empty((EQUATION_ROWS, most), dtype=np.float32)
-    small = np.empty(12), np.empty(3), np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
-    return colour_buffers(forward), colour_buffers(backward), rows, small
-
-
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
-def add_colour_equations(pose, forward, backward, weight, centre, surface_m, workspace, gradient, matrix):
-    """Add the equations of features to those of `point_to_plane.equations`.
-
-    Args:
-        pose: (12,) rows of target_from_source.
-        forward: the `ColourProjection` of the source's points in the target, and
-        backward: of the target's in the source.
-        weight: inverse variance of the difference of features (method.md, eq. 20).
-        centre: (3,) point of the source in m.
-        surface_m: noise of the surfaces in m beyond that of points and planes, within which points match.
-        workspace: of `new_colour_workspace`.
-        gradient: (6,) is added to.
-        matrix: (6, 6) is added to.
-    """
-    if forward.values.shape[0] == 0:
-        return
-    there, back, rows, (inverse, transformed_centre, part, block, rotated, turned, turned_block) = workspace
-    surface_m2 = np.float32(surface_m * surface_m)
-    for k in range(3):
-        transformed_centre[k] = pose[4 * k + 3]
-        for m in range(3):
-            transformed_centre[k] += pose[4 * k + m] * centre[m]
-    look_up(pose, forward, there)
-    linearise_colour(forward, there[0][0], there[0][2], there[1], transformed_centre, surface_m2, weight, rows)
-    accumulate(rows, forward.values.shape[0], part, block)
-    rotate_to_source(pose, part, block, rotated, turned, turned_block)
-    invert(pose, inverse)
-    look_up(inverse, backward, back)
-    linearise_colour(backward, back[0][0], back[0][2], back[1], centre, surface_m2, weight, rows)
-    accumulate(rows, backward.values.shape[0], part, block)
-    for k in range(6):
-        gradient[k] += turned[k] - part[k]
-        for m in range(6):
-            matrix[k, m] += turned_block[k, m] + block[k, m]

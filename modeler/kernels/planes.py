@@ -5,6 +5,8 @@ import math
 import numba
 import numpy as np
 
+from modeler.kernels.threads import over_rows
+
 # Columns of a cell, the 32 bytes a likelihood reads for one pixel (float32).
 NORMAL_X, NORMAL_Y, NORMAL_Z = 0, 1, 2  # unit normal n of the local plane, towards the camera
 DISTANCE = 3  # of the plane from the camera, m: n · p + distance is how far p lies in front of it
@@ -107,7 +109,6 @@ def add_line(points, row, shift, pad, radius_m2, step, sums):
             sums[5, j] += weighted * weighted
 
 
-@numba.njit(cache=True, parallel=True)
 def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse):
     """Fit a plane to every object pixel's neighbours within a ball.
 
@@ -126,24 +127,32 @@ def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse):
     Returns:
         (h, w, 8) float32 cells, columns as above.
     """
-    height, width = depth_m.shape
+    window = bounds(mask)
+    points = padded(depth_m, mask, intrinsics, window, ball[1])
+    images = depth_m, mask, silhouette_px, points
+    return over_rows(_local_planes, np.arange(len(depth_m)), *images, window, intrinsics, ball, sigma_inverse)
+
+
+@numba.njit(cache=True, nogil=True)
+def _local_planes(rows, depth_m, mask, silhouette_px, points, window, intrinsics, ball, sigma_inverse):
+    width = depth_m.shape[1]
     fx, fy, cx, cy = intrinsics
     radius_m, reach, stride = ball
-    window = bounds(mask)
     top, bottom, left, right = window
-    points = padded(depth_m, mask, intrinsics, window, reach)
-    cells = np.empty((height, width, CELL_SIZE), dtype=np.float32)
-    for row in numba.prange(height):
+    cells = np.zeros((len(rows), width, CELL_SIZE), dtype=np.float32)
+    line, sums = np.empty((6, right - left), dtype=np.float32), np.empty((10, right - left))
+    for row in rows:
+        found = cells[row - rows[0]]
         for column in range(width):
-            for k in range(CELL_SIZE):
-                cells[row, column, k] = 0.0
-            cells[row, column, SILHOUETTE] = silhouette_px[row, column]
+            found[column, SILHOUETTE] = silhouette_px[row, column]
             if depth_m[row, column] > 0.0:
-                cells[row, column, DEPTH] = depth_m[row, column]
-                cells[row, column, KIND] = RAGGED if mask[row, column] else BACKGROUND
+                found[column, DEPTH] = depth_m[row, column]
+                found[column, KIND] = RAGGED if mask[row, column] else BACKGROUND
         if row < top or row >= bottom:
             continue
-        line, sums = np.empty((6, right - left), dtype=np.float32), np.zeros((10, right - left))
+        for k in range(10):
+            for j in range(right - left):
+                sums[k, j] = 0.0
         for dy in range(-reach, reach + 1, stride):
             add_line(points, row - top, dy, reach, np.float32(radius_m * radius_m), stride, line)
             for j in range(right - left):
@@ -159,9 +168,9 @@ def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse):
                 sums[8, j] += dy * b
                 sums[9, j] += line[5, j]
         for column in range(left, right):
-            if cells[row, column, KIND] == RAGGED:
+            if found[column, KIND] == RAGGED:
                 w, h = (column - cx) / fx, (row - cy) / fy
-                fit_plane(cells[row, column], sums[:, column - left], w, h, fx, fy, sigma_inverse)
+                fit_plane(found[column], sums[:, column - left], w, h, fx, fy, sigma_inverse)
     return cells
 
 

@@ -24,6 +24,7 @@ from modeler.kernels.planes import (
     SURFACE,
     VARIANCE,
 )
+from modeler.kernels.threads import over_rows
 
 # Classes of a point, see `classify`.
 UNKNOWN, MATCHED, BEHIND, IN_FRONT, HIDDEN, IN_EMPTY_SPACE = 0, 1, 2, 3, 4, 5
@@ -125,9 +126,9 @@ def transform_points(pose, projection, transformed, pixels):
 
 
 @numba.njit(cache=True, forceinline=True)
-def fetch_cells(pixels, cells, looked_up):
-    """Copy the cells at `pixels` (n,) into the columns of `looked_up` (8, n); outside the image they are `MISSING`."""
-    for j in range(pixels.shape[0]):
+def fetch_cells(count, pixels, cells, looked_up):
+    """Copy the cells at the first `pixels` (n,) into columns of `looked_up` (8, n); outside they are `MISSING`."""
+    for j in range(count):
         cell = np.uint32(max(pixels[j], np.int32(0)))
         for k in range(CELL_SIZE):
             looked_up[k, j] = cells[cell, k]
@@ -137,9 +138,12 @@ def fetch_cells(pixels, cells, looked_up):
 
 @numba.njit(cache=True, forceinline=True)
 def project(pose, projection, transformed, pixels, looked_up):
-    """Transform points by a pose (12,) and look up their cells: `transform_points`, then `fetch_cells`."""
+    """Transform points by a pose (12,) and look up their cells: `transform_points`, then `fetch_cells`.
+
+    The buffers may be longer than there are points.
+    """
     transform_points(pose, projection, transformed, pixels)
-    fetch_cells(pixels, projection.cells, looked_up)
+    fetch_cells(projection.points.shape[1], pixels, projection.cells, looked_up)
 
 
 @numba.njit(cache=True, forceinline=True)
@@ -243,22 +247,6 @@ def sum_over_points(points, transformed, looked_up, parameters):
     return total, explained
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
-def pair_log_likelihood(pose, forward, backward, forward_parameters, backward_parameters, workspace):
-    """Return the log-likelihood of one pose (12,) and the number of explained points; see `log_likelihoods`.
-
-    The workspace holds the `buffers` of both directions, and (12,).
-    """
-    there, back, inverse = workspace
-    project(pose, forward, there[0], there[1], there[2])
-    total, explained = sum_over_points(forward.points, there[0], there[2], forward_parameters)
-    invert(pose, inverse)
-    project(inverse, backward, back[0], back[1], back[2])
-    more, further = sum_over_points(backward.points, back[0], back[2], backward_parameters)
-    return np.float64(total) + np.float64(more), np.float64(explained) + np.float64(further)
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
 def log_likelihoods(poses, forward, backward, forward_parameters, backward_parameters):
     """Return the log-likelihood of each pose, summed over the points of two views (method.md, eq. 3).
 
@@ -274,14 +262,28 @@ def log_likelihoods(poses, forward, backward, forward_parameters, backward_param
     Returns:
         (m, 2): log-likelihood; number of points that the other view explains, each weighted by f.
     """
-    block = 16  # poses per set of buffers
-    result = np.empty((poses.shape[0], 2))
-    for group in numba.prange((poses.shape[0] + block - 1) // block):
-        workspace = buffers(forward), buffers(backward), np.empty(12)
-        for i in range(group * block, min((group + 1) * block, poses.shape[0])):
-            result[i, LOG_LIKELIHOOD], result[i, EXPLAINED] = pair_log_likelihood(
-                poses[i], forward, backward, forward_parameters, backward_parameters, workspace
+    return over_rows(_log_likelihoods, poses, (forward, backward), (forward_parameters, backward_parameters), least=16)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _log_likelihoods(poses, projections, parameters):
+    result = np.zeros((poses.shape[0], 2))
+    carried = np.empty(12)
+    wide = projections[0] if projections[0].points.shape[1] > projections[1].points.shape[1] else projections[1]
+    transformed, pixels, looked_up = buffers(wide)
+    for i in range(poses.shape[0]):
+        for direction in range(2):  # one copy of the code: compiling is slow
+            if direction == 0:
+                for k in range(12):
+                    carried[k] = poses[i, k]
+            else:
+                invert(poses[i], carried)
+            project(carried, projections[direction], transformed, pixels, looked_up)
+            total, explained = sum_over_points(
+                projections[direction].points, transformed, looked_up, parameters[direction]
             )
+            result[i, LOG_LIKELIHOOD] += total
+            result[i, EXPLAINED] += explained
     return result
 
 

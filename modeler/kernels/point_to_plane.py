@@ -1,4 +1,4 @@
-"""Point-to-plane equations of surface that both views measured, and patches of the surface."""
+"""Matches of surface that both views measured, their point-to-plane equations, and patches of the surface."""
 
 import numba
 import numpy as np
@@ -19,7 +19,6 @@ from modeler.kernels.point_likelihood import (
     Y,
     Z,
     buffers,
-    invert,
     normal_agreement,
     plane_distance,
     project,
@@ -29,7 +28,6 @@ from modeler.kernels.point_likelihood import (
 POSITION, OWN, OTHER, RESIDUAL, WEIGHT, FACING_WEIGHT = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11
 
 _OF_SURFACE = np.float32(SURFACE)
-EQUATION_ROWS = 9  # of one direction's equations: six derivatives, residual, weight, and a buffer for products
 
 
 @numba.njit(cache=True, inline="always")
@@ -72,7 +70,7 @@ def matches(pose, projection, surface_m):
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def linearise(points, transformed, found, centre, surface_m2, rows):
-    """Write the equations of matches into `rows` (9, n): derivatives by ζ, residual and weight; see `equations`."""
+    """Write the equations of matches into `rows` (9, n): derivatives by ζ, residual and weight, see `gauss_newton`."""
     cx, cy, cz = np.float32(centre[0]), np.float32(centre[1]), np.float32(centre[2])
     for j in range(points.shape[1]):
         residual = plane_distance(transformed, found, j)
@@ -90,86 +88,6 @@ def linearise(points, transformed, found, centre, surface_m2, rows):
         rows[3, j], rows[4, j], rows[5, j] = normal_x, normal_y, normal_z
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
-def accumulate(rows, count, gradient, matrix):
-    """Write the gradient (6,), -Σ w a r, and the matrix (6, 6), Σ w a aᵀ, of the first equations in `rows` (8, n)."""
-    for u in range(6):
-        total = ZERO
-        for j in range(count):
-            rows[8, j] = rows[u, j] * rows[7, j]
-            total += rows[8, j] * rows[6, j]
-        gradient[u] = -np.float64(total)
-        for v in range(u, 6):
-            total = ZERO
-            for j in range(count):
-                total += rows[8, j] * rows[v, j]
-            matrix[u, v] = matrix[v, u] = np.float64(total)
-
-
-@numba.njit(cache=True)
-def new_workspace(forward, backward):
-    """Return the buffers of `equations`."""
-    most = max(forward.points.shape[1], backward.points.shape[1])
-    rows = np.empty((EQUATION_ROWS, most), dtype=np.float32)
-    small = np.empty(12), np.empty(3), np.empty(6), np.empty((6, 6)), np.empty((6, 6))
-    return buffers(forward), buffers(backward), rows, small
-
-
-@numba.njit(cache=True)
-def rotate_to_source(pose, part, block, rotated, gradient, matrix):
-    """Write Rᵀ g and Rᵀ M R, by halves and blocks of three, of a gradient (6,) and a symmetric matrix (6, 6)."""
-    for half in range(0, 6, 3):
-        for k in range(3):
-            a, b, c = pose[k], pose[4 + k], pose[8 + k]
-            gradient[half + k] = a * part[half] + b * part[half + 1] + c * part[half + 2]
-            for m in range(6):
-                rotated[half + k, m] = a * block[half, m] + b * block[half + 1, m] + c * block[half + 2, m]
-    for half in range(0, 6, 3):
-        for k in range(3):
-            a, b, c = pose[k], pose[4 + k], pose[8 + k]
-            for m in range(6):
-                matrix[m, half + k] = a * rotated[m, half] + b * rotated[m, half + 1] + c * rotated[m, half + 2]
-
-
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
-def equations(pose, forward, backward, centre, surface_m, workspace, gradient, matrix):
-    """Write the point-to-plane normal equations of matches, for ξ of a pose about the centre (method.md, eq. 10).
-
-    For small motions ζ = (ω, v) of transformed points about a point c, x → c + exp(ω)(x - c) + v, the gradient is
-    -Σ w a r and the matrix Σ w a aᵀ with a = ((x - c) × n, n). In the target, a source point moves by ζ = (R ω, R v)
-    about the transformed centre; in the source, a target point moves by -ξ about the centre.
-
-    Args:
-        pose: (12,) rows of target_from_source.
-        forward: the `Projection` of the source's points in the target, and
-        backward: of the target's in the source.
-        centre: (3,) point of the source in m.
-        surface_m: noise of the surfaces in m beyond that of points and planes.
-        workspace: of `new_workspace`.
-        gradient: (6,) out.
-        matrix: (6, 6) out.
-    """
-    there, back, rows, (inverse, transformed_centre, part, block, rotated) = workspace
-    surface_m2 = np.float32(surface_m * surface_m)
-    for k in range(3):
-        transformed_centre[k] = pose[4 * k + 3]
-        for m in range(3):
-            transformed_centre[k] += pose[4 * k + m] * centre[m]
-    project(pose, forward, there[0], there[1], there[2])
-    linearise(forward.points, there[0], there[2], transformed_centre, surface_m2, rows)
-    accumulate(rows, forward.points.shape[1], part, block)
-    rotate_to_source(pose, part, block, rotated, gradient, matrix)
-    invert(pose, inverse)
-    project(inverse, backward, back[0], back[1], back[2])
-    linearise(backward.points, back[0], back[2], centre, surface_m2, rows)
-    accumulate(rows, backward.points.shape[1], part, block)
-    for k in range(6):
-        gradient[k] -= part[k]
-        for m in range(6):
-            matrix[k, m] += block[k, m]
-
-
-@numba.njit(cache=True)
 def bisected(points, halvings):
     """Return the patch number (n,) of each point (n, 3): recursive bisection, each across its longest side.
 
@@ -177,23 +95,15 @@ def bisected(points, halvings):
         points: (n, 3).
         halvings: depth of the recursion; there are 2 to this power patches.
     """
-    order, starts = np.arange(len(points)), np.array([0, len(points)])
+    groups = [np.arange(len(points))]
     for _ in range(halvings):
-        cut = np.empty(2 * len(starts) - 1, dtype=np.int64)
-        for number in range(len(starts) - 1):
-            group = order[starts[number] : starts[number + 1]]
-            best, side = -1.0, 0
-            for k in range(3):
-                extent = 0.0
-                if len(group):
-                    extent = np.max(points[group, k]) - np.min(points[group, k])
-                if extent > best:
-                    best, side = extent, k
-            group[:] = group[np.argsort(points[group, side], kind="mergesort")]
-            cut[2 * number], cut[2 * number + 1] = starts[number], starts[number] + len(group) // 2
-        cut[-1] = len(points)
-        starts = cut
+        halves = []
+        for group in groups:
+            side = int(np.argmax(np.ptp(points[group], axis=0))) if len(group) else 0
+            order = group[np.argsort(points[group, side], kind="stable")]
+            halves += [order[: len(group) // 2], order[len(group) // 2 :]]
+        groups = halves
     patches = np.empty(len(points), dtype=np.int64)
-    for number in range(len(starts) - 1):
-        patches[order[starts[number] : starts[number + 1]]] = number
+    for number, group in enumerate(groups):
+        patches[group] = number
     return patches

@@ -14,6 +14,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from modeler.kernels.threads import over_rows
+
 SIDE = 4  # voxels along the side of a block
 SAME_SIDE = 0.3  # least cosine between normals on the same side of the object; chosen by hand
 MAJORITY = 3  # a side is rejected if this many times as many votes contradict it; chosen by hand
@@ -61,7 +63,6 @@ def between(image, column, row, channel):
     return (1.0 - bottom) * upper + bottom * lower
 
 
-@njit(cache=True, parallel=True)
 def integrate(
     blocks, origin, voxel_m, tau_m, empty_weight, views, index, free_m, poses, intrinsics, points, normals, weights
 ):
@@ -85,10 +86,20 @@ def integrate(
         normals: (n, 3).
         weights: (n,).
     """
+    stacked = views, index, free_m, poses, intrinsics, points, normals, weights
+    values, totals = over_rows(_integrate, np.ascontiguousarray(blocks), origin, voxel_m, tau_m, empty_weight, *stacked)
+    shape = (len(blocks), SIDE, SIDE, SIDE)
+    return values.reshape(shape), totals.reshape(shape)
+
+
+@njit(cache=True, nogil=True)
+def _integrate(
+    blocks, origin, voxel_m, tau_m, empty_weight, views, index, free_m, poses, intrinsics, points, normals, weights
+):
     values = np.zeros((len(blocks), SIDE**3), dtype=np.float32)
     totals = np.zeros((len(blocks), SIDE**3), dtype=np.float32)
-    for b in prange(len(blocks)):
-        positions = np.empty((SIDE**3, 3))
+    positions = np.empty((SIDE**3, 3))
+    for b in range(len(blocks)):
         for voxel in range(SIDE**3):
             positions[voxel, 0] = origin[0] + (blocks[b, 0] * SIDE + voxel // (SIDE * SIDE) + 0.5) * voxel_m
             positions[voxel, 1] = origin[1] + (blocks[b, 1] * SIDE + voxel // SIDE % SIDE + 0.5) * voxel_m
@@ -113,8 +124,7 @@ def integrate(
                     points,
                     normals,
                 )
-    shape = (len(blocks), SIDE, SIDE, SIDE)
-    return values.reshape(shape), totals.reshape(shape)
+    return values, totals
 
 
 @njit(cache=True)
@@ -155,23 +165,7 @@ def collect_votes(positions, tau_m, index, free_m, poses, intrinsics, points, no
     return seen, distance, weight, number, empty
 
 
-@njit(cache=True, parallel=True)
-def observe(
-    queries,
-    directions,
-    tolerance_m,
-    tau_m,
-    index,
-    free_m,
-    poses,
-    intrinsics,
-    points,
-    normals,
-    weights,
-    colour,
-    gains,
-    focus,
-):
+def observe(queries, directions, tolerance_m, tau_m, *views):
     """Return what the views observe at oriented points (F7 to F9).
 
     A view supports a point if it sees a surface within `tolerance_m` along the same pixel that faces the same way.
@@ -182,24 +176,25 @@ def observe(
         directions: (n, 3) unit normals.
         tolerance_m: largest distance along the normal.
         tau_m: least distance of empty points from the end of the empty space.
-        index: (f, h, w) int32.
-        free_m: (f, h, w) float32.
-        poses: (f, 3, 4) camera_from_object.
-        intrinsics: (f, 4).
-        points: (p, 3).
-        normals: (p, 3).
-        weights: (p,).
-        colour: (f, h, w, 3) uint8.
-        gains: (f, 4) gains of red, green and blue, and the weight of a view's colours, 0 = none.
-        focus: exponent of the view weights for colours.
+        views: index (f, h, w) int32; free_m (f, h, w) float32; poses (f, 3, 4) camera_from_object; intrinsics (f, 4);
+            points (p, 3), normals (p, 3) and weights (p,); colour (f, h, w, 3) uint8; gains (f, 4) of red, green and
+            blue, and the weight of a view's colours, 0 = none; exponent of the view weights for colours.
 
     Returns:
         (n, 5): sum of the supporting views' weights w, number of views that see the point empty, number of supporting
         views, Σ w d and Σ w d² with d the distance of the point above the surface; and (n, 4) RGB with its weight.
     """
+    return over_rows(_observe, np.hstack([queries, directions]), tolerance_m, tau_m, *views)
+
+
+@njit(cache=True, nogil=True)
+def _observe(
+    queries, tolerance_m, tau_m, index, free_m, poses, intrinsics, points, normals, weights, colour, gains, focus
+):
     frames, height, width = index.shape
     observed, colours = np.zeros((len(queries), 5)), np.zeros((len(queries), 4))
-    for q in prange(len(queries)):
+    directions = queries[:, 3:]
+    for q in range(len(queries)):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
         for f in range(frames):
             u, v, depth = project(poses[f], intrinsics[f], x, y, z)

@@ -265,12 +265,12 @@ class PairLikelihood:
 
     def _colours(
         self, band: int, correlation: float, stride: int
-    ) -> tuple[ColourProjection, ColourProjection, np.float32]:
+    ) -> tuple[tuple[ColourProjection, ColourProjection], np.float32]:
         """Return the colours of both directions and their weight, as kernels take them; without colour, no points."""
         if self.colour is None:
-            return no_colour(self.forward.projection(1)), no_colour(self.backward.projection(1)), np.float32(0.0)
+            return (no_colour(self.forward.projection(1)), no_colour(self.backward.projection(1))), np.float32(0.0)
         projections = self.colour.projections(band, _COLOUR_STRIDE * stride)
-        return *projections, np.float32(_COLOUR_STRIDE * weight_of(correlation))
+        return projections, np.float32(_COLOUR_STRIDE * weight_of(correlation))
 
     def match_noise(self, pose: Array, blur_m: float) -> MatchNoise:
         """Return how well surfaces and colours match under a pose (4, 4), see `surface_noise_m`."""
@@ -345,7 +345,7 @@ class PairLikelihood:
         projections = self.forward.projection(stride), self.backward.projection(stride)
         colours = self._colours(noise.band, noise.correlation, stride)
         gradients, equations = gauss_newton.normal_equations(
-            rows(poses), *projections, *colours, self.centre_m, noise.surface_m
+            rows(poses), projections, *colours, self.centre_m, noise.surface_m
         )
         return stride * gradients, stride * equations
 
@@ -355,7 +355,7 @@ class PairLikelihood:
         regulariser = _per_point(regulariser, _DESCENT_STRIDE)
         band = 0 if self.colour is None else self.colour.band(blur_m)
         colours = self._colours(band, UNDECIDED, _DESCENT_STRIDE)
-        moved = gauss_newton.descend(rows(poses), *projections, *colours, self.centre_m, blur_m, regulariser, steps)
+        moved = gauss_newton.descend(rows(poses), projections, *colours, self.centre_m, blur_m, regulariser, steps)
         return matrices(moved)
 
 

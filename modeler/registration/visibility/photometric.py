@@ -51,7 +51,7 @@ class PairColour:
             stride: every `stride`-th point is used.
         """
         forward, backward = self.projections(band, stride)
-        found = photometric.moments(rows(poses), forward, backward, surface_m)
+        found = photometric.moments(rows(poses), (forward, backward), surface_m)
         scale = np.sqrt(found[:, photometric.OWN_SQUARE] * found[:, photometric.OTHER_SQUARE])
         share = found[:, photometric.MATCHES] / (len(forward.values) + len(backward.values))
         return found[:, photometric.PRODUCT] / np.maximum(scale, 1e-12), share
