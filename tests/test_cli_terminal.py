@@ -316,3 +316,21 @@ def test_what_is_wrong_with_an_option_is_said_in_any_encoding(encoding: str) -> 
     assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
     assert "--sede" in ended.stderr
     assert "--seed" in ended.stderr
+
+
+@pytest.mark.slow
+def test_what_was_compiled_ahead_is_all_that_a_run_needs(tmp_path: Path) -> None:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+
+    def kept() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb[ci]")}
+
+    ahead = "from modeler.cli.compiling import compile_kernels; compile_kernels()"
+    done = subprocess.run([sys.executable, "-c", ahead], env=environment, capture_output=True, text=True, check=True)
+    assert "compiling kernels, once on this machine: 10 of 10" in done.stderr
+    compiled = kept()
+    again = subprocess.run([sys.executable, "-c", ahead], env=environment, capture_output=True, text=True, check=True)
+    assert not again.stderr
+    build = [*COMMAND, "build", str(BOX), "--frames", ":3", "--prior", "table", "--out", str(tmp_path / "run")]
+    subprocess.run(build, env=environment, check=True, capture_output=True)
+    assert kept() == compiled

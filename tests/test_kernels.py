@@ -283,8 +283,5 @@ def test_patches_come_from_recursive_bisection(rng, count):
 
 
 def test_kernels_know_that_they_are_compiled():
-    rng = np.random.default_rng(0)
-    point_likelihood.log_likelihoods(
-        rows(np.eye(4)[None]), random_projection(rng), random_projection(rng), parameters(), parameters()
-    )
-    assert kernels.compiled()
+    point_likelihood.classify(rows(np.eye(4)[None])[0], random_projection(np.random.default_rng(0)), parameters())
+    assert kernels.compiled("point_likelihood", "classify")

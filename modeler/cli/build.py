@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from modeler.cli.compiling import compile_kernels
 from modeler.cli.console import Console, Interrupt, say
 from modeler.cli.options import (
     MIN_VOXEL_M,
@@ -94,6 +95,7 @@ class Build:
             RunFolder(self.out).pairs.drop()  # what a kill at the very end left of them
             say("the run had come to its end; --overwrite makes it anew")
             return _summarise(RunFolder(self.out).report(), self, modeler.prior)
+        compile_kernels()
         scene = compose.scene(modeler, whole)
         with alone(self.out):
             before = RunFolder(self.out).changed_versions(meta) if self.resume else ()

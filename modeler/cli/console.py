@@ -157,11 +157,7 @@ class Console:
 
     def __enter__(self) -> Console:
         """Show the bar."""
-        from modeler import kernels
-
         self._bar.start()
-        if self._bar.console.is_terminal and not kernels.compiled():
-            self._say("the first registration on this machine compiles for about a minute")
         if self._address is not None:
             self._say(f"watch at {self._address}")
         return self

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
+from modeler.cli.compiling import compile_kernels
 from modeler.cli.console import bar, say
 from modeler.cli.options import SEED, FrameOptions, Method, ObjectOptions, PriorOptions, StrictPaths, default
 
@@ -116,6 +117,7 @@ def _evaluate_pairs(options: Evaluate) -> int:
         seed=options.seed,
     )
     _check_offsets(plan.pairing, recorded)
+    compile_kernels()
     with bar() as progress:
         task = progress.add_task("", total=sum(plan.size(sequence) for sequence in recorded))
         rows = experiment.evaluate(

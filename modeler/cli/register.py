@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from modeler.cli.compiling import compile_kernels
 from modeler.cli.console import say
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions, StrictPaths
 
@@ -43,6 +44,7 @@ class Register:
             raise InputError(f"SOURCE and TARGET are both frame {self.source}; name two frames")
         sequence = open_sequence(self.sequence, Overrides(strict_paths=self.strict_paths))
         modeler = compose.modeler(sequence, self.prior, self.method, self.where)
+        compile_kernels()
         scene = compose.scene(modeler, sequence)
         views = []
         for index in (self.source, self.target):

@@ -2,6 +2,7 @@
 
 import os
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 
 from numba.core import config
@@ -24,11 +25,10 @@ def drop_stale(folder: Path) -> None:
                 index.unlink()
 
 
-def compiled() -> bool:
-    """Return whether kernels of the registration as they stand have been compiled on this machine."""
-    from modeler.kernels.point_likelihood import classify
-
-    return any(Path(str(classify.stats.cache_path)).glob("point_likelihood.classify-*.nbi"))
+def compiled(module: str, name: str) -> bool:
+    """Return whether a kernel as it stands has been compiled on this machine."""
+    kernel = getattr(import_module(f"modeler.kernels.{module}"), name)
+    return any(Path(str(kernel.stats.cache_path)).glob(f"{module}.{name}-*.nbi"))
 
 
 drop_stale(Path(__file__).parent)

@@ -1,0 +1,124 @@
+"""Compile the kernels ahead of the first registration, in one process for each half of a run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from modeler.cli.console import say
+
+_USED = ("planes", "lie_group", "point_likelihood", "photometric", "point_to_plane", "gauss_newton", "mixture")
+_USED_TO_FUSE = ("tsdf", "marching_cubes", "point_clouds")
+
+
+def compile_kernels() -> None:
+    """Compile kernels that are missing, and say how far that is; they are kept for later commands.
+
+    Does nothing where they are compiled. What cannot be compiled here is compiled, or reported, where it is used.
+    """
+    from modeler import kernels
+
+    missing = [name for name, job in _JOBS.items() if not kernels.compiled(*job.last)]
+    if not missing:
+        return
+    begun: set[str] = set()
+    lock = threading.Lock()
+
+    def follow(process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            with lock:
+                if line.strip() not in begun:
+                    begun.add(line.strip())
+                    say(f"compiling kernels, once on this machine: {len(begun)} of {total}")
+
+    total = len(_USED) + (len(_USED_TO_FUSE) if "fusion" in missing else 0)
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", f"from modeler.cli.compiling import work; work({job!r})"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        for job in missing
+    ]
+    threads = [threading.Thread(target=follow, args=[process], daemon=True) for process in processes]
+    try:
+        for thread in threads:
+            thread.start()
+        for process in processes:
+            process.wait()
+    finally:
+        for process in processes:
+            process.terminate()
+    for thread in threads:
+        thread.join()
+
+
+def _registration() -> None:
+    """Register two frames of a bundled sequence."""
+    from modeler.pipeline import Modeler
+    from sequences import bundled, open_sequence
+
+    sequence = open_sequence(bundled("box"))
+    modeler = Modeler()
+    frames = [sequence.frame(index) for index in sequence.indices[:2]]
+    scene = modeler.segmenter.scene(frames)
+    views = [modeler.prepare(frame, scene).view for frame in frames]
+    assert views[0] is not None
+    assert views[1] is not None
+    modeler.register(views[1], views[0])
+
+
+def _fusion() -> None:
+    """Fuse two frames of a bundled sequence."""
+    from modeler import se3
+    from modeler.fusion import IncrementalTsdf
+    from modeler.pipeline import Modeler
+    from sequences import bundled, open_sequence
+
+    sequence = open_sequence(bundled("box"))
+    modeler, truth = Modeler(), sequence.truth()
+    assert truth is not None
+    frames = {index: sequence.frame(index) for index in sequence.indices[:2]}
+    scene = modeler.segmenter.scene(list(frames.values()))
+    views = {index: modeler.prepare(frame, scene).view for index, frame in frames.items()}
+    seen = {index: view for index, view in views.items() if view is not None}
+    trajectory = {index: se3.inverse(truth[index]) for index in seen}
+    IncrementalTsdf(modeler.fuser).updated(seen, trajectory).model()
+    modeler.fuser.fuse(seen, trajectory)
+
+
+class _Job(NamedTuple):
+    work: Callable[[], None]
+    last: tuple[str, str]
+    """Module and name of a kernel that it compiles last."""
+
+
+_JOBS = {
+    "registration": _Job(_registration, ("point_likelihood", "classify")),
+    "fusion": _Job(_fusion, ("tsdf", "_observe")),
+}
+
+
+def work(job: str) -> None:
+    """Do one job, and print the module of each kernel that it compiles."""
+    from numba.core import event
+
+    class Reporter(event.Listener):
+        def on_start(self, event: event.Event) -> None:
+            assert event.data is not None
+            path = Path(event.data["dispatcher"].py_func.__code__.co_filename)
+            if path.parent.name == "kernels":
+                print(path.stem, flush=True)
+
+        def on_end(self, event: event.Event) -> None:
+            """Nothing to say."""
+
+    event.register("numba:compile", Reporter())
+    _JOBS[job].work()
