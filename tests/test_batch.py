@@ -353,3 +353,13 @@ def test_options_of_build_are_options_of_batch(tmp_path: Path) -> None:
     batch = parsed(["batch", "s", "--out", "d", "--prior", "table", "--every", "2", "--voxel-m", "0.001"])
     assert isinstance(batch, Batch)
     assert (batch.prior.prior, batch.selection.every, batch.model.voxel_m) == ("table", 2, 0.001)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_builds")
+def test_pages_are_written_where_that_is_asked_for_and_linked(cli: Run, scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert cli("batch", scene, "--out", out, *QUICK, "--pages").status == 0
+    assert "</html>" in (out / "box" / "report.html").read_text()
+    assert cli("gallery", out).status == 0
+    assert '"link":"box/report.html"' in (out / "gallery.html").read_text()

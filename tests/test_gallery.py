@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -76,11 +75,11 @@ def test_a_thousand_models_are_there_within_two_seconds(cli: Run, folder: Path, 
     ended = cli("gallery", folder, "--overwrite")
     assert (ended.status, ended.out) == (0, "")
     assert {path.name for path in folder.iterdir() if path.is_file()} == {"gallery.html", "models.parquet"}
-    began_s = time.monotonic()
     page.open((folder / "gallery.html").as_uri())
+    loaded_ms = page.value("performance.timing.loadEventEnd - performance.timing.navigationStart")
+    assert 0 < loaded_ms < 2000
     assert page.value("document.querySelectorAll('.model').length") == COUNT
     page.wait_for("document.querySelector('.model img').naturalWidth == 160")
-    assert time.monotonic() - began_s < 2.0
     decoded = page.value("[...document.images].filter((image) => image.src).length")
     assert 20 < decoded < 200  # those near the window
     assert page.picture()[200:, :].std() > 20.0
@@ -88,6 +87,16 @@ def test_a_thousand_models_are_there_within_two_seconds(cli: Run, folder: Path, 
     page.wait_for("[...document.images].at(-1).naturalWidth == 160")
     assert page.complaints == []
     assert all(address.startswith(("file:", "data:")) for address in page.requested)
+    words = page.value(
+        "[...document.querySelectorAll('.model')].slice(0, 10).map((card) => card.children[2].textContent)"
+    )
+    assert words == [
+        "cannot be trusted",
+        *["can be trusted"] * 4,
+        "cannot be trusted",
+        *["can be trusted"] * 3,
+        "failed",
+    ]
     assert page.value("document.querySelector('a').getAttribute('href')") == "model-0000/report.html"
     assert page.value("document.querySelectorAll('a')[1].getAttribute('href')") == "model-0001/report.json"
 

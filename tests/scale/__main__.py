@@ -1,0 +1,141 @@
+"""Measure a batch.
+
+    PYTHONPATH=tests python -m scale builds FOLDER --sequences 200 --alone 40
+    PYTHONPATH=tests python -m scale tasks FOLDER --count 10000 [--executor dask:ADDRESS]
+
+`builds` renders small sequences, builds some one by one, each by a `modeler build` with one thread, and all of them by
+`modeler batch` with two workers. `tasks` has an engine do nothing many times, and a batch find everything done.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import wait
+from dataclasses import replace
+from pathlib import Path
+
+from modeler.cli.engines import engine
+from modeler.cli.jobs import NOTES, Job, fingerprint, write_note
+from sequences.rendering.recipe import load_recipe
+from sequences.rendering.renderer import render
+
+RECIPE = {
+    "name": "small",
+    "object": {
+        "kind": "compound",
+        "parts": [{"shape": {"kind": "box", "size_m": [0.13, 0.075, 0.18]}, "rgb": [225, 190, 90]}],
+    },
+    "trajectory": {
+        "kind": "tabletop",
+        "frames": 6,
+        "step_deg": 25,
+        "step_sigma_deg": 3,
+        "shift_m": 0.02,
+        "start_deg": 20,
+    },
+    "view": {"width": 160, "height": 120, "focal_px": 144, "look_height_m": 0.06},
+}
+OPTIONS = ("--prior", "table")
+ONE_THREAD = {name: "1" for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS")}
+
+
+def rendered(folder: Path, count: int) -> list[Path]:
+    """Return sequences that differ in their noise and motion, rendered where they are not there yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "small.json").write_text(json.dumps(RECIPE))
+    recipe = load_recipe(str(folder / "small.json"))
+    found = [folder / "sequences" / f"s{number:05d}" for number in range(count)]
+    for number, path in enumerate(found):
+        if not path.exists():
+            render(replace(recipe, seed=number), path, lambda sequence, *_: sequence)
+    return found
+
+
+def timed(commands: Sequence[Sequence[object]]) -> tuple[float, float]:
+    """Return wall time and processor time in s of commands, one after the other."""
+    began_s, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    for command in commands:
+        words = [sys.executable, "-m", "modeler", *map(str, command)]
+        done = subprocess.run(words, env={**os.environ, **ONE_THREAD}, capture_output=True, text=True, check=False)
+        assert done.returncode in (0, 3), done.stderr
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    used_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return time.monotonic() - began_s, used_s
+
+
+def builds(folder: Path, count: int, alone: int) -> None:
+    """Print what sequences cost one by one and in a batch of two workers."""
+    paths = rendered(folder, count)
+    singles = [("build", path, "--out", folder / "alone" / path.name, "--overwrite", *OPTIONS) for path in paths]
+    options = (*OPTIONS, "--workers", "2", "--seed", str(int(time.time())))  # nothing is done yet
+    first = timed(singles[: alone // 2])
+    batch = timed([("batch", *paths, "--out", folder / "batch", "--overwrite", *options)])
+    last = timed(singles[alone // 2 : alone])
+    wall_s, used_s = ((one + other) / alone for one, other in zip(first, last, strict=True))
+    print(f"one by one, {alone}: {wall_s:.2f} s, {used_s:.2f} s of a processor each")
+    print(f"batch of {count}: {batch[0] / count:.2f} s, {batch[1] / count:.2f} s of a processor each")
+    print(f"throughput of two workers over twice that of one: {wall_s / (2.0 * batch[0] / count):.2f}")
+    print(f"load of the machine: {os.getloadavg()}")
+
+
+def nothing(job: Job) -> str:
+    """Do nothing."""
+    return job.name
+
+
+def tasks(folder: Path, count: int, executor: str) -> None:
+    """Print what an engine takes for a task that does nothing, and a batch for a sequence that is done."""
+    folder.mkdir(parents=True, exist_ok=True)
+    told = folder / "done"
+    jobs = [Job(f"s{k:06d}", str(told / "in" / f"s{k:06d}"), str(told / "out"), OPTIONS) for k in range(count)]
+    with engine(executor, 2) as opened:
+        opened.submit(nothing, jobs[0]).result()
+        began_s = time.monotonic()
+        futures = [opened.submit(nothing, job) for job in jobs]
+        submitted_s = time.monotonic() - began_s
+        wait(futures)
+        ended_s = time.monotonic() - began_s
+    print(f"{executor}: {1e3 * submitted_s / count:.3f} ms to submit, {1e3 * ended_s / count:.3f} ms a task")
+    if executor != "processes":
+        return
+    (told / "out" / NOTES).mkdir(parents=True, exist_ok=True)
+    for job in jobs:
+        for number in range(20):
+            path = Path(job.sequence) / "depth" / f"{number:06d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+        job.run.mkdir(exist_ok=True)
+        (job.run / "report.json").touch()
+        note = {"sequence": job.sequence, "arguments": list(job.arguments), "status": 0, "record": {"frames": 20}}
+        write_note(job.note, {**note, "glance": fingerprint(job, content=False)})
+    (folder / "list.csv").write_text("\n".join(["sequence", *(job.sequence for job in jobs)]) + "\n")
+    table = ("--manifest", folder / "list.csv", "--out", told / "out", *OPTIONS)
+    wall_s, used_s = timed([("batch", *table)])
+    print(f"all of {count} done: {1e3 * wall_s / count:.3f} ms, {1e3 * used_s / count:.3f} ms of a processor each")
+
+
+def main() -> None:
+    """Measure what is asked for."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("what", choices=["builds", "tasks"])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--sequences", type=int, default=200)
+    parser.add_argument("--alone", type=int, default=40)
+    parser.add_argument("--count", type=int, default=10_000)
+    parser.add_argument("--executor", default="processes")
+    options = parser.parse_args()
+    if options.what == "builds":
+        builds(options.folder, options.sequences, options.alone)
+    else:
+        tasks(options.folder, options.count, options.executor)
+
+
+if __name__ == "__main__":
+    main()
