@@ -76,7 +76,8 @@ class Batch:
             InputError: where options, the manifest, the engine or the folder cannot be used.
             KeyboardInterrupt: after what is done has been listed.
         """
-        from modeler.cli.engines import check_engine
+        from modeler.cli.compiling import compile_kernels
+        from modeler.cli.engines import check_engine, is_here
         from modeler.cli.jobs import ended, read_note, standing
         from modeler.cli.models import write_models
         from modeler.cli.outputs import check_folder
@@ -104,6 +105,8 @@ class Batch:
             words = f"{len(jobs)} {_sequences(len(jobs))}: {words}, {stand['new'] + stand['changed']} to be built"
             if not waiting:
                 say(words)
+            elif is_here(self.executor):
+                compile_kernels()  # once, and not in every build that begins
             try:
                 with bar() as progress:
                     task = progress.add_task("", total=len(jobs), completed=len(ends))
