@@ -279,6 +279,20 @@ def test_it_is_the_square_root_of_the_rows_that_are_left(seed: int) -> None:
     assert len(root.cliques()) > 5
 
 
+def test_cliques_keep_their_numbers_and_nothing_else() -> None:
+    rng = np.random.default_rng(3)
+    pairs = [(k, j) for k in range(60) for j in range(max(0, k - 1), k)] + [(k, k - 12) for k in range(12, 60)]
+    root = SquareRoot().plus([_row(rng, 0), *(_row(rng, *pair) for pair in pairs)])
+    wide = 0
+    for clique in root.cliques():
+        assert all(array.base is None for array in (clique.r, clique.s, *clique.marginal))
+        assert all(block.any(axis=1).all() for block in clique.marginal)  # no zeros below the diagonal
+        heights = {len(rows) for rows in clique.separator_rows.values()} if clique.marginal else {0}
+        assert heights == {max(map(len, clique.marginal), default=0)}
+        wide = max(wide, len(clique.marginal))
+    assert wide > 3
+
+
 def test_what_hangs_on_one_row_leaves_all_else_alone() -> None:
     rng = np.random.default_rng(0)
     trunk = SquareRoot().plus([_row(rng, 0), *(_row(rng, k, k + 1) for k in range(20)), _row(rng, 0, 20)])

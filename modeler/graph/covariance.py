@@ -49,15 +49,20 @@ class Clique:
     separator: tuple[int, ...]
     r: Array
     s: Array
-    marginal: Array
-    """(m, 6 p) rows: what it and all cliques below say of the separator."""
+    marginal: tuple[Array, ...]
+    """By variable of the separator, blocks of m rows: what it and all cliques below say of it. Upper triangular: block
+    k has its first 6 k + 6 rows alone. Empty where they say nothing."""
     rows: tuple[Rows, ...]
     """Rows that name a frontal variable and none of a clique below."""
 
     @property
     def separator_rows(self) -> Rows:
-        """`marginal` by variable."""
-        return {frame: self.marginal[:, 6 * k : 6 * k + 6] for k, frame in enumerate(self.separator)}
+        """`marginal` by variable, with all rows."""
+        height = max(map(len, self.marginal), default=0)
+        return {
+            frame: np.vstack([block, np.zeros((height - len(block), 6))])
+            for frame, block in zip(self.separator, self.marginal, strict=True)
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,8 +239,11 @@ def _clique(
     reflected, *_ = _qr(matrix, lwork=_PANEL * matrix.shape[1], overwrite_a=1)
     upper = np.triu(reflected[: min(matrix.shape)])
     size = 6 * len(frontals)
-    r = np.asfortranarray(upper[:size, :size])  # as BLAS takes it
-    return Clique(frontals, separator, r, upper[:size, size:], upper[size:, size:], tuple(own))
+    # Copies: a part would keep the whole in memory.
+    r = upper[:size, :size].copy(order="F")  # as BLAS takes it
+    height, ends = len(upper) - size, range(6, 6 * len(separator) + 1, 6)
+    marginal = tuple(upper[size : size + end, size + end - 6 : size + end].copy() for end in ends if height > 0)
+    return Clique(frontals, separator, r, upper[:size, size:].copy(order="K"), marginal, tuple(own))
 
 
 @dataclass(frozen=True, eq=False)
