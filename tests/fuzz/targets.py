@@ -245,8 +245,8 @@ def _command(*arguments: str) -> Callable[[Path], None]:
     """Return what runs a command; names that begin with @ are those of files in the folder of the input."""
 
     def run(folder: Path) -> None:
-        for name in ("out", "out.obj", "out.html"):
-            remove(folder / name)
+        for made in folder.glob("out*"):
+            remove(made)
         said = io.StringIO()
         placed = [str(folder / argument[1:]) if argument.startswith("@") else argument for argument in arguments]
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
@@ -283,6 +283,12 @@ TARGETS |= {
     "export": Target(_runs, ("a/model.ply", "a/report.json"), _command("export", "@a", "--out", "@out.obj"), 0.3),
     "export anew": Target(
         _runs, ("a/report.json",), _command("export", "@a", "--out", "@out.obj", "--voxel-m", "0.01"), 0.1
+    ),
+    "export for a simulator": Target(
+        _runs,
+        ("a/model.ply", "a/report.json"),
+        _command("export", "@a", "--for", "mujoco", "--out", "@out"),
+        0.02,
     ),
     "page": Target(_runs, ("a/report.json", "a/recording.rrd"), _command("report", "@a", "--out", "@out.html"), 0.1),
     "join": Target(_runs, ("a/report.json", "b/report.json"), _command("join", "@a", "@b", "--out", "@out"), 0.1),
