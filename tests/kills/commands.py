@@ -24,6 +24,8 @@ COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
     "render": ("render", "recipe.json", "--out", "made/out"),
     "export": ("export", "a", "--out", "made/out.obj"),
     "export of texture": ("export", "a", "--out", "made/out.obj", "--texture"),
+    "export for a simulator": ("export", "a", "--for", "mujoco", "--out", "made/out"),
+    "batch": ("batch", "s", "--out", "made/out", "--prior", "table", "--method", "icp", "--workers", "1"),
     "calibrate-sensor": ("calibrate-sensor", "still", "--out", "made/out.json"),
     "calibrate-camera": ("calibrate-camera", "a", "--out", "made/out.json"),
     "export of poses": ("convert", "a", "--out", "made/out.json"),
