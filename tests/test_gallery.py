@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from commanded import Run
 from PIL import Image
 
 from modeler.cli.jobs import NOTES
-from modeler.cli.models import THUMBNAIL_PX, write_models
+from modeler.cli.models import THUMBNAIL_PX
 from modeler.export.models_table import enclosed_m3, read_table
 from sequences.rendering.meshes import Mesh
 from sequences.rendering.shapes import Box
@@ -53,11 +54,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder of a thousand made-up models."""
     out = tmp_path_factory.mktemp("many")
     (out / NOTES).mkdir()
+    pictures = [picture(number) for number in range(30)]
     for number in range(COUNT):
         name = f"model-{number:04d}"
         (out / NOTES / f"{name}.json").write_text(json.dumps(note(number)))
         if number % 10 != 9:
-            (out / NOTES / f"{name}.jpg").write_bytes(picture(number))
+            (out / NOTES / f"{name}.jpg").write_bytes(pictures[number % len(pictures)])
             (out / name).mkdir()
             (out / name / "report.json").write_text("{}")
     (out / "model-0000" / "report.html").write_text("a page")
@@ -99,6 +101,13 @@ def test_a_thousand_models_are_there_within_two_seconds(cli: Run, folder: Path, 
     ]
     assert page.value("document.querySelector('a').getAttribute('href')") == "model-0000/report.html"
     assert page.value("document.querySelectorAll('a')[1].getAttribute('href')") == "model-0001/report.json"
+
+
+def test_a_model_that_was_removed_leaves_its_row(cli: Run, tmp_path: Path) -> None:
+    (tmp_path / NOTES).mkdir()
+    (tmp_path / NOTES / "gone.json").write_text(json.dumps(note(1)))
+    assert cli("gallery", tmp_path).status == 0
+    assert '"link":null' in (tmp_path / "gallery.html").read_text()
 
 
 @browser
@@ -159,7 +168,9 @@ def test_a_model_without_picture_gets_one(cli: Run, built: Path, tmp_path: Path)
     assert sorted(path.name for path in built.iterdir()) == before
     (row,) = read_table(tmp_path / "models.parquet")
     assert (row["name"], row["status"]) == ("run", 0)
-    write_models(tmp_path)
+    os.utime(tmp_path / NOTES / "run.jpg", (1, 1))  # as if the model had been built anew
+    assert cli("gallery", tmp_path, "--overwrite").status == 0
+    assert (tmp_path / NOTES / "run.jpg").stat().st_mtime > 1.0
 
 
 def opened(mesh: Mesh) -> np.ndarray:

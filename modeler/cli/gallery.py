@@ -53,11 +53,12 @@ class Gallery:
         with bar() as progress:
             for row in progress.track(rows):
                 name = row["name"]
-                picture = self.folder / NOTES / f"{name}.jpg"
-                if row.get("triangles") and not picture.exists():
-                    thumbnail_of(self.folder / name, picture)
-                if picture.exists():
-                    pictures[name] = read_regular(picture)
+                if row.get("triangles"):
+                    picture = self.folder / NOTES / f"{name}.jpg"
+                    if not _newer(picture, self.folder / name / "model.ply"):
+                        thumbnail_of(self.folder / name, picture)
+                    if picture.exists():  # not so where the model was removed
+                        pictures[name] = read_regular(picture)
                 pages = [self.folder / name / page for page in ("report.html", "report.json")]
                 page = next((page for page in pages if page.exists()), None)
                 if page is not None:
@@ -65,3 +66,8 @@ class Gallery:
         write_gallery(out, self.folder.absolute().name, [blank() | row for row in rows], pictures, links)
         say(f"open {out} in a browser")
         return 0
+
+
+def _newer(picture: Path, model: Path) -> bool:
+    """Return whether there is a picture of a model as it is now, or no model any more."""
+    return picture.exists() and (not model.exists() or picture.stat().st_mtime_ns >= model.stat().st_mtime_ns)
