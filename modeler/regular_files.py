@@ -6,9 +6,11 @@ A FIFO, a socket or a device can block whoever opens it, or never end; only regu
 from __future__ import annotations
 
 import errno
+import glob
 import json
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -75,6 +77,17 @@ def create_regular(path: Path) -> None:
         os.ftruncate(descriptor, 0)
     finally:
         os.close(descriptor)
+
+
+def left_behind(path: Path, ending: str) -> Iterator[Path]:
+    """Yield what killed processes were to replace a path by: beside it, named `.NAME.PROCESS` and the ending."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*{ending}"):
+        try:
+            os.kill(int(left.name.removesuffix(ending).rpartition(".")[2]), 0)
+        except (ProcessLookupError, OverflowError):
+            yield left
+        except (ValueError, PermissionError):
+            pass  # not ours, or still at it
 
 
 def read_regular(path: Path, most_bytes: int = MAX_BYTES) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import json
 import os
 import re
@@ -17,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
+from modeler.regular_files import left_behind
 from modeler.types import Array, BoolArray, Camera, Frame, InputError
 from sequences.base import AbstractSequence
 from sequences.image_files import (
@@ -295,7 +295,8 @@ def write_bop(
         raise InputError(f"{folder}: exists already; remove it or give another --out.")
     partial = folder.parent / f".{folder.name}.{os.getpid()}.partial"
     try:
-        _tidy(folder)
+        for left in left_behind(folder, ".partial"):
+            shutil.rmtree(left, ignore_errors=True)
         partial.mkdir(parents=True)
         _fill(partial, frames, truth, meta or {}, depth_scale_mm=depth_scale_mm, colour_suffix=colour_suffix)
         for name, content in (files or {}).items():
@@ -305,18 +306,6 @@ def write_bop(
         raise InputError(f"{folder}: cannot be written ({error.strerror}); check space and permissions.") from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-
-
-def _tidy(folder: Path) -> None:
-    """Remove partial folders that killed processes have left."""
-    for left in folder.parent.glob(f".{glob.escape(folder.name)}.*.partial"):
-        process = left.name.split(".")[-2]
-        try:
-            os.kill(int(process), 0)
-        except (ProcessLookupError, OverflowError):
-            shutil.rmtree(left, ignore_errors=True)
-        except (ValueError, PermissionError):
-            pass  # not ours, or still at it
 
 
 def _fill(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -225,6 +226,16 @@ def test_file_is_whole_whatever_happens_while_it_is_written(tmp_path: Path, monk
             write_atomically(path, "new")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_kill_left_of_a_file_goes_when_it_is_written_again(tmp_path: Path) -> None:
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    for name in (f".a.txt.{ended.pid}.part", f".a.txt.{os.getppid()}.part", ".a.txt.mine.part", f".b.{ended.pid}.part"):
+        (tmp_path / name).write_text("half")
+    write_atomically(tmp_path / "a.txt", "whole")
+    left = {f".a.txt.{os.getppid()}.part", ".a.txt.mine.part", f".b.{ended.pid}.part"}
+    assert {path.name for path in tmp_path.iterdir()} == {"a.txt", *left}
 
 
 # Run folders that are damaged or made by hand are refused in one line, and give no broken mesh.

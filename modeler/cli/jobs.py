@@ -6,6 +6,7 @@ Engines run `run` wherever they like; what they carry there and back is small an
 from __future__ import annotations
 
 import fcntl
+import glob
 import hashlib
 import json
 import os
@@ -227,6 +228,8 @@ def run(job: Job) -> Ended | None:
         now = standing(job)
         if now in ("done", "failed"):
             return ended(job.name, read_note(job.note), fresh=False)
+        for left in job.note.parent.glob(f".{glob.escape(job.note.name)}.*.part"):  # by a kill
+            left.unlink(missing_ok=True)
         log.truncate(0)
         command = [sys.executable, "-m", BUILDER, json.dumps(asdict(job))]
         status = PROCESSES.run(command, _environment(job.threads), log.fileno())

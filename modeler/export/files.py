@@ -10,12 +10,13 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+from modeler.regular_files import left_behind
 from modeler.types import InputError
 
 PART = ".part"  # ending of a file that is still being written
 
 
-def write_atomically(path: Path, content: str | bytes, *, lasting: bool = False) -> None:
+def write_atomically(path: Path, content: str | bytes, *, lasting: bool = False, tidy: bool = True) -> None:
     """Write a file so that whoever looks at any moment, also after a kill, finds the old one or the new one whole.
 
     A folder that is not there is made.
@@ -24,6 +25,7 @@ def write_atomically(path: Path, content: str | bytes, *, lasting: bool = False)
         path: the file.
         content: all of it.
         lasting: wait until it is on the disk, so that the same holds after a power cut.
+        tidy: remove what killed processes were to write there, for which the folder is listed.
 
     Raises:
         InputError: where the file cannot be written.
@@ -33,6 +35,8 @@ def write_atomically(path: Path, content: str | bytes, *, lasting: bool = False)
     try:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            for left in left_behind(path, PART) if tidy else ():
+                left.unlink(missing_ok=True)
             part.write_bytes(data)
             if lasting:
                 settle(part)

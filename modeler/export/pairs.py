@@ -63,7 +63,7 @@ class Pairs:
         with contextlib.suppress(OSError, InputError):
             self.folder.mkdir(exist_ok=True)
             path = self._path(posterior.source, posterior.target, question)
-            write_atomically(path, packed.getvalue())
+            write_atomically(path, packed.getvalue(), tidy=False)  # thousands; they go together
             settle_soon(path, self.folder)  # waiting for the disk would take as long as registering
 
     @property
