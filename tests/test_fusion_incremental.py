@@ -65,11 +65,11 @@ def test_what_is_added_and_taken_back_leaves_nothing():
     normals = np.tile([0.0, 0.0, -1.0], (360, 1))
     seen = (index, np.full((20, 20), 0.6, dtype=np.float32), points, normals, rng.uniform(0.1, 1.0, 360))
     sums = np.zeros((12, 12, 24, 6), dtype=np.float32)
-    box = sums[2:, :11]
+    box = np.array([[2, 0, 0], [12, 11, 24]])
     origin, pose, lens = np.array([-0.04, -0.06, 0.35]), np.eye(4)[:3], np.array([60.0, 60.0, 9.5, 9.5])
     colours = np.concatenate([rng.integers(0, 256, (360, 3)), np.ones((360, 1))], axis=1).astype(np.float64)
     for sign in (1.0, -1.0):
-        kernels.integrate_view(box, origin, 0.01, 0.03, 0.3, sign, pose, lens, *seen, colours)
+        kernels.integrate_view(sums, box, origin, 0.01, 0.03, 0.3, sign, pose, lens, *seen, colours)
         if sign > 0.0:
             assert np.count_nonzero(sums[..., 0]) > 1000
             assert not sums[:2].any()
@@ -84,7 +84,9 @@ def test_distances_are_those_along_the_normal_within_the_band():
     seen = (index, np.full((1, 1), 0.5, dtype=np.float32), np.array([[0.0, 0.0, 0.5]]), normal, np.ones(1))
     origin, pose = np.array([-0.0025, -0.0025, 0.4]), np.eye(4)[:3]
     lens, colours = np.array([1.0, 1.0, 0.0, 0.0]), np.array([[10.0, 20.0, 30.0, 1.0]])
-    kernels.integrate_view(sums, origin, 0.005, 0.02, 0.3, 1.0, pose, lens, *seen, colours)
+    kernels.integrate_view(
+        sums, np.array([[0, 0, 0], [1, 1, 40]]), origin, 0.005, 0.02, 0.3, 1.0, pose, lens, *seen, colours
+    )
     along = 0.8 * (0.5 - (0.4 + 0.005 * (np.arange(40) + 0.5)))
     inside = np.abs(along) <= 0.02
     expected = np.where(inside, np.minimum(1.0, 1.5 * (1.0 + along / 0.02) + 1e-3), np.where(along > 0.02, 0.3, 0.0))

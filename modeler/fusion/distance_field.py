@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from modeler.fusion.depth_views import ViewBlocks
 from modeler.kernels import marching_cubes, tsdf
-from modeler.types import Array
+from modeler.types import Array, BoolArray
 
 LEAST_NEIGHBOURS = 15  # of the 26 around a voxel that fill it: more than half, so that open borders do not grow
 FAINT = 1e-3  # weight of a voxel that is filled: known, but next to nothing against an observation
@@ -77,7 +77,7 @@ def measured(grid: VoxelGrid, views: ViewBlocks, *, tau_m: float, empty_weight: 
     near = np.zeros(grid.blocks, dtype=bool)
     for some in views:
         near[tuple(tsdf.blocks_near(some.points_m, grid.origin_m, block_m, tau_m, grid.blocks).T)] = True
-    voxels = np.argwhere(near)
+    voxels = voxels_where(near)
     distance, weight = (np.zeros((len(voxels), *(tsdf.SIDE,) * 3), dtype=np.float32) for _ in range(2))
     for some in views:
         value, share = tsdf.integrate(
@@ -92,7 +92,12 @@ def measured(grid: VoxelGrid, views: ViewBlocks, *, tau_m: float, empty_weight: 
     weights = weights.transpose(0, 3, 1, 4, 2, 5).reshape(grid.shape)
     for axis in range(3):
         np.moveaxis(weights, axis, 0)[[0, -1]] = 0.0
-    return DistanceField(grid, values, weights, np.argwhere(weights > 0.0))
+    return DistanceField(grid, values, weights, voxels_where(weights > 0.0))
+
+
+def voxels_where(mask: BoolArray) -> npt.NDArray[np.int64]:
+    """Return the voxels (n, 3) where a mask (x, y, z) is true, in ascending order: `np.argwhere` in half the time."""
+    return np.stack(np.unravel_index(np.flatnonzero(mask), mask.shape), axis=1)
 
 
 def filled(field: DistanceField) -> DistanceField:
@@ -103,7 +108,7 @@ def filled(field: DistanceField) -> DistanceField:
     values, weights = field.values_m.copy(), field.weights.copy()
     values[tuple(cells.T)] = means
     weights[tuple(cells.T)] = FAINT
-    return DistanceField(field.grid, values, weights, np.argwhere(weights > 0.0))
+    return DistanceField(field.grid, values, weights, voxels_where(weights > 0.0))
 
 
 def crossed(values_m: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
@@ -116,4 +121,4 @@ def crossed(values_m: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
         low[axis], high[axis] = slice(None, -1), slice(1, None)
         some = some[tuple(low)] | some[tuple(high)]
         every = every[tuple(low)] & every[tuple(high)]
-    return np.argwhere(some & ~every)
+    return voxels_where(some & ~every)

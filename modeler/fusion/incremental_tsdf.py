@@ -11,6 +11,7 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.fusion import meshing
 from modeler.fusion.depth_views import GREY, free_of, posed_views
+from modeler.fusion.distance_field import voxels_where
 from modeler.fusion.fuser import Fuser
 from modeler.kernels import marching_cubes, tsdf
 from modeler.types import Array, ObjectModel, RayImage
@@ -98,7 +99,7 @@ class IncrementalTsdf:
             np.moveaxis(weights, axis, 0)[[0, -1]] = 0.0
         known = weights > 0.0
         values = np.where(known, self.sums[..., 1] / np.where(known, weights, 1.0), 0.0).astype(np.float32)
-        positions, triangles = marching_cubes.extract(values, weights, np.argwhere(known))
+        positions, triangles = marching_cubes.extract(values, weights, voxels_where(known))
         shown = triangles[meshing.large_pieces(positions, triangles, self.fuser.min_piece)]
         used, shown = meshing.used_vertices(shown, len(positions))
         positions = positions[used]
@@ -151,9 +152,9 @@ class IncrementalTsdf:
         colours = np.ones((len(view.points_m), 4))
         colours[:, :3] = GREY if view.frame.colour is None else view.frame.colour[tuple(view.pixels.T)]
         colours[:, 3] = view.frame.colour is not None
-        box = tuple(slice(*ends) for ends in np.subtract((at.low, at.high), self.low).T)
         tsdf.integrate_view(
-            self.sums[box],
+            self.sums,
+            np.subtract((at.low, at.high), self.low),
             np.array(at.low) * self.voxel_m,
             self.voxel_m,
             self.tau_m,

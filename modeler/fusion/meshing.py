@@ -8,7 +8,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from modeler.fusion.distance_field import DistanceField
+from modeler.fusion.distance_field import DistanceField, voxels_where
 from modeler.kernels import marching_cubes
 from modeler.types import Array, BoolArray
 
@@ -26,19 +26,24 @@ PINCH_DEPTH = 1e-2  # how far inside a voxel is put to resolve a pinch, in voxel
 
 def without_pinches(field: DistanceField) -> DistanceField:
     """Return the field with sheets of the zero level set joined that touch along an edge."""
-    values, known = field.values_m, field.known
+    values, cells, known = field.values_m, field.known, np.zeros(field.values_m.shape, dtype=bool)
     for _ in range(PINCH_ROUNDS):
-        voxels = marching_cubes.pinched_voxels(values, field.weights, known)
+        voxels = marching_cubes.pinched_voxels(values, field.weights, cells)
         if not len(voxels):
             break
         if values is field.values_m:
             values = values.copy()
+            known[tuple(field.known.T)] = True
         values[tuple(voxels.T)] = -PINCH_DEPTH * field.grid.voxel_m
-        # Cells crossed by the surface now were crossed before, or lie around a changed voxel.
-        around = (voxels[:, None] - np.argwhere(np.ones((2, 2, 2)))).reshape(-1, 3)
-        keys = (np.ravel_multi_index(tuple(cells.T), values.shape) for cells in (known, around))
-        known = np.stack(np.unravel_index(np.union1d(*keys), values.shape), axis=1)
-    return field if values is field.values_m else DistanceField(field.grid, values, field.weights, known)
+        # Only cells around a changed voxel can be crossed that were not before; they and those that share a face with
+        # them can have new pinches.
+        around = (voxels[:, None] - np.indices((2, 2, 2)).reshape(3, -1).T).reshape(-1, 3)
+        known[tuple(around.T)] = True
+        cells = np.unique(np.concatenate([around, *(around - side for side in np.eye(3, dtype=np.int64))]), axis=0)
+        cells = cells[cells.min(axis=1) >= 0]
+    if values is field.values_m:
+        return field
+    return DistanceField(field.grid, values, field.weights, voxels_where(known))
 
 
 def extracted_mesh(field: DistanceField) -> tuple[Array, Triangles]:

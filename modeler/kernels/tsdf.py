@@ -12,7 +12,7 @@ surface along its normal, a weight, and the number of the surface point. Equatio
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from modeler.kernels.threads import over_rows
 
@@ -398,34 +398,48 @@ def occluding_votes(best, position, seen, distance, weight, number, views, index
     return count
 
 
-@njit(cache=True, parallel=True)
-def integrate_view(
-    sums, origin, voxel_m, tau_m, empty_weight, sign, pose, camera, index, free_m, points, normals, weights, colours
-):
+def integrate_view(sums, box, *view):
     """Add one view to the sums of a box of voxels in place (F5 with plain sums, without F6).
 
     Args:
         sums: (x, y, z, 6) float32: Σ w, Σ w d, Σ c, Σ c red, Σ c green, Σ c blue.
-        origin: (3,) lowest corner of the box in m, object frame.
-        voxel_m: side of a voxel.
-        tau_m: half width of the truncation band.
-        empty_weight: relative to 1 for a surface seen head-on.
-        sign: 1 adds, -1 removes what was added with the same arguments.
-        pose: (3, 4) camera_from_object.
-        camera: (4,) fx, fy, cx, cy of the images.
-        index: (h, w) int32 number of the surface point at a pixel, -1 = none.
-        free_m: (h, w) float32 depth up to which a pixel sees empty space, 0 = unknown.
-        points: (n, 3) in the object frame.
-        normals: (n, 3).
-        weights: (n,).
-        colours: (n, 4) RGB and 1, or 0 without colour.
+        box: (2, 3) first voxel of the box, and the one after its last.
+        view: lowest corner (3,) of the box in m, object frame; side of a voxel in m; half width in m of the truncation
+            band; weight of empty space, relative to 1 for a surface seen head-on; 1 to add the view, -1 to remove what
+            was added with the same arguments; camera_from_object (3, 4); fx, fy, cx, cy (4,) of the images; number of
+            the surface point at a pixel (h, w) int32, -1 = none; depth in m up to which a pixel sees empty space
+            (h, w) float32, 0 = unknown; points (n, 3) in the object frame, normals (n, 3) and weights (n,); colours
+            (n, 4), RGB and 1, or 0 without colour.
     """
-    for i in prange(sums.shape[0]):
-        x = origin[0] + (i + 0.5) * voxel_m
-        for j in range(sums.shape[1]):
-            y = origin[1] + (j + 0.5) * voxel_m
-            for k in range(sums.shape[2]):
-                z = origin[2] + (k + 0.5) * voxel_m
+    over_rows(_integrate_view, np.arange(box[1, 0] - box[0, 0]), sums, box, *view)
+
+
+@njit(cache=True, nogil=True)
+def _integrate_view(
+    layers,
+    sums,
+    box,
+    origin,
+    voxel_m,
+    tau_m,
+    empty_weight,
+    sign,
+    pose,
+    camera,
+    index,
+    free_m,
+    points,
+    normals,
+    weights,
+    colours,
+):
+    """Add a view to some layers of a box along its first axis; return those layers."""
+    for layer in layers:
+        x, i = origin[0] + (layer + 0.5) * voxel_m, box[0, 0] + layer
+        for j in range(box[0, 1], box[1, 1]):
+            y = origin[1] + (j - box[0, 1] + 0.5) * voxel_m
+            for k in range(box[0, 2], box[1, 2]):
+                z = origin[2] + (k - box[0, 2] + 0.5) * voxel_m
                 u, v, depth = project(pose, camera, x, y, z)
                 if not (depth > 0.0 and -0.5 <= u < index.shape[1] - 0.5 and -0.5 <= v < index.shape[0] - 0.5):
                     continue
@@ -443,3 +457,4 @@ def integrate_view(
                 elif along > 0.0 and depth < free_m[row, column] - tau_m:
                     sums[i, j, k, 0] += sign * empty_weight
                     sums[i, j, k, 1] += sign * empty_weight * tau_m
+    return layers

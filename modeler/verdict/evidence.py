@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 from scipy import ndimage
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtri
 
 from modeler import se3
 from modeler.types import AbstractPrior, Array, BoolArray, Edge, InputError, LoopOpening, RayImage, Solution
@@ -135,9 +135,7 @@ def contradiction(distances: Sequence[tuple[Edge, float]]) -> Contradiction | No
     if not distances:
         return None
     edge, nats = max(distances, key=lambda found: found[1])
-    return Contradiction(
-        edge.source, edge.target, Figure(float(np.sqrt(2.0 * nats)), float(np.sqrt(chi2.isf(TAIL, 6))))
-    )
+    return Contradiction(edge.source, edge.target, Figure(float(np.sqrt(2.0 * nats)), float(np.sqrt(chdtri(6, TAIL)))))
 
 
 def prior_figure(distances: Sequence[tuple[Edge, float]]) -> Figure | None:
@@ -153,7 +151,7 @@ def prior_figure(distances: Sequence[tuple[Edge, float]]) -> Figure | None:
     if not squared:
         return None
     freedom = 6 * len(squared)
-    return Figure(sum(squared) / freedom, float(chi2.isf(LOOP_TAIL, freedom)) / freedom)
+    return Figure(sum(squared) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
 
 
 def loop_figure(openings: Sequence[LoopOpening]) -> tuple[LoopOpening, Figure] | None:
@@ -166,7 +164,7 @@ def loop_figure(openings: Sequence[LoopOpening]) -> tuple[LoopOpening, Figure] |
     if not finite:
         return None
     worst = max(finite, key=lambda opening: opening.sigmas)
-    return worst, Figure(worst.sigmas, float(np.sqrt(chi2.isf(LOOP_TAIL / len(finite), 6) / 6.0)))
+    return worst, Figure(worst.sigmas, float(np.sqrt(chdtri(6, LOOP_TAIL / len(finite)) / 6.0)))
 
 
 def graph_figure(edges: Sequence[Edge], solution: Solution) -> Figure | None:
@@ -186,7 +184,7 @@ def graph_figure(edges: Sequence[Edge], solution: Solution) -> Figure | None:
     ]
     xi = se3.log(np.stack(apart))
     whitened = np.linalg.solve(np.stack([pose.covariance for pose in poses]), xi[..., None])[..., 0]
-    return Figure(float(np.sum(xi * whitened)) / freedom, float(chi2.isf(LOOP_TAIL, freedom)) / freedom)
+    return Figure(float(np.sum(xi * whitened)) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
 
 
 def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage]) -> Figure:
@@ -272,7 +270,7 @@ def spread_of_places(views: Mapping[int, RayImage], solution: Solution, factor: 
 
 def _widest(sigmas: Mapping[int, float], wrong: float) -> Spread | None:
     """Return the largest standard deviation by frame number; `wrong` is the error from which on a pose is wrong."""
-    limit = wrong / float(norm.isf(WRONG_SHARE / 2.0))
+    limit = wrong / float(-ndtri(WRONG_SHARE / 2.0))
     worst = max(sigmas, key=lambda frame: sigmas[frame], default=None)
     if worst is None:
         return None
