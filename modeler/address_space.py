@@ -1,6 +1,5 @@
-"""Memory as the operating system sees it: whether there is room for libraries, and what a run no longer needs."""
+"""Whether there is room for libraries that end the process, or wait for ever, where there is none."""
 
-import ctypes
 import mmap
 import sys
 
@@ -16,13 +15,3 @@ def check_room(size: int) -> None:
     """
     if sys.platform == "linux":
         mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=mmap.PROT_READ).close()
-
-
-def return_free_memory() -> None:
-    """Return to the operating system what was allocated and is free again, where the C library keeps it (glibc).
-
-    Matrices of a graph that grows are larger with every frame, so that those that are free seldom fit for new ones.
-    """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)

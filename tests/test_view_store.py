@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import mmap
-import platform
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,6 @@ import pytest
 import tabletop
 from test_pipeline import FRAMES, Oracle, modeler
 
-from modeler.address_space import return_free_memory
 from modeler.pipeline import Run
 from modeler.pipeline.state import State
 from modeler.pipeline.view_store import ViewStore
@@ -31,21 +29,6 @@ def arrays(view: RayImage) -> dict[str, np.ndarray]:
         "normals": view.normals,
         "pixels": view.pixels,
     }
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have ways of their own")
-def test_memory_that_is_free_again_is_returned() -> None:
-    def resident_mb() -> float:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return next(int(line.split()[1]) / 1000.0 for line in lines if line.startswith("RssAnon"))
-
-    matrices = [np.ones(10_000) for _ in range(600)]  # 48 MB
-    kept = matrices[::60] + matrices[-1:]
-    full_mb = resident_mb()
-    del matrices
-    return_free_memory()
-    assert resident_mb() < full_mb - 30.0
-    assert len(kept) == 11
 
 
 def on_disk(view: RayImage) -> bool:

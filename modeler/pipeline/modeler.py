@@ -10,7 +10,6 @@ from typing import final
 
 import numpy as np
 
-from modeler.address_space import return_free_memory
 from modeler.closure import Closer
 from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances
 from modeler.graph import CommonAxis, shared_noise
@@ -36,8 +35,6 @@ from modeler.types import (
     Searching,
     Step,
 )
-
-_FRAMES_A_TRIM = 50  # after so many, memory that is free again is returned, which takes some ms
 
 
 @final
@@ -147,8 +144,6 @@ class Run:
             prepared = self.modeler.prepare(frame, self.scene)
             self.state = self.state.read(prepared)
             yield from self._place(prepared, self.state.latest, last=last)
-            if len(self.state.places) % _FRAMES_A_TRIM == 0:
-                return_free_memory()
 
     def revisit(self) -> Iterator[Step | Searching]:
         """Register lost frames again, newest first, with the views that followed them; yield steps of those placed."""
