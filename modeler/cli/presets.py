@@ -22,8 +22,9 @@ from modeler.cli.inputs import Reopened, reopened
 from modeler.cli.outputs import check_files, check_folder, run_inputs
 from modeler.export import bop, physics, solids
 from modeler.export.checks import Checks, loaded, mesh_checks
+from modeler.export.standing import model_up
 from modeler.export.texture import TRIANGLES, Texture
-from modeler.fusion import Fuser, FusionVolume
+from modeler.fusion import Fuser, FusionVolume, Symmetries, SymmetryFinder
 from modeler.types import InputError, ObjectModel
 from sequences import write_bop
 
@@ -248,8 +249,13 @@ class Preset:
             model = files.simplified(model, self.options.triangles)
         model = solids.without_degenerate(model)
         place = files.placement(model, run.report, "bbox", "z")
-        files.write_bop(model, self._bop_model, place)
+        found = self._symmetries(model)
+        axes = ((axis.direction, axis.point_m) for axis in found.continuous)
+        entries = bop.symmetry_entries(found.discrete, axes, place.object_from_mesh)
+        entries["symmetries_tolerance_mm"] = 1000.0 * found.tolerance_m
+        files.write_bop(model, self._bop_model, place, entries)
         self._tell(place)
+        say(found.words)
         placed, count = place.placed(model), 0
         for name, views in scenes.items():
             poses = {k: se3.inverse(run.solution.trajectory[k]) @ place.object_from_mesh for k in views}
@@ -266,6 +272,17 @@ class Preset:
             count += len(shots)
         words = f"{count} frames with masks, boxes and poses in {len(scenes)} scene{'s' if len(scenes) > 1 else ''}"
         return mesh_checks(self._bop_model, unit_m=1e-3, most_triangles=10**7).also(self._reads_back(scenes), words)
+
+    def _symmetries(self, model: ObjectModel) -> Symmetries:
+        """Return the rotations that map a mesh of the object frame onto itself, as far as it was seen."""
+        sigmas_m = model.vertex_sigmas_m
+        known = np.zeros(0) if sigmas_m is None else sigmas_m[np.isfinite(sigmas_m)]
+        return SymmetryFinder().find(
+            model.vertices_m,
+            model.triangles,
+            up=model_up(self._reopened.report)[0],
+            sigma_m=float(np.median(known)) if len(known) else 0.0,
+        )
 
     def _sides(self) -> dict[str, list[int]]:
         """Return the frames of each scene: BOP's static onboarding has one of the object upright, one turned over."""

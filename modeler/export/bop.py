@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
+from modeler import se3
 from modeler.export.files import write_atomically
 from modeler.export.formats import ply_bytes
 from modeler.export.placing import Placement
@@ -90,6 +91,33 @@ def _diameter(points: Array) -> float:
     except QhullError:  # flat
         points = np.unique(points, axis=0)
     return float(pdist(points).max()) if len(points) > 1 else 0.0
+
+
+def symmetry_entries(
+    discrete: Iterable[Array], continuous: Iterable[tuple[Array, Array]], object_from_mesh: Array
+) -> dict[str, Any]:
+    """Return the entries of `models_info.json` for symmetries; none where there are none.
+
+    Args:
+        discrete: rotations (4, 4) of the object frame onto itself, m.
+        continuous: directions (3,) and points (3,), m, of axes in the object frame.
+        object_from_mesh: (4, 4) from the frame of the model, m.
+    """
+    mesh_from_object = se3.inverse(object_from_mesh)
+    turns = []
+    for pose in discrete:
+        turn = mesh_from_object @ pose @ object_from_mesh
+        turn[:3, 3] *= 1000.0
+        turns.append(turn.ravel().tolist())
+    axes = [
+        {
+            "axis": (mesh_from_object[:3, :3] @ direction).tolist(),
+            "offset": (1000.0 * se3.transform(mesh_from_object, point_m[None])[0]).tolist(),
+        }
+        for direction, point_m in continuous
+    ]
+    entries = {"symmetries_discrete": turns, "symmetries_continuous": axes}
+    return {name: values for name, values in entries.items() if values}
 
 
 def scene_gt_info(model: ObjectModel, frames: Iterable[Frame], camera_from_model: Mapping[int, Array]) -> str:

@@ -4,5 +4,15 @@ from modeler.fusion.alignment import Match, Matcher
 from modeler.fusion.depth_views import conditional_covariances
 from modeler.fusion.fuser import Fuser, FusionVolume
 from modeler.fusion.incremental_tsdf import IncrementalTsdf
+from modeler.fusion.symmetries import Symmetries, SymmetryFinder
 
-__all__ = ["Fuser", "FusionVolume", "IncrementalTsdf", "Match", "Matcher", "conditional_covariances"]
+__all__ = [
+    "Fuser",
+    "FusionVolume",
+    "IncrementalTsdf",
+    "Match",
+    "Matcher",
+    "Symmetries",
+    "SymmetryFinder",
+    "conditional_covariances",
+]

@@ -62,7 +62,7 @@ class Matcher:
         chosen = np.linspace(0, len(source_m) - 1, min(self.points, len(source_m))).astype(np.int64)
         tree = KDTree(target_m)
         aligned = []
-        for rotation in _even_rotations(self.rotations):
+        for rotation in even_rotations(self.rotations):
             start = np.eye(4)
             start[:3, :3] = rotation
             start[:3, 3] = target_m.mean(axis=0) - rotation @ source_m.mean(axis=0)
@@ -137,7 +137,7 @@ def _even(model: ObjectModel, voxel_m: float) -> tuple[Array, Array]:
     return downsampled(model.points_m, model.normals, np.ones(len(model.points_m)), voxel_m=voxel_m, max_voxels=128**3)
 
 
-def _even_rotations(count: int) -> Array:
+def even_rotations(count: int) -> Array:
     """Return rotations (n, 3, 3) evenly spread over SO(3) (Alexa 2022, "Super-Fibonacci spirals")."""
     steps = np.arange(count) + 0.5
     small, large = np.sqrt(steps / count), np.sqrt(1.0 - steps / count)

@@ -1,0 +1,338 @@
+"""Rotations that map the surface of a model onto itself, as far as it was seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from modeler import se3
+from modeler.fusion.alignment import even_rotations
+from modeler.types import Array, BoolArray
+
+ORDERS = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 16)
+"""Orders n of rotations by 360°/n that are tried about the likely axes; about the others, 2 and 3."""
+_LIKELY = 6
+_NEAR = (0.2, 0.3, 0.5, 0.6, 0.7)  # of the points, within three tolerances at each step of ICP: else it is given up
+_GENERIC_DEG = 360.0 * (np.arange(1, 13) * 0.61803398875 % 1.0)  # no two of them, nor their differences, make an order
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """A line in the object frame."""
+
+    direction: Array
+    """(3,) unit."""
+    point_m: Array
+    """(3,) a point on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetries:
+    """What was found."""
+
+    tolerance_m: float
+    """Distance within which surface counts as the same."""
+    discrete: tuple[Array, ...] = ()
+    """(4, 4) rotations of the object frame onto itself, without the identity; those about a continuous axis are left
+    out, and of those that differ by a turn about it, one is named."""
+    continuous: tuple[Axis, ...] = ()
+    """Axes about which any rotation maps the model onto itself; of a ball three, through its centre."""
+    compared: float = 1.0
+    """Share of the seen surface that was compared, in the rotation for which it was least."""
+
+    @property
+    def words(self) -> str:
+        """The same in a sentence."""
+        found = [f"{len(self.continuous)} axis of revolution"] if len(self.continuous) == 1 else []
+        found += ["all rotations about a centre"] if len(self.continuous) > 1 else []
+        found += [f"{len(self.discrete)} discrete rotation{'s' * (len(self.discrete) > 1)}"] if self.discrete else []
+        return (
+            f"symmetries of the shape within {1000.0 * self.tolerance_m:.1f} mm, as far as it was seen: "
+            f"{' and '.join(found) or 'none'}"
+        )
+
+
+@dataclass(frozen=True)
+class SymmetryFinder:
+    """Register a surface with itself from likely axes, and keep rotations under which next to nothing is elsewhere.
+
+    Axes are the vertical, the principal axes of the surface, directions in which much of it faces and those between
+    them, and directions spread evenly. Each is refined by point-to-plane ICP of the surface with itself. A rotation
+    is a symmetry where fewer than `elsewhere` of the points end farther than the tolerance from the surface, and fewer
+    than `unknown` end where no surface was seen; nothing is said of what was not compared.
+    """
+
+    sigmas: float = 3.0
+    """Tolerance in standard deviations of the distance between two places of the surface, each of which errs."""
+    least_share: float = 0.01
+    """And at least this share of the diameter: what is smaller tells no pose estimator apart."""
+    elsewhere: float = 0.006
+    """Largest share of points farther than the tolerance from the surface, which allows for outliers."""
+    unknown: float = 0.1
+    """Largest share of points that end where nothing was seen."""
+    points: int = 4000
+    """Points that are compared."""
+    icp_points: int = 250
+    """Points used by ICP."""
+    directions: int = 24
+    """Directions spread evenly over half a sphere."""
+
+    def find(
+        self, vertices_m: Array, triangles: npt.NDArray[np.int64], *, up: Array, sigma_m: float, closed: bool = False
+    ) -> Symmetries:
+        """Return the symmetries of a surface.
+
+        Args:
+            vertices_m: (v, 3) of what was seen.
+            triangles: (t, 3) vertex numbers, counter-clockwise from outside.
+            up: (3,) unit, normal of the support, or whatever axis is likely.
+            sigma_m: standard deviation of the surface along its normal.
+            closed: whether all of the surface was seen, so that nothing ends where it was not.
+        """
+        surface = _Surface.of(vertices_m, triangles, self.points, closed=closed)
+        tolerance_m = max(self.sigmas * np.sqrt(2.0) * sigma_m, self.least_share * surface.diameter_m)
+        search = _Search(self, surface, tolerance_m)
+        likely = search.likely_axes(up)
+        continuous: list[Axis] = []
+        for direction in likely:
+            axis = search.refined(direction, 100.0)
+            if axis is None or any(_parallel(axis, other) for other in continuous):
+                continue
+            if all(search.maps(_rotation(axis, np.radians(angle))) for angle in _GENERIC_DEG):
+                continuous.append(axis)
+            if len(continuous) == 3:
+                break
+        if len(continuous) > 1:  # two make a ball
+            centre = _meeting_point(continuous)
+            axes = tuple(Axis(direction, centre) for direction in np.eye(3))
+            if all(search.maps(_rotation(axis, np.radians(a))) for axis in axes for a in _GENERIC_DEG[:4]):
+                return Symmetries(tolerance_m, (), axes, search.compared)
+            continuous = continuous[:1]
+        found: list[Array] = []
+        others = search.other_axes(likely)
+        for place, direction in enumerate((*likely, *others)):
+            for order in ORDERS if place < len(likely) else ORDERS[:2]:
+                axis = search.refined(direction, 360.0 / order)
+                if axis is None or any(_parallel(axis, other) for other in continuous):
+                    continue
+                search.add(found, continuous, *(_rotation(axis, 2.0 * np.pi * k / order) for k in range(1, order)))
+        search.close(found, continuous)
+        return Symmetries(tolerance_m, tuple(found), tuple(continuous), search.compared)
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """A surface to look up distances from, and points on it."""
+
+    points_m: Array
+    normals: Array
+    scene: object
+    at_border: BoolArray
+    """(t,) triangles beside which the surface is not known."""
+    closed: bool
+    diameter_m: float
+
+    @staticmethod
+    def of(vertices_m: Array, triangles: npt.NDArray[np.int64], count: int, *, closed: bool) -> _Surface:
+        import open3d as o3d
+
+        corners = vertices_m[triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.linalg.norm(normals, axis=1)
+        rng = np.random.default_rng(0)
+        picked = rng.choice(len(triangles), count, p=areas / areas.sum())
+        u, v = rng.random((2, count))
+        u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
+        at = corners[picked]
+        points = at[:, 0] + u[:, None] * (at[:, 1] - at[:, 0]) + v[:, None] * (at[:, 2] - at[:, 0])
+        scene = o3d.t.geometry.RaycastingScene()
+        tensor = o3d.core.Tensor.from_numpy
+        scene.add_triangles(tensor(vertices_m.astype(np.float32)), tensor(triangles.astype(np.uint32)))
+        edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        distinct, counts = np.unique(edges, axis=0, return_counts=True)
+        border: BoolArray = np.zeros(len(vertices_m), dtype=bool)
+        border[distinct[counts == 1].ravel()] = not closed
+        extent_m = float(np.linalg.norm(np.ptp(points, axis=0)))
+        return _Surface(
+            points, normals[picked] / areas[picked, None], scene, np.any(border[triangles], axis=1), closed, extent_m
+        )
+
+    def nearest(self, points_m: Array) -> tuple[Array, Array, npt.NDArray[np.int64]]:
+        """Return the nearest points (n, 3) on the surface, their normals (n, 3) and triangles (n,)."""
+        import open3d as o3d
+
+        found = self.scene.compute_closest_points(o3d.core.Tensor.from_numpy(points_m.astype(np.float32)))  # pyright: ignore[reportAttributeAccessIssue]
+        at, normals, numbers = (found[name].numpy() for name in ("points", "primitive_normals", "primitive_ids"))
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        return at.astype(np.float64), normals.astype(np.float64), numbers.astype(np.int64)
+
+
+@dataclass(eq=False)
+class _Search:
+    """Trials of rotations on one surface."""
+
+    finder: SymmetryFinder
+    surface: _Surface
+    tolerance_m: float
+    compared: float = field(default=1.0)
+
+    def likely_axes(self, up: Array) -> list[Array]:
+        """Return the vertical, the principal axes and the directions in which most of the surface faces, distinct."""
+        points_m, normals = self.surface.points_m, self.surface.normals
+        principal = np.linalg.svd(points_m - points_m.mean(axis=0), full_matrices=False)[2]
+        facing = np.linalg.eigh(normals.T @ normals)[1].T
+        axes: list[Array] = []
+        for direction in (up, *principal, *facing, *self._faces()):
+            if len(axes) < 3 * _LIKELY and all(abs(direction @ other) < np.cos(np.radians(5.0)) for other in axes):
+                axes.append(direction)
+        return axes[: 2 * _LIKELY]
+
+    def _faces(self) -> list[Array]:
+        """Return directions in which flat parts of the surface face, the largest first."""
+        normals, found = self.surface.normals[::4], []
+        near = np.abs(normals @ normals.T) > np.cos(np.radians(6.0))
+        remaining = np.ones(len(normals), dtype=bool)
+        for _ in range(_LIKELY):
+            counts = (near & remaining).sum(axis=1) * remaining
+            best = int(counts.argmax())
+            if counts[best] < 0.05 * len(normals):
+                break
+            members = near[best] & remaining
+            mean = (normals[members] * np.sign(normals[members] @ normals[best])[:, None]).mean(axis=0)
+            found.append(mean / np.linalg.norm(mean))
+            remaining &= ~members
+        return found
+
+    def other_axes(self, likely: list[Array]) -> list[Array]:
+        """Return directions between likely axes, as the diagonals of a cube, and directions spread evenly."""
+        axes: list[Array] = []
+        signs = [
+            np.array(sign, float) for sign in ((1, 1, 0), (1, -1, 0), (1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1))
+        ]
+        first = likely[0]
+        across = [axis for axis in likely[1:] if abs(axis @ first) < 0.1]
+        for one in across[:2]:
+            frame = np.stack([first, one, np.cross(first, one)])
+            axes += [sign @ frame / np.linalg.norm(sign) for sign in signs]
+            axes += [frame[2]]
+        axes += list(even_rotations(self.finder.directions)[:, :, 2])
+        return axes
+
+    def refined(self, direction: Array, angle_deg: float) -> Axis | None:
+        """Return the axis to which ICP of the surface with itself brings a rotation; None where it is no symmetry."""
+        centre = self.surface.points_m.mean(axis=0)
+        points_m = self.surface.points_m[: self.finder.icp_points] - centre
+        normals = self.surface.normals[: self.finder.icp_points]
+        angle = np.radians(angle_deg)
+        axis = Axis(direction, np.zeros(3))
+        # Damping: of the motions of an axis, those along it and about it change nothing.
+        damping = 1e-3 * len(points_m) * np.diag([1e-2 * self.surface.diameter_m**2] * 3 + [1.0] * 3)
+        for step, limit_m in enumerate(self.surface.diameter_m * np.geomspace(0.1, 0.02, 10)):
+            pose = _rotation(axis, angle)
+            turn = pose[:3, :3]
+            moved = se3.transform(pose, points_m)
+            at, facing, _ = self.surface.nearest(moved + centre)
+            away = at - centre - moved
+            off_m = np.linalg.norm(away, axis=1)
+            kept = (off_m < limit_m) & (np.sum(facing * (normals @ turn.T), axis=1) > 0.5)
+            near = np.mean(off_m < 3.0 * self.tolerance_m)
+            if np.count_nonzero(kept) < 0.5 * len(points_m) or near < _NEAR[min(step, len(_NEAR) - 1)]:
+                return None
+            # The angle stays; the axis moves by Exp(ξ), the rotation S to Exp(ξ) S Exp(-ξ).
+            n, back, p, q = facing[kept], facing[kept] @ turn, points_m[kept], moved[kept]
+            rows = np.concatenate([np.cross(q, n) - np.cross(p, back), n - back], axis=1)
+            xi = np.linalg.solve(rows.T @ rows + damping, rows.T @ np.sum(n * away[kept], axis=1))
+            motion = se3.exp(xi)
+            axis = Axis(motion[:3, :3] @ axis.direction, se3.transform(motion, axis.point_m[None])[0])
+        axis = Axis(axis.direction / np.linalg.norm(axis.direction), axis.point_m + centre)
+        return axis if self.maps(_rotation(axis, angle)) else None
+
+    def maps(self, pose: Array) -> bool:
+        """Return whether a motion maps the surface onto itself as far as it was seen."""
+        for count in (self.finder.icp_points, self.finder.points):  # most are refused by the first few
+            elsewhere, unknown = self._shares(pose, count)
+            slack = 0.02 if count < self.finder.points else 0.0
+            if elsewhere > self.finder.elsewhere + slack or unknown > self.finder.unknown + slack:
+                return False
+        self.compared = min(self.compared, 1.0 - unknown)
+        return True
+
+    def _shares(self, pose: Array, count: int) -> tuple[float, float]:
+        """Return the shares of points that end away from the surface, and where none was seen."""
+        moved = se3.transform(pose, self.surface.points_m[:count])
+        at, facing, numbers = self.surface.nearest(moved)
+        far = np.linalg.norm(moved - at, axis=1) > self.tolerance_m
+        # Beside or behind the border of what was seen there may be surface; in front of it there is none.
+        ahead = np.sum(facing * (moved - at), axis=1) > self.tolerance_m
+        unknown = far & self.surface.at_border[numbers] & ~ahead
+        return float(np.mean(far & ~unknown)), float(np.mean(unknown))
+
+    def add(self, found: list[Array], continuous: list[Axis], *poses: Array) -> None:
+        """Add motions that map the surface onto itself and are not there yet."""
+        for pose in poses:
+            if self._is_new(pose, found, continuous) and self.maps(pose):
+                found.append(pose)
+
+    def _is_new(self, pose: Array, found: list[Array], continuous: list[Axis]) -> bool:
+        if se3.rotation_angle(pose) < np.radians(5.0):
+            return False
+        if not continuous:
+            return all(se3.rotation_angle(se3.inverse(pose) @ other) > np.radians(5.0) for other in found)
+        # About an axis of revolution, what takes the axis to the same place is the same.
+        direction = continuous[0].direction
+        ends = [direction, *(other[:3, :3] @ direction for other in found)]
+        return all(pose[:3, :3] @ direction @ end < np.cos(np.radians(5.0)) for end in ends)
+
+    def close(self, found: list[Array], continuous: list[Axis]) -> None:
+        """Add products until there are no new ones: symmetries are a group, of 59 rotations at most but for axes."""
+        tried = 0
+        while tried < len(found) < 64:
+            one = found[tried]
+            for other in list(found):
+                product = _snapped(one @ other)
+                if product is not None:
+                    self.add(found, continuous, product)
+            tried += 1
+
+
+def _rotation(axis: Axis, angle_rad: float) -> Array:
+    """Return the rotation (4, 4) about an axis."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec(angle_rad * axis.direction).as_matrix()
+    return se3.translation(axis.point_m) @ turn @ se3.translation(-axis.point_m)
+
+
+def _axis_of(pose: Array, angle_rad: float) -> Axis | None:
+    """Return the axis of a motion that turns by about an angle; None where it turns by another."""
+    vector = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
+    angle = float(np.linalg.norm(vector))
+    if abs(angle - min(angle_rad, 2.0 * np.pi - angle_rad)) > np.radians(6.0):
+        return None
+    direction = vector / angle
+    across = pose[:3, 3] - direction * (direction @ pose[:3, 3])
+    # Of all points on the axis the one nearest to the origin: (I - R) c = t, solved across the axis.
+    return Axis(direction, np.linalg.lstsq(np.eye(3) - pose[:3, :3], across, rcond=1e-9)[0])
+
+
+def _snapped(pose: Array) -> Array | None:
+    """Return a rotation (4, 4) by the multiple of 360°/n nearest to that of a motion; None where there is none near."""
+    angle = float(np.linalg.norm(Rotation.from_matrix(pose[:3, :3]).as_rotvec()))
+    steps = [2.0 * np.pi * k / order for order in ORDERS for k in range(1, order // 2 + 1)]
+    nearest = min(steps, key=lambda step: abs(step - angle))
+    axis = _axis_of(pose, nearest)
+    return None if axis is None or abs(nearest - angle) > np.radians(4.0) else _rotation(axis, nearest)
+
+
+def _meeting_point(axes: list[Axis]) -> Array:
+    """Return the point (3,) nearest to several axes that are not all parallel."""
+    across = [np.eye(3) - np.outer(axis.direction, axis.direction) for axis in axes]
+    return np.linalg.solve(
+        np.sum(across, axis=0), np.sum([p @ a.point_m for p, a in zip(across, axes, strict=True)], axis=0)
+    )
+
+
+def _parallel(one: Axis, other: Axis) -> bool:
+    return bool(abs(one.direction @ other.direction) > np.cos(np.radians(5.0)))

@@ -1,0 +1,127 @@
+"""Symmetries of a surface, found by registering it with itself."""
+
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+import pytest
+import trimesh
+from trimesh.transformations import random_rotation_matrix
+
+from modeler import se3
+from modeler.export.bop import symmetry_entries
+from modeler.fusion import Symmetries, SymmetryFinder
+from modeler.types import Array
+
+SIGMA_M = 3e-4
+
+
+def noisy(mesh: Any, seed: int = 0) -> tuple[Array, Any, Any]:
+    """Vertices (v, 3), with noise, and triangles (t, 3) of a shape that is turned away from its axes; what was up."""
+    rng = np.random.default_rng(seed)
+    vertices, triangles = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, max_edge=0.01)[:2]
+    pose = random_rotation_matrix(rng.random(3))
+    pose[:3, 3] = [0.1, -0.2, 0.7]
+    return se3.transform(pose, vertices) + SIGMA_M * rng.normal(size=vertices.shape), triangles, pose[:3, 2]
+
+
+def distances(vertices: Array, triangles: Any, points: Array) -> Array:
+    """Distances (n,) of points (n, 3) from a surface."""
+    scene, tensor = o3d.t.geometry.RaycastingScene(), o3d.core.Tensor.from_numpy
+    scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(triangles.astype(np.uint32)))
+    return scene.compute_distance(tensor(points.astype(np.float32))).numpy()
+
+
+def found(mesh: Any, *, closed: bool = True) -> Symmetries:
+    vertices, triangles, up = noisy(mesh)
+    return SymmetryFinder().find(vertices, triangles, up=up, sigma_m=SIGMA_M, closed=closed)
+
+
+def prism(corners: int) -> Any:
+    """A prism that is higher than wide."""
+    return trimesh.creation.cylinder(0.04, 0.12, sections=corners)
+
+
+def bracket() -> Any:
+    angle = trimesh.creation.box((0.1, 0.05, 0.02))
+    leg = trimesh.creation.box((0.02, 0.05, 0.07))
+    leg.apply_translation([0.04, 0.0, 0.045])
+    bump = trimesh.creation.box((0.02, 0.02, 0.02))
+    bump.apply_translation([-0.03, 0.01, 0.02])
+    return trimesh.util.concatenate([angle, leg, bump])
+
+
+@pytest.mark.parametrize(
+    ("mesh", "discrete", "continuous"),
+    [
+        (trimesh.creation.box((0.06, 0.1, 0.14)), 3, 0),
+        (trimesh.creation.box((0.08, 0.08, 0.14)), 7, 0),
+        (trimesh.creation.box((0.1, 0.1, 0.1)), 23, 0),
+        (prism(3), 5, 0),
+        (prism(5), 9, 0),
+        (trimesh.creation.cylinder(0.04, 0.12, sections=96), 1, 1),
+        (trimesh.creation.cone(0.05, 0.12, sections=96), 0, 1),
+        (trimesh.creation.icosphere(subdivisions=4, radius=0.06), 0, 3),
+        (bracket(), 0, 0),
+    ],
+    ids=["box", "square", "cube", "3", "5", "cylinder", "cone", "ball", "bracket"],
+)
+def test_symmetries_are_those_of_the_shape(mesh: Any, discrete: int, continuous: int) -> None:
+    result = found(mesh)
+    assert (len(result.discrete), len(result.continuous)) == (discrete, continuous)
+    for pose in result.discrete:
+        assert se3.is_rigid(pose, tolerance=1e-9, farthest_m=10.0)
+        assert se3.rotation_angle(pose) > np.radians(10.0)
+
+
+def test_each_symmetry_and_the_products_of_them_map_the_surface_onto_itself() -> None:
+    mesh = trimesh.creation.box((0.08, 0.08, 0.14))
+    vertices, triangles, _ = noisy(mesh)
+    result = found(mesh)
+    for one in result.discrete:
+        away_m = distances(vertices, triangles, se3.transform(one, vertices))
+        assert np.mean(away_m > result.tolerance_m) < 0.01
+        for other in result.discrete:
+            product = one @ other
+            angles = [se3.rotation_angle(se3.inverse(product) @ known) for known in (np.eye(4), *result.discrete)]
+            assert min(angles) < np.radians(2.0)
+
+
+def test_nothing_is_said_of_turns_that_bring_up_what_was_not_seen() -> None:
+    """Of a box that stands on a table, only the half turn about the vertical is evident."""
+    box = trimesh.creation.box((0.06, 0.1, 0.05))
+    vertices, triangles, up = noisy(box)
+    heights = (vertices[triangles] @ up).mean(axis=1)
+    seen = triangles[heights > heights.min() + 1e-3]
+    result = SymmetryFinder().find(vertices, seen, up=up, sigma_m=SIGMA_M)
+    assert len(result.discrete) == 1
+    axis = np.linalg.eigh(result.discrete[0][:3, :3] + result.discrete[0][:3, :3].T)[1][:, -1]
+    assert abs(axis @ up) > np.cos(np.radians(2.0))
+    assert 0.85 < result.compared <= 1.0
+
+
+def test_a_small_part_on_a_body_of_revolution_counts() -> None:
+    can = trimesh.creation.cylinder(0.04, 0.12, sections=96)
+    handle = trimesh.creation.box((0.02, 0.01, 0.02))
+    handle.apply_translation([0.05, 0.0, 0.02])
+    result = found(trimesh.util.concatenate([can, handle]))
+    assert (result.discrete, result.continuous) == ((), ())
+    assert "none" in result.words
+
+
+def test_bop_entries_hold_the_symmetries_in_the_frame_and_unit_of_the_model() -> None:
+    mesh = trimesh.creation.cylinder(0.04, 0.12, sections=96)
+    vertices, triangles, up = noisy(mesh)
+    result = found(mesh)
+    object_from_mesh = se3.exp(np.array([0.3, 0.1, -0.4, 0.1, -0.2, 0.7]))
+    entries = symmetry_entries(result.discrete, [(a.direction, a.point_m) for a in result.continuous], object_from_mesh)
+    vertices_mm = 1000.0 * se3.transform(se3.inverse(object_from_mesh), vertices)
+    (axis,) = entries["symmetries_continuous"]
+    direction, offset = np.array(axis["axis"]), np.array(axis["offset"])
+    turn = np.asarray(trimesh.transformations.rotation_matrix(0.7, direction, offset))
+    (flip,) = (np.reshape(numbers, (4, 4)) for numbers in entries["symmetries_discrete"])
+    for pose in (turn, flip):
+        away_mm = distances(vertices_mm, triangles, se3.transform(pose, vertices_mm))
+        assert np.mean(away_mm > 1000.0 * result.tolerance_m) < 0.01
+    assert abs(direction @ object_from_mesh[:3, :3].T @ up) > np.cos(np.radians(1.0))
+    assert symmetry_entries((), (), np.eye(4)) == {}
