@@ -32,6 +32,7 @@ LIMITS = {
     "paper_1e8_s": 10.0,
     "register_warm_s": 3.0,
     "help_s": 1.0,
+    "build / Open3D multiway and TSDF": 1.5,
     "build_peak_gb": 1.5,
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,6 +97,28 @@ def fpfh_icp(source: FeatureView, target: FeatureView) -> Array:
         _registration.RANSACConvergenceCriteria(100_000, 0.999),
     )
     return _refined(source.whole, target.whole, found.transformation, reach_m=0.4 * FEATURE_VOXEL_M, iterations=30)
+
+
+def tsdf(frames: Sequence[Frame], poses: Sequence[Array], voxel_m: float, tau_m: float) -> o3d.t.geometry.TriangleMesh:
+    """Return the mesh of object pixels, object_from_camera (4, 4) given.
+
+    By VoxelBlockGrid, which replaces ScalableTSDFVolume: that gives empty meshes in Open3D 0.20.
+    """
+    single, scalar = o3d.core.float32, o3d.core.SizeVector([1])
+    volume = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), (single, single), (scalar, scalar), voxel_m, 16, 1000, o3d.core.Device("CPU:0")
+    )
+    band = max(1.01, tau_m / voxel_m)
+    for frame, object_from_camera in zip(frames, poses, strict=True):
+        camera, depth_m = frame.camera, np.nan_to_num(frame.depth_m)
+        depth_m = depth_m if frame.mask is None else np.where(frame.mask, depth_m, 0.0)
+        image = o3d.t.geometry.Image(o3d.core.Tensor.from_numpy(depth_m[..., None].astype(np.float32)))
+        matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+        lens = o3d.core.Tensor.from_numpy(matrix)
+        pose = o3d.core.Tensor.from_numpy(np.ascontiguousarray(se3.inverse(object_from_camera)))
+        blocks = volume.compute_unique_block_coordinates(image, lens, pose, 1.0, 5.0, band)
+        volume.integrate(blocks, image, lens, pose, 1.0, 5.0, band)
+    return volume.extract_triangle_mesh(weight_threshold=1.0)
 
 
 def _thinned(whole: o3d.geometry.PointCloud, voxel_m: float) -> o3d.geometry.PointCloud:

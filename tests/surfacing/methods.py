@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import numpy.typing as npt
 import open3d as o3d
+from bench.reference import tsdf
 
 from modeler import se3
 from modeler.fusion import Fuser
@@ -25,23 +26,8 @@ def ours(views: Mapping[int, RayImage], poses: Mapping[int, Array], voxel_m: flo
 
 
 def open3d_tsdf(views: Mapping[int, RayImage], poses: Mapping[int, Array], voxel_m: float, tau_m: float) -> Surface:
-    """Integrate into a VoxelBlockGrid, which replaces ScalableTSDFVolume: that gives empty meshes in Open3D 0.20."""
-    single, scalar = o3d.core.float32, o3d.core.SizeVector([1])
-    volume = o3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight"), (single, single), (scalar, scalar), voxel_m, 16, 1000, o3d.core.Device("CPU:0")
-    )
-    band = max(1.01, tau_m / voxel_m)
-    for frame, view in views.items():
-        camera, mask = view.frame.camera, view.frame.mask
-        depth_m = np.nan_to_num(view.frame.depth_m)
-        depth_m = depth_m if mask is None else np.where(mask, depth_m, 0.0)
-        image = o3d.t.geometry.Image(o3d.core.Tensor.from_numpy(depth_m[..., None].astype(np.float32)))
-        matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-        lens = o3d.core.Tensor.from_numpy(matrix)
-        pose = o3d.core.Tensor.from_numpy(np.ascontiguousarray(se3.inverse(poses[frame])))
-        blocks = volume.compute_unique_block_coordinates(image, lens, pose, 1.0, 5.0, band)
-        volume.integrate(blocks, image, lens, pose, 1.0, 5.0, band)
-    mesh = volume.extract_triangle_mesh(weight_threshold=1.0)
+    """Integrate with Open3D."""
+    mesh = tsdf([view.frame for view in views.values()], [poses[frame] for frame in views], voxel_m, tau_m)
     return mesh.vertex.positions.numpy().astype(np.float64), mesh.triangle.indices.numpy().astype(np.int64)
 
 
