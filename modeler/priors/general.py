@@ -82,19 +82,22 @@ class GeneralDensity(AbstractPoseDensity):
 def relaxed_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -> tuple[float, float]:
     """Return the limits of rotation in degrees and of the centroids' offset in m for a number of steps (at least 1).
 
-    The rotation is capped at what two views can be registered across: beyond, they share too little surface. The
-    centroid of the visible surface lies in front of the object's centre, so that a turn by θ separates two of them by
-    a chord proportional to 2 sin(θ/2); the offset grows with it.
+    The rotation is capped at what two views can be registered across: beyond, they share too little surface. Offsets
+    add up, by the triangle inequality at most to their sum.
     """
     rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, _WIDEST_DEG))
-    chord = np.sin(np.radians(rotation_deg) / 2.0) / np.sin(np.radians(max_rotation_deg) / 2.0)
-    return rotation_deg, min(float(max(chord, 1.0)) * max_offset_m, MAX_LENGTH_M)
+    return rotation_deg, min(steps * max_offset_m, MAX_LENGTH_M)
 
 
 def turned_offset_m(max_offset_m: float, turn_rad: float) -> float:
-    """Return the limit of the centroids' offset in m for a turn of any size; up to 30 degrees the limit as given."""
-    share = max(abs(np.remainder(turn_rad + np.pi, 2.0 * np.pi) - np.pi) / np.radians(_SMALL_DEG), 1.0)
-    return relaxed_limits(_SMALL_DEG, max_offset_m, float(share))[1]
+    """Return the limit of the centroids' offset in m for a turn of any size; up to 30 degrees the limit as given.
+
+    The centroid of the visible surface lies in front of the object's centre, so that a turn by θ separates two of them
+    by a chord proportional to 2 sin(θ/2).
+    """
+    turn_rad = np.clip(abs(np.remainder(turn_rad + np.pi, 2.0 * np.pi) - np.pi), *np.radians([_SMALL_DEG, _WIDEST_DEG]))
+    chord = np.sin(turn_rad / 2.0) / np.sin(np.radians(_SMALL_DEG) / 2.0)
+    return min(float(chord) * max_offset_m, MAX_LENGTH_M)
 
 
 def sample_angles(limit_rad: float, count: int, rng: np.random.Generator) -> Array:
