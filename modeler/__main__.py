@@ -9,8 +9,11 @@ def main() -> int:
     before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during an import ends without a traceback
     from modeler.cli import main as run
 
-    signal.signal(signal.SIGINT, before)
-    return run()
+    try:
+        signal.signal(signal.SIGINT, before)
+        return run()
+    except KeyboardInterrupt:  # before the command could handle it
+        return 128 + signal.SIGINT
 
 
 if __name__ == "__main__":

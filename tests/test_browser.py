@@ -48,6 +48,7 @@ def coloured(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
 def test_the_report_draws_the_model_and_turns_it(run: Path, page: chromium.Page) -> None:
     page.open((run / "report.html").as_uri())
     page.wait_for("document.getElementById('mesh')?.dataset.drawn == '12'")
+    page.value("document.getElementById('mesh').scrollIntoView()")
     left, top, width, height = (
         page.value(f"document.getElementById('mesh').getBoundingClientRect().{side}")
         for side in ("left", "top", "width", "height")

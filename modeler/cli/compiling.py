@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 from modeler.cli.console import say
@@ -108,17 +107,7 @@ _JOBS = {
 
 def work(job: str) -> None:
     """Do one job, and print the module of each kernel that it compiles."""
-    from numba.core import event
+    from modeler import kernels
 
-    class Reporter(event.Listener):
-        def on_start(self, event: event.Event) -> None:
-            assert event.data is not None
-            path = Path(event.data["dispatcher"].py_func.__code__.co_filename)
-            if path.parent.name == "kernels":
-                print(path.stem, flush=True)
-
-        def on_end(self, event: event.Event) -> None:
-            """Nothing to say."""
-
-    event.register("numba:compile", Reporter())
+    kernels.on_compiling(lambda module: print(module, flush=True))
     _JOBS[job].work()

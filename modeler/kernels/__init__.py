@@ -1,11 +1,12 @@
 """Compiled functions: arrays in, arrays out; no package types, no hidden randomness."""
 
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
-from numba.core import config
+from numba.core import config, event
 
 # OpenMP is thread-safe (pairs may be registered from several threads) and Open3D needs libgomp anyway.
 config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore[reportAttributeAccessIssue]
@@ -29,6 +30,22 @@ def compiled(module: str, name: str) -> bool:
     """Return whether a kernel as it stands has been compiled on this machine."""
     kernel = getattr(import_module(f"modeler.kernels.{module}"), name)
     return any(Path(str(kernel.stats.cache_path)).glob(f"{module}.{name}-*.nbi"))
+
+
+def on_compiling(report: Callable[[str], None]) -> None:
+    """Call `report` with the name of the module whenever the compilation of a kernel begins."""
+
+    class Reporter(event.Listener):
+        def on_start(self, event: event.Event) -> None:
+            assert event.data is not None
+            path = Path(event.data["dispatcher"].py_func.__code__.co_filename)
+            if path.parent == Path(__file__).parent:
+                report(path.stem)
+
+        def on_end(self, event: event.Event) -> None:
+            """Nothing to say."""
+
+    event.register("numba:compile", Reporter())
 
 
 drop_stale(Path(__file__).parent)
