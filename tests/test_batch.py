@@ -248,7 +248,7 @@ def test_what_is_interrupted_loses_a_pair_of_each_sequence_at_most(
     cli: Run, tmp_path: Path, how: signal.Signals
 ) -> None:
     out = tmp_path / "out"
-    folders = [sequence(tmp_path / f"s{k}", pairs=6, pause_s=0.15) for k in range(3)]
+    folders = [sequence(tmp_path / f"s{k}", pairs=6, pause_s=0.4) for k in range(3)]
     process = started(*folders, "--out", out, "--workers", 2)
     wait_for(lambda: len(book(out)) >= 4)
     process.send_signal(how)
