@@ -6,9 +6,13 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from modeler.cli.console import say
+
+if TYPE_CHECKING:
+    from modeler.pipeline import Modeler
+    from modeler.types import Array, RayImage
 
 _USED = ("planes", "lie_group", "point_likelihood", "photometric", "point_to_plane", "gauss_newton", "mixture")
 _USED_TO_FUSE = ("tsdf", "marching_cubes", "point_clouds")
@@ -61,36 +65,32 @@ def compile_kernels() -> None:
 
 def _registration() -> None:
     """Register two frames of a bundled sequence."""
-    from modeler.pipeline import Modeler
-    from sequences import bundled, open_sequence
-
-    sequence = open_sequence(bundled("box"))
-    modeler = Modeler()
-    frames = [sequence.frame(index) for index in sequence.indices[:2]]
-    scene = modeler.segmenter.scene(frames)
-    views = [modeler.prepare(frame, scene).view for frame in frames]
-    assert views[0] is not None
-    assert views[1] is not None
-    modeler.register(views[1], views[0])
+    modeler, (target, source), _ = _prepared()
+    modeler.register(source, target)
 
 
 def _fusion() -> None:
     """Fuse two frames of a bundled sequence."""
-    from modeler import se3
     from modeler.fusion import IncrementalTsdf
+
+    modeler, views, trajectory = _prepared()
+    by_frame = {view.index: view for view in views}
+    IncrementalTsdf(modeler.fuser).updated(by_frame, trajectory).model()
+    modeler.fuser.fuse(by_frame, trajectory)
+
+
+def _prepared() -> tuple[Modeler, list[RayImage], dict[int, Array]]:
+    """Return what registers and fuses, two views of a bundled sequence, and its true object_from_camera (4, 4)."""
+    from modeler import se3
     from modeler.pipeline import Modeler
     from sequences import bundled, open_sequence
 
-    sequence = open_sequence(bundled("box"))
-    modeler, truth = Modeler(), sequence.truth()
-    assert truth is not None
-    frames = {index: sequence.frame(index) for index in sequence.indices[:2]}
-    scene = modeler.segmenter.scene(list(frames.values()))
-    views = {index: modeler.prepare(frame, scene).view for index, frame in frames.items()}
-    seen = {index: view for index, view in views.items() if view is not None}
-    trajectory = {index: se3.inverse(truth[index]) for index in seen}
-    IncrementalTsdf(modeler.fuser).updated(seen, trajectory).model()
-    modeler.fuser.fuse(seen, trajectory)
+    sequence, modeler = open_sequence(bundled("box")), Modeler()
+    frames = [sequence.frame(index) for index in sequence.indices[:2]]
+    scene = modeler.segmenter.scene(frames)
+    views = [modeler.prepare(frame, scene).view for frame in frames]
+    truth = sequence.truth() or {}
+    return modeler, [view for view in views if view is not None], {k: se3.inverse(truth[k]) for k in truth}
 
 
 class _Job(NamedTuple):

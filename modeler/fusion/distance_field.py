@@ -96,7 +96,7 @@ def measured(grid: VoxelGrid, views: ViewBlocks, *, tau_m: float, empty_weight: 
 
 
 def voxels_where(mask: BoolArray) -> npt.NDArray[np.int64]:
-    """Return the voxels (n, 3) where a mask (x, y, z) is true, in ascending order: `np.argwhere` in half the time."""
+    """Return the voxels (n, 3) where a mask (x, y, z) is true, in ascending order: faster than `np.argwhere`."""
     return np.stack(np.unravel_index(np.flatnonzero(mask), mask.shape), axis=1)
 
 

@@ -13,7 +13,7 @@ os.register_at_fork(after_in_child=_pools.clear)  # a child process has none of 
 
 
 def over_rows(kernel: Callable[..., Any], rows: np.ndarray, *arguments: Any, least: int = 4) -> Any:
-    """Return what a kernel returns for `rows`, an array or a tuple of arrays: computed in blocks and concatenated.
+    """Return what a kernel returns for `rows`: one array or several, computed in blocks of rows and concatenated.
 
     Args:
         kernel: releases the GIL (`nogil=True`); takes rows and the arguments, each row on its own.
