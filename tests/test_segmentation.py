@@ -60,6 +60,16 @@ def test_wall_clutter_and_a_passer_by_are_not_the_object(rng):
     judge(*turned(8, rng, surround))
 
 
+def test_a_board_behind_the_object_is_not_part_of_it(rng):
+    """The board ends within the image, and what is seen beyond it is far away."""
+
+    def surround(world, k):
+        world.box((0.0, 0.1, 0.16), (0.3, 0.005, 0.16))
+        return world.box((0.0, 3.0, 0.5), (9.0, 0.01, 9.0))
+
+    judge(*turned(8, rng, surround, tilt_deg=12.0))
+
+
 def test_what_stands_on_a_turntable_does_not_include_the_turntable(rng):
     frames, masks = [], []
     for k in range(6):
@@ -413,6 +423,7 @@ def test_table_of_rendered_sequences(name):
         ("kleenex", (11000, 16500), (315, 260)),
         ("castard", (38000, 75000), (345, 250)),
         ("dog_upright", (19000, 27000), (350, 200)),
+        ("figure", (19000, 38000), (315, 240)),
     ],
 )
 def test_real_sequences(name, pixels, object_px):

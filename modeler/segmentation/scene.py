@@ -144,8 +144,9 @@ def _standing_object(
     levels = levels[parallel(levels, levels[0])]
     tolerance = noise.tolerance_m(depth)
     free = allowed.copy()
-    for wall in _walls(planes[~facing] if facing.any() else planes[1:], points, noise):
-        free &= ~(np.abs(heights(points, wall)) < tolerance)
+    for plane in planes[~facing] if facing.any() else planes[1:]:
+        if _beyond_image(plane, points, noise):
+            free &= ~(np.abs(heights(points, plane)) < tolerance)
     for level in levels[np.argsort(-levels[:, 3])]:
         labels = pieces(depth, free & (heights(points, level) > tolerance))
         merit = _central(labels, depth, np.ones_like(depth))
@@ -165,21 +166,19 @@ def _central(labels: Labels, depth_m: Float32Array, weight: Float32Array) -> npt
     return merit.astype(np.float64)
 
 
-def _walls(planes: Array, points: Float32Array, noise: DepthNoise) -> list[Array]:
-    """Return those planes that extend beyond the image."""
-    edge = edge_of(np.isfinite(points[..., 2]))
-    rim = points[edge]
-    tolerance = noise.tolerance_m(rim[:, 2])
-    least = _WALL_BORDER_SHARE * len(rim)
-    return [plane for plane in planes if np.count_nonzero(np.abs(heights(rim, plane)) < tolerance) > least]
+def _beyond_image(plane: Array, points: Float32Array, noise: DepthNoise) -> bool:
+    """Return whether a plane extends beyond the image."""
+    rim = points[edge_of(np.isfinite(points[..., 2]))]
+    on = np.abs(heights(rim, plane)) < noise.tolerance_m(rim[:, 2])
+    return bool(np.count_nonzero(on) > _WALL_BORDER_SHARE * len(rim))
 
 
 def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | None, noise: DepthNoise) -> Float32Array:
     """Return the depth (h, w) at and beyond which there is no object, infinite where unknown.
 
     A static piece above the support that lies within the image may belong to the object: the middle of a mug on a
-    turntable looks static, and only its handle moves. Without a support, nothing static is the object. Walls behind the
-    whole object are extended behind it.
+    turntable looks static, and only its handle moves. Without a support, nothing static is the object. Nor are walls
+    behind all that moves: planes that extend beyond the image, or show more than it covers. They go on behind it.
     """
     back = layers.back_m[..., 2]
     above = layers.still & ~found
@@ -193,13 +192,18 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
     depth = np.where(outside[labels], back, np.float32(np.inf))
     body = layers.front_m[found]
     tolerance = noise.tolerance_m(body[:, 2])
-    for wall in _walls(planes, layers.back_m, noise):
-        is_support = support is not None and bool((wall == support).all())
-        if is_support or np.mean(heights(body, wall) > -tolerance) < _IN_FRONT_SHARE:
+    for plane in planes:
+        is_support = support is not None and bool((plane == support).all())
+        if is_support or np.mean(heights(body, plane) > -tolerance) < _IN_FRONT_SHARE:
             continue
-        facing = layers.rays @ wall[:3].astype(np.float32)
-        behind = np.float32(wall[3]) / np.maximum(-facing, np.float32(1e-6))
-        depth = np.where(layers.still, depth, np.minimum(depth, behind))
+        above = heights(layers.back_m, plane)
+        on = layers.still & (np.abs(above) < noise.tolerance_m(back))
+        if np.count_nonzero(on) < np.count_nonzero(found) and not _beyond_image(plane, layers.back_m, noise):
+            continue
+        facing = layers.rays @ plane[:3].astype(np.float32)
+        behind = np.float32(plane[3]) / np.maximum(-facing, np.float32(1e-6))
+        standing = np.where(above < noise.tolerance_m(back), back, depth)
+        depth = np.where(layers.still, standing, np.minimum(depth, behind))
     return depth
 
 
