@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from modeler import se3
+from modeler.cli.advice import outcome_advice
 from modeler.evaluation import nees, rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
@@ -62,10 +63,13 @@ def test_harmed_images_cost_accuracy_not_honesty(flashlight, harm, rng):
 def test_a_motion_beyond_the_prior_is_not_passed_off_as_one_within(flashlight, rng):
     frames, plane, sensor, _ = flashlight
     target, source = (sensor.ray_image(frame, plane) for frame in frames)
-    density = TablePrior(max_rotation_deg=12.0).between(source, target)  # the object turned by 24°
-    posterior = VisibilityRegistrar().register(source, target, density, rng=rng)
+    prior = TablePrior(max_rotation_deg=12.0)  # the object turned by 24°
+    posterior = VisibilityRegistrar().register(source, target, prior.between(source, target), rng=rng)
     assert posterior.outcome is Outcome.AT_LIMIT
     assert not posterior.usable
+    (beyond,) = posterior.beyond
+    assert np.degrees(se3.rotation_angle(beyond)) == pytest.approx(24.0, abs=3.0)
+    assert "--max-rotation-deg 24" in outcome_advice(posterior.outcome, prior, posterior)
 
 
 def test_surfaces_that_share_nothing_do_not_overlap(flashlight, rng):

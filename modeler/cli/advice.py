@@ -10,7 +10,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors import GeneralPrior, TablePrior, TurntablePrior
-from modeler.types import AbstractPrior, Failed, Outcome, Reason, advice
+from modeler.types import AbstractPrior, Failed, Outcome, Posterior, Reason, advice
 from modeler.verdict.evidence import MAX_UNSURE
 from sequences import AbstractSequence
 
@@ -19,10 +19,6 @@ _FAR_SDS: Final = 3.0  # of the stated step, beyond which the measured one contr
 _ROUGH: Final = 0.25  # of a step: how unevenly an object is turned by hand (11° to 37° where 18° were intended)
 _NEAR_LIMIT_DEG: Final = 15.0  # from the limit: the search follows poses beyond it so far (docs/method.md)
 _BY_OPTIONS: Final = {
-    Outcome.AT_LIMIT: (
-        "The motion may be larger than the prior allows; raise --max-rotation-deg (general, table), --max-offset-m "
-        "(general) or --max-shift-m (table, turntable)."
-    ),
     Outcome.TOO_FEW_POINTS: "The object covers too few pixels; check the mask, --roi and --max-depth-m.",
     Outcome.UNSURE_MASK: (
         "The object is hard to tell from its surroundings; give --roi, --max-depth-m, or masks that hold nothing else."
@@ -30,14 +26,35 @@ _BY_OPTIONS: Final = {
 }
 
 
-def outcome_advice(outcome: Outcome) -> str:
-    """Return what to do about an outcome, in terms of options."""
+def outcome_advice(outcome: Outcome, prior: AbstractPrior | None = None, posterior: Posterior | None = None) -> str:
+    """Return what to do about an outcome, in terms of options.
+
+    Args:
+        outcome: of a frame or a registration.
+        prior: of the registration.
+        posterior: its result; with it and the prior, the limit that was hit is named.
+    """
+    if outcome is Outcome.AT_LIMIT and prior is not None and posterior is not None:
+        wanted = posterior.beyond[0] if len(posterior.beyond) else posterior.pose.mean
+        wider = _wider(prior, float(np.degrees(se3.rotation_angle(wanted))))
+        if wider is not None:
+            options = " ".join(f"--{option} {value}" for option, value in wider.options.items())
+            return f"{wider.words[0].upper()}{wider.words[1:]}: {options}."
     return _BY_OPTIONS.get(outcome, outcome.advice)
 
 
-def reason_advice(reason: Reason) -> str:
-    """Return what to do about a frame that was left out, in terms of options; "" where there is nothing to do."""
-    return outcome_advice(reason.outcome) if isinstance(reason, Failed) else advice(reason)
+def reason_advice(reason: Reason, prior: AbstractPrior | None = None, posteriors: Sequence[Posterior] = ()) -> str:
+    """Return what to do about a frame that was left out, in terms of options; "" where there is nothing to do.
+
+    Args:
+        reason: why it was left out.
+        prior: of the run.
+        posteriors: registrations of the frame.
+    """
+    if not isinstance(reason, Failed):
+        return advice(reason)
+    failed = next((posterior for posterior in posteriors if posterior.outcome is reason.outcome), None)
+    return outcome_advice(reason.outcome, prior, failed)
 
 
 def comes_back(frames: AbstractSequence, prior: AbstractPrior, reach_deg: float) -> bool:
@@ -194,9 +211,13 @@ def _at_limit(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
     edges = [edge for edge in report["edges"] if edge["source"] in lost and edge["outcome"] == Outcome.AT_LIMIT.label]
     if not edges:
         return None
-    turned_deg = max(
-        float(np.degrees(se3.rotation_angle(np.reshape(edge["target_from_source"], (4, 4))))) for edge in edges
-    )
+    wanted = [(edge.get("beyond") or [edge["target_from_source"]])[0] for edge in edges]
+    turned_deg = max(float(np.degrees(se3.rotation_angle(np.reshape(pose, (4, 4))))) for pose in wanted)
+    return _wider(prior, turned_deg)
+
+
+def _wider(prior: AbstractPrior, turned_deg: float) -> Remedy | None:
+    """Return the limit to raise where a registration ended at a rotation at a limit; None where the prior has none."""
     if isinstance(prior, GeneralPrior | TablePrior) and turned_deg >= prior.max_rotation_deg - _NEAR_LIMIT_DEG:
         return Remedy("allow for larger rotations", {"max-rotation-deg": _twice_deg(prior.max_rotation_deg)})
     if isinstance(prior, GeneralPrior):

@@ -215,7 +215,7 @@ def _run(
     seconds = {"scene": time.perf_counter() - began_s, "registration": 0.0, "total": 0.0}
     report: Mapping[str, Any] = {}
     try:
-        with Interrupt() as interrupt, Console(len(frames), stream.address) as console:
+        with Interrupt() as interrupt, Console(len(frames), stream.address, modeler.prior) as console:
             wanted = frames.until(lambda: interrupt.asked)
             coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
             for event in _events(modeler.start(scene), coming, interrupt):

@@ -7,14 +7,14 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from modeler.types import Event, Reason, Step
+    from modeler.types import AbstractPrior, Event, Posterior, Reason, Step
 
 T = TypeVar("T")
 
@@ -144,11 +144,11 @@ def bar() -> Progress:
 class Console:
     """A sink of steps, for a terminal; where stderr is none, only frames left out are reported."""
 
-    def __init__(self, frames: int, address: str | None) -> None:
+    def __init__(self, frames: int, address: str | None, prior: AbstractPrior | None = None) -> None:
         self._bar = bar()
         self._task = self._bar.add_task("", total=frames)
         self._frames, self._stage = frames, ""
-        self._address = address
+        self._address, self._prior = address, prior
         self._placed: dict[int, bool] = {}  # a lost frame that later views place comes a second time
         self._unsure: set[int] = set()
         self._advised: set[str] = set()
@@ -203,7 +203,7 @@ class Console:
         description = f"{len(step.views)} joined, {loops} {'loop' if loops == 1 else 'loops'} closed"
         self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=description)
         if step.left_out is not None and before is None:
-            self._tell(frame, f"left out: {self._why(step.left_out)}")
+            self._tell(frame, f"left out: {self._why(step.left_out, step.posteriors)}")
         elif accepted and before is False:
             self._tell(frame, "placed after all")
         elif accepted:
@@ -235,12 +235,12 @@ class Console:
             self._say(f"frames {self._held[0]} to {self._held[-1]} are {self._reported}")
         self._reported, self._aloud, self._held = "", 0, []
 
-    def _why(self, reason: Reason) -> str:
+    def _why(self, reason: Reason, posteriors: Sequence[Posterior]) -> str:
         """Return why a frame was left out, with what to do about it where that has not been said yet."""
         from modeler.cli.advice import reason_advice
         from modeler.types import summary
 
-        what, what_to_do = summary(reason), reason_advice(reason)
+        what, what_to_do = summary(reason), reason_advice(reason, self._prior, posteriors)
         if not what_to_do or what_to_do in self._advised:
             return what
         self._advised.add(what_to_do)

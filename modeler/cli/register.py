@@ -54,7 +54,8 @@ class Register:
                 raise InputError(f"{self.sequence}: frame {index} has {flaw.label}. {outcome_advice(flaw)}")
             views.append(prepared.view)
         posterior = modeler.register(*views)
-        edge = Edge(posterior, "odometry", posterior.usable, Stated(outcome_advice(posterior.outcome)))
+        what_to_do = outcome_advice(posterior.outcome, modeler.prior, posterior)
+        edge = Edge(posterior, "odometry", posterior.usable, Stated(what_to_do))
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}
         print(json.dumps(record, allow_nan=False))
         _, remark = compose.resolved_prior(self.prior, sequence)

@@ -73,6 +73,8 @@ class Posterior:
     """Log of the mean likelihood under the prior, relative to no match at all (nats)."""
     seconds: float = float("nan")
     """Wall time of the registration in s."""
+    beyond: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    """(1, 4, 4) target_from_source that matches far better and lies beyond the limits of the prior; (0, 4, 4): none."""
 
     @property
     def usable(self) -> bool:

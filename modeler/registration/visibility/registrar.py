@@ -95,7 +95,8 @@ class VisibilityRegistrar(AbstractRegistrar):
         refined = [self._refined(pair, density, samples, rng) for samples in compared]
         modes = weigh_modes(refined)
         at_limit = self._share_at_limit(pair, density, found, modes[0][1], rng)
-        return self._judged(pair, modes, at_limit=at_limit, seconds=time.perf_counter() - started)
+        posterior = self._judged(pair, modes, at_limit=at_limit, seconds=time.perf_counter() - started)
+        return replace(posterior, beyond=found.beyond) if _leads_beyond(found) else posterior
 
     def _sampled(
         self, pair: PairLikelihood, density: AbstractPoseDensity, found: Candidates, rng: np.random.Generator
@@ -131,7 +132,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         rng: np.random.Generator,
     ) -> float:
         """Return the share of the heaviest mode at the limit of the prior; 1 where surface leads beyond it."""
-        if found.beyond_gain > -np.log(MIN_MODE_SHARE):  # beside it the best inside would be negligible
+        if _leads_beyond(found):
             return 1.0
         return share_at_limit(density, heaviest.poses, heaviest.weights, pair.centre_m, rng)
 
@@ -173,3 +174,8 @@ class VisibilityRegistrar(AbstractRegistrar):
             return Outcome.DEGENERATE
         sigma_rad = np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])
         return Outcome.AMBIGUOUS if sigma_rad > np.deg2rad(self.max_sigma_deg) else Outcome.CONVERGED
+
+
+def _leads_beyond(found: Candidates) -> bool:
+    """Return whether surface leads beyond the prior's support: beside it the best inside would be negligible."""
+    return found.beyond_gain > -np.log(MIN_MODE_SHARE)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,8 @@ class Candidates:
     """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid (method.md, eq. 11)."""
     beyond_gain: float = -np.inf
     """How much better (nats) than the best candidate a pose beyond the prior's support is."""
+    beyond: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    """(1, 4, 4) that pose; (0, 4, 4) where there is none."""
 
     def __len__(self) -> int:
         """Return the number of candidates."""
@@ -133,8 +135,12 @@ class Search:
         found = Candidates(poses[order], scores[order], _spreads(pair, prior, poses[order], fine_m))
         if pair.overlap(found.poses[0]) > min_overlap:
             outside = self._near_support(pair, prior, density, outside)
-        gain = pair.tempered(outside, fine_m).max() - found.scores[0] if len(outside) else -np.inf
-        return replace(found.distinct(pair.centre_m), beyond_gain=float(gain))
+        found = found.distinct(pair.centre_m)
+        if not len(outside):
+            return found
+        gains = pair.tempered(outside, fine_m) - found.scores[0]
+        best = int(np.argmax(gains))
+        return replace(found, beyond_gain=float(gains[best]), beyond=outside[best : best + 1])
 
     def _drawn(self, pair: PairLikelihood, density: AbstractPoseDensity, count: int, rng: np.random.Generator) -> Array:
         """Return starting poses (n, 4, 4): samples of the prior that match best at twice the coarsest blur."""
