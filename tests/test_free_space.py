@@ -149,14 +149,14 @@ def test_which_motions_pass_depends_on_no_thread_and_no_batch(rng):
     spread = GeneralDensity(CENTRE_M, CENTRE_M, 0.3, 0.04)
     draws = NumberedDraws.of(spread, rng)
     assert draws is not None
-    whole = free.passing(draws, 0, 30_000)
-    assert 0 < len(whole) < 30_000
+    drawn = draws.poses(0, 30_000)
+    passes = free.passes(drawn)
+    assert 0 < passes.sum() < 30_000
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        parts = np.concatenate([free.passing(draws, first, 10_000) for first in (0, 10_000, 20_000)])
+        parts = [draws.poses(first, 10_000) for first in (0, 10_000, 20_000)]
+        assert np.concatenate(parts).tobytes() == drawn.tobytes()
+        assert np.concatenate([free.passes(part) for part in parts]).tobytes() == passes.tobytes()
     finally:
         numba.set_num_threads(threads)
-    assert parts.tobytes() == whole.tobytes()
-    drawn = draws.poses(0, 30_000)
-    assert drawn[free.passes(drawn)].tobytes() == whole.tobytes()

@@ -9,6 +9,8 @@ import math
 import numba
 import numpy as np
 
+from modeler.kernels.threads import over_rows
+
 NEVER = -np.inf
 
 STRIDE = np.uint64(64)  # random numbers reserved for each draw; the chance that one needs more is 10⁻¹⁵
@@ -166,7 +168,6 @@ def point_density(point_b, pose, ranges_m, intrinsics, noise, reach_sigmas):
     return k2 * total
 
 
-@numba.njit(cache=True, parallel=True)
 def log_likelihoods(poses, points_b, ranges_m, intrinsics, noise, options):
     """Return log p(P_B | M_A, T) (m,) for poses (paper, eq. P_B), -inf where a sample is rejected early.
 
@@ -179,10 +180,15 @@ def log_likelihoods(poses, points_b, ranges_m, intrinsics, noise, options):
         options: (2,) reach in lateral standard deviations (inf = all pixels); density, as a share of K2, below
             which a point rejects the sample (0 = only where it vanishes).
     """
+    return over_rows(_log_likelihoods, poses, points_b, ranges_m, intrinsics, noise, options)
+
+
+@numba.njit(cache=True, nogil=True)
+def _log_likelihoods(poses, points_b, ranges_m, intrinsics, noise, options):
     result = np.empty(poses.shape[0])
     # In units of K2 for a point that is not turned, so that the threshold is a number of pixels, not of 1/m.
     unit = 1.0 / math.sqrt(inverse_3(2.0 * noise)[1])
-    for i in numba.prange(poses.shape[0]):
+    for i in range(poses.shape[0]):
         total = 0.0
         for j in range(points_b.shape[0]):
             density = point_density(points_b[j], poses[i], ranges_m, intrinsics, noise, options[0])
@@ -304,41 +310,33 @@ def passes(pose, checks, near_m, images):
     return True
 
 
-@numba.njit(cache=True, parallel=True)
-def passing(first, count, draws, checks, near_m, images):
-    """Return which (count,) of the draws numbered from `first` pass all checks.
+def passing(poses, checks, near_m, images):
+    """Return which (m,) of poses (m, 12) pass all checks.
 
     Args:
-        first: number of the first draw.
-        count: number of draws.
-        draws: seed (uint64) and limits (17,), see `draw`.
+        poses: rows of target_from_source.
         checks: (n, 5), the most selective first.
         near_m: target's and source's `nearest_ranges`.
         images: target's and source's image, see `forbidden`.
     """
-    seed, limits = draws
-    result = np.empty(count, dtype=np.bool_)
-    size = 4096
-    for block in numba.prange((count + size - 1) // size):
-        pose = np.empty(12)
-        for i in range(block * size, min((block + 1) * size, count)):
-            draw(np.uint64(first + i), seed, limits, pose)
-            result[i] = passes(pose, checks, near_m, images)
-    return result
+    return over_rows(_passing, poses, checks, near_m, images)
 
 
-@numba.njit(cache=True, parallel=True)
-def passing_poses(poses, checks, near_m, images):
-    """Return which (m,) of poses (m, 12) pass all checks; arguments as for `passing`."""
+@numba.njit(cache=True, nogil=True)
+def _passing(poses, checks, near_m, images):
     result = np.empty(poses.shape[0], dtype=np.bool_)
-    for i in numba.prange(poses.shape[0]):
+    for i in range(poses.shape[0]):
         result[i] = passes(poses[i], checks, near_m, images)
     return result
 
 
-@numba.njit(cache=True)
 def drawn(numbers, seed, limits):
     """Return the poses (m, 12) of numbers (m,), see `draw`."""
+    return over_rows(_drawn, numbers, seed, limits)
+
+
+@numba.njit(cache=True, nogil=True)
+def _drawn(numbers, seed, limits):
     poses = np.empty((numbers.shape[0], 12))
     for i in range(numbers.shape[0]):
         draw(np.uint64(numbers[i]), seed, limits, poses[i])
@@ -356,7 +354,6 @@ def verdicts(poses, checks, near_m, images):
     return result
 
 
-@numba.njit(cache=True, parallel=True)
 def nearest_ranges(ranges_m, reach_px):
     """Return the least range (h + 2b, w + 2a) within reach of anything that rounds to a pixel, never rounded up.
 
@@ -366,10 +363,16 @@ def nearest_ranges(ranges_m, reach_px):
         ranges_m: (h, w) range of every pixel in m; 0 = no measurement, which forbids nothing.
         reach_px: (2,) half axes of the ellipse of pixels that count, along columns and rows.
     """
-    height, width = ranges_m.shape
     across, down = math.ceil(reach_px[0] + 0.5), math.ceil(reach_px[1] + 0.5)
-    result = np.full((height + 2 * down, width + 2 * across), np.float32(np.inf))
-    for row in numba.prange(height + 2 * down):
+    return over_rows(_nearest_ranges, np.arange(ranges_m.shape[0] + 2 * down), ranges_m, reach_px, across, down)
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_ranges(rows, ranges_m, reach_px, across, down):
+    height, width = ranges_m.shape
+    result = np.full((rows.shape[0], width + 2 * across), np.float32(np.inf))
+    for i in range(rows.shape[0]):
+        row = rows[i]
         for dy in range(-down, down + 1):
             other = row - down + dy
             if other < 0 or other >= height:
@@ -383,6 +386,6 @@ def nearest_ranges(ranges_m, reach_px):
                 for column in range(width):
                     value = np.float32(ranges_m[other, column] * (1.0 - 1e-6))
                     place = column + across - dx
-                    if value < result[row, place]:
-                        result[row, place] = value
+                    if value < result[i, place]:
+                        result[i, place] = value
     return result

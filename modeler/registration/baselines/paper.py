@@ -21,7 +21,6 @@ from modeler.se3 import matrices, rows
 from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, BoolArray, Outcome, Posterior, RayImage
 
 _SAMPLES, _UNIFORM_SAMPLES = 200_000, 2_000_000
-_DRAWN = 1 << 22  # numbered poses at a time: one byte each
 _PILOT = 4096  # poses by which the checks are ordered
 _ANGLE_LIMIT_RAD = 2.0  # up to here rejection sampling of the rotation succeeds mostly
 _WIDENING = 1.5  # the test holds for points whose rays spread up to 1.5 times as wide as at the nearest point seen
@@ -39,7 +38,7 @@ class PaperRegistrar(AbstractRegistrar):
     samples: int | None = None
     """Number of samples of the prior; None = 2·10⁶ of a uniform prior, 2·10⁵ of others, which take longer."""
     batch: int = 50_000
-    """Samples drawn at a time; a uniform prior is sampled within the kernel instead."""
+    """Samples drawn at a time."""
     points: int = 60
     """Number of surface points taken from each view."""
     reach_sigmas: float = 4.0
@@ -107,17 +106,12 @@ class PaperRegistrar(AbstractRegistrar):
         free = FreeSpace.of(*views, self.reach_sigmas, self.reject_below)
         draws = NumberedDraws.of(density, rng)
         samples = self.samples or (_SAMPLES if draws is None else _UNIFORM_SAMPLES)
-        if draws is None:
-            for first in range(0, samples, self.batch):
-                poses = rows(density.sample(min(self.batch, samples - first), rng))
-                if first == 0:
-                    free = free.ordered(poses[:_PILOT])
-                yield len(poses), poses[free.passes(poses)]
-        else:
-            free = free.ordered(draws.poses(0, min(_PILOT, samples)))
-            for first in range(0, samples, _DRAWN):
-                count = min(_DRAWN, samples - first)
-                yield count, free.passing(draws, first, count)
+        for first in range(0, samples, self.batch):
+            count = min(self.batch, samples - first)
+            poses = rows(density.sample(count, rng)) if draws is None else draws.poses(first, count)
+            if first == 0:
+                free = free.ordered(poses[:_PILOT])
+            yield count, poses[free.passes(poses)]
 
 
 def _log_correction(density: AbstractPoseDensity, poses: Array) -> Array | float:
@@ -207,12 +201,7 @@ class FreeSpace:
 
     def passes(self, poses: Array) -> BoolArray:
         """Return which (m,) of poses (m, 12) pass."""
-        return kernel.passing_poses(poses, self.checks, self.near_m, self.images)
-
-    def passing(self, draws: NumberedDraws, first: int, count: int) -> Array:
-        """Return those (m, 12) of `count` draws, numbered from `first`, that pass."""
-        alive = kernel.passing(first, count, (draws.seed, draws.limits), self.checks, self.near_m, self.images)
-        return kernel.drawn(first + np.flatnonzero(alive), draws.seed, draws.limits)
+        return kernel.passing(poses, self.checks, self.near_m, self.images)
 
 
 @dataclass(frozen=True, eq=False)
