@@ -135,11 +135,11 @@ def test_a_terminal_sees_which_frame_is_tried_again_and_what_follows_the_last(ev
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
-def test_a_terminal_sees_how_far_it_is_and_how_long_it_takes() -> None:
-    said = on_a_terminal([*COMMAND, "info", str(bundled("tube"))])
-    assert "14/14" in said
+def test_a_terminal_sees_how_far_it_is_and_how_long_it_takes(scene: Path) -> None:
+    said = on_a_terminal([*COMMAND, "info", str(scene)])
+    assert "3/3" in said
     assert "0:00:0" in said  # gone by, and to go
-    assert "tube" not in said  # data goes to stdout
+    assert "box" not in said  # data goes to stdout
 
 
 def test_nobody_is_told_where_there_is_no_bar(capfd: pytest.CaptureFixture[str]) -> None:
@@ -155,24 +155,25 @@ def test_nobody_is_told_where_there_is_no_bar(capfd: pytest.CaptureFixture[str])
 @pytest.mark.parametrize(
     ("closed", "arguments", "status"),
     [
-        (">&-", ("info", BOX), 0),
+        (">&-", ("info", "SCENE"), 0),
         ("2>&-", ("view", "/nowhere"), 2),
         ("<&-", ("view", "/nowhere"), 2),
-        ("<&- >&- 2>&-", ("info", BOX), 0),
+        ("<&- >&- 2>&-", ("info", "SCENE"), 0),
         ("<&- >&- 2>&-", ("view", "/nowhere"), 2),
     ],
 )
-def test_a_stream_that_is_closed_changes_no_status(closed: str, arguments: tuple[str, ...], status: int) -> None:
-    ended = subprocess.run(
-        ["sh", "-c", f'"$@" {closed}', "sh", *COMMAND, *arguments], capture_output=True, text=True, check=False
-    )
+def test_a_stream_that_is_closed_changes_no_status(
+    scene: Path, closed: str, arguments: tuple[str, ...], status: int
+) -> None:
+    command = [*COMMAND, *(str(scene) if argument == "SCENE" else argument for argument in arguments)]
+    ended = subprocess.run(["sh", "-c", f'"$@" {closed}', "sh", *command], capture_output=True, text=True, check=False)
     assert ended.returncode == status
     assert "Traceback" not in ended.stderr
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_messages_that_cannot_be_written_change_no_status() -> None:
-    for arguments, status in ((["info", BOX], 0), (["biuld"], 2)):
+def test_messages_that_cannot_be_written_change_no_status(scene: Path) -> None:
+    for arguments, status in ((["info", str(scene)], 0), (["biuld"], 2)):
         with Path("/dev/full").open("w") as full:
             ended = subprocess.run(
                 [*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=full, check=False, timeout=120

@@ -121,7 +121,7 @@ def test_swapping_the_views_inverts_the_motion(method: AbstractRegistrar) -> Non
 
 @pytest.mark.parametrize(
     "method",
-    [registration.VisibilityRegistrar(), registration.PaperRegistrar(samples=300_000, points=4)],
+    [registration.VisibilityRegistrar(), registration.PaperRegistrar(samples=50_000, points=4)],
     ids=lambda m: type(m).__name__,
 )
 def test_a_guess_tells_where_to_look_and_is_no_evidence(method: AbstractRegistrar) -> None:

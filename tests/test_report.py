@@ -53,6 +53,13 @@ def page(run: Path) -> str:
     return (run / "page.html").read_text(encoding="utf-8")
 
 
+@pytest.fixture
+def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave plots and the picture of the mesh blank, which take most of the time of a page."""
+    monkeypatch.setattr("viz.report.plots._svg", lambda figure: b"<svg xmlns='http://www.w3.org/2000/svg'></svg>")
+    monkeypatch.setattr("viz.report.page.portrait", lambda mesh, object_from_upright, size: b"")
+
+
 class Elements(HTMLParser):
     """Collects what a browser would load, and checks that elements close in order."""
 
@@ -76,6 +83,7 @@ class Elements(HTMLParser):
             self.headings.append(data)
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_the_first_screen_shows_the_evidence_beside_its_limits(run: Path, page: str, tmp_path: Path) -> None:
     first_screen = page.partition("<h2>")[0]
     evidence = json.loads((run / "report.json").read_text())["evidence"]
@@ -126,6 +134,7 @@ def test_every_pair_is_told_with_its_pictures(page: str, run: Path) -> None:
     assert f"frame {LOST} was left out" in page
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_the_worst_pairs_come_first(run: Path, tmp_path: Path) -> None:
     report = json.loads((run / "report.json").read_bytes())
     placed = {pose["id"] for pose in report["poses"]}
@@ -181,6 +190,7 @@ def test_points_of_a_frame_that_is_tried_again_are_its_own(tmp_path: Path) -> No
         np.testing.assert_allclose(found[frame], view.points_m, atol=1e-6)
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_without_a_closure_there_is_nothing_to_compare(run: Path, tmp_path: Path) -> None:
     report = json.loads((run / "report.json").read_text())
     report["edges"] = [edge for edge in report["edges"] if edge["kind"] == "odometry"]
@@ -255,6 +265,7 @@ def test_a_recording_that_ends_its_reader_is_as_good_as_none(
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_without_truth_recording_or_mesh_the_page_says_so(run: Path, tmp_path: Path) -> None:
     (tmp_path / "report.json").write_bytes((run / "report.json").read_bytes())
     write_page(tmp_path, tmp_path / "page.html")
@@ -295,6 +306,7 @@ def test_the_command_writes_the_page_and_says_where(run: Path, tmp_path: Path, c
     assert not out.exists()
 
 
+@pytest.mark.usefixtures("_undrawn")
 def test_modes_what_a_pair_leaves_open_and_both_names_of_joined_runs_are_told(run: Path, tmp_path: Path) -> None:
     report = json.loads((run / "report.json").read_bytes())
     edge = report["edges"][0]

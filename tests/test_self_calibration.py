@@ -46,7 +46,7 @@ def estimate(stated: float, *, closed: bool = True) -> FocalLength:
     return FocalCalibrator().estimate(views, chain, SENSOR, MODELER.register, MODELER.prior)
 
 
-@pytest.mark.parametrize("stated", [0.93, 1.0, 1.06])
+@pytest.mark.parametrize("stated", [0.93, 1.0, pytest.param(1.06, marks=pytest.mark.slow)])
 def test_a_closed_turn_tells_the_focal_length(stated: float) -> None:
     found = estimate(stated)
     assert found.told_by == "loop"
