@@ -18,8 +18,9 @@ from modeler import evaluation, se3
 from modeler.types import ACCEPTED, Array, Edge, Outcome, explain
 from viz import entities
 from viz.blueprint import FROM_THE_SIDE
+from viz.reader import FRAME_PATHS
 from viz.readings import certainty_words
-from viz.report.run_data import FRAME_PATHS, Result, Row, cloud
+from viz.report.run_data import Result, Row, cloud
 
 
 def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Array) -> Sequence[str]:
