@@ -19,7 +19,7 @@ from modeler.pipeline.view_store import ViewStore
 
 VOXEL_M = 0.002
 BRICK = tabletop.Box((0.07, 0.05, 0.04))
-POSES = tabletop.turntable(24)
+POSES = tabletop.turntable(12)
 
 
 def in_blocks(monkeypatch: pytest.MonkeyPatch, views: int) -> None:
@@ -31,7 +31,7 @@ def in_blocks(monkeypatch: pytest.MonkeyPatch, views: int) -> None:
 def test_several_blocks_make_the_same_model_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
     views, trajectory = tabletop.views(BRICK, POSES, np.random.default_rng(0)), tabletop.trajectory(POSES)
     whole = Fuser(voxel_m=VOXEL_M).volume(views, trajectory)
-    in_blocks(monkeypatch, 8)
+    in_blocks(monkeypatch, 4)
     parts = Fuser(voxel_m=VOXEL_M).volume(views, trajectory)
     assert (len(whole.views.blocks), len(parts.views.blocks)) == (1, 3)
     assert parts.tau_m == pytest.approx(whole.tau_m, rel=0.02)
@@ -47,7 +47,7 @@ def test_several_blocks_make_the_same_model_as_one(monkeypatch: pytest.MonkeyPat
 def test_views_of_all_blocks_are_counted_and_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
     views, trajectory = tabletop.views(BRICK, POSES, np.random.default_rng(0)), tabletop.trajectory(POSES)
     whole = Fuser(voxel_m=VOXEL_M).volume(views, trajectory)
-    in_blocks(monkeypatch, 6)
+    in_blocks(monkeypatch, 3)
     # The limits that follow from the disagreement of views within blocks are those of all views.
     parts = replace(Fuser(voxel_m=VOXEL_M).volume(views, trajectory), near_m=whole.near_m, sigma_m=whole.sigma_m)
     model = whole.model()
@@ -106,9 +106,9 @@ def test_memory_does_not_grow_with_the_number_of_views(monkeypatch: pytest.Monke
     def most_mib(count: int) -> float:
         """Return the peak of the memory that fusing a number of views allocates; pages of mapped files do not count."""
         store = ViewStore(memory_bytes=0, chunk_bytes=2**23)
-        views = {k: store.keep(replace(made[k % 24], frame=replace(made[k % 24].frame, index=k))) for k in range(count)}
+        views = {k: store.keep(replace(made[k % 12], frame=replace(made[k % 12].frame, index=k))) for k in range(count)}
         tracemalloc.start()
-        Fuser(voxel_m=0.006).fuse(views, {k: poses[k % 24] for k in range(count)})
+        Fuser(voxel_m=0.006).fuse(views, {k: poses[k % 12] for k in range(count)})
         _, most = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         return most / 2**20
@@ -116,7 +116,7 @@ def test_memory_does_not_grow_with_the_number_of_views(monkeypatch: pytest.Monke
     made, poses = tabletop.views(BRICK, POSES, np.random.default_rng(0)), tabletop.trajectory(POSES)
     monkeypatch.setattr(depth_views, "BLOCK_BYTES", 2**24)
     monkeypatch.setattr(depth_views, "STATISTICS", 10**5)
-    most_mib(48)  # what is made once, such as compiled kernels
-    few, many = most_mib(96), most_mib(384)
+    most_mib(24)  # what is made once, such as compiled kernels
+    few, many = most_mib(48), most_mib(192)
     held_mib = sum(array.nbytes for array in (made[0].points_m, made[0].normals, made[0].frame.depth_m)) / 2**20
-    assert (many - few) / (384 - 96) < 0.1 * held_mib
+    assert (many - few) / (192 - 48) < 0.1 * held_mib

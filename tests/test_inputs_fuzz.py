@@ -58,7 +58,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @given(which=st.sampled_from(["scene_camera.json", "scene_gt.json", "sequence.json"]), tree=ENTRIES | JSON)
-@settings(max_examples=120)
+@settings(max_examples=60)
 def test_any_json_is_read_or_refused(scene: Path, which: str, tree: object) -> None:
     path = scene / which
     intact, told = path.read_bytes(), ""

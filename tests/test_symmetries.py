@@ -1,5 +1,6 @@
 """Symmetries of a surface, found by registering it with itself."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -51,33 +52,37 @@ def bracket() -> Any:
     return trimesh.util.concatenate([angle, leg, bump])
 
 
-@pytest.mark.parametrize(
-    ("mesh", "discrete", "continuous"),
-    [
-        (trimesh.creation.box((0.06, 0.1, 0.14)), 3, 0),
-        (trimesh.creation.box((0.08, 0.08, 0.14)), 7, 0),
-        (trimesh.creation.box((0.1, 0.1, 0.1)), 23, 0),
-        (prism(3), 5, 0),
-        (prism(5), 9, 0),
-        (trimesh.creation.cylinder(0.04, 0.12, sections=96), 1, 1),
-        (trimesh.creation.cone(0.05, 0.12, sections=96), 0, 1),
-        (trimesh.creation.icosphere(subdivisions=4, radius=0.06), 0, 3),
-        (bracket(), 0, 0),
-    ],
-    ids=["box", "square", "cube", "3", "5", "cylinder", "cone", "ball", "bracket"],
-)
-def test_symmetries_are_those_of_the_shape(mesh: Any, discrete: int, continuous: int) -> None:
-    result = found(mesh)
-    assert (len(result.discrete), len(result.continuous)) == (discrete, continuous)
+SHAPES = {
+    "box": (trimesh.creation.box((0.06, 0.1, 0.14)), 3, 0),
+    "square": (trimesh.creation.box((0.08, 0.08, 0.14)), 7, 0),
+    "cube": (trimesh.creation.box((0.1, 0.1, 0.1)), 23, 0),
+    "3": (prism(3), 5, 0),
+    "5": (prism(5), 9, 0),
+    "cylinder": (trimesh.creation.cylinder(0.04, 0.12, sections=96), 1, 1),
+    "cone": (trimesh.creation.cone(0.05, 0.12, sections=96), 0, 1),
+    "ball": (trimesh.creation.icosphere(subdivisions=4, radius=0.06), 0, 3),
+    "bracket": (bracket(), 0, 0),
+}
+"""Shapes, and how many discrete and continuous symmetries they have."""
+
+
+@cache
+def of_shape(name: str) -> Symmetries:
+    return found(SHAPES[name][0])
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_symmetries_are_those_of_the_shape(name: str) -> None:
+    result = of_shape(name)
+    assert (len(result.discrete), len(result.continuous)) == SHAPES[name][1:]
     for pose in result.discrete:
         assert se3.is_rigid(pose, tolerance=1e-9, farthest_m=10.0)
         assert se3.rotation_angle(pose) > np.radians(10.0)
 
 
 def test_each_symmetry_and_the_products_of_them_map_the_surface_onto_itself() -> None:
-    mesh = trimesh.creation.box((0.08, 0.08, 0.14))
-    vertices, triangles, _ = noisy(mesh)
-    result = found(mesh)
+    vertices, triangles, _ = noisy(SHAPES["square"][0])
+    result = of_shape("square")
     for one in result.discrete:
         away_m = distances(vertices, triangles, se3.transform(one, vertices))
         assert np.mean(away_m > result.tolerance_m) < 0.01
@@ -110,9 +115,8 @@ def test_a_small_part_on_a_body_of_revolution_counts() -> None:
 
 
 def test_bop_entries_hold_the_symmetries_in_the_frame_and_unit_of_the_model() -> None:
-    mesh = trimesh.creation.cylinder(0.04, 0.12, sections=96)
-    vertices, triangles, up = noisy(mesh)
-    result = found(mesh)
+    vertices, triangles, up = noisy(SHAPES["cylinder"][0])
+    result = of_shape("cylinder")
     object_from_mesh = se3.exp(np.array([0.3, 0.1, -0.4, 0.1, -0.2, 0.7]))
     entries = symmetry_entries(result.discrete, [(a.direction, a.point_m) for a in result.continuous], object_from_mesh)
     vertices_mm = 1000.0 * se3.transform(se3.inverse(object_from_mesh), vertices)

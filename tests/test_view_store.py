@@ -86,6 +86,6 @@ def test_memory_does_not_grow_with_the_number_of_views() -> None:
 
     store = ViewStore(memory_bytes=0, chunk_bytes=2**23)
     kept, before_mib = [], resident_mib()
-    while sum(view.points_m.nbytes for view in kept) < 2**27:
+    while sum(view.points_m.nbytes for view in kept) < 2**26:
         kept.append(store.keep(VIEW))
-    assert resident_mib() - before_mib < 48.0
+    assert resident_mib() - before_mib < 24.0

@@ -33,11 +33,12 @@ def compile_kernels() -> None:
 
     def follow(process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
-        for line in process.stdout:
-            with lock:
-                if line.strip() not in begun:
-                    begun.add(line.strip())
-                    say(f"compiling kernels, once on this machine: {len(begun)} of {total}")
+        with process.stdout as lines:
+            for line in lines:
+                with lock:
+                    if line.strip() not in begun:
+                        begun.add(line.strip())
+                        say(f"compiling kernels, once on this machine: {len(begun)} of {total}")
 
     total = len(_USED) + (len(_USED_TO_FUSE) if "fusion" in missing else 0)
     processes = [

@@ -5,10 +5,10 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from modeler.kernels.threads import over_rows
 from modeler.kernels.tsdf import project
 
 
-@njit(cache=True, parallel=True)
 def observation_counts(origin, cell_m, shape, margin_m, free_m, poses, intrinsics, planes):
     """Return how many views see cells of a grid empty, at a surface, and hidden behind one, (3, x, y, z) uint16.
 
@@ -24,23 +24,31 @@ def observation_counts(origin, cell_m, shape, margin_m, free_m, poses, intrinsic
         intrinsics: (f, 4) fx, fy, cx, cy.
         planes: (f, 4) normal and offset in the object frame, NaN where no plane is seen.
     """
+    layers = np.arange(shape[0])
+    return over_rows(
+        _observation_counts, layers, origin, cell_m, shape, margin_m, free_m, poses, intrinsics, planes
+    ).transpose(1, 0, 2, 3)
+
+
+@njit(cache=True, nogil=True)
+def _observation_counts(layers, origin, cell_m, shape, margin_m, free_m, poses, intrinsics, planes):
     frames, height, width = free_m.shape
-    counts = np.zeros((3, shape[0], shape[1], shape[2]), dtype=np.uint16)
-    for i in prange(shape[0]):
-        x = origin[0] + (i + 0.5) * cell_m
+    counts = np.zeros((layers.shape[0], 3, shape[1], shape[2]), dtype=np.uint16)
+    for i in range(layers.shape[0]):
+        x = origin[0] + (layers[i] + 0.5) * cell_m
         for j in range(shape[1]):
             y = origin[1] + (j + 0.5) * cell_m
             for k in range(shape[2]):
                 z = origin[2] + (k + 0.5) * cell_m
                 for f in range(frames):
                     if planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z + planes[f, 3] < -margin_m:
-                        counts[0, i, j, k] += 1
+                        counts[i, 0, j, k] += 1
                         continue
                     u, v, depth = project(poses[f], intrinsics[f], x, y, z)
                     if depth > 0.0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
                         free = free_m[f, int(v + 0.5), int(u + 0.5)]
                         if free > 0.0:
-                            counts[int(depth >= free - margin_m) + int(depth > free + margin_m), i, j, k] += 1
+                            counts[i, int(depth >= free - margin_m) + int(depth > free + margin_m), j, k] += 1
     return counts
 
 
