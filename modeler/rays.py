@@ -1,11 +1,13 @@
 """From a segmented frame to the image that registration uses: smoothed surface points, local planes, silhouette."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from modeler.kernels import planes
-from modeler.types import Frame, Plane, RayImage
+from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
+from modeler.types import BoolArray, Frame, Plane, RayImage
 
 
 @dataclass(frozen=True)
@@ -41,23 +43,37 @@ class Sensor:
         """
         camera = frame.camera
         depth_m = np.ascontiguousarray(frame.depth_m, dtype=np.float32)
-        mask = (depth_m > 0) & (depth_m < np.inf)  # not NaN either
-        if frame.mask is not None:
-            mask &= frame.mask
+        seen = (depth_m > 0) & (depth_m < np.inf)  # not NaN either
+        mask = seen if frame.mask is None else seen & frame.mask
         # Object pixels without depth still occlude: the silhouette is that of the whole mask.
-        outline = mask if frame.mask is None else frame.mask
+        outline, surface = mask if frame.mask is None else frame.mask, mask
+        window = _window(outline, 0)
+        gap = gap_px(measured_share(mask[window], None if frame.mask is None else outline[window]))
+        if gap >= 1.0:  # surface and background go on between measurements
+            outline = closed(mask, gap) if frame.mask is None else outline
+            window = _window(outline, math.ceil(self.max_silhouette_px))
+            near_m, near, inside = depth_m[window], seen[window], outline[window]
+            depth_m = depth_m.copy()
+            depth_m[window] = np.where(
+                inside,
+                nearest_depth(near_m, near & inside, inside, gap),
+                nearest_depth(near_m, near & ~inside, ~inside, gap),
+            )
+            surface = outline & (depth_m > 0)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        rows, columns = _places(mask)
-        ball, sigma_inverse, sharing = self._smoothing(frame, rows, columns)
+        ball, sigma_inverse, sharing = self._smoothing(frame, mask, outline)
         cells = planes.local_planes(
             depth_m,
-            mask,
+            surface,
             planes.silhouette_distance(outline, self.max_silhouette_px),
             intrinsics,
             ball,
             sigma_inverse,
+            None if surface is mask else mask,
         )
-        points_m, normals, pixels, variance_m2 = planes.frontal_points(cells, mask, intrinsics, self.min_cosine)
+        points_m, normals, pixels, variance_m2 = planes.frontal_points(cells, surface, intrinsics, self.min_cosine)
+        if surface is not mask:  # all measured pixels take part, and most points lie between them
+            sharing *= max(len(points_m), 1) / max(np.count_nonzero(mask), 1)
         return RayImage(
             frame=frame,
             plane=plane,
@@ -71,31 +87,43 @@ class Sensor:
         )
 
     def _smoothing(
-        self, frame: Frame, rows: np.ndarray, columns: np.ndarray
+        self, frame: Frame, measured: BoolArray, outline: BoolArray
     ) -> tuple[tuple[float, int, int], float, float]:
-        """Return how the object at given pixels is smoothed (method.md, eq. 1 and 2).
+        """Return how an object is smoothed (method.md, eq. 1 and 2).
+
+        Args:
+            frame: with the depth.
+            measured: (h, w) its measured pixels.
+            outline: (h, w) all its pixels.
 
         Returns:
             Radius of the ball in m, in px at the nearest point, and the stride between its pixels; the least standard
-            deviation of inverse depth (1/m); and the number of points that share the noise of a pixel.
+            deviation of inverse depth (1/m); and the number of measured pixels that share the noise of one.
         """
+        rows, columns = _places(measured)
         if rows.size == 0:  # nothing to smooth
             return (0.0, 1, 1), 0.0, 1.0
         depth_m = frame.depth_m[rows, columns]
         nearest_m, middle_m = (float(value) for value in np.percentile(depth_m, [2, 50]))
         metres_per_px = middle_m / frame.camera.fx
         extent_m = metres_per_px * float(np.hypot(np.ptp(rows), np.ptp(columns)))
-        density = rows.size / max(float(frame.mask.sum()) if frame.mask is not None else rows.size, 1.0)
+        density = rows.size / float(outline.sum())
         sparse_px = np.sqrt(self.min_neighbours / (np.pi * max(density, 0.01)))
         # method.md, eq. 1
         radius_m = max(self.smoothing * np.sqrt(self.sigma_r_m * extent_m), sparse_px * metres_per_px)
-        reach_px = int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, 16))
+        reach_px = int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, max(16, np.ceil(1.2 * sparse_px))))
         # A stride of 2 px is enough where a wide window holds many pixels.
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours
         ball = (radius_m, reach_px, 2 if reach_px > 4 and enough else 1)
         sharing = max(density * np.pi * (radius_m / metres_per_px + self.correlation_px) ** 2, 1.0)
         # A tenth of the sensor's noise: neighbouring pixels err alike, so that residuals understate it.
         return ball, 0.1 * self.sigma_r_m / middle_m**2, float(sharing)
+
+
+def _window(mask: BoolArray, margin: int) -> tuple[slice, slice]:
+    """Return the rows and columns of an image that hold a mask (h, w) and a margin in px."""
+    top, bottom, left, right = planes.bounds(mask)
+    return slice(max(top - margin, 0), bottom + margin), slice(max(left - margin, 0), right + margin)
 
 
 def _places(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -75,11 +75,12 @@ def padded(depth_m, mask, intrinsics, window, pad):
 
 
 @numba.njit(cache=True, fastmath={"contract", "nsz"})
-def add_line(points, row, shift, pad, radius_m2, step, sums):
+def add_line(centres, points, row, shift, pad, radius_m2, step, sums):
     """Add up, for every pixel of a row, its neighbours on one line that lie within the ball around it.
 
     Args:
-        points: of `padded`.
+        centres: of the balls, of `padded`.
+        points: of `padded`; the neighbours.
         row: the pixels' row, and
         shift: by how much the line lies below it.
         pad: of `padded`; the line is read as far as this to either side.
@@ -95,10 +96,10 @@ def add_line(points, row, shift, pad, radius_m2, step, sums):
         for j in range(sums.shape[1]):
             k = np.uint32(j + pad)
             m = np.uint32(j + pad + dx)
-            away_x = points[0, there, m] - points[0, here, k]
-            away_y = points[1, there, m] - points[1, here, k]
-            away_z = points[2, there, m] - points[2, here, k]
-            b = points[3, there, m] - points[3, here, k]
+            away_x = points[0, there, m] - centres[0, here, k]
+            away_y = points[1, there, m] - centres[1, here, k]
+            away_z = points[2, there, m] - centres[2, here, k]
+            b = points[3, there, m] - centres[3, here, k]
             inside = away_x * away_x + away_y * away_y + away_z * away_z <= radius_m2
             one, weighted = np.float32(1.0) if inside else np.float32(0.0), b if inside else np.float32(0.0)
             sums[0, j] += one
@@ -109,7 +110,7 @@ def add_line(points, row, shift, pad, radius_m2, step, sums):
             sums[5, j] += weighted * weighted
 
 
-def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse):
+def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse, measured=None):
     """Fit a plane to every object pixel's neighbours within a ball.
 
     A plane is linear in inverse depth over the image (1/z = N · (w, h, 1)), where triangulating cameras have constant
@@ -123,18 +124,21 @@ def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse):
         intrinsics: (4,) fx, fy, cx, cy in px.
         ball: radius in m; half-width of its window in px; stride between the pixels that are read.
         sigma_inverse: sensor noise of 1/z, in 1/m.
+        measured: (h, w) bool, the object pixels that planes are fitted to; the depth of others is a guess of where to
+            look for neighbours. None: all.
 
     Returns:
         (h, w, 8) float32 cells, columns as above.
     """
     window = bounds(mask)
-    points = padded(depth_m, mask, intrinsics, window, ball[1])
-    images = depth_m, mask, silhouette_px, points
+    centres = padded(depth_m, mask, intrinsics, window, ball[1])
+    points = centres if measured is None else padded(depth_m, measured, intrinsics, window, ball[1])
+    images = depth_m, mask, silhouette_px, centres, points
     return over_rows(_local_planes, np.arange(len(depth_m)), *images, window, intrinsics, ball, sigma_inverse)
 
 
 @numba.njit(cache=True, nogil=True)
-def _local_planes(rows, depth_m, mask, silhouette_px, points, window, intrinsics, ball, sigma_inverse):
+def _local_planes(rows, depth_m, mask, silhouette_px, centres, points, window, intrinsics, ball, sigma_inverse):
     width = depth_m.shape[1]
     fx, fy, cx, cy = intrinsics
     radius_m, reach, stride = ball
@@ -154,7 +158,7 @@ def _local_planes(rows, depth_m, mask, silhouette_px, points, window, intrinsics
             for j in range(right - left):
                 sums[k, j] = 0.0
         for dy in range(-reach, reach + 1, stride):
-            add_line(points, row - top, dy, reach, np.float32(radius_m * radius_m), stride, line)
+            add_line(centres, points, row - top, dy, reach, np.float32(radius_m * radius_m), stride, line)
             for j in range(right - left):
                 n, x, b = line[0, j], line[1, j], line[3, j]
                 sums[0, j] += n

@@ -22,6 +22,7 @@ from modeler.segmentation.depth_images import (
 )
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
 from modeler.segmentation.scene import Scene, clean, is_island, learn, shows_object_alone
+from modeler.sparsity import interpolated
 from modeler.types import Array, BoolArray, Camera, Float32Array, Frame, InputError, Outcome, Plane, Segmentation
 
 Window = tuple[slice, slice]
@@ -226,6 +227,7 @@ class Segmenter:
         shown = [frame for frame in shown if frame.depth_m.shape == shown[0].depth_m.shape]
         if not shown:
             return Scene()
+        shown = [_interpolated(frame) for frame in shown]
         if shows_object_alone([_measured(frame) for frame in shown], shown[0].camera, self.noise):
             return Scene(alone=True)
         scene = self._learn(shown)
@@ -246,8 +248,10 @@ class Segmenter:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
 
         A frame's own mask is kept, within region and largest depth; it is UNSURE_MASK if it covers much of the support,
-        or if the object's surface goes on beyond most of its rim.
+        or if the object's surface goes on beyond most of its rim. Where measurements are sparse, the mask holds what
+        lies between those of the object.
         """
+        frame = _interpolated(frame)
         if frame.mask is not None:
             mask = frame.mask & self._allowed(frame.depth_m)
             few = np.count_nonzero(mask & (frame.depth_m > 0.0)) < self.min_points
@@ -355,6 +359,11 @@ class Segmenter:
         body, ground = points[found & np.isfinite(points[..., 2])], points[around]
         guess = choose_support(planes, body, ground, self.noise)
         return None if guess is None else fit_beside(ground, body, guess=guess, noise=self.noise)
+
+
+def _interpolated(frame: Frame) -> Frame:
+    """Return a frame with depth between measurements, where they are sparse."""
+    return replace(frame, depth_m=interpolated(frame.depth_m, frame.camera))
 
 
 def _measured(frame: Frame) -> Float32Array:

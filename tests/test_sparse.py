@@ -1,0 +1,125 @@
+"""Depth images with pixels missing at random: what is known between measurements, and how well."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration.specimens import load_specimen
+from calibration.study import Condition, staged
+
+from modeler.evaluation import nees, rotation_error_deg, true_motion
+from modeler.kernels import planes
+from modeler.priors import TablePrior
+from modeler.rays import Sensor
+from modeler.registration import VisibilityRegistrar
+from modeler.segmentation import Segmenter
+from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
+from modeler.types import Camera, Frame
+from sequences.rendering.renderer import RenderedSequence
+
+SHAPE = (120, 160)
+CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
+
+
+def thinned(frame, share, rng):
+    """Return a frame of whose pixels a share is kept, at random."""
+    kept = rng.random(frame.depth_m.shape) < share
+    return replace(frame, depth_m=np.where(kept, frame.depth_m, np.nan).astype(np.float32))
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.5, 0.9])
+def test_the_share_of_measured_pixels_is_that_of_random_loss_within_any_outline(share, rng):
+    outline = np.zeros(SHAPE, dtype=bool)
+    outline[20:100, 30:130] = True
+    whole, inside = rng.random(SHAPE) < share, outline & (rng.random(SHAPE) < share)
+    assert measured_share(whole) == pytest.approx(share, rel=0.1)
+    assert measured_share(inside, outline) == pytest.approx(share, rel=0.15)
+
+
+def test_a_dense_image_with_holes_has_no_gaps_and_its_holes_stay():
+    depth_m = np.full(SHAPE, 0.8, dtype=np.float32)
+    depth_m[40:60, 50:90] = np.nan
+    assert gap_px(measured_share(np.isfinite(depth_m))) < 1.0
+    view = Sensor().ray_image(Frame(0, 0.0, depth_m, CAMERA, mask=np.ones(SHAPE, dtype=bool)))
+    assert (view.layers["cells"][40:60, 50:90, planes.KIND] == planes.MISSING).all()
+
+
+@pytest.mark.parametrize("share", [0.03, 0.1, 0.5])
+def test_gaps_that_random_loss_leaves_are_closed_and_larger_ones_stay(share, rng):
+    measured = rng.random((300, 300)) < share
+    measured[100:200, 100:200] = False
+    between = closed(measured, gap_px(share))
+    assert not between[120:180, 120:180].any()
+    assert np.concatenate([between[20:80, 20:280], between[220:280, 20:280]]).mean() > 0.98
+
+
+def test_pixels_between_measurements_have_the_depth_of_the_nearest(rng):
+    measured = rng.random((30, 40)) < 0.1
+    depth_m = rng.uniform(0.5, 1.0, (30, 40)).astype(np.float32)
+    filled = nearest_depth(depth_m, measured, np.ones_like(measured), 4.0)
+    places = np.argwhere(measured)
+    for pixel in np.argwhere(rng.random((30, 40)) < 0.1):
+        away_px = np.hypot(*(places - pixel).T)
+        nearest = places[np.isclose(away_px, away_px.min())]
+        if away_px.min() <= 4.0:
+            assert filled[tuple(pixel)] in depth_m[tuple(nearest.T)]
+        else:
+            assert np.isnan(filled[tuple(pixel)])
+
+
+def test_planes_between_sparse_measurements_err_as_they_state(rng):
+    sigma_m, ratios, covered = 0.002, [], []
+    w, h = CAMERA.rays()
+    exact = 1.0 / (1.2 - 0.3 * w + 0.4 * h)
+    for _ in range(8):
+        depth_m = (exact + exact**2 * sigma_m * rng.normal(size=SHAPE)).astype(np.float32)
+        frame = thinned(Frame(0, 0.0, depth_m, CAMERA, mask=np.ones(SHAPE, dtype=bool)), 0.1, rng)
+        view = Sensor(0.001, sigma_m).ray_image(frame)
+        normal = np.array([-0.3, 0.4, 1.2])
+        off_m = (view.points_m @ normal - 1.0) / np.linalg.norm(normal)
+        ratios.append(np.mean(off_m**2 / view.layers["variance_m2"]))
+        covered.append(len(view.points_m) / depth_m.size)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.3)
+    assert min(covered) > 0.7  # planes between measurements, not only at a tenth of the pixels
+
+
+@pytest.fixture(scope="module")
+def drill():
+    """Return a rendered drill 1.3 m away, of three frames."""
+    return RenderedSequence(staged(load_specimen("drill"), Condition(distance_m=1.3), frames=3, seed=4))
+
+
+def segmented(frames):
+    """Return segmentations of frames by what they show together."""
+    scene = Segmenter().scene(frames)
+    return [Segmenter().segment(frame, scene) for frame in frames]
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_sparse_frames_show_the_object_and_its_support_as_dense_ones_do(drill, masked, rng):
+    dense = [drill.frame(index) if masked else replace(drill.frame(index), mask=None) for index in drill.indices]
+    sparse = [thinned(frame, 0.1, rng) for frame in dense]
+    for want, got in zip(segmented(dense), segmented(sparse), strict=True):
+        assert got.outcome is want.outcome
+        assert got.plane is not None
+        assert want.plane is not None
+        assert got.plane.normal @ want.plane.normal > np.cos(np.radians(0.3))
+        assert abs(got.plane.offset_m - want.plane.offset_m) < 0.002
+        assert np.count_nonzero(got.mask & want.mask) > 0.8 * np.count_nonzero(got.mask | want.mask)
+
+
+@pytest.mark.parametrize(("share", "worst_deg"), [(0.1, 10.0), (0.03, 30.0)])
+def test_sparse_views_are_registered_as_well_as_they_state(drill, share, worst_deg):
+    indices, sensor, squares = drill.indices[:2], Sensor(*drill.sensor()), []
+    truth = true_motion(drill.truth(), *indices)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        frames = [thinned(drill.frame(index), share, rng) for index in indices]
+        target, source = (
+            sensor.ray_image(frame, found.plane) for frame, found in zip(frames, segmented(frames), strict=True)
+        )
+        found = VisibilityRegistrar().register(source, target, TablePrior().between(source, target), rng=rng)
+        assert found.usable
+        assert rotation_error_deg(found.pose.mean, truth) < worst_deg
+        squares.append(nees(found.pose, truth))
+    assert np.mean(squares) < 2.0 * 6.0  # 6 on average; the mean of three exceeds 12 with a probability of 0.7 %
