@@ -7,7 +7,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.closure import Closer, MapView
-from modeler.graph import PoseGraph, solve
+from modeler.graph import PoseGraph, Smoother
 from modeler.types import Array, Camera, Edge, Frame, Outcome, PoseGaussian, Posterior, RayImage, Solution
 
 CENTROID_M = np.array([0.03, -0.02, 0.8])
@@ -44,7 +44,8 @@ class Run:
         self.judged: dict[int, tuple[Edge, ...]] = {}
         self.graph = PoseGraph(first=self.numbers[0])
         self.views: dict[int, RayImage] = {}
-        self.solution = Solution()
+        self.keyframes: tuple[int, ...] = ()
+        self.smoother = Smoother()
 
     def measured(self, target: int, source: int, rng: np.random.Generator, bias: Array) -> Posterior:
         noise = rng.multivariate_normal(np.zeros(6), COVARIANCE) + se3.adjoint(ABOUT_OBJECT) @ bias
@@ -60,7 +61,7 @@ class Run:
         bias_here = np.zeros(6) if bias is None else bias
         for source in self.numbers:
             posteriors: list[Posterior] = []
-            map_view = MapView(self.views, self.solution, self.graph.edges)
+            map_view = self.map_view
             steps = self.numbers.index(source) - self.numbers.index(max(self.views)) if self.views else 1
             if self.views:
                 posteriors = [spoil(self.measured(next(reversed(self.views)), source, rng, bias_here))]
@@ -80,7 +81,17 @@ class Run:
             self.graph = self.graph.plus(edges)
             if not self.views or any(edge.accepted for edge in edges):
                 self.views[source] = view(source)
-            self.solution = solve(self.graph, self.solution.trajectory)
+            self.smoother = self.smoother.to(self.graph)
+            if source in self.views and closer.is_keyframe(source, self.map_view):
+                self.keyframes = (*self.keyframes, source)
+
+    @property
+    def solution(self) -> Solution:
+        return self.smoother.solution
+
+    @property
+    def map_view(self) -> MapView:
+        return MapView(self.views, self.solution, self.graph.edges, self.keyframes)
 
     def truth_between(self, target: int, source: int) -> Array:
         return se3.inverse(self.truth[target]) @ self.truth[source]

@@ -252,28 +252,28 @@ def test_scattered_or_missing_evidence_rejects_nothing() -> None:
 def test_once_all_frames_are_in_each_is_tried_over_two_steps() -> None:
     run = Run(list(REGULAR_DEG))
     run.run(Closer(max_closures=0))
-    pairs = Closer().span_pairs(MapView(run.views, run.solution, run.graph.edges))
+    pairs = Closer().span_pairs(run.map_view)
     assert {(source, source - 2) for source in range(2, 12)} <= set(pairs)
     assert {source for source, _ in pairs} == set(range(2, 14))
-    assert Closer(max_spans=0).span_pairs(MapView(run.views, run.solution, run.graph.edges)) == ()
+    assert Closer(max_spans=0).span_pairs(run.map_view) == ()
     assert Closer(max_span_deg=40.0).span_pairs(MapView(run.views, run.solution, run.graph.edges[:11])) == ()
     rng = np.random.default_rng(1)
     for source, target in pairs:
         true = run.measured(target, source, rng, np.zeros(6))
-        edge = Closer().judge_span(true, MapView(run.views, run.solution, run.graph.edges))
+        edge = Closer().judge_span(true, run.map_view)
         assert edge.accepted
         assert edge.kind == ("closure" if source - target > 3 else "span")
         wrong = replace(true, pose=PoseGaussian(true.pose.mean @ turned(30.0), COVARIANCE))
-        edge = Closer().judge_span(wrong, MapView(run.views, run.solution, run.graph.edges))
+        edge = Closer().judge_span(wrong, run.map_view)
         assert not edge.accepted
         assert isinstance(edge.reason, Consistency)
-        assert Closer().judge_span(witnessed(true, -1e9), MapView(run.views, run.solution, run.graph.edges)).accepted
+        assert Closer().judge_span(witnessed(true, -1e9), run.map_view).accepted
 
 
 def test_of_small_steps_the_most_informative_span_is_tried() -> None:
     run = Run(list(3.0 * np.arange(30)))
     run.run(Closer(max_closures=0))
-    pairs = Closer().span_pairs(MapView(run.views, run.solution, run.graph.edges))
+    pairs = Closer().span_pairs(run.map_view)
     apart = [source - target for source, target in pairs if source > 20]
     assert len(apart) == 9
     assert min(apart) >= 4
@@ -348,7 +348,7 @@ def test_an_open_turn_does_no_harm_where_the_graph_knows_it_better(sigma_deg: fl
 
 
 def _map_view(run: Run) -> MapView:
-    return MapView(run.views, run.solution, run.graph.edges)
+    return run.map_view
 
 
 # Frames that nothing places, and the first one after them: what is believed of its registrations.

@@ -26,7 +26,7 @@ def chain(angles_deg: Sequence[float]) -> tuple[MapView, Run]:
     """Return what is known after frames at angles, each registered against the one before alone."""
     run = Run(list(angles_deg))
     run.run(Closer(max_closures=0))
-    return MapView(run.views, run.solution, run.graph.edges), run
+    return run.map_view, run
 
 
 FRAMES = [0, 1, 2, 3, 4]
@@ -87,7 +87,7 @@ def test_coming_back_depends_on_the_path_not_on_frame_numbers() -> None:
     """A frame that was lost hangs on a view far round; its number lies beside that of the first."""
     run = Run([0.0, 0.0, *(40.0 * np.arange(1, 5))], [0, 1, 2, 3, 4, 5])
     run.run(Closer(max_closures=0), lambda posterior: posterior)
-    map_view = MapView(run.views, run.solution, run.graph.edges)
+    map_view = run.map_view
     assert map_view.came_back(0, 1, map_view.shortest_paths(5), away_deg=90.0)
     assert not map_view.came_back(0, 1, map_view.shortest_paths(1), away_deg=90.0)
 

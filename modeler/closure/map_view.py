@@ -25,6 +25,13 @@ class MapView:
     """The poses so far."""
     edges: Sequence[Edge] = ()
     """Every edge judged so far."""
+    keyframes: Sequence[int] | None = None
+    """Views to which closures and spans may lead; None: all."""
+
+    @cached_property
+    def targets(self) -> list[int]:
+        """Those of them that have a pose, in order of acceptance."""
+        return self.frames if self.keyframes is None else [k for k in self.keyframes if k in self.solution.trajectory]
 
     @cached_property
     def frames(self) -> list[int]:

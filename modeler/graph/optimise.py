@@ -104,7 +104,8 @@ def poses_of(values: gtsam.Values, frames: Iterable[int], root: int) -> dict[int
     rows = np.asarray(gtsam.utilities.extractPose3(values), dtype=np.float64)  # by key: rotation, translation
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
-    found = dict(zip(values.keys(), poses, strict=True))
+    # Copies: whoever keeps one pose, as a linearisation point, would keep all poses of this solution in memory.
+    found = {frame: pose.copy() for frame, pose in zip(values.keys(), poses, strict=True)}
     return {frame: found[frame] for frame in frames} | {root: np.eye(4)}
 
 

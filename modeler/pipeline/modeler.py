@@ -208,6 +208,9 @@ class Run:
         prepared = replace(prepared, left_out=_left_out(prepared, edges, first=not self.state.views))
         self.state = self.state.joined(prepared, edges)
         if prepared.accepted:
+            number = prepared.frame.index
+            if self.modeler.closer.is_keyframe(number, self.state.map_view):
+                self.state = replace(self.state, keyframes=(*self.state.keyframes, number))
             self._preview()
         if prepared.accepted or not again:
             yield self._step(prepared, posteriors, edges)

@@ -27,6 +27,8 @@ class State:
     """Its solution."""
     views: Mapping[int, RayImage] = field(default_factory=dict)
     """The accepted views by frame number, in order of acceptance, without the images that a likelihood looks up."""
+    keyframes: tuple[int, ...] = ()
+    """Those of them that are keyframes."""
     ready: Mapping[int, RayImage] = field(default_factory=dict)
     """The newest of them with these images."""
     places: Mapping[int, int] = field(default_factory=dict)
@@ -54,7 +56,7 @@ class State:
     @cached_property
     def map_view(self) -> MapView:
         """What closures are chosen and judged by."""
-        return MapView(self.views, self.solution, self.graph.edges)
+        return MapView(self.views, self.solution, self.graph.edges, self.keyframes)
 
     @property
     def latest(self) -> int | None:

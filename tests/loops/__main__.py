@@ -24,6 +24,7 @@ from modeler.export import write_atomically
 from modeler.types import Step, explain
 
 _WIDTHS = (19, 8, 6, 6, 6, 7, 9, 8, 10, 9, 7, 7, 9, 10, 8, 6)
+_OF_CLOSER: dict[str, Any] = {"max_closures": int, "min_gain_nats": float, "max_spans": int, "keyframe_deg": float}
 _HEADS = (
     *("case", "joined", "regs", "close", "span", "reject", "before°", "after°", "before mm", "after mm"),
     *("NEES", "after", "turned°", "residual°", "after°", "s"),
@@ -40,10 +41,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--long", type=int, metavar="N", help="instead: N small frames at 3°, and what each costs")
     parser.add_argument("--told-truth", action="store_true", help="register by the truth: what all else costs")
     parser.add_argument("--out", type=Path, default=Path("runs/loops"), help="folder of the results")
-    for field, kind in (("max_closures", int), ("min_gain_nats", float), ("max_spans", int)):
+    for field, kind in _OF_CLOSER.items():
         parser.add_argument(f"--{field.replace('_', '-')}", type=kind, default=getattr(Closer, field), help="of Closer")
     options = parser.parse_args(arguments)
-    closer = Closer(max_closures=options.max_closures, min_gain_nats=options.min_gain_nats, max_spans=options.max_spans)
+    closer = Closer(**{field: getattr(options, field) for field in _OF_CLOSER})
     cases = [(case, seed) for seed in options.seeds for case in _cases(options, seed)]
     if not cases:
         parser.error("no case is left; check --cases")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -38,6 +39,22 @@ def write_sequence(folder: Path, frames: int, *, shape: str, width: int) -> None
     sigma_wh, sigma_r_m = sequence.sensor() or (0.0, 0.0)
     sensor = {"sigma_wh": sigma_wh, "sigma_r_m": sigma_r_m}
     write_bop(folder, sequence, sequence.truth(), {"name": folder.name, "sensor": sensor})
+
+
+def write_repeated(folder: Path, pictures: Path, count: int, frames: int) -> None:
+    """Make a sequence of frames whose files are those of another of `count` frames, in turn."""
+    for part in (path for path in pictures.iterdir() if path.is_dir()):
+        (folder / part.name).mkdir(parents=True)
+        for frame in range(frames):
+            for path in part.glob(f"{frame % count:06d}*"):
+                os.link(path, folder / part.name / path.name.replace(f"{frame % count:06d}", f"{frame:06d}", 1))
+    for name in ("scene_camera.json", "scene_gt.json"):
+        entries = json.loads((pictures / name).read_text())
+        repeated = {str(frame): entries[str(frame % count)] for frame in range(frames)}
+        (folder / name).write_text(json.dumps(repeated))
+    described = json.loads((pictures / "sequence.json").read_text())
+    described["timestamps_s"] = {str(frame): frame / 30.0 for frame in range(frames)}
+    (folder / "sequence.json").write_text(json.dumps(described))
 
 
 class Meter(Console):
@@ -73,6 +90,9 @@ def run() -> int:
     """Run the study and return the status of the command."""
     parser = argparse.ArgumentParser(prog="loops.memory", description=__doc__)
     parser.add_argument("--frames", type=int, default=1000)
+    parser.add_argument(
+        "--pictures", type=int, help="frames to render, whose files further frames share; whole turns are 120 each"
+    )
     parser.add_argument("--every", type=int, default=250, help="steps between lines")
     parser.add_argument("--shape", default="figurine", help="recipe of the rendered object")
     parser.add_argument("--width", type=int, default=320, help="of the images in pixels, whose height is 3/4 of it")
@@ -81,8 +101,12 @@ def run() -> int:
     parser.add_argument("options", nargs="*", default=["--prior", "table"], help="of modeler build, after --")
     options = parser.parse_args()
     sequence = options.out / f"{options.shape}-{options.width}-{options.frames}"
+    count = min(options.pictures or options.frames, options.frames)
+    pictures = options.out / f"{options.shape}-{options.width}-{count}"
+    if not pictures.exists():
+        write_sequence(pictures, count, shape=options.shape, width=options.width)
     if not sequence.exists():
-        write_sequence(sequence, options.frames, shape=options.shape, width=options.width)
+        write_repeated(sequence, pictures, count, options.frames)
     Meter.every = options.every
     build.Console = Meter
     if options.told_truth:
