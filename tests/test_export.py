@@ -33,7 +33,7 @@ from modeler.export.formats import cloud_ply, mesh_ply
 from modeler.export.mesh import MADE_UP_RGB
 from modeler.export.reading import fault
 from modeler.export.run_folder import frame_record
-from modeler.export.standing import ring_upright, upright
+from modeler.export.standing import upright
 from modeler.types import (
     Array,
     InputError,
@@ -379,13 +379,16 @@ def test_what_turned_on_a_table_stands_upright(tilt_deg: float) -> None:
     """The camera looks down on the ring that it makes around the object, by so many degrees."""
     up = _looking_down(tilt_deg)
     turns = [se3.exp(np.concatenate([angle * up, np.zeros(3)])) for angle in np.linspace(0.0, 5.0, 8)]
-    centres_m = np.array([turn[:3, :3] @ [0.0, 0.0, -0.7] for turn in turns])
-    right, down, forward = ring_upright(centres_m).T
+    poses = [turn @ se3.translation(np.array([0.0, 0.0, -0.7])) for turn in turns]
+    records = [
+        {"id": k, "object_from_camera": pose.ravel(), "covariance": np.eye(6).ravel()} for k, pose in enumerate(poses)
+    ]
+    right, down, forward = model_upright({"poses": records}).T
     np.testing.assert_allclose(down, -up, atol=1e-9)
     np.testing.assert_allclose(right, [1.0, 0.0, 0.0], atol=1e-9)  # as the first camera sees it
     np.testing.assert_allclose(np.cross(right, down), forward, atol=1e-9)
     for few in (1, 2):
-        assert np.array_equal(ring_upright(centres_m[:few]), np.eye(3))
+        assert np.array_equal(model_upright({"poses": records[:few]}), np.eye(3))
 
 
 def test_a_support_that_is_seen_lies_level_in_a_view(last: Step) -> None:

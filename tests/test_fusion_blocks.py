@@ -11,11 +11,10 @@ import pytest
 import tabletop
 from scipy.spatial import KDTree
 
-from modeler.disk_arrays import DiskArrays
+from modeler.disk_arrays import DiskArrays, ViewStore
 from modeler.fusion import Fuser, depth_views
 from modeler.fusion.fuser import downsampled, voxel_means
 from modeler.fusion.support import _solved
-from modeler.pipeline.view_store import ViewStore
 
 VOXEL_M = 0.002
 BRICK = tabletop.Box((0.07, 0.05, 0.04))

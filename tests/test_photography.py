@@ -16,8 +16,7 @@ from modeler import se3
 from modeler.types import Array, InputError
 from sequences.rendering.charts import Chart, Cylindrical, Faces, Spherical, Unwrapped
 from sequences.rendering.labels import Embedded, Label, Picture, Print, gamma_coded, linear_light
-from sequences.rendering.normals import SmoothNormals
-from sequences.rendering.photography import Lamp, Photography
+from sequences.rendering.photography import Lamp, Photography, SmoothNormals
 from sequences.rendering.recipe import Recipe, Viewpoint, load_recipe
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.shapes import AnyShape, Box, Cylinder, MeshFile, Sphere

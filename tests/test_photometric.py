@@ -9,7 +9,7 @@ import pytest
 from scipy import ndimage
 
 import modeler
-from modeler import photometry, se3
+from modeler import se3
 from modeler.cli.build import Build
 from modeler.cli.options import MethodOptions
 from modeler.kernels import gauss_newton, photometric, point_to_plane
@@ -17,6 +17,7 @@ from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
+from modeler.registration.visibility import photometric as colours
 from modeler.se3 import rows
 from modeler.types import Array, Camera, Frame, InputError, Outcome, Posterior, RayImage
 from sequences import bundled, open_sequence
@@ -65,29 +66,29 @@ def test_exposure_does_not_change_features(rng):
     frame = picture(rng)
     assert frame.colour is not None
     brighter = replace(frame, colour=(1.2 * (frame.colour.astype(float) + 4.0) - 4.0).round().astype(np.uint8))
-    features = photometry.features(frame, everywhere(frame))
-    changed = photometry.features(brighter, everywhere(frame))
-    for band in range(photometry.BANDS):
-        deviation = features[band, photometry.VALUE].std()
-        assert np.abs(changed[band, photometry.VALUE] - features[band, photometry.VALUE]).max() < 0.1 * deviation
+    features = colours.features(frame, everywhere(frame))
+    changed = colours.features(brighter, everywhere(frame))
+    for band in range(colours.BANDS):
+        deviation = features[band, colours.VALUE].std()
+        assert np.abs(changed[band, colours.VALUE] - features[band, colours.VALUE]).max() < 0.1 * deviation
 
 
 def test_a_plain_image_has_no_features(rng):
     frame = replace(picture(rng), colour=np.full((60, 80, 3), 90, dtype=np.uint8))
-    np.testing.assert_allclose(photometry.features(frame, everywhere(frame)), 0.0, atol=1e-5)
+    np.testing.assert_allclose(colours.features(frame, everywhere(frame)), 0.0, atol=1e-5)
 
 
 def test_bands_are_differences_of_gaussian_means(rng):
     frame = picture(rng)
     assert frame.colour is not None
-    image = photometry.features(frame, everywhere(frame)).reshape(photometry.BANDS, 3, 60, 80)
+    image = colours.features(frame, everywhere(frame)).reshape(colours.BANDS, 3, 60, 80)
     logs = np.log(frame.colour + 4.0).mean(axis=2)
     inside = (slice(20, -20), slice(20, -20))
     for band in range(3):
-        width_px = photometry.FINEST_PX * 2**band
+        width_px = colours.FINEST_PX * 2**band
         exact = ndimage.gaussian_filter(logs, width_px) - ndimage.gaussian_filter(logs, 2.0 * width_px)
         by_row, by_column = np.gradient(exact, axis=0), np.gradient(exact, axis=1)
-        for layer, want in ((0, exact), (photometry.BY_ROW, by_row), (photometry.BY_COLUMN, by_column)):
+        for layer, want in ((0, exact), (colours.BY_ROW, by_row), (colours.BY_COLUMN, by_column)):
             assert np.corrcoef(image[band, layer][inside].ravel(), want[inside].ravel())[0][1] > 0.95
 
 

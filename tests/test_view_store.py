@@ -12,9 +12,9 @@ import pytest
 import tabletop
 from test_pipeline import FRAMES, Oracle, modeler
 
+from modeler.disk_arrays import ViewStore
 from modeler.pipeline import Run
 from modeler.pipeline.state import State
-from modeler.pipeline.view_store import ViewStore
 from modeler.segmentation import Scene
 from modeler.types import RayImage, Step
 

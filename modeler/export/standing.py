@@ -87,18 +87,6 @@ def level_axes(up: Array) -> Array:
     return np.stack([np.cross(forward, up), forward, up], axis=1)
 
 
-def ring_upright(centres_m: Array) -> Array:
-    """Return right, down and forward (3, 3), as columns, of a view in which a ring of cameras lies level.
-
-    The identity, which is the view of the first frame's camera, where they make no ring.
-
-    Args:
-        centres_m: (n, 3) where the cameras are, in the object frame.
-    """
-    up = _ring_up(centres_m)
-    return np.eye(3) if up is None else standing(up)
-
-
 def _ring_up(centres_m: Array) -> Array | None:
     """Return what is up (3,) on a ring of cameras at (n, 3); None where they make none."""
     long, wide, high = np.pad(np.linalg.svd(centres_m - centres_m.mean(axis=0), compute_uv=False), (0, 3))[:3]

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from modeler.closure import MapView
+from modeler.disk_arrays import ViewStore
 from modeler.fusion import IncrementalTsdf
 from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.pipeline.pairs import Prepared
-from modeler.pipeline.view_store import ViewStore
 from modeler.types import Edge, InputError, ObjectModel, RayImage, Solution
 
 _READY = 8  # views kept ready for registration; of others the images that a likelihood looks up are made again
