@@ -28,7 +28,7 @@ def untrusted(*codes: str, turn_deg: float = 40.0, outcome: Outcome = Outcome.CO
     edge = {"accepted": outcome is Outcome.CONVERGED, "kind": "odometry", "source": 1, "target": 0}
     edge |= {"outcome": outcome.label, "target_from_source": turn.ravel().tolist()}
     frames = [{"id": 0, "cause": ""}, {"id": 1, "cause": "" if edge["accepted"] else outcome.label}]
-    return {"reason_codes": list(codes), "frames": frames, "edges": [edge], **more}
+    return {"reason_codes": list(codes), "frames": frames, "edges": [edge], "closed": False, **more}
 
 
 @pytest.mark.parametrize(
@@ -74,6 +74,14 @@ def test_what_to_do_next_is_the_limit_that_was_hit_or_what_is_missing(
         assert ("max-rotation-deg" in found.options) is ("max-rotation-deg" in options)
         if isinstance(options, dict):
             assert options.items() <= found.options.items()
+
+
+@pytest.mark.parametrize(("closed", "first"), [(True, "modeler report"), (False, "")])
+def test_surface_that_is_not_there_leads_to_the_masks_where_a_loop_confirms_the_poses(closed: bool, first: str) -> None:
+    found = remedy(untrusted("seen_through", "absent", closed=closed, up=[0.0, -1.0, 0.0]), priors.GeneralPrior())
+    assert found is not None
+    assert found.first.startswith(first)
+    assert bool(found.options) is not closed
 
 
 def test_a_loop_that_is_open_leads_to_the_focal_length() -> None:

@@ -138,9 +138,9 @@ class Remedy:
     words: str
     """For people."""
     options: Mapping[str, str] = field(default_factory=dict)
-    """Of `modeler build`, by name without dashes, with their values; those given before stay."""
+    """Of `modeler build`, by name without dashes, with their values; those given before stay. Empty: no other build."""
     first: str = ""
-    """A command to run before; "" = none."""
+    """A command to run first; "" = none."""
 
 
 def remedy(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
@@ -157,7 +157,8 @@ def remedy(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
         **dict.fromkeys(("unsure_masks", "no_motion"), _region),
         **dict.fromkeys(("loop_open", "edges_disagree"), _camera),
         "closures_refused": _camera,
-        **dict.fromkeys(("seen_through", "absent", "little_overlap", "other_modes"), _more_known),
+        **dict.fromkeys(("seen_through", "absent"), _surface),
+        **dict.fromkeys(("little_overlap", "other_modes"), _more_known),
         **dict.fromkeys(("unsure_rotation", "unsure_place"), _more_known),
     }
     found = (by_code[code](report, prior) for code in codes if code in by_code)
@@ -167,6 +168,14 @@ def remedy(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
 def _region(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
     region = {"roi": "X0 Y0 X1 Y1", "max-depth-m": "M"}
     return Remedy("say where the object is: the pixels around it in all frames, and the depth behind it", region)
+
+
+def _surface(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
+    """Return a look at the masks where a loop and all else confirm the poses, else a stronger prior."""
+    if report["closed"] and set(report["reason_codes"]) <= {"seen_through", "absent"}:
+        words = "the loop confirms the poses; see in the report whether masks or filled holes hold more than the object"
+        return Remedy(words, first="modeler report {run}")
+    return _more_known(report, prior)
 
 
 def _camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:

@@ -271,6 +271,7 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
             say(remark)
     next_step = None if report["trustworthy"] else remedy(report, prior)
     if next_step is not None:
-        before = next_step.first.format(run=shlex.quote(str(options.out)))
-        say(f"{next_step.words}: {before}{' && ' * bool(before)}{options.command(next_step.options)}")
+        commands = [next_step.first.format(run=shlex.quote(str(options.out)))] if next_step.first else []
+        commands += [options.command(next_step.options)] if next_step.options else []
+        say(f"{next_step.words}: {' && '.join(commands)}")
     return 0 if report["trustworthy"] else 3

@@ -44,6 +44,7 @@ from modeler.verdict.evidence import (
     spread_of_rotations,
 )
 
+_NO_SURFACE: Final = "poses are wrong, masks hold more than the object, or it changed its shape"
 _LITTLE_OVERLAP: Final = 0.5  # views farther apart are registered wrongly now and then, and surely so
 
 
@@ -204,12 +205,12 @@ def _found(
     if (free := free_space(views, solution.trajectory)) is not None:
         words = (
             f"other frames see through {100.0 * free.seen_through.value:.0f} % of the surface of frame {free.frame} by "
-            f"more than {1000.0 * WRONG_M:.0f} mm: poses are wrong, or the object changed its shape"
+            f"more than {1000.0 * WRONG_M:.0f} mm: {_NO_SURFACE}"
         )
         found.append(_Finding("seen_through", free.seen_through, "seen_through", words))
         words = (
             f"{100.0 * free.absent.value:.0f} % of the surface of frame {free.bare_frame} is not there by most frames "
-            "that look: poses are wrong, or the object changed its shape"
+            f"that look: {_NO_SURFACE}"
         )
         found.append(_Finding("absent", free.absent, "absent", words))
     others = other_modes(edges, solution, views)
