@@ -373,7 +373,7 @@ def tensor(values, kind):
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(values, dtype=kind))
 
 
-@pytest.mark.parametrize("name", ["flashlight", "tube"])
+@pytest.mark.parametrize("name", [pytest.param("flashlight", marks=pytest.mark.slow), "tube"])
 def test_bundled_objects_are_fused_within_3_mm(name):
     sequence = BopSequence(Path(__file__).parents[1] / "sequences" / "bundled" / name)
     truth, noise = sequence.truth(), sequence.sensor()

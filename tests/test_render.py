@@ -152,7 +152,9 @@ def turned(name: str, angle_deg: float, **changes: object) -> RenderedSequence:
     return RenderedSequence(replace(load_specimen(name), trajectory=Places((place, place, there)), **changes))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", ["can", "goblet", "soup_plate"])
+@pytest.mark.parametrize(
+    "name", ["can", *(pytest.param(name, marks=pytest.mark.slow) for name in ("goblet", "soup_plate"))]
+)
 def test_a_shape_of_revolution_looks_the_same_however_it_is_turned(name: str) -> None:
     exact, _, there = turned(name, 137.0, sensor=None)
     assert exact.mask is not None
