@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from modeler import export as files
 from modeler import se3
 from modeler.cli.console import say
 from modeler.cli.convert import finest_unit_mm
+from modeler.cli.export import Export, Purpose
 from modeler.cli.inputs import Reopened, reopened
 from modeler.cli.outputs import check_files, check_folder, run_inputs
 from modeler.export import bop, physics, solids
@@ -27,11 +28,6 @@ from modeler.export.texture import TRIANGLES, Texture
 from modeler.fusion import Fuser, FusionVolume, Symmetries, SymmetryFinder
 from modeler.types import InputError, ObjectModel
 from sequences import write_bop
-
-if TYPE_CHECKING:
-    from modeler.cli.export import Export
-
-Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "print"]
 
 _FILES: Final = {"foundationpose": ".obj", "print": ".stl"}
 _PLAIN_TRIANGLES: Final = 50_000  # of a mesh without texture, whose vertices carry the colours

@@ -1,7 +1,6 @@
 """Pure metrics: how far estimates and models are from the truth, and whether they knew."""
 
 from modeler.evaluation.poses import LEVELS as LEVELS
-from modeler.evaluation.poses import TrajectoryErrors as TrajectoryErrors
 from modeler.evaluation.poses import about_point as about_point
 from modeler.evaluation.poses import align_to_model as align_to_model
 from modeler.evaluation.poses import coverage as coverage

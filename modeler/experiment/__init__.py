@@ -1,9 +1,7 @@
 """Methods and models compared with what is known to be true: which pairs, which errors, which tables."""
 
 from modeler.experiment.experiment import Experiment as Experiment
-from modeler.experiment.experiment import Pair as Pair
 from modeler.experiment.experiment import Pairing as Pairing
-from modeler.experiment.experiment import Recorded as Recorded
 from modeler.experiment.experiment import sparse_view as sparse_view
 from modeler.experiment.models import Modelled as Modelled
 from modeler.experiment.models import ModelScore as ModelScore

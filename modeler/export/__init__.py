@@ -5,7 +5,6 @@ from modeler.export.bop import write_bop as write_bop
 from modeler.export.files import alone as alone
 from modeler.export.files import write_atomically as write_atomically
 from modeler.export.formats import g2o_text as g2o_text
-from modeler.export.formats import ply_bytes as ply_bytes
 from modeler.export.formats import tum_text as tum_text
 from modeler.export.mesh import AS_GIVEN as AS_GIVEN
 from modeler.export.mesh import files_of as files_of
@@ -16,9 +15,7 @@ from modeler.export.mesh import tinted as tinted
 from modeler.export.mesh import write_mesh as write_mesh
 from modeler.export.pairs import Pairs as Pairs
 from modeler.export.pairs import Remembered as Remembered
-from modeler.export.placing import Origin as Origin
 from modeler.export.placing import Placement as Placement
-from modeler.export.placing import Up as Up
 from modeler.export.placing import default_up as default_up
 from modeler.export.placing import placement as placement
 from modeler.export.placing import pose_file as pose_file
