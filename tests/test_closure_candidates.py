@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -159,3 +160,26 @@ def test_there_is_no_path_between_frames_that_no_edges_connect() -> None:
     assert found.along(1) == ShortestPaths().along(1) == []
     assert PathNetwork.of([], Solution()).shortest_paths(7)[7].edges == 0
     np.testing.assert_array_equal(found.to([1, 0])[0], [np.inf, 0.0])
+
+
+def test_a_network_that_grew_is_that_of_all_edges() -> None:
+    """Also where an edge no longer takes part, or enters with another pose."""
+    run = Run(list(20.0 * np.arange(24)))
+    run.run(Closer())
+    edges, solution = run.graph.edges, run.solution
+    closure = run.closures()[0]
+    pose = PoseGaussian(closure.posterior.pose.mean, 0.5 * closure.posterior.pose.covariance)
+    posed = replace(solution, edge_poses={(closure.source, closure.target): pose})
+    network = PathNetwork()
+    for count, newer in [
+        *((count, solution) for count in range(0, len(edges) + 1, 5)),
+        (len(edges), replace(solution, outliers=(closure,))),
+        (len(edges), posed),
+        (len(edges), replace(posed, edge_poses={**posed.edge_poses, (-1, -2): pose})),
+        (8, solution),
+    ]:
+        network, wholly = network.plus(edges[:count], newer), PathNetwork.of(edges[:count], newer)
+        assert network.index == wholly.index
+        np.testing.assert_array_equal(
+            np.stack(network.shortest_paths(3).to(run.numbers)), np.stack(wholly.shortest_paths(3).to(run.numbers))
+        )

@@ -150,6 +150,7 @@ class Console:
         self._frames, self._stage = frames, ""
         self._address, self._prior = address, prior
         self._placed: dict[int, bool] = {}  # a lost frame that later views place comes a second time
+        self._loops = 0
         self._unsure: set[int] = set()
         self._advised: set[str] = set()
         self._reported, self._aloud = "", 0
@@ -195,7 +196,9 @@ class Console:
         """Show what became of a frame; a lost frame that is placed later has a second step, and so has the last."""
         from modeler.types import Outcome, loops_closed
 
-        loops = loops_closed([edge for edge in step.edges_so_far if edge.accepted])
+        if step.last or any(edge.kind == "closure" for edge in step.edges):  # edges that join frames close none
+            self._loops = loops_closed([edge for edge in step.edges_so_far if edge.accepted])
+        loops = self._loops
         frame, accepted = step.frame.index, step.accepted
         before, self._placed[frame] = self._placed.get(frame), accepted
         if accepted and step.segmentation.outcome is Outcome.UNSURE_MASK:

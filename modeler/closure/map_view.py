@@ -27,6 +27,8 @@ class MapView:
     """Every edge judged so far."""
     keyframes: Sequence[int] | None = None
     """Views to which closures and spans may lead; None: all."""
+    before: PathNetwork = field(default_factory=lambda: PathNetwork())
+    """That of fewer edges, if it is known."""
 
     @cached_property
     def targets(self) -> list[int]:
@@ -49,7 +51,7 @@ class MapView:
 
     def shortest_paths(self, start: int) -> ShortestPaths:
         """Return the paths of least rotation variance from a frame to all others."""
-        return self._network.shortest_paths(start)
+        return self.network.shortest_paths(start)
 
     def extrapolated(self, frame: int) -> Array:
         """Return object_from_camera (4, 4) of a frame if the motion between the two views nearest to it is steady.
@@ -78,8 +80,9 @@ class MapView:
         return bool(cosine.min(initial=1.0) <= np.cos(np.radians(away_deg)))  # method.md, eq. C7
 
     @cached_property
-    def _network(self) -> PathNetwork:
-        return PathNetwork.of(self.edges, self.solution)
+    def network(self) -> PathNetwork:
+        """What shortest paths lead along."""
+        return self.before.plus(self.edges, self.solution)
 
 
 def composed(first: PoseGaussian, then: PoseGaussian) -> PoseGaussian:
@@ -158,29 +161,55 @@ class ShortestPaths(Mapping[int, ShortestPath]):
 
 @dataclass(frozen=True, eq=False)
 class PathNetwork:
-    """The edges that take part, weighted by their rotation variance."""
+    """The edges that take part, weighted by their rotation variance. A value: `plus` makes a new one."""
 
-    index: Mapping[int, int]
-    """Index of each frame in the matrix."""
-    variances_rad2: csr_array
-    """(n, n), from frame to frame."""
+    edges: Sequence[Edge] = ()
+    """All that were judged, whether they take part or not."""
+    solution: Solution = field(default_factory=Solution)
+    """What says which take part, and with which poses."""
+    ends: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    """(m, 2) source and target of those that do."""
+    edge_variances_rad2: Array = field(default_factory=lambda: np.zeros(0))
+    """(m,) of the rotation."""
 
     @classmethod
     def of(cls, edges: Sequence[Edge], solution: Solution) -> PathNetwork:
         """Return the network of judged edges, with the poses by which a solution took them."""
-        taking_part = [edge for edge in edges if solution.takes_part(edge)]
-        ends = np.array([(edge.posterior.source, edge.posterior.target) for edge in taking_part], dtype=np.int64)
-        variances = np.array([solution.pose_of(edge).rotation_variance_rad2 for edge in taking_part])
-        frames, indices = np.unique(ends.reshape(-1, 2), return_inverse=True)
-        indices = indices.reshape(-1, 2)
+        return cls().plus(edges, solution)
+
+    def plus(self, edges: Sequence[Edge], solution: Solution) -> PathNetwork:
+        """Return that of other edges, with as little work as what differs asks for."""
+        known, old = len(self.edges), self.solution
+        same = tuple(edges[:known]) == tuple(self.edges) and solution.outliers == old.outliers
+        if known and not (same and old.edge_poses.items() <= solution.edge_poses.items()):
+            return PathNetwork().plus(edges, solution)
+        new = [edge for edge in edges[known:] if solution.takes_part(edge)]
+        ends = np.array([(edge.source, edge.target) for edge in new], dtype=np.int64).reshape(-1, 2)
+        variances = np.array([solution.pose_of(edge).rotation_variance_rad2 for edge in new], dtype=np.float64)
+        both = np.concatenate([self.ends, ends]), np.concatenate([self.edge_variances_rad2, variances])
+        return PathNetwork(edges, solution, *both)
+
+    @cached_property
+    def index(self) -> Mapping[int, int]:
+        """Index of each frame in the matrix."""
+        return {frame: index for index, frame in enumerate(self._indexed[0].tolist())}
+
+    @cached_property
+    def variances_rad2(self) -> csr_array:
+        """(n, n), from frame to frame."""
+        size, indices = len(self._indexed[0]), self._indexed[1]
         rows, columns = np.concatenate([indices, indices[:, ::-1]]).T
-        order = np.lexsort((np.tile(variances, 2), columns, rows))
-        rows, columns, variances = rows[order], columns[order], np.tile(variances, 2)[order]
+        variances = np.tile(self.edge_variances_rad2, 2)
+        order = np.lexsort((variances, columns, rows))
+        rows, columns, variances = rows[order], columns[order], variances[order]
         first = np.ones(len(order), dtype=bool)  # of several edges between two frames, that of least variance
         first[1:] = (np.diff(rows) != 0) | (np.diff(columns) != 0)
-        size = len(frames)
-        matrix = csr_array((variances[first], (rows[first], columns[first])), shape=(size, size))
-        return cls({frame: index for index, frame in enumerate(frames.tolist())}, matrix)
+        return csr_array((variances[first], (rows[first], columns[first])), shape=(size, size))
+
+    @cached_property
+    def _indexed(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        frames, indices = np.unique(self.ends, return_inverse=True)
+        return frames, indices.reshape(-1, 2)
 
     def shortest_paths(self, start: int) -> ShortestPaths:
         """Return the shortest path from a frame to every other that edges connect with it (Dijkstra 1959)."""

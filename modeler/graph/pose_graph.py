@@ -175,6 +175,12 @@ def chain(tree: Sequence[Factor], root: int, guess: Mapping[int, Array]) -> dict
     poses = {root: np.eye(4)}
     poses |= {frame: guess[frame] for factor in tree for frame in (factor.target, factor.source) if frame in guess}
     poses[root] = np.eye(4)
+    return extended(poses, tree)
+
+
+def extended(poses: Mapping[int, Array], tree: Sequence[Factor]) -> dict[int, Array]:
+    """Return object_from_camera by frame: the known ones, then those to which factors lead from them."""
+    poses = dict(poses)
     left = [factor for factor in tree if factor.target not in poses or factor.source not in poses]
     known = [frame for factor in left for frame in (factor.target, factor.source) if frame in poses]
     for frame, neighbour, factor in walk(left, *known):

@@ -13,7 +13,7 @@ from modeler.graph.axis import AxisSolution, CommonAxis
 from modeler.graph.covariance import PoseCovariances, RelativeCovariance
 from modeler.graph.modes import select_modes
 from modeler.graph.optimise import IncrementalSolver, inliers, selected, solve_loops, values_of
-from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, chain, collapse_modes
+from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, chain, collapse_modes, extended
 from modeler.graph.shared import SharedCovariance
 from modeler.types import Array, Edge, Solution
 
@@ -82,19 +82,22 @@ class Smoother:
         root = graph.root
         if root is None:
             return replace(self, graph=graph, solution=Solution(), state=_State())
-        known = self.state.factors
-        factors = {edge: known.get(edge) or Factor(edge, collapse_modes(edge.posterior)) for edge in graph.accepted}
+        factors = self._factors(graph)
         spanning, grew = self._spanning(list(factors.values()), root)
         tree, loops = spanning.tree, spanning.loops
         closes = not grew or len(loops) > len(self.state.spanning.loops)
-        odometry = chain(tree, root, self.solution.odometry if grew else {})
+        known = len(self.state.spanning.tree)
+        odometry = extended(self.solution.odometry, tree[known:]) if grew else chain(tree, root, {})
         weights, decided = self.state.weights, self.state.decided
         if closes:
             weights, decided = self._decided(tree, loops, root, grew=grew)
         if decided:
             tree, loops = ([decided.get(factor.edge, factor) for factor in some] for some in (tree, loops))
         jumped = _mode_changed(decided, self.state)
-        start = chain(tree, root, {} if jumped else anchored(self.solution.trajectory, root))
+        if grew and not jumped:
+            start = extended(self.solution.trajectory, tree[known:])
+        else:
+            start = chain(tree, root, {} if jumped else anchored(self.solution.trajectory, root))
         inlier, solver = self.state.inlier, self.state.solver
         trajectory: Mapping[int, Array] = start if grew or loops else chain(tree, root, {})
         if closes:  # otherwise each new frame has one edge
@@ -151,6 +154,14 @@ class Smoother:
             mode_weights={(factor.source, factor.target): _weights(factor, state.weights) for factor in several},
             camera_from_axis=None if with_axis is None else with_axis.camera_from_axis,
         )
+
+    def _factors(self, graph: PoseGraph) -> dict[Edge, Factor]:
+        """Return every accepted edge of a graph as one Gaussian, those of the solved graph's as they are."""
+        known, count = self.state.factors, len(self.graph.edges)
+        if known and graph.edges[:count] == self.graph.edges:
+            new = [edge for edge in graph.edges[count:] if edge.accepted]
+            return {**known, **{edge: Factor(edge, collapse_modes(edge.posterior)) for edge in new}}
+        return {edge: known.get(edge) or Factor(edge, collapse_modes(edge.posterior)) for edge in graph.accepted}
 
     def _spanning(self, factors: list[Factor], root: int) -> tuple[SpanningTree, bool]:
         """Return tree and loops, and whether they have only grown."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-from modeler.closure import MapView
+from modeler.closure import MapView, PathNetwork
 from modeler.disk_arrays import ViewStore
 from modeler.fusion import IncrementalTsdf
 from modeler.graph import CommonAxis, PoseGraph, Smoother
@@ -29,6 +29,8 @@ class State:
     """The accepted views by frame number, in order of acceptance, without the images that a likelihood looks up."""
     keyframes: tuple[int, ...] = ()
     """Those of them that are keyframes."""
+    network: PathNetwork = field(default_factory=PathNetwork)
+    """That of the edges before the newest frame's."""
     ready: Mapping[int, RayImage] = field(default_factory=dict)
     """The newest of them with these images."""
     places: Mapping[int, int] = field(default_factory=dict)
@@ -56,7 +58,7 @@ class State:
     @cached_property
     def map_view(self) -> MapView:
         """What closures are chosen and judged by."""
-        return MapView(self.views, self.solution, self.graph.edges, self.keyframes)
+        return MapView(self.views, self.solution, self.graph.edges, self.keyframes, self.network)
 
     @property
     def latest(self) -> int | None:
@@ -95,6 +97,7 @@ class State:
             graph=graph,
             smoother=self.smoother.to(graph),
             views={**self.views, number: light.view},
+            network=self.map_view.network,
             ready=dict(list(ready.items())[-_READY:]),
             newest=newest,
             vain=0 if found else self.vain,

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Final, Literal
 
 import numpy as np
+import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -108,22 +109,28 @@ def loops_closed(edges: Sequence[Edge]) -> int:
     A closure that is a bridge of the graph is checked by nothing: where two consecutive views share little surface and
     an early view places the next frame, the graph is a tree and has no loop.
     """
-    closures = [edge.kind == "closure" for edge in edges]
-    if not any(closures):
+    closures = np.array([edge.kind == "closure" for edge in edges], dtype=bool)
+    if not closures.any():
         return 0
-    without = [edge for edge, closure in zip(edges, closures, strict=True) if not closure]
-    return sum(closures) - (_parts(without, edges) - _parts(edges, edges))
+    ends = _ends(edges)
+    return int(closures.sum()) - (_parts(ends[~closures], ends) - _parts(ends, ends))
 
 
 def joined_without(edge: Edge, edges: Sequence[Edge]) -> bool:
     """Return whether the ends of an edge are connected without it."""
-    return _parts([other for other in edges if other is not edge], edges) == _parts(edges, edges)
+    ends, others = _ends(edges), np.array([other is not edge for other in edges], dtype=bool)
+    return _parts(ends[others], ends) == _parts(ends, ends)
 
 
-def _parts(edges: Sequence[Edge], everything: Sequence[Edge]) -> int:
-    """Return the number of connected components of the frames of `everything` under `edges`."""
-    frames = np.unique([(edge.source, edge.target) for edge in everything])
-    ends = np.searchsorted(frames, np.reshape([(edge.source, edge.target) for edge in edges], (-1, 2)))
+def _ends(edges: Sequence[Edge]) -> npt.NDArray[np.int64]:
+    """Return the two frames (n, 2) of edges."""
+    return np.array([(edge.posterior.source, edge.posterior.target) for edge in edges], dtype=np.int64).reshape(-1, 2)
+
+
+def _parts(ends: npt.NDArray[np.int64], everything: npt.NDArray[np.int64]) -> int:
+    """Return the number of connected components of the frames of `everything` (n, 2) under edges (m, 2)."""
+    frames = np.unique(everything)
+    ends = np.searchsorted(frames, ends)
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(frames), len(frames)))
     return int(connected_components(graph, directed=False)[0])
 
