@@ -27,11 +27,10 @@ def main() -> int:
     job, note = begin(sys.argv[1])
     status = command(["build", job.sequence, "--out", str(job.run), "--resume", *job.arguments])
     if status in ENDED:
-        from modeler.cli.models import record_of, thumbnail_of
+        from modeler.cli.models import record_of
 
         if job.page:
             command(["report", str(job.run), "--overwrite"])
-        thumbnail_of(job.run, job.note.with_suffix(".jpg"))
         ended = {"status": status, "seconds": time.perf_counter() - began_s}
         write_note(job.note, {**note, **ended, "record": record_of(job.run)})
     return status
