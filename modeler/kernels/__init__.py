@@ -8,9 +8,9 @@ from pathlib import Path
 
 from numba.core import config, event
 
-# OpenMP is thread-safe (pairs may be registered from several threads) and Open3D needs libgomp anyway.
+# Numba asks a threading layer for the number of threads, from several threads too: OpenMP's, as Open3D needs libgomp.
 config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore[reportAttributeAccessIssue]
-# Threads that spin at the end of each short loop delay each other on a busy machine.
+# Threads of Open3D that spin at the end of each short loop delay each other on a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 

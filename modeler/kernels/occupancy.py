@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from modeler.kernels.threads import over_rows
 from modeler.kernels.tsdf import project
@@ -52,7 +52,6 @@ def _observation_counts(layers, origin, cell_m, shape, margin_m, free_m, poses, 
     return counts
 
 
-@njit(cache=True, parallel=True)
 def minimal_surface(start, fixed, rounds):
     """Return the field (x, y, z) of least total variation with the given fixed values (F11).
 
@@ -65,33 +64,50 @@ def minimal_surface(start, fixed, rounds):
         fixed: (x, y, z) bool; the outermost cells must be fixed.
         rounds: iterations.
     """
-    nx, ny, nz = start.shape
     u, ahead = start.copy(), start.copy()
-    px, py, pz = np.zeros_like(start), np.zeros_like(start), np.zeros_like(start)
+    if len(start) < 3:  # all cells are outermost ones
+        return u
+    slopes = [np.zeros_like(start) for _ in range(3)]
     step = np.float32(1.0 / math.sqrt(12.0))  # τ σ ‖∇‖² <= 1, with ‖∇‖² <= 12 in three dimensions
     for _ in range(rounds):
-        for i in prange(nx - 1):
-            for j in range(ny - 1):
-                for k in range(nz - 1):
-                    here = ahead[i, j, k]
-                    a = px[i, j, k] + step * (ahead[i + 1, j, k] - here)
-                    b = py[i, j, k] + step * (ahead[i, j + 1, k] - here)
-                    c = pz[i, j, k] + step * (ahead[i, j, k + 1] - here)
-                    size = a * a + b * b + c * c
-                    if size > 1.0:
-                        size = np.float32(1.0) / np.float32(math.sqrt(size))
-                        a, b, c = a * size, b * size, c * size
-                    px[i, j, k], py[i, j, k], pz[i, j, k] = a, b, c
-        for i in prange(1, nx - 1):
-            for j in range(1, ny - 1):
-                for k in range(1, nz - 1):
-                    if fixed[i, j, k]:
-                        continue
-                    divergence = (
-                        px[i, j, k] - px[i - 1, j, k] + py[i, j, k] - py[i, j - 1, k] + pz[i, j, k] - pz[i, j, k - 1]
-                    )
-                    old = u[i, j, k]
-                    new = min(np.float32(1.0), max(np.float32(-1.0), old + step * divergence))
-                    u[i, j, k] = new
-                    ahead[i, j, k] = np.float32(2.0) * new - old
+        over_rows(_ascend, np.arange(len(start) - 1), *slopes, ahead, step)
+        over_rows(_descend, np.arange(1, len(start) - 1), u, ahead, *slopes, fixed, step)
     return u
+
+
+@njit(cache=True, nogil=True)
+def _ascend(layers, px, py, pz, ahead, step):
+    """Follow the gradient of the field in successive layers, and shorten the slopes to 1; they are written to."""
+    ny, nz = ahead.shape[1:]
+    for i in range(layers[0], layers[-1] + 1):
+        for j in range(ny - 1):
+            for k in range(nz - 1):
+                here = ahead[i, j, k]
+                a = px[i, j, k] + step * (ahead[i + 1, j, k] - here)
+                b = py[i, j, k] + step * (ahead[i, j + 1, k] - here)
+                c = pz[i, j, k] + step * (ahead[i, j, k + 1] - here)
+                size = a * a + b * b + c * c
+                if size > 1.0:
+                    size = np.float32(1.0) / np.float32(math.sqrt(size))
+                    a, b, c = a * size, b * size, c * size
+                px[i, j, k], py[i, j, k], pz[i, j, k] = a, b, c
+    return layers
+
+
+@njit(cache=True, nogil=True)
+def _descend(layers, u, ahead, px, py, pz, fixed, step):
+    """Follow the slopes' divergence in successive layers where the field u is not fixed; u and ahead are written to."""
+    ny, nz = u.shape[1:]
+    for i in range(layers[0], layers[-1] + 1):
+        for j in range(1, ny - 1):
+            for k in range(1, nz - 1):
+                if fixed[i, j, k]:
+                    continue
+                divergence = (
+                    px[i, j, k] - px[i - 1, j, k] + py[i, j, k] - py[i, j - 1, k] + pz[i, j, k] - pz[i, j, k - 1]
+                )
+                old = u[i, j, k]
+                new = min(np.float32(1.0), max(np.float32(-1.0), old + step * divergence))
+                u[i, j, k] = new
+                ahead[i, j, k] = np.float32(2.0) * new - old
+    return layers
