@@ -10,11 +10,15 @@ from modeler.types import BoolArray, Camera, Float32Array
 
 _ON_PLANE = 25.0  # measurements to which a plane is fitted: as many as in `rays`
 _UNLIKELY = 0.01  # probability that random loss leaves a hole of the radius of `gap_px`
+_LEAST = 0.01  # least share; of fewer measurements no more than a few would be in reach of each other
+_WIDE_PX = 10
 _NEIGHBOURS = tuple((row, column) for row in range(3) for column in range(-2, 3) if row or column > 0)
 
 
 def measured_share(measured: BoolArray, within: BoolArray | None = None) -> float:
-    """Return the share of measured pixels, at most 2 px away, next to measured ones: 1 where an image only has holes.
+    """Return the share of measured pixels next to measured ones: about 1 where an image only has holes.
+
+    Next to is up to 2 px away, and up to 10 px where that leaves gaps: measurements may lie on a grid.
 
     Args:
         measured: (h, w).
@@ -29,7 +33,16 @@ def measured_share(measured: BoolArray, within: BoolArray | None = None) -> floa
             either += np.count_nonzero(measured[one]) + np.count_nonzero(measured[other])
         else:
             either += np.count_nonzero(measured[one] & within[other]) + np.count_nonzero(within[one] & measured[other])
-    return both / either if either else 1.0
+    share = both / either if either else 1.0
+    if gap_px(share) < 1.0:
+        return share
+    width, inside = 2 * _WIDE_PX + 1, np.ones_like(measured) if within is None else within
+    seen, all_of = (
+        width**2 * ndimage.uniform_filter(image.astype(np.float64), width, mode="constant")[measured].sum()
+        - np.count_nonzero(measured)  # themselves
+        for image in (measured, inside)
+    )
+    return float(seen / all_of)
 
 
 def gap_px(share: float) -> float:
@@ -38,7 +51,7 @@ def gap_px(share: float) -> float:
     A disc of n pixels holds no measurement with probability (1 - share)^n. Below 1 px there is nothing between
     measurements.
     """
-    share = min(max(share, 1e-3), 1.0 - 1e-6)
+    share = min(max(share, _LEAST), 1.0 - 1e-6)
     return float(np.sqrt(np.log(_UNLIKELY) / (np.pi * np.log1p(-share))))
 
 
@@ -81,9 +94,9 @@ def interpolated(depth_m: Float32Array, camera: Camera) -> Float32Array:
         camera: the camera.
     """
     measured = np.isfinite(depth_m) & (depth_m > 0.0)
-    share = measured_share(measured)
+    share = max(measured_share(measured), _LEAST)
     gap = gap_px(share)
-    if gap < 1.0 or not measured.any():
+    if gap < 1.0:
         return depth_m
     between = closed(measured, gap)
     guess_m = nearest_depth(depth_m, measured, between, gap)

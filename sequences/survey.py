@@ -116,8 +116,8 @@ class Survey:
                 )
         if self.joined < LEAST_JOINED:
             doubts.append(
-                f"{1.0 - self.joined:.0%} of the measured pixels have no measured neighbours: single points show no "
-                "surface to register; fill the gaps, or scale the images down until they close"
+                f"{1.0 - self.joined:.0%} of the measured pixels have no measured neighbours: surface between them is "
+                "interpolated, poses and model will be coarse; if the images were enlarged, scale them down again"
             )
         if self.repeated:
             doubts.append(

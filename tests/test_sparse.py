@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 from calibration.specimens import load_specimen
 from calibration.study import Condition, staged
+from scipy.stats import chi2
 
 from modeler.evaluation import nees, rotation_error_deg, true_motion
+from modeler.fusion import Fuser
 from modeler.kernels import planes
+from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
-from modeler.segmentation import Segmenter
+from modeler.segmentation import Scene, Segmenter
 from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
-from modeler.types import Camera, Frame
+from modeler.types import Camera, Frame, Outcome, Step
 from sequences.rendering.renderer import RenderedSequence
 
 SHAPE = (120, 160)
@@ -34,6 +37,13 @@ def test_the_share_of_measured_pixels_is_that_of_random_loss_within_any_outline(
     whole, inside = rng.random(SHAPE) < share, outline & (rng.random(SHAPE) < share)
     assert measured_share(whole) == pytest.approx(share, rel=0.1)
     assert measured_share(inside, outline) == pytest.approx(share, rel=0.15)
+
+
+@pytest.mark.parametrize("step", [2, 3, 5, 7])
+def test_the_share_of_a_grid_is_that_of_its_cells(step):
+    measured = np.zeros(SHAPE, dtype=bool)
+    measured[::step, ::step] = True
+    assert measured_share(measured) == pytest.approx(1.0 / step**2, rel=0.5)  # windows end between its lines
 
 
 def test_a_dense_image_with_holes_has_no_gaps_and_its_holes_stay():
@@ -123,3 +133,39 @@ def test_sparse_views_are_registered_as_well_as_they_state(drill, share, worst_d
         assert rotation_error_deg(found.pose.mean, truth) < worst_deg
         squares.append(nees(found.pose, truth))
     assert np.mean(squares) < 2.0 * 6.0  # 6 on average; the mean of three exceeds 12 with a probability of 0.7 %
+
+
+def test_a_small_object_is_registered_by_a_hundred_pixels(drill):
+    indices, (sigma_wh, sigma_r_m) = drill.indices[:2], drill.sensor()
+    found = segmented([drill.frame(index) for index in indices])
+    target, source = (
+        Sensor(sigma_wh, sigma_r_m).ray_image(coarse(drill.frame(index), 6), segmentation.plane)
+        for index, segmentation in zip(indices, found, strict=True)
+    )
+    density = TablePrior().between(source, target)
+    posterior = VisibilityRegistrar().register(source, target, density, rng=np.random.default_rng(0))
+    assert np.count_nonzero(source.frame.mask & np.isfinite(source.frame.depth_m)) < 130
+    assert posterior.outcome is not Outcome.TOO_FEW_POINTS
+    assert nees(posterior.pose, true_motion(drill.truth(), *indices)) < chi2.ppf(0.999, 6)
+
+
+def coarse(frame, step):
+    """Return a frame of every so many rows and columns."""
+    camera = frame.camera
+    smaller = Camera(
+        -(-camera.width // step),
+        -(-camera.height // step),
+        *(value / step for value in (camera.fx, camera.fy, camera.cx, camera.cy)),
+    )
+    depth_m, mask = (np.ascontiguousarray(image[::step, ::step]) for image in (frame.depth_m, frame.mask))
+    return replace(frame, depth_m=depth_m, mask=mask, camera=smaller)
+
+
+def test_sparse_frames_make_a_model(drill, rng):
+    frames = [thinned(drill.frame(index), 0.1, rng) for index in drill.indices]
+    builder = Modeler(sensor=Sensor(*drill.sensor()), prior=TablePrior(), fuser=Fuser(voxel_m=0.008))
+    *_, last = (event for event in builder.run(frames, Scene()) if isinstance(event, Step))
+    assert set(last.solution.trajectory) == set(drill.indices)
+    assert last.model is not None
+    sizes_m = np.ptp(last.model.vertices_m, axis=0)
+    assert np.sort(sizes_m)[-1] == pytest.approx(0.2, abs=0.04)  # of the drill's sides that were seen

@@ -200,7 +200,7 @@ class Segmenter:
     """Region in which the object is: x0 y0 x1 y1 in px, x1 and y1 outside it; None = the whole image."""
     max_depth_m: float | None = None
     """Largest depth of the object in m; None = no limit."""
-    min_points: int = 200
+    min_points: int = 100
     """Number of pixels below which an object is too small to register."""
     gap_m: float = 0.012
     """Largest gap in m between parts of one object."""

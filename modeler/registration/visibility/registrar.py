@@ -70,8 +70,8 @@ class VisibilityRegistrar(AbstractRegistrar):
     refiner: Refiner = field(default_factory=Refiner)
     max_modes: int = 4
     """Largest number of modes that are sampled."""
-    min_points: int = 60
-    """Views with fewer surface points are not registered."""
+    min_points: int = 20
+    """Views with fewer surface points are not registered: they do not determine how far matching surface differs."""
     min_overlap: float = 0.5
     """Least share of the surface that both views should see and do."""
     max_at_limit: float = 0.2
