@@ -13,7 +13,7 @@ from trust.plan import viewed
 from trust.stage import Recorded, Stage, posed
 
 from modeler import priors, se3
-from modeler.cli.advice import ends_without, remedy
+from modeler.cli.advice import ends_without, remedy, unchecked_focal_length
 from modeler.cli.build import Build
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.segmentation import Segmenter
@@ -74,6 +74,23 @@ def test_what_to_do_next_is_the_limit_that_was_hit_or_what_is_missing(
         assert ("max-rotation-deg" in found.options) is ("max-rotation-deg" in options)
         if isinstance(options, dict):
             assert options.items() <= found.options.items()
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "known", "said"),
+    [
+        (150.0, {"trustworthy": True}, "1.5°"),
+        (150.0, {"trustworthy": True, "closed": True}, ""),  # the loop checks it
+        (150.0, {"trustworthy": False}, ""),  # there are other reasons to look at first
+        (60.0, {"trustworthy": True}, ""),
+    ],
+)
+def test_a_turn_without_a_loop_tells_what_hangs_on_the_focal_length(
+    turn_deg: float, known: dict[str, Any], said: str
+) -> None:
+    words = unchecked_focal_length(untrusted(turn_deg=turn_deg, **known))
+    assert said in words
+    assert bool(words) is bool(said)
 
 
 @pytest.mark.parametrize(("closed", "first"), [(True, "modeler report"), (False, "")])

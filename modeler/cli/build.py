@@ -246,7 +246,7 @@ def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt) -> Iterator
 
 def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
     """Write a summary of the run to stderr, and return the exit status."""
-    from modeler.cli.advice import ends_without, other_step, remedy, sense_in_doubt
+    from modeler.cli.advice import ends_without, other_step, remedy, sense_in_doubt, unchecked_focal_length
     from modeler.types import ACCEPTED
 
     accepted = sum(frame["outcome"] == ACCEPTED for frame in report["frames"])
@@ -266,7 +266,7 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
         say(f"not to be trusted: {first}{more}")
         if sense_in_doubt(report, prior):
             say("the stated direction of rotation is assumed; if it may be the other, give --step-sign unknown")
-    for remark in (other_step(report["edges"], prior), ends_without(report["frames"])):
+    for remark in (other_step(report["edges"], prior), ends_without(report["frames"]), unchecked_focal_length(report)):
         if remark:
             say(remark)
     next_step = None if report["trustworthy"] else remedy(report, prior)
