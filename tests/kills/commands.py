@@ -32,10 +32,12 @@ COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
     "report": ("report", "a", "--out", "made/out.html"),
     "evaluate": ("evaluate", "rendered", "--methods", "icp", "--out", "made/out"),
     "join": ("join", "a", "b", "--out", "made/out"),
+    "gallery": ("gallery", "made/runs", "--out", "made/runs/gallery.html"),
 }
 """Arguments; names are relative to the folder of the inputs."""
 # Of others a folder appears whole or not at all.
 _ASKS: Final = frozenset(COMMANDS) - {"convert", "render"}
+_WRITES_BESIDE: Final[Mapping[str, str]] = {"gallery": "made/runs"}  # what it reads, where copies of runs are put first
 _RECIPE: Final = (
     '{"object": {"kind": "box", "size_m": [0.1, 0.08, 0.06]}, "view": {"width": 80, "height": 60, "focal_px": 72},'
     ' "trajectory": {"kind": "tabletop", "frames": 3}}'
@@ -109,6 +111,8 @@ class CommandTrials:
         """Run the command, and return its status, what it said, and how often it changed the disk."""
         if not keep:
             shutil.rmtree(self._made, ignore_errors=True)
+            for run in ("a", "b") if self.name in _WRITES_BESIDE else ():
+                shutil.copytree(self.inputs / run, self.inputs / _WRITES_BESIDE[self.name] / run)
         self._made.mkdir(exist_ok=True)
         log = self.inputs.with_name(f"{self.inputs.name}.log")
         log.unlink(missing_ok=True)
