@@ -12,22 +12,19 @@ _ON_PLANE = 25.0  # measurements to which a plane is fitted: as many as in `rays
 _UNLIKELY = 0.01  # probability that random loss leaves a hole of the radius of `gap_px`
 _LEAST = 0.01  # least share; of fewer measurements no more than a few would be in reach of each other
 _WIDE_PX = 10
-_NEIGHBOURS = tuple((row, column) for row in range(3) for column in range(-2, 3) if row or column > 0)
 
 
 def measured_share(measured: BoolArray, within: BoolArray | None = None) -> float:
     """Return the share of measured pixels next to measured ones: about 1 where an image only has holes.
 
-    Next to is up to 2 px away, and up to 10 px where that leaves gaps: measurements may lie on a grid.
+    Next to is beside, above and below, and up to 10 px away where that leaves gaps: measurements may lie on a grid.
 
     Args:
         measured: (h, w).
         within: (h, w) region, with all measured pixels, whose pixels count; None: the whole image.
     """
     both = either = 0
-    for row, column in _NEIGHBOURS:  # the other half by symmetry
-        one = slice(0, -row or None), slice(max(-column, 0), -max(column, 0) or None)
-        other = slice(row, None), slice(max(column, 0), -max(-column, 0) or None)
+    for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         both += 2 * np.count_nonzero(measured[one] & measured[other])
         if within is None:
             either += np.count_nonzero(measured[one]) + np.count_nonzero(measured[other])
