@@ -34,7 +34,7 @@ _READER: Final = ("-m", "viz.reader")
 
 
 @dataclass
-class Step:
+class LoggedStep:
     """What was logged at once."""
 
     frame: int
@@ -43,7 +43,7 @@ class Step:
     """By entity."""
 
 
-def steps_of(recording: Path) -> dict[int, Step]:
+def steps_of(recording: Path) -> dict[int, LoggedStep]:
     """Return the steps of a run by the time, in ns since its start, at which they were drawn; none of a damaged one.
 
     Another process reads them, because Rerun 0.41 aborts the one in which it reads some damaged recordings.
@@ -56,12 +56,12 @@ def steps_of(recording: Path) -> dict[int, Step]:
         stderr=subprocess.DEVNULL,
         check=False,
     )
-    steps: dict[int, Step] = {}
+    steps: dict[int, LoggedStep] = {}
     source = pa.BufferReader(read.stdout if read.returncode == 0 else b"")
     while source.tell() < source.size():
         with pa.ipc.open_stream(source) as stream:
             row, said = stream.read_all(), stream.schema.metadata
-        step = steps.setdefault(int(said[b"elapsed"]), Step(int(said[b"frame"])))
+        step = steps.setdefault(int(said[b"elapsed"]), LoggedStep(int(said[b"frame"])))
         step.rows.setdefault(said[b"path"].decode(), {})[said[b"component"].decode()] = row["value"].combine_chunks()
     return steps
 
@@ -77,11 +77,11 @@ def write_steps(recording: Path, out: BinaryIO) -> None:
                     stream.write_batch(row)
 
 
-def read_steps(recording: Path) -> dict[int, Step]:
+def read_steps(recording: Path) -> dict[int, LoggedStep]:
     """Return the steps of a run as `steps_of` does, each value an array of one, for scalars are sent slowly."""
     import rerun.chunk
 
-    steps: dict[int, Step] = {}
+    steps: dict[int, LoggedStep] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a run that was killed leaves a recording without its last page
         for chunk in rerun.chunk.RrdReader(recording).stream():
@@ -96,7 +96,7 @@ def read_steps(recording: Path) -> dict[int, Step]:
                 times = zip(batch[entities.ELAPSED], batch[entities.FRAME].to_pylist(), strict=True)
                 for place, (elapsed, frame) in enumerate(times):
                     if batch[name][place].is_valid:
-                        step = steps.setdefault(elapsed.value, Step(frame))
+                        step = steps.setdefault(elapsed.value, LoggedStep(frame))
                         step.rows.setdefault(path, {})[component] = batch[name].take([place])
     for step in steps.values():
         if {"buffer", "format"} <= step.rows.get(entities.MASK, {}).keys():

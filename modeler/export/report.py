@@ -180,7 +180,7 @@ def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) ->
         "reason": explain(OptimisationOutlier() if outlier else edge.reason),
         "target_from_source": posterior.pose.mean,
         "covariance": posterior.pose.covariance,
-        "beyond": [pose for pose in posterior.beyond],
+        "beyond": list(posterior.beyond),
         "undetermined": undetermined(posterior, view),
         "modes": [_mode_record(mode, None if left is None else left[k]) for k, mode in enumerate(posterior.modes)],
         "effective_samples": posterior.effective_samples,

@@ -94,10 +94,8 @@ class Smoother:
         if decided:
             tree, loops = ([decided.get(factor.edge, factor) for factor in some] for some in (tree, loops))
         jumped = _mode_changed(decided, self.state)
-        if grew and not jumped:
-            start = extended(self.solution.trajectory, tree[known:])
-        else:
-            start = chain(tree, root, {} if jumped else anchored(self.solution.trajectory, root))
+        guess = {} if jumped else anchored(self.solution.trajectory, root)
+        start = extended(guess, tree[known:]) if grew and not jumped else chain(tree, root, guess)
         inlier, solver = self.state.inlier, self.state.solver
         trajectory: Mapping[int, Array] = start if grew or loops else chain(tree, root, {})
         if closes:  # otherwise each new frame has one edge

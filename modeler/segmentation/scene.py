@@ -144,8 +144,9 @@ def _standing_object(
     levels = levels[parallel(levels, levels[0])]
     tolerance = noise.tolerance_m(depth)
     free = allowed.copy()
+    rim = _rim(points)
     for plane in planes[~facing] if facing.any() else planes[1:]:
-        if _beyond_image(plane, points, noise):
+        if _beyond_image(plane, rim, noise):
             free &= ~(np.abs(heights(points, plane)) < tolerance)
     for level in levels[np.argsort(-levels[:, 3])]:
         labels = pieces(depth, free & (heights(points, level) > tolerance))
@@ -166,9 +167,13 @@ def _central(labels: Labels, depth_m: Float32Array, weight: Float32Array) -> npt
     return merit.astype(np.float64)
 
 
-def _beyond_image(plane: Array, points: Float32Array, noise: DepthNoise) -> bool:
-    """Return whether a plane extends beyond the image."""
-    rim = points[edge_of(np.isfinite(points[..., 2]))]
+def _rim(points: Float32Array) -> Float32Array:
+    """Return the points (n, 3) of an image (h, w, 3) at the edge of the field of view."""
+    return points[edge_of(np.isfinite(points[..., 2]))]
+
+
+def _beyond_image(plane: Array, rim: Float32Array, noise: DepthNoise) -> bool:
+    """Return whether a plane (4,) extends beyond the image, on whose rim the points (n, 3) are."""
     on = np.abs(heights(rim, plane)) < noise.tolerance_m(rim[:, 2])
     return bool(np.count_nonzero(on) > _WALL_BORDER_SHARE * len(rim))
 
@@ -190,19 +195,19 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
     outside |= support is None
     outside[0] = False
     depth = np.where(outside[labels], back, np.float32(np.inf))
-    body = layers.front_m[found]
-    tolerance = noise.tolerance_m(body[:, 2])
+    body, rim = layers.front_m[found], _rim(layers.back_m)
+    tolerance_m, body_tolerance_m = noise.tolerance_m(back), noise.tolerance_m(body[:, 2])
     for plane in planes:
         is_support = support is not None and bool((plane == support).all())
-        if is_support or np.mean(heights(body, plane) > -tolerance) < _IN_FRONT_SHARE:
+        if is_support or np.mean(heights(body, plane) > -body_tolerance_m) < _IN_FRONT_SHARE:
             continue
-        above = heights(layers.back_m, plane)
-        on = layers.still & (np.abs(above) < noise.tolerance_m(back))
-        if np.count_nonzero(on) < np.count_nonzero(found) and not _beyond_image(plane, layers.back_m, noise):
+        in_front_m = heights(layers.back_m, plane)
+        on = layers.still & (np.abs(in_front_m) < tolerance_m)
+        if np.count_nonzero(on) < np.count_nonzero(found) and not _beyond_image(plane, rim, noise):
             continue
         facing = layers.rays @ plane[:3].astype(np.float32)
         behind = np.float32(plane[3]) / np.maximum(-facing, np.float32(1e-6))
-        standing = np.where(above < noise.tolerance_m(back), back, depth)
+        standing = np.where(in_front_m < tolerance_m, back, depth)
         depth = np.where(layers.still, standing, np.minimum(depth, behind))
     return depth
 
