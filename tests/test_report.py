@@ -53,14 +53,14 @@ def page(run: Path) -> str:
     return (run / "page.html").read_text(encoding="utf-8")
 
 
-READ: dict[bytes, dict[int, reader.Step]] = {}
+READ: dict[bytes, dict[int, reader.LoggedStep]] = {}
 
 
 @pytest.fixture(autouse=True)
 def _read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Read equal recordings once: a process reads each, which takes a second to start."""
 
-    def steps_of(recording: Path) -> dict[int, reader.Step]:
+    def steps_of(recording: Path) -> dict[int, reader.LoggedStep]:
         content = recording.read_bytes()
         if content not in READ:
             READ[content] = reader.steps_of(recording)
