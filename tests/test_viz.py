@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import itertools
+import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
+import rerun.blueprint as rrb
 import rerun.chunk
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -17,15 +21,17 @@ from streamed import MERGED, Recording, drawn, read, record
 from turning_box import CENTRE_M, COUNT, COVARIANCE, HALF_M, LOST, steps
 
 from modeler import se3
+from modeler.graph import PoseGraph, dead_reckoning
 from modeler.types import Failed, Outcome, Plane, PoseGaussian, Segmentation, Solution, Step
 from viz import blueprint, entities, graph_view, images, model_view, pair_view
+from viz.pose_table import pose_table
+from viz.readings import sd_of
 from viz.stream import graph_due, open_stream
 
 PAIR_CLOUDS = (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER)
 GHOSTS = (entities.GHOSTS, entities.GHOST_MEANS, entities.GHOST_TIPS)
 CAPTIONS = (
     entities.MAGNIFICATION,
-    entities.BEFORE_MAGNIFICATION,
     entities.EDGES_MAGNIFICATION,
     entities.GHOST_LABELS,
     entities.PAIR_CAPTION,
@@ -34,11 +40,9 @@ CAPTIONS = (
 SPREADS = (
     entities.POSITION_1_SIGMA,
     entities.POSITION_3_SIGMA,
-    entities.AXIS_TIPS_1_SIGMA,
-    entities.BEFORE_POSITION_1_SIGMA,
     entities.BEFORE_POSITION_3_SIGMA,
-    entities.BEFORE_AXIS_TIPS_1_SIGMA,
 )
+OUTLINES = (entities.OUTLINE, entities.DEPTH_OUTLINE)
 EDGES = (entities.ODOMETRY, entities.CLOSURE, entities.REJECTED)
 
 
@@ -52,13 +56,20 @@ def test_every_promised_entity_is_recorded(recording: Recording) -> None:
         "buffer": [entities.MASK, entities.VISIBILITY_AREAS],
         "positions": [*PAIR_CLOUDS, entities.PAIR_DRAWS, entities.CLOUD, *GHOSTS, entities.VISIBILITY_AGREES, *MERGED],
         "vertex_positions": [entities.MESH],
-        "strips": [entities.CAMERAS, entities.CURRENT, entities.CHAIN, entities.BEFORE_CAMERAS, *EDGES],
+        "strips": [
+            entities.CAMERAS,
+            entities.CURRENT,
+            entities.CHAIN,
+            *EDGES,
+            entities.OUTLINE,
+            entities.DEPTH_OUTLINE,
+        ],
         "vectors": [entities.AXES, entities.PAIR_AXES],
         "half_sizes": [*SPREADS, entities.EDGES_1_SIGMA, entities.GHOST_CENTRE_1_SIGMA, entities.GHOST_CENTRE_3_SIGMA],
         "labels": CAPTIONS,
         "scalars": [f"{path}/{kind}" for path in entities.READINGS for kind in ("odometry", "closure")]
         + [f"{path}/pose" for path in entities.POSE_READINGS],
-        "text": [entities.NOW, entities.LOG, entities.LEGEND, entities.RUN],
+        "text": [entities.NOW, entities.POSES, entities.LOG, entities.LEGEND, entities.RUN],
         "xyz": [entities.PAIR, entities.WORLD],
     }
     for component, paths in promised.items():
@@ -98,8 +109,21 @@ def test_a_recording_opens_with_a_layout(tmp_path: Path, run: list[Step]) -> Non
     assert views == [22, 22]
     eyes = [c.to_record_batch() for c in knowing if str(c.entity_path).endswith("/EyeControls3D")]
     targets = np.array([batch["EyeControls3D:look_target"][0].as_py()[0] for batch in eyes])
-    assert len(targets) == 9
+    assert len(targets) == 8
     assert np.linalg.norm(targets - CENTRE_M, axis=1).max() < HALF_M.max()
+
+
+def test_the_first_screen_has_three_panels(run: list[Step]) -> None:
+    for first in (None, run[0].view):
+        tabs = blueprint.layout(first).root_container
+        assert isinstance(tabs, rrb.Tabs)
+        assert tabs.active_tab == 0
+        assert [panels(tab) for tab in tabs.contents] == [3, 3, 6, 7, 3]
+        assert all(isinstance(tab, rrb.Container) and tab.name for tab in tabs.contents)
+
+
+def panels(part: rrb.Container | rrb.View) -> int:
+    return sum(panels(inner) for inner in part.contents) if isinstance(part, rrb.Container) else 1
 
 
 def test_captions_lie_below_the_object_where_its_support_is_seen(run: list[Step]) -> None:
@@ -222,7 +246,9 @@ def test_a_recording_stays_small(tmp_path: Path) -> None:
 
 def drawn_factor(label: str) -> float:
     """Return how many times larger than life a caption says that something is drawn."""
-    return 1.0 if label.endswith("to scale") else float(label.rpartition("\N{MULTIPLICATION SIGN}")[2])
+    found = re.search("\N{MULTIPLICATION SIGN}([0-9.]+)", label)
+    assert found or "to scale" in label
+    return float(found[1]) if found else 1.0
 
 
 def test_the_camera_stands_where_its_pose_says(run: list[Step], recording: Recording) -> None:
@@ -286,16 +312,55 @@ def test_closure_makes_the_drawn_ellipsoids_smaller(recording: Recording) -> Non
     assert half_axes[COUNT - 1][-1].max() < half_axes[COUNT - 2][-1].max()
 
 
-def test_axis_tips_spread_as_sampled_rotations_do() -> None:
+def test_poses_before_closure_and_after_and_edges_are_magnified_alike(run: list[Step], recording: Recording) -> None:
+    last, row = run[-1], COUNT - 1
+    captions = [recording[path][row]["labels"][0] for path in (entities.MAGNIFICATION, entities.EDGES_MAGNIFICATION)]
+    (factor,) = set(map(drawn_factor, captions))
+    chain = dead_reckoning(PoseGraph(last.edges_so_far, min(last.solution.odometry)))
+    drawn_axes = np.sort(recording[entities.BEFORE_POSITION_3_SIGMA][row]["half_sizes"], axis=1)
+    frames = [frame for frame in sorted(last.solution.covariances) if frame in chain]
+    sds = [np.sqrt(np.linalg.eigvalsh(chain[frame].covariance[3:, 3:])) for frame in frames]
+    np.testing.assert_allclose(drawn_axes[:, 2], 3.0 * factor * np.array(sds)[:, 2], rtol=1e-4)
+    edges = [edge for edge in last.edges_so_far if last.solution.takes_part(edge)]
+    of_edges = np.max(recording[entities.EDGES_1_SIGMA][row]["half_sizes"], axis=1)
+    sds = [math.sqrt(np.linalg.eigvalsh(edge.posterior.pose.covariance[3:, 3:])[-1]) for edge in edges]
+    np.testing.assert_allclose(of_edges, factor * np.array(sds), rtol=1e-4)
+
+
+def test_the_table_states_every_pose_before_closure_and_after(run: list[Step], recording: Recording) -> None:
+    last = run[-1]
+    rows = [line for line in recording[entities.POSES][COUNT - 1]["text"][0].splitlines() if re.match(r"\| \d", line)]
+    assert [int(row.split("|")[1]) for row in rows] == list(range(COUNT - 1, -1, -1))
+    assert "lost: " in rows[COUNT - 1 - LOST]
+    assert "first" in rows[-1]
+    newest = last.views[COUNT - 1].centroid_m
+    after = sd_of(PoseGaussian(np.eye(4), last.solution.covariances[COUNT - 1]), newest)
+    assert f"\N{RIGHTWARDS ARROW} {after.rotation_deg:.2g}**°" in rows[0]
+    assert f"\N{RIGHTWARDS ARROW} {after.translation_mm:.2g}** mm" in rows[0]
+    assert "No frame" in pose_table(replace(last, solution=Solution()), {}, [])
+
+
+def sides(mask: npt.NDArray[np.bool_]) -> set[tuple[int, ...]]:
+    """Return the sides of pixels between a mask and the rest: column and row of both ends."""
+    padded = np.pad(mask, 1)
+    level = {(x - 1, y - 1, x, y - 1) for y, x in np.argwhere(padded[1:] != padded[:-1]) + np.array([1, 0])}
+    upright = {(x - 1, y - 1, x - 1, y) for y, x in np.argwhere(padded[:, 1:] != padded[:, :-1]) + np.array([0, 1])}
+    return level | upright
+
+
+def test_the_outline_of_a_mask_is_every_side_between_it_and_the_rest() -> None:
     rng = np.random.default_rng(0)
-    rotation = se3.exp(np.array([0.3, -1.0, 0.4, 0.0, 0.0, 0.0]))[:3, :3]
-    factor = rng.standard_normal((3, 3)) * 0.02
-    omegas = rng.standard_normal((100_000, 3)) @ factor.T
-    samples = rotation @ se3.exp(np.concatenate([omegas, np.zeros_like(omegas)], axis=1))[:, :3, :3]
-    got = graph_view.axis_tip_covariances(rotation, factor @ factor.T)
-    for axis in range(3):
-        wanted = np.cov(samples[:, :, axis].T)
-        np.testing.assert_allclose(got[axis], wanted, atol=0.03 * np.trace(wanted))
+    for shape in ((1, 1), (7, 11), (20, 5)):
+        for share in (0.0, 0.1, 0.5, 1.0):
+            mask = rng.random(shape) < share
+            found = set()
+            for start, end in images.outline(mask).astype(int):
+                step = (end - start) // np.abs(end - start).max()
+                ends = [start + k * step for k in range(np.abs(end - start).max() + 1)]
+                pieces = {(*map(int, one), *map(int, other)) for one, other in itertools.pairwise(ends)}
+                assert not pieces & found
+                found |= pieces
+            assert found == sides(mask)
 
 
 def test_magnification_is_round_and_never_grows(run: list[Step]) -> None:

@@ -17,19 +17,13 @@ FROM_THE_SIDE: Final = np.array([-0.8, -0.35, -0.5])  # errors along the camera'
 
 
 def layout(first: RayImage | None) -> rrb.Blueprint:
-    """Return the layout: images left, model, graph and readings in the middle, the newest pair right.
+    """Return the layout: tabs, the first of which has the poses and their uncertainty large.
 
     Args:
         first: the first accepted view, which tells where to look from; None before there is one.
     """
-    middle = rrb.Vertical(
-        rrb.Horizontal(*_object(first), column_shares=[1.0, 1.2]),
-        rrb.Horizontal(*_closure(first), _words(), column_shares=[1.0, 1.0, 1.35]),
-        row_shares=[1.55, 1.0],
-    )
-    above = rrb.Horizontal(_images(first), middle, _pair(first), column_shares=[1.0, 3.2, 1.0])
     return rrb.Blueprint(
-        rrb.Vertical(above, _readings(), row_shares=[4.6, 1.0]),
+        rrb.Tabs(_poses(first), _object(first), _pair(first), _edges(first), _words(), active_tab=0),
         rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=3.0),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
@@ -38,107 +32,123 @@ def layout(first: RayImage | None) -> rrb.Blueprint:
     )
 
 
-def _images(first: RayImage | None) -> rrb.Container:
-    """Return the camera's images, without colour where the first frame has none, and the picture of visibility."""
-    near = None if first is None else around(first)
-    coloured = first is None or first.frame.colour is not None
-    depth = rrb.Spatial2DView(
+def _poses(first: RayImage | None) -> rrb.Container:
+    """Return the object among the cameras with their uncertainty, before closure and after; frame and table beside."""
+    contents = [f"{entities.WORLD}/model/**", entities.CAMERAS, entities.CURRENT, entities.CHAIN, entities.CLOSURE]
+    contents += [entities.BEFORE_POSITION_3_SIGMA, entities.POSITION_1_SIGMA, entities.POSITION_3_SIGMA]
+    contents += [entities.MAGNIFICATION]
+    beside = rrb.Vertical(
+        _frame(first), rrb.TextDocumentView(origin=entities.POSES, name="Every pose"), row_shares=[1.0, 1.7]
+    )
+    large = _spatial("Cameras around the object, before and after loop closure", contents, _far(first))
+    return rrb.Horizontal(large, beside, column_shares=[2.1, 1.0], name="Poses and uncertainty")
+
+
+def _frame(first: RayImage | None) -> rrb.View:
+    """Return the camera's image, in colour unless the first frame has none, with the object outlined."""
+    if first is None or first.frame.colour is not None:
+        contents = [entities.COLOUR, entities.OUTLINE]
+        return rrb.Spatial2DView(origin=entities.CAMERA, contents=contents, name="Frame, object outlined")
+    return _depth(first)
+
+
+def _depth(first: RayImage | None) -> rrb.View:
+    """Return the depth image around the object, which is outlined."""
+    return rrb.Spatial2DView(
         origin=entities.CAMERA,
-        contents=[entities.DEPTH] if coloured else [entities.DEPTH, entities.MASK],
-        name="Depth of the frame" if coloured else "Depth of the frame, object bright",
-        visual_bounds=near,
-    )
-    seen = rrb.Spatial2DView(
-        origin=entities.VISIBILITY,
-        contents=[f"{entities.VISIBILITY}/**"],
-        name="New points in previous view",
-        visual_bounds=near,
-    )
-    if not coloured:
-        return rrb.Vertical(depth, seen)
-    colour = rrb.Spatial2DView(
-        origin=entities.CAMERA, contents=[entities.COLOUR, entities.MASK], name="Frame, object bright"
-    )
-    return rrb.Vertical(colour, depth, seen)
-
-
-def _object(first: RayImage | None) -> tuple[rrb.Container, rrb.View]:
-    """Return the views of the model alone, with the merged points behind it, and among the cameras that saw it."""
-    graph = [f"{entities.WORLD}/{part}/**" for part in ("model", "poses", "edges")]
-    graph += [entities.EDGES_1_SIGMA, entities.EDGES_MAGNIFICATION]
-    near = _near(first, _ABOVE_LEFT, 4.0)
-    tabs = (("Object model", f"{entities.WORLD}/model/**"),)
-    tabs += (("Before closure", entities.MERGED_BEFORE), ("After closure", entities.MERGED_AFTER))
-    return (
-        rrb.Tabs(*(_spatial(name, entities.WORLD, [what], near) for name, what in tabs), active_tab=0),
-        _spatial("Pose graph: cameras, edges and their uncertainty", entities.WORLD, graph, _far(first)),
+        contents=[entities.DEPTH, entities.DEPTH_OUTLINE],
+        name="Depth, object outlined",
+        visual_bounds=None if first is None else around(first),
     )
 
 
-def _closure(first: RayImage | None) -> tuple[rrb.View, rrb.View]:
-    """Return the poses' uncertainty without loop closure and with it, seen alike."""
-    model = f"{entities.WORLD}/model/**"
-    before = [model, f"{entities.WORLD}/before/**", entities.CHAIN]
-    after = [model, entities.CAMERAS, entities.ODOMETRY, entities.CLOSURE, entities.MAGNIFICATION]
-    after += [entities.POSITION_1_SIGMA, entities.POSITION_3_SIGMA, entities.AXIS_TIPS_1_SIGMA]
-    return (
-        _spatial("Uncertainty before closure", entities.WORLD, before, _far(first)),
-        _spatial("Uncertainty after closure", entities.WORLD, after, _far(first)),
+def _object(first: RayImage | None) -> rrb.Container:
+    """Return the model alone, beside the merged points before and after closure."""
+    near = _near(first, _ABOVE_LEFT, 3.4)
+    return rrb.Horizontal(
+        _spatial("Object model", [f"{entities.WORLD}/model/**"], near),
+        rrb.Vertical(
+            _spatial("All points before loop closure", [entities.MERGED_BEFORE], near),
+            _spatial("All points after loop closure", [entities.MERGED_AFTER], near),
+        ),
+        column_shares=[1.5, 1.0],
+        name="Object",
     )
 
 
 def _pair(first: RayImage | None) -> rrb.Container:
-    """Return the newest pair before and after alignment, and the magnified posterior."""
+    """Return the newest pair: depth and what the target saw, before and after alignment, posterior and words."""
     eye = _near(first, FROM_THE_SIDE, 4.2)
     before = [entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_CAPTION]
     after = [entities.PAIR_TARGET, entities.PAIR_AFTER, entities.PAIR_AXES, entities.PAIR_DRAWS]
     ghosts = [entities.GHOSTS, entities.GHOST_MEANS, entities.GHOST_TIPS, entities.GHOST_LABELS]
     ghosts += [entities.GHOST_CENTRE_1_SIGMA, entities.GHOST_CENTRE_3_SIGMA, entities.PAIR_AXES]
-    return rrb.Vertical(
-        _spatial("Pair before alignment", entities.PAIR, before, eye),
-        _spatial("Pair after alignment", entities.PAIR, after, eye),
-        _spatial("Posterior, magnified", entities.PAIR, ghosts, eye),
+    seen = rrb.Spatial2DView(
+        origin=entities.VISIBILITY,
+        contents=[f"{entities.VISIBILITY}/**"],
+        name="New points in previous view",
+        visual_bounds=None if first is None else around(first),
+    )
+    return rrb.Grid(
+        _spatial("Pair before alignment", before, eye, origin=entities.PAIR),
+        _spatial("Pair after alignment", after, eye, origin=entities.PAIR),
+        _depth(first),
+        _spatial("Posterior, magnified", ghosts, eye, origin=entities.PAIR),
+        seen,
+        rrb.TextDocumentView(origin=entities.NOW, name="In words"),
+        grid_columns=3,
+        name="Newest pair",
+    )
+
+
+def _edges(first: RayImage | None) -> rrb.Container:
+    """Return the pose graph with the uncertainty of its edges, beside a plot for each reading."""
+    graph = [f"{entities.WORLD}/{part}/**" for part in ("model", "poses", "edges")]
+    graph += [f"- {entities.CHAIN}", entities.EDGES_1_SIGMA, entities.EDGES_MAGNIFICATION]
+    return rrb.Horizontal(
+        _spatial("Pose graph", graph, _far(first)), rrb.Grid(*_readings(), grid_columns=2), name="Edges"
     )
 
 
 def _words() -> rrb.Container:
-    """Return what happened in words, with the run's facts, the history and the legend behind it."""
-    return rrb.Tabs(
-        rrb.TextDocumentView(origin=entities.NOW, name="Now"),
-        rrb.TextDocumentView(origin=entities.RUN, name="Run"),
-        rrb.TextLogView(origin=entities.LOG, name="History"),
+    """Return the legend, the run's facts and its history."""
+    return rrb.Horizontal(
         rrb.TextDocumentView(origin=entities.LEGEND, name="Legend"),
-        active_tab=0,
+        rrb.Vertical(
+            rrb.TextDocumentView(origin=entities.RUN, name="Run"),
+            rrb.TextLogView(origin=entities.LOG, name="History"),
+        ),
+        name="Legend and history",
     )
 
 
-def _readings() -> rrb.Container:
+def _readings() -> list[rrb.View]:
     """Return one plot for each reading."""
     titles = {
         entities.TURNED: "Turned by [°]",
+        entities.OVERLAP: "Overlap [%]",
         entities.ROTATION_SD: "Rotation sd [°]",
         entities.TRANSLATION_SD: "Translation sd [mm]",
         entities.EFFECTIVE_SAMPLES: "Effective samples",
-        entities.OVERLAP: "Overlap [%]",
         entities.SECONDS: "Seconds per pair",
     }
     hidden = rrb.PlotLegend(visible=False)
     dark = rrb.archetypes.PlotBackground(color=_BACKGROUND)  # in the browser too, whatever its theme, for white lines
-    return rrb.Horizontal(
-        *(
-            rrb.TimeSeriesView(
-                origin=path,
-                name=title,
-                plot_legend=hidden,
-                background=dark,
-                axis_y=rrb.ScalarAxis(range=(0.0, 105.0)) if path == entities.OVERLAP else None,
-            )
-            for path, title in titles.items()
+    return [
+        rrb.TimeSeriesView(
+            origin=path,
+            name=title,
+            plot_legend=hidden,
+            background=dark,
+            axis_y=rrb.ScalarAxis(range=(0.0, 105.0)) if path == entities.OVERLAP else None,
         )
-    )
+        for path, title in titles.items()
+    ]
 
 
-def _spatial(name: str, origin: str, contents: list[str], eye: rrb.EyeControls3D | None = None) -> rrb.Spatial3DView:
+def _spatial(
+    name: str, contents: list[str], eye: rrb.EyeControls3D | None, *, origin: str = entities.WORLD
+) -> rrb.Spatial3DView:
     """Return a 3D view without a ground grid, for nothing here stands on one."""
     return rrb.Spatial3DView(
         origin=origin,
@@ -171,7 +181,7 @@ def _far(first: RayImage | None) -> rrb.EyeControls3D | None:
     """Return an eye on the whole graph; None before there is an object."""
     if first is None:
         return None
-    return _eye(first, 2.8 * float(np.linalg.norm(first.centroid_m)), graph_view.OVER_THE_RING)
+    return _eye(first, 2.5 * float(np.linalg.norm(first.centroid_m)), graph_view.OVER_THE_RING)
 
 
 def _radius_m(view: RayImage) -> float:

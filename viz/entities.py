@@ -13,6 +13,8 @@ CAMERA: Final = "camera"
 COLOUR: Final = "camera/colour"
 DEPTH: Final = "camera/depth"
 MASK: Final = "camera/mask"
+OUTLINE: Final = "camera/outline"
+DEPTH_OUTLINE: Final = "camera/depth_outline"
 
 # The newest pair of views, in the target's camera frame.
 PAIR: Final = "pair"
@@ -51,15 +53,10 @@ CLOSURE: Final = "world/edges/closure"
 REJECTED: Final = "world/edges/rejected"
 POSITION_1_SIGMA: Final = "world/uncertainty/position_1_sigma"
 POSITION_3_SIGMA: Final = "world/uncertainty/position_3_sigma"
-AXIS_TIPS_1_SIGMA: Final = "world/uncertainty/axis_tips_1_sigma"
 EDGES_1_SIGMA: Final = "world/uncertainty/edges_1_sigma"
 EDGES_MAGNIFICATION: Final = "world/uncertainty/edges_magnification"
 MAGNIFICATION: Final = "world/uncertainty/magnification"
-BEFORE_CAMERAS: Final = "world/before/cameras"
-BEFORE_POSITION_1_SIGMA: Final = "world/before/position_1_sigma"
 BEFORE_POSITION_3_SIGMA: Final = "world/before/position_3_sigma"
-BEFORE_AXIS_TIPS_1_SIGMA: Final = "world/before/axis_tips_1_sigma"
-BEFORE_MAGNIFICATION: Final = "world/before/magnification"
 MERGED_BEFORE: Final = "world/merged/before_closure"
 MERGED_AFTER: Final = "world/merged/after_closure"
 
@@ -76,6 +73,7 @@ POSE_READINGS: Final = (ROTATION_SD, TRANSLATION_SD)
 
 # Words
 NOW: Final = "words/now"
+POSES: Final = "words/poses"
 LOG: Final = "words/log"
 RUN: Final = "words/run"
 LEGEND: Final = "words/legend"
@@ -88,36 +86,40 @@ CLOSURE_RGB: Final[Rgb] = (70, 220, 110)
 REJECTED_RGB: Final[Rgb] = (240, 60, 60)
 CAMERA_RGB: Final[Rgb] = (130, 145, 165)
 CURRENT_RGB: Final[Rgb] = SOURCE_RGB
-CHAIN_RGB: Final[Rgb] = (120, 100, 160)
+BEFORE_RGB: Final[Rgb] = (165, 125, 240)
 MODE_RGB: Final[tuple[Rgb, ...]] = (SOURCE_RGB, (200, 120, 255), (120, 210, 90), (255, 110, 130), (110, 170, 255))
 AREAS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((0, 0, 0), (128, 128, 128), (45, 85, 190))
 AGREES_RGB: Final[Rgb] = SOURCE_RGB
 HIDDEN_RGB: Final[Rgb] = (120, 80, 45)
 NO_SAY_RGB: Final[Rgb] = (70, 70, 70)
 VIOLATION_RGB: Final[Rgb] = (255, 40, 160)
+OUTLINE_RGB: Final[Rgb] = (90, 255, 120)
 UNCERTAINTY_RGB: Final[Rgb] = (255, 225, 90)
 AXIS_RGB: Final[tuple[Rgb, Rgb, Rgb]] = ((230, 70, 70), (80, 200, 80), (90, 130, 255))
 
 LEGEND_TEXT: Final = """\
-**Images** (left). Top: the frame, with everything but the object dimmed. Middle: its depth. Bottom: the image of
-the view to which the frame is registered (blue: object, grey: background, black: no measurement) with the points of
-the new view projected into it: orange points agree with the surface measured there, brown ones are hidden behind
-it, **pink ones lie in front of what was measured**, which few points do at the true pose.
+**Poses and uncertainty.** Pyramids are camera poses around the object, which is drawn as if it stood still; the newest
+is orange. Around each position lies an ellipsoid: the region within 3 standard deviations (sd), which holds the true
+position with 97 % probability. Violet: before loop closure, along the violet chain of consecutive pairs, where
+errors add up. Yellow: after it, solid within 1 sd. The green line is a closure: a registration to a view that the
+object had turned away from. All ellipsoids are magnified by the factor written below them. The table states the sd of
+each pose relative to the first, along its least certain axis; translation is that of the object's centre.
 
-**Pair** (right). New view orange, the view it is registered to teal, in the camera frame of the latter. Bottom: the
-posterior, magnified by the factor written there. The object is drawn at the mean and, dimmed, at samples; dots are
-the ends of its axes, yellow ellipsoids its centre within 1 and 3 standard deviations (sd). Further modes have other
-colours and are labelled with their probabilities.
+**Object.** Pink surface was not seen by any view; it closes the mesh. After the last frame, the points of all views
+stand beside it, by the poses before loop closure and after it, coloured by frame from blue to yellow. Where the loop
+was open before closure, yellow points lie apart from blue ones.
 
-**Model.** Pink surface was not seen by any view; it closes the mesh. After the last frame, two more tabs show the
-points of all views before and after loop closure, coloured by frame from blue to yellow. Where the loop was open
-before closure, yellow points lie apart from blue ones.
+**Newest pair.** New view orange, the view it is registered to teal, in the camera frame of the latter. *Posterior*: the
+distribution over relative poses that the registration returns, its spread magnified by the factor written there; the
+object is drawn at the mean and, dimmed, at samples; dots are the ends of its axes, yellow ellipsoids its centre
+within 1 and 3 sd. Further modes (separate poses that explain the images too) have other colours and are labelled with
+their probabilities. *New points in previous view*: what that view measured (blue: object, grey: background, black:
+nothing) with the new points projected into it: orange points agree with the surface measured there, brown ones are
+hidden behind it, **pink ones lie in front of what was measured**, which few points do at the true pose.
 
-**Pose graph.** Pyramids are camera poses in the object frame, the newest orange. Edges: odometry and spans white,
-closures green, rejected red; the ellipsoid on an edge is the 1 sd region of its translation. Yellow: 1 sd (solid)
-and 3 sd (wire) regions of camera positions; discs at the tips of the axes: 1 sd of rotation. All are magnified by
-the factor written below the graph.
-
-**Plots** (bottom). Left: the angle by which a pair turned. White: odometry; green: closure; yellow: the newest pose
-after optimisation. The sd is that along the least certain axis; translation is that of the object's centre.
+**Edges.** An edge is a registration that the pose graph takes in: odometry joins a frame to the previous one, spans
+join frames several steps apart (both white), closures are green, rejected registrations red; the ellipsoid on an edge
+is the 1 sd region of its translation. Plots: the angle by which a pair turned; overlap: how much of the surface that
+both views should see, both saw; sd along the least certain axis; effective samples: how many independent samples the
+posterior is worth. White: odometry; green: closure; yellow: the newest pose after optimisation.
 """

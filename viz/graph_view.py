@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 import rerun as rr
 
 from modeler import se3
 from modeler.export.standing import upright
 from modeler.graph import PoseGraph, dead_reckoning
-from modeler.types import Array, Camera, Edge, Step
+from modeler.types import Array, Camera, Edge, PoseGaussian, Step
 from viz import entities
 from viz.drawings import CLEAR, Drawing, caption, ellipsoids, rounded_down, scale_words
+from viz.pose_table import pose_table
 
 OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
 """From the object towards the eye that looks at the whole graph."""
@@ -32,9 +35,7 @@ def draw_graph(step: Step) -> Drawing:
     yield entities.CAMERAS, _frusta(poses, step.frame.camera, size_m, (entities.CAMERA_RGB, 1.0))
     yield entities.AXES, _axes(poses, size_m)
     chain = [step.solution.odometry[k][:3, 3] for k in sorted(step.solution.odometry)]
-    yield entities.CHAIN, _lines([chain] if len(chain) > 1 else [], entities.CHAIN_RGB, 1.0)
-    before = np.array([step.solution.odometry[k] for k in shown(step) if k in step.solution.odometry]).reshape(-1, 4, 4)
-    yield entities.BEFORE_CAMERAS, _frusta(before, step.frame.camera, size_m, (entities.CHAIN_RGB, 1.0))
+    yield entities.CHAIN, _lines([chain] if len(chain) > 1 else [], entities.BEFORE_RGB, 1.0)
     yield from _edges(step)
 
 
@@ -117,83 +118,83 @@ def _axes(poses: Array, size_m: float) -> rr.AsComponents:
 
 
 _LARGEST_3_SIGMA: Final = 0.3  # half axis of the largest ellipsoid of a chain, as a share of the object's distance
-_LARGEST_EDGE_SIGMA: Final = 0.12  # half axis of the largest ellipsoid of an edge, as a share of that distance
-_AFTER: Final = (
-    entities.POSITION_1_SIGMA,
-    entities.POSITION_3_SIGMA,
-    entities.AXIS_TIPS_1_SIGMA,
-    entities.MAGNIFICATION,
-)
-_BEFORE: Final = (
-    entities.BEFORE_POSITION_1_SIGMA,
-    entities.BEFORE_POSITION_3_SIGMA,
-    entities.BEFORE_AXIS_TIPS_1_SIGMA,
-    entities.BEFORE_MAGNIFICATION,
-)
+_SOLID: Final = rr.components.FillMode.Solid
+_WIRE: Final = rr.components.FillMode.MajorWireframe
 
 
 def draw_uncertainty(step: Step) -> Drawing:
-    """Yield the ellipsoids of the edges, of the poses, and of the poses of the chain before closure, all magnified."""
+    """Yield the ellipsoids of the poses before and after closure and of the edges, all magnified alike, and a table.
+
+    Before closure, poses have the covariances of the chain of consecutive edges.
+    """
     factor = magnification(step.edges_so_far, distance_m(step))
-    frames = shown(step)
-    after = {frame: step.solution.covariances[frame] for frame in frames if frame in step.solution.covariances}
-    yield from _of_poses(step, _AFTER, step.solution.trajectory, after, factor)
     root = next(iter(step.solution.odometry), None)  # the chain is walked outwards from it
-    chain = dead_reckoning(PoseGraph(step.edges_so_far, root))
-    chained = {k: chain[k].covariance for k in frames if k in chain and k in step.solution.odometry}
-    yield from _of_poses(step, _BEFORE, step.solution.odometry, chained, factor)
-    yield from _of_edges(step)
+    chain = {
+        frame: pose
+        for frame, pose in dead_reckoning(PoseGraph(step.edges_so_far, root)).items()
+        if frame in step.solution.odometry
+    }
+    covariances = step.solution.covariances
+    poses = {k: PoseGaussian(step.solution.trajectory[k], covariances[k]) for k in shown(step) if k in covariances}
+    before = _positions([chain[frame] for frame in poses if frame in chain], factor)
+    after = _positions(list(poses.values()), factor)
+    yield entities.BEFORE_POSITION_3_SIGMA, before.drawn(3.0, entities.BEFORE_RGB, _WIRE)
+    yield entities.POSITION_3_SIGMA, after.drawn(3.0, entities.UNCERTAINTY_RGB, _WIRE)
+    yield entities.POSITION_1_SIGMA, after.drawn(1.0, entities.UNCERTAINTY_RGB, _SOLID)
+    yield from _of_edges(step, factor)
+    words = f"positions within 1 and 3 sd, {scale_words(factor)}: violet before closure, yellow after"
+    yield entities.MAGNIFICATION, _below_ring(step, words if len(after.centres_m) else "")
+    yield entities.POSES, rr.TextDocument(pose_table(step, chain, shown(step)), media_type=rr.MediaType.MARKDOWN)
 
 
-def _of_poses(
-    step: Step, paths: Sequence[str], trajectory: Mapping[int, Array], covariances: Mapping[int, Array], factor: float
-) -> Drawing:
-    """Yield the ellipsoids of poses whose covariance is known, to the four paths of a set."""
-    covariances = {k: covariance for k, covariance in covariances.items() if np.isfinite(covariance).all()}
-    if not covariances or not step.views:
-        for path in paths:
-            yield path, CLEAR
-        return
-    size_m = camera_size_m(step)
-    known_poses = np.array([trajectory[k] for k in covariances])
-    rotations, centres = known_poses[:, :3, :3], known_poses[:, :3, 3]
-    blocks = np.array(list(covariances.values()))
-    half_axes, quaternions = ellipsoids(rotations @ blocks[:, 3:, 3:] @ np.swapaxes(rotations, 1, 2))
-    one_sigma, three_sigma, tips_one_sigma, label = paths
-    for path, sigmas, style in (
-        (one_sigma, 1.0, rr.components.FillMode.Solid),
-        (three_sigma, 3.0, rr.components.FillMode.MajorWireframe),
-    ):
-        yield (
-            path,
-            rr.Ellipsoids3D(
-                centers=centres,
-                half_sizes=sigmas * factor * half_axes,
-                quaternions=quaternions,
-                colors=entities.UNCERTAINTY_RGB,
-                line_radii=rr.Radius.ui_points(0.75),
-                fill_mode=style,
-            ),
+@dataclass(frozen=True, eq=False)
+class _Ellipsoids:
+    """Ellipsoids of one standard deviation, magnified."""
+
+    centres_m: Array
+    """(n, 3)."""
+    half_axes_m: Array
+    """(n, 3)."""
+    quaternions: Array
+    """(n, 4) x, y, z, w."""
+
+    @classmethod
+    def of(cls, centres_m: Array, covariances: Array, factor: float) -> _Ellipsoids:
+        """Return those of covariances (n, 3, 3) in m² about points (n, 3), `factor` times as large as they are."""
+        half_axes_m, quaternions = ellipsoids(covariances)
+        return cls(centres_m, factor * half_axes_m, quaternions)
+
+    def drawn(
+        self, sigmas: float, rgb: entities.Rgb | npt.NDArray[np.uint8], style: rr.components.FillMode
+    ) -> rr.AsComponents:
+        """Return the regions of so many standard deviations in one colour or one each (n, 3); nothing without any."""
+        if len(self.centres_m) == 0:
+            return CLEAR
+        return rr.Ellipsoids3D(
+            centers=self.centres_m,
+            half_sizes=sigmas * self.half_axes_m,
+            quaternions=self.quaternions,
+            colors=rgb,
+            line_radii=rr.Radius.ui_points(0.75),
+            fill_mode=style,
         )
-    tips = np.concatenate(
-        [axis_tip_covariances(rotation, block[:3, :3]) for rotation, block in zip(rotations, blocks, strict=True)]
-    )
-    half_axes, quaternions = ellipsoids(size_m**2 * tips)
-    yield (
-        tips_one_sigma,
-        rr.Ellipsoids3D(
-            centers=(centres[:, None] + size_m * np.swapaxes(rotations, 1, 2)).reshape(-1, 3),
-            half_sizes=factor * half_axes,
-            quaternions=quaternions,
-            colors=np.tile(np.array(entities.AXIS_RGB, dtype=np.uint8), (len(blocks), 1)),
-            fill_mode=rr.components.FillMode.Solid,
-        ),
-    )
-    words = f"1 and 3 sd, {scale_words(factor)}"
-    yield label, caption(below_ring_m(step), words, entities.UNCERTAINTY_RGB)
 
 
-def _of_edges(step: Step) -> Drawing:
+def _positions(poses: Sequence[PoseGaussian], factor: float) -> _Ellipsoids:
+    """Return the ellipsoids of the positions of poses whose covariance is known."""
+    poses = [pose for pose in poses if np.isfinite(pose.covariance).all()]
+    means = np.array([pose.mean for pose in poses]).reshape(-1, 4, 4)
+    blocks = np.array([pose.covariance[3:, 3:] for pose in poses]).reshape(-1, 3, 3)
+    return _Ellipsoids.of(means[:, :3, 3], _rotated(means, blocks), factor)
+
+
+def _rotated(poses: Array, covariances: Array) -> Array:
+    """Return covariances (n, 3, 3) along the axes of poses (n, 4, 4) along those in which the poses are."""
+    rotations = poses[:, :3, :3]
+    return rotations @ covariances @ np.swapaxes(rotations, 1, 2)
+
+
+def _of_edges(step: Step, factor: float) -> Drawing:
     """Yield an ellipsoid half way along each edge that takes part: the shift within 1 sd that its posterior allows."""
     trajectory = step.solution.trajectory
     edges = [
@@ -202,28 +203,19 @@ def _of_edges(step: Step) -> Drawing:
         if edge.source in trajectory and edge.target in trajectory and step.solution.takes_part(edge)
     ]
     edges = [edge for edge in edges if np.isfinite(edge.posterior.pose.covariance).all()]
-    if not edges or not step.views:
-        yield entities.EDGES_1_SIGMA, CLEAR
-        yield entities.EDGES_MAGNIFICATION, CLEAR
-        return
     ends = np.array([[trajectory[edge.target][:3, 3], trajectory[edge.source][:3, 3]] for edge in edges])
-    rotations = np.array([trajectory[edge.source][:3, :3] for edge in edges])
-    blocks = np.array([edge.posterior.pose.covariance[3:, 3:] for edge in edges])
-    half_axes, quaternions = ellipsoids(rotations @ blocks @ np.swapaxes(rotations, 1, 2))
-    factor = rounded_down(_LARGEST_EDGE_SIGMA * distance_m(step) / max(float(half_axes.max()), 1e-9))
-    factor = min(max(factor, 0.1), 1000.0)
-    yield (
-        entities.EDGES_1_SIGMA,
-        rr.Ellipsoids3D(
-            centers=ends.mean(axis=1),
-            half_sizes=factor * half_axes,
-            quaternions=quaternions,
-            colors=np.array([_edge_rgb(edge) for edge in edges], dtype=np.uint8),
-            fill_mode=rr.components.FillMode.Solid,
-        ),
-    )
-    words = f"edges: 1 sd, {scale_words(factor)}"
-    yield entities.EDGES_MAGNIFICATION, caption(below_ring_m(step), words, entities.UNCERTAINTY_RGB)
+    sources = np.array([trajectory[edge.source] for edge in edges]).reshape(-1, 4, 4)
+    blocks = np.array([edge.posterior.pose.covariance[3:, 3:] for edge in edges]).reshape(-1, 3, 3)
+    spreads = _Ellipsoids.of(ends.reshape(-1, 2, 3).mean(axis=1), _rotated(sources, blocks), factor)
+    colours = np.array([_edge_rgb(edge) for edge in edges], dtype=np.uint8)
+    yield entities.EDGES_1_SIGMA, spreads.drawn(1.0, colours, _SOLID)
+    words = f"edges within 1 sd, {scale_words(factor)}"
+    yield entities.EDGES_MAGNIFICATION, _below_ring(step, words if edges else "")
+
+
+def _below_ring(step: Step, words: str) -> rr.AsComponents:
+    """Return a caption below the graph, nothing without words or where nothing is drawn."""
+    return caption(below_ring_m(step), words, entities.UNCERTAINTY_RGB) if words and step.views else CLEAR
 
 
 def _edge_rgb(edge: Edge) -> entities.Rgb:
@@ -246,19 +238,6 @@ def magnification(edges: Sequence[Edge], distance_m: float) -> float:
         return 1.0
     sigma_m = math.sqrt(max(9.0 * variances[0], sum(variances)))  # room for nine edges from the start
     return min(max(rounded_down(_LARGEST_3_SIGMA * distance_m / (3.0 * sigma_m)), 0.1), 1000.0)
-
-
-def axis_tip_covariances(rotation: Array, covariance: Array) -> Array:
-    """Return the covariances (3, 3, 3) of the tips of a pose's three unit axes about its centre.
-
-    A tip moves by R (ω × e) under the right perturbation ω of the rotation R.
-
-    Args:
-        rotation: (3, 3) of the pose.
-        covariance: (3, 3) of ω.
-    """
-    jacobians = -rotation @ se3.hat(np.eye(3))
-    return jacobians @ covariance @ np.swapaxes(jacobians, 1, 2)
 
 
 def _largest_variance(covariance: Array) -> float:

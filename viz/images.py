@@ -25,27 +25,44 @@ _DEPTH_PIXELS: Final = 100_000
 _JPEG_QUALITY: Final = 80
 _DEPTH_UNITS_PER_M: Final = 1000.0  # finer units make the picture no better and the file several times larger
 _RUN_LENGTHS: Final = 3  # zlib's strategy; for filtered depth the quickest, and small
-_DIMMED: Final = 0.65  # how dark what is not the object becomes
-
-
-def draw_mask_colours() -> Drawing:
-    """Yield the colours of the mask: it dims all but the object."""
-    background = rr.AnnotationInfo(id=0, label="background", color=(0, 0, 0))
-    yield entities.MASK, rr.AnnotationContext([background, rr.AnnotationInfo(1, "object", (0, 0, 0, 0))])
 
 
 def draw_frame(step: Step) -> Drawing:
-    """Yield the colour image, the depth image and the mask of the step's frame."""
+    """Yield the colour image, the depth image, and the mask of the step's frame with its outline in both."""
     stride, coarse = stride_px(step.frame), depth_stride_px(step.frame)
     mask = step.segmentation.mask
     if step.frame.colour is None:
-        yield entities.COLOUR, rr.Clear(recursive=False)
+        yield entities.COLOUR, CLEAR
     else:
         yield entities.COLOUR, _jpeg(step.frame.colour[::stride, ::stride])
     yield entities.DEPTH, _depth_png(step.frame.depth_m[::coarse, ::coarse], mask[::coarse, ::coarse])
-    stride = coarse if step.frame.colour is None else stride  # it is laid over the colours, else over the depth
-    shown = mask[::stride, ::stride].astype(np.uint8)
-    yield entities.MASK, rr.SegmentationImage(shown, opacity=_DIMMED, draw_order=1.0)
+    stride = coarse if step.frame.colour is None else stride  # the report lays it over the colours, else over the depth
+    yield entities.MASK, rr.SegmentationImage(mask[::stride, ::stride].astype(np.uint8), draw_order=-1.0)
+    for path, mask_stride in ((entities.OUTLINE, stride), (entities.DEPTH_OUTLINE, coarse)):
+        lines = outline(mask[::mask_stride, ::mask_stride])
+        drawn = rr.LineStrips2D(lines, colors=entities.OUTLINE_RGB, radii=rr.Radius.ui_points(1.0), draw_order=5.0)
+        yield path, drawn if len(lines) else CLEAR
+
+
+def outline(mask: BoolArray) -> npt.NDArray[np.float32]:
+    """Return the lines (n, 2, 2: column and row of both ends) between the pixels of a mask (h, w) and all others.
+
+    They follow the sides of pixels, whose corners are at whole numbers.
+    """
+    inside = np.pad(mask, 1).astype(np.int8)
+    level = _runs(np.diff(inside, axis=0))
+    upright = _runs(np.diff(inside, axis=1).T)
+    return (np.concatenate([level, upright[:, :, ::-1]]) - 1.0).astype(np.float32)
+
+
+def _runs(change: npt.NDArray[np.int8]) -> Array:
+    """Return runs of one value other than 0 along rows (h + 1, w + 2) as lines (n, 2, 2: column and row)."""
+    begins_ends = np.diff(change, axis=1, prepend=np.int8(0), append=np.int8(0)) != 0
+    before = np.pad(change, ((0, 0), (1, 0)))[begins_ends] != 0
+    after = np.pad(change, ((0, 0), (0, 1)))[begins_ends] != 0
+    rows, columns = np.nonzero(begins_ends)
+    places = np.stack([columns, rows + 1], axis=1).astype(np.float64)
+    return np.stack([places[after], places[before]], axis=1)
 
 
 def stride_px(frame: Frame) -> int:

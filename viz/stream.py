@@ -169,7 +169,6 @@ def open_stream(
         recording.send_recording_name(name)
         recording.send_blueprint(blueprint.layout(None))
         for path, archetype in itertools.chain(
-            images.draw_mask_colours(),
             drawings.draw_axes(),
             images.draw_area_colours(),
             readings.draw_legend(name, facts or {}),
