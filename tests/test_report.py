@@ -8,12 +8,14 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 from turning_box import CENTRE_M, COUNT, HALF_M, LOST, object_from_camera, steps
 
 from modeler import se3
@@ -25,6 +27,7 @@ from modeler.types import Array, InputError
 from sequences import bundled
 from viz import entities, reader
 from viz.report import run_data, write_page
+from viz.report.evidence import CHECKS
 from viz.report.mesh import read_mesh, scene
 from viz.report.run_data import Result, recorded, surfaces
 from viz.stream import open_stream
@@ -100,14 +103,16 @@ class Elements(HTMLParser):
 
 
 @pytest.mark.usefixtures("_undrawn")
-def test_the_first_screen_shows_the_evidence_beside_its_limits(run: Path, page: str, tmp_path: Path) -> None:
-    first_screen = page.partition("<h2>")[0]
+def test_the_evidence_is_explained_and_stands_beside_its_limits(run: Path, page: str, tmp_path: Path) -> None:
+    section = page.partition("<h2>What was checked</h2>")[2].partition("<h2>")[0]
     evidence = json.loads((run / "report.json").read_text())["evidence"]
     assert set(evidence) >= {"unsure_masks", "motion_m", "other_modes"}
-    assert first_screen.count("</td></tr>") == len(evidence)
-    assert "<th>frames with an unsure mask</th><td>0 %</td><td class='quiet'>at most 50 %</td><td>holds" in first_screen
-    assert "<th>largest motion of the surface</th>" in first_screen
-    assert "at least" in first_screen
+    assert section.count("</td></tr>") == len(evidence)
+    assert set(evidence) <= set(CHECKS)
+    for name in evidence:
+        assert f"<th>{escape(CHECKS[name].words)}<p class='quiet'>{escape(CHECKS[name].why)}</p></th>" in section
+    assert re.search("unsure mask.*</th><td>0 %</td><td class='quiet'>at most 50 %</td><td>holds", section)
+    assert "at least" in section
     older = tmp_path / "older"
     shutil.copytree(run, older)
     report = json.loads((older / "report.json").read_text())
@@ -176,13 +181,19 @@ def test_the_mask_of_every_frame_is_shown(run: Path, page: str) -> None:
     pictures = [base64.b64decode(found) for found in re.findall(r"base64,([^']*)'", masks)]
     rows = recorded(run / "recording.rrd")
     for frame, picture in enumerate(pictures):
-        shown = np.asarray(Image.open(io.BytesIO(picture)).convert("L"), dtype=float)
+        shown = np.asarray(Image.open(io.BytesIO(picture)), dtype=float)
+        line = (shown[..., 1] > shown[..., 0] + 40.0) & (shown[..., 1] > shown[..., 2] + 40.0)
+        inside = ndimage.binary_fill_holes(line)
+        assert inside is not None
         (blob,) = rows[entities.MASK][frame]["blob"]
         mask = Image.open(io.BytesIO(bytes(blob.as_py()[0] if isinstance(blob.as_py()[0], list) else blob.as_py())))
-        on = np.asarray(mask.resize(shown.shape[::-1])) > 0
-        assert on.any()
-        if frame != LOST:
-            assert shown[on].mean() > 1.5 * shown[~on].mean()
+        left, top, right, bottom = mask.convert("L").getbbox() or (0, 0, 0, 0)
+        rows_in, columns_in = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+        height, width = np.ptp(rows_in) + 1, np.ptp(columns_in) + 1
+        assert width / height == pytest.approx((right - left) / (bottom - top), rel=0.1)
+        assert min(shown.shape[1] / width, shown.shape[0] / height) > 1.3  # there is room around it
+        share = np.asarray(mask.convert("L").crop((left, top, right, bottom))).astype(bool).mean()
+        assert inside.sum() / (height * width) == pytest.approx(share, abs=0.1)
 
 
 def test_merged_points_are_those_of_the_views(run: Path) -> None:

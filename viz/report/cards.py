@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
+from scipy import ndimage
 
 from modeler import evaluation, se3
 from modeler.types import ACCEPTED, Array, Edge, Outcome, explain
@@ -21,6 +22,20 @@ from viz.blueprint import FROM_THE_SIDE
 from viz.reader import FRAME_PATHS
 from viz.readings import certainty_words
 from viz.report.run_data import Result, Row, cloud
+
+_TERMS: Final = {
+    "13 → 12": "frame 13 was registered to frame 12: the pose of the object in the one relative to the other",
+    "odometry": "to the previous frame; this is how a frame gets its first pose",
+    "span": "over several frames, to make their poses more precise",
+    "closure": "to a view that the object had turned away from; it closes the loop",
+    "converged": "one narrow pose explains both images; other outcomes say what is wrong, and what to do",
+    "rejected": "did not join the pose graph, for the reason written below it",
+    "rotation sd, translation sd": "standard deviation along the least certain axis, at the object's centre",
+    "overlap": "of the surface that both views should see, how much both saw; from 50 % on it is enough",
+    "effective samples": "how many independent samples the estimate is worth; it needs 100",
+    "sd from the poses": "how far the pair is from the final poses, in its own sd; about 1 is expected",
+    "modes": "separate poses that explain the images too, each with its probability",
+}
 
 
 def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Array) -> Sequence[str]:
@@ -32,7 +47,7 @@ def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Arr
         centre_m: (3,) the object's centre, in the object frame.
     """
     note = (
-        "From left: the frame, all but the object dimmed; its surface (<span class='orange'>orange</span>) and that of "
+        "From left: the frame, its object outlined; its surface (<span class='orange'>orange</span>) and that of "
         "the view it is registered to (<span class='teal'>teal</span>) before and after alignment."
         if pictures
         else "There are no pictures because recording.rrd is missing."
@@ -46,7 +61,11 @@ def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Arr
         _pair_card(result, edge, record, pictures.get(edge.source), centre_m)
         for edge, record in sorted(told, key=lambda pair: _badness(result, pair[0]), reverse=True)
     ]
-    return [f"<h2>Pairs</h2><p class='quiet'>{note}</p><div class='pairs'>{''.join(cards)}</div>"]
+    terms = "".join(f"<div><dt>{term}:</dt> <dd>{words}</dd></div>" for term, words in _TERMS.items())
+    return [
+        f"<h2>Pairs</h2><p class='quiet'>{note}</p><dl class='terms'>{terms}</dl>"
+        f"<div class='pairs'>{''.join(cards)}</div>"
+    ]
 
 
 def mask_cards(result: Result, pictures: Mapping[int, Thumbnails]) -> Sequence[str]:
@@ -59,15 +78,19 @@ def mask_cards(result: Result, pictures: Mapping[int, Thumbnails]) -> Sequence[s
     cards = []
     for frame in result.report["frames"]:
         shown = pictures.get(frame["id"])
-        if shown is not None and shown.masked is not None:
+        if shown is not None and shown.outlined is not None:
             unsure = frame.get("mask") == Outcome.UNSURE_MASK.label
             words = [str(frame["id"]), *(["unsure"] if unsure else [])]
             words += [] if frame["outcome"] == ACCEPTED else ["left out"]
             cards.append(
-                f"<div class='mask{' no' if len(words) > 1 else ''}'><img src='{data_address(shown.masked, 'jpeg')}' "
+                f"<div class='mask{' no' if len(words) > 1 else ''}'><img src='{data_address(shown.outlined, 'jpeg')}' "
                 f"alt=''><p>{', '.join(words)}</p></div>"
             )
-    note = "What was taken for the object in each frame; the rest is dimmed."
+    note = (
+        "The outline of what was taken for the object in each frame. It should follow the object all around: what it "
+        "holds too much becomes part of the model, what it leaves out is missing. Unsure: the object could not be told "
+        "from its surroundings for certain."
+    )
     return [f"<h2>Masks</h2><p class='quiet'>{note}</p><div class='masks'>{''.join(cards)}</div>"] if cards else []
 
 
@@ -108,7 +131,7 @@ def _pair_card(
     posterior = edge.posterior
     shown = ""
     if pictures is not None and edge.kind == "odometry":
-        images = [image for image in (pictures.masked, pictures.before, pictures.after) if image is not None]
+        images = [image for image in (pictures.outlined, pictures.before, pictures.after) if image is not None]
         shown = "".join(f"<img src='{data_address(image, 'jpeg')}' alt=''>" for image in images)
         shown = f"<div class='pictures'>{shown}</div>"
     seen_m = centre_m
@@ -140,7 +163,7 @@ def _pair_card(
 _SIZE: Final = (150, 200)  # height and width in px
 _JPEG_QUALITY: Final = 82
 _BACKGROUND: Final = 250
-_DIM: Final = 0.35  # brightness of what is not the object
+_ROOM: Final = 0.3  # around the object, as a share of its size
 _DOT: Final = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])  # pixels of a point
 
 
@@ -148,8 +171,8 @@ _DOT: Final = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])  # pixels of a point
 class Thumbnails:
     """Small pictures of a frame as JPEG; None where there is nothing to show."""
 
-    masked: bytes | None
-    """What the camera saw, in colour or else its depth, all but the object dimmed."""
+    outlined: bytes | None
+    """What the camera saw around the object, which is outlined, in colour or else its depth."""
     before: bytes | None
     """The frame's surface and that of the view it was registered to, both in their own camera's coordinates."""
     after: bytes | None
@@ -168,33 +191,49 @@ def thumbnails(rows: Mapping[str, Mapping[int, Row]]) -> dict[int, Thumbnails]:
 
 def _of_frame(rows: Mapping[str, Row]) -> Thumbnails:
     seen, depth, mask = (_picture(rows[path]) for path in (entities.COLOUR, entities.DEPTH, entities.MASK))
-    masked = _masked(depth if seen is None else seen, mask)
+    outlined = _outlined(depth if seen is None else seen, mask)
     target, before, after = (cloud(rows[p]) for p in (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER))
     if target is None or before is None or after is None:
-        return Thumbnails(masked, None, None)
-    return Thumbnails(masked, _pair_picture(target, before), _pair_picture(target, after))
+        return Thumbnails(outlined, None, None)
+    return Thumbnails(outlined, _pair_picture(target, before), _pair_picture(target, after))
 
 
 def _picture(row: Row) -> Image.Image | None:
-    """Return the picture of a row, small; None where it has none."""
+    """Return the picture of a row; None where it has none."""
     blob = row.get("blob")
-    if blob is None:
-        return None
-    picture = Image.open(io.BytesIO(bytes(blob.values[0].values.to_numpy())))
-    height, width = _SIZE
-    picture.thumbnail((width, height), Image.Resampling.NEAREST if picture.mode != "RGB" else Image.Resampling.BICUBIC)
-    return picture
+    return None if blob is None else Image.open(io.BytesIO(bytes(blob.values[0].values.to_numpy())))
 
 
-def _masked(picture: Image.Image | None, mask: Image.Image | None) -> bytes | None:
-    """Return a picture in colour or of depth with all but the object dimmed; None without a picture."""
+def _outlined(picture: Image.Image | None, mask: Image.Image | None) -> bytes | None:
+    """Return the part of a picture (colour or depth) around the object, small and outlined; None without a picture."""
     if picture is None:
         return None
-    pixels = np.asarray(picture, dtype=np.float64)
-    on = np.ones(pixels.shape[:2], bool) if mask is None else np.asarray(mask.resize(picture.size)) > 0
+    mask = Image.new("L", picture.size, 255) if mask is None else mask.convert("L").resize(picture.size)
+    box = _around(np.asarray(mask) > 0)
+    shape = (_SIZE[1], round(_SIZE[1] * (box[3] - box[1]) / (box[2] - box[0])))
+    on = np.asarray(mask.crop(box).resize(shape, Image.Resampling.NEAREST)) > 0
+    how = Image.Resampling.BICUBIC if picture.mode == "RGB" else Image.Resampling.NEAREST
+    pixels = np.array(picture.crop(box).resize(shape, how), dtype=np.float64)
     if pixels.ndim == 2:
         pixels = _grey(pixels, on)
-    return _jpeg(Image.fromarray(np.where(on[..., None], pixels, _DIM * pixels).astype(np.uint8)))
+    line = ndimage.binary_dilation(on) != ndimage.binary_erosion(on, border_value=1)
+    pixels[line] = entities.OUTLINE_RGB
+    return _jpeg(Image.fromarray(pixels.astype(np.uint8)))
+
+
+def _around(on: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:
+    """Return the box (left, top, right, bottom) around what is set in a mask (h, w), with room around it."""
+    height, width = on.shape
+    if not on.any():
+        return 0, 0, width, height
+    rows, columns = np.flatnonzero(on.any(axis=1)), np.flatnonzero(on.any(axis=0))
+    shape = np.array([width / height, 1.0])  # that of the whole picture, so that it has room for the box
+    extent = np.array([np.ptp(columns) + 1, np.ptp(rows) + 1]) * (1.0 + 2.0 * _ROOM)
+    size = np.minimum(float((extent / shape).max()) * shape, [width, height])
+    middle = 0.5 * np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1])
+    start = np.clip(middle - 0.5 * size, 0.0, np.array([width, height]) - size)
+    left, top, right, bottom = np.rint([*start, *(start + size)]).astype(np.int64)
+    return int(left), int(top), int(right), int(bottom)
 
 
 def _grey(depth: Array, on: npt.NDArray[np.bool_]) -> Array:
@@ -229,7 +268,7 @@ def _pair_picture(*clouds: tuple[Array, npt.NDArray[np.uint8]]) -> bytes:
 
 def _jpeg(picture: Image.Image) -> bytes:
     content = io.BytesIO()
-    picture.save(content, "JPEG", quality=_JPEG_QUALITY)
+    picture.save(content, "JPEG", quality=_JPEG_QUALITY, subsampling=0)  # thin lines keep their colour
     return content.getvalue()
 
 

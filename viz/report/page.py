@@ -8,7 +8,7 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from modeler.export.standing import model_upright
 from modeler.types import ACCEPTED, Array, Outcome, loops_closed
 from viz.report import plots
 from viz.report.cards import data_address, mask_cards, pair_cards, thumbnails
+from viz.report.evidence import evidence_table
 from viz.report.mesh import Mesh, portrait, read_mesh, scene
 from viz.report.run_data import Result, Row, recorded, surfaces
 
@@ -41,7 +42,8 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
     mesh = read_mesh(run / "model.ply")
     centre_m = se3.transform(result.poses[result.first].mean, np.zeros((1, 3)))[0] if mesh is None else mesh.centre_m
     rows = recorded(run / "recording.rrd")
-    parts = [_head(result, mesh), *_model(result, mesh), *_trajectory(result, mesh, centre_m)]
+    parts = [_head(result, mesh), *_model(result, mesh), evidence_table(result.report.get("evidence") or {})]
+    parts += [*_trajectory(result, mesh, centre_m)]
     parts += [*_closure(result, rows), *_accuracy(result, centre_m), *mask_cards(result, pictures := thumbnails(rows))]
     parts += pair_cards(result, pictures, centre_m)
     parts.append(_settings(result))
@@ -51,11 +53,13 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
     write_atomically(out, page)
 
 
-def _opening(loop: Mapping[str, float] | None) -> list[tuple[str, str]]:
+def _opening(loop: Mapping[str, float] | None) -> list[tuple[str, str, str]]:
     """Return by how much the loop was open, as a key figure; nothing where no loop was closed."""
     if loop is None:
         return []
-    return [(f"{loop['opening_deg']:.1f}°, {loop['sigmas']:.1f} sd", "open loop, before optimisation")]
+    value = f"{loop['opening_deg']:.1f}°, {loop['sigmas']:.1f} sd"
+    why = "by how much the chain of pairs misses its start; 1 sd (standard deviation) is what the pairs state"
+    return [(value, "open loop, before optimisation", why)]
 
 
 def _head(result: Result, mesh: Mesh | None) -> str:
@@ -70,55 +74,28 @@ def _head(result: Result, mesh: Mesh | None) -> str:
     closed = loops_closed([edge for edge in result.edges if edge.accepted])
     total_s = report["seconds"].get("total")
     figures = [
-        (f"{len(result.poses)} of {len(report['frames'])}", "frames placed"),
-        (str(closed), "loop closed" if closed == 1 else "loops closed"),
+        (f"{len(result.poses)} of {len(report['frames'])}", "frames placed", "registered well enough to have a pose"),
+        (
+            str(closed),
+            "loop closed" if closed == 1 else "loops closed",
+            "a view was registered to one that the object had turned away from",
+        ),
         *_opening(report.get("loop")),
-        ("none" if mesh is None else f"{mesh.total:,}", "triangles"),
-        ("unknown" if total_s is None else f"{total_s:.0f} s", "build time"),
+        ("none" if mesh is None else f"{mesh.total:,}", "triangles", "of the fused mesh"),
+        ("unknown" if total_s is None else f"{total_s:.0f} s", "build time", "reading and writing included"),
     ]
     if result.true_pose(result.first) is not None:
         poses = {k: pose.mean for k, pose in result.poses.items() if result.true_pose(k) is not None}
         off = evaluation.trajectory_errors(poses, result.truth, np.zeros(3))
-        figures.append((f"{off.max_rotation_deg:.2f}°", "largest rotation error"))
-    cells = "".join(f"<div><b>{value}</b>{words}</div>" for value, words in figures)
+        figures.append(
+            (f"{off.max_rotation_deg:.2f}°", "largest rotation error", "of a pose relative to the first, against truth")
+        )
+    cells = "".join(f"<div><b>{value}</b>{words}<p class='quiet'>{why}</p></div>" for value, words, why in figures)
     where = escape(str(report["sequence"]))
     return (
         f"<h1>{escape(_name(result))}</h1><p class='quiet'>{where}, prior {escape(report['prior'])}, seed "
-        f"{report['seed']}</p>{verdict}<div class='figures'>{cells}</div>{_evidence(report.get('evidence') or {})}"
+        f"{report['seed']}</p>{verdict}<div class='figures'>{cells}</div>"
     )
-
-
-_CHECKS: Final = {
-    "unsure_masks": ("frames with an unsure mask", 100.0, " %"),
-    "motion_m": ("largest motion of the surface", 1000.0, " mm"),
-    "prior_sds": ("farthest pair from what the prior expects", 1.0, " sd"),
-    "prior_chi2": ("squared distances from the prior over its variances, all pairs", 1.0, ""),
-    "loop_sigmas": ("widest open loop, before optimisation", 1.0, " sd"),
-    "graph_chi2": ("squared residuals of the edges over their covariances", 1.0, ""),
-    "seen_through": ("surface of a frame that others see through", 100.0, " %"),
-    "absent": ("surface of a frame that most others that look see through", 100.0, " %"),
-    "pose_sd_deg": ("largest standard deviation of a pose's rotation", 1.0, "°"),
-    "pose_sd_m": ("largest standard deviation of a pose's place", 1000.0, " mm"),
-    "other_modes": ("probability of another mode", 100.0, " %"),
-}
-"""Figures of the evidence in words, each with the factor to its unit."""
-
-
-def _evidence(evidence: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the figures behind the verdict beside their limits; "" for runs of earlier versions."""
-    rows = []
-    for name, figure in evidence.items():
-        words, factor, unit = _CHECKS.get(name, (name.replace("_", " "), 1.0, ""))
-        value, limit = (
-            "unknown" if number is None else f"{factor * number:.3g}{unit}"
-            for number in (figure["value"], figure["limit"])
-        )
-        bound = "at least" if figure.get("at_least") else "at most"
-        mark = "holds" if figure["holds"] else "<b class='no'>does not hold</b>"
-        rows.append(
-            f"<tr><th>{escape(words)}</th><td>{value}</td><td class='quiet'>{bound} {limit}</td><td>{mark}</td></tr>"
-        )
-    return f"<table class='evidence'>{''.join(rows)}</table>" if rows else ""
 
 
 def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
@@ -154,15 +131,17 @@ def _trajectory(result: Result, mesh: Mesh | None, centre_m: Array) -> Sequence[
         "<h2>Camera poses</h2>",
         figure(
             plots.trajectory(result, shape_m),
-            "Camera positions in the object frame; the black dot is the first frame. Ellipses are 3 sd regions of the "
-            "positions, to scale. Grey: the object.",
+            "Camera positions in the object frame, as if the object stood still; the black dot is the first frame. "
+            "Ellipses hold the position within 3 standard deviations (sd), that is with 99 %, and are drawn to scale. "
+            "Grey: the object.",
         ),
         "<h2>Uncertainty</h2>",
         figure(
             plots.uncertainty(result, centre_m),
-            "Standard deviation (sd) along the least certain axis: of each edge, and of each pose relative to the "
-            "first frame, before loop closure (chain of consecutive edges) and after optimisation. The gap between the "
-            "two lines is the effect of loop closure.",
+            "Standard deviation (sd) along the least certain axis: of each edge (the relative pose of two frames that "
+            "a registration states), and of each pose relative to the first frame, before loop closure (edges of "
+            "consecutive frames, one after another, so that their errors add up) and after the pose graph of all edges "
+            "was optimised. The gap between the two lines is the effect of loop closure.",
         ),
     ]
 
@@ -204,7 +183,8 @@ def _accuracy(result: Result, centre_m: Array) -> Sequence[str]:
         "<h2>Calibration of the covariances</h2>",
         figure(
             plots.coverage(result),
-            "Share of true poses inside the region of a given probability. On the diagonal: calibrated; below: "
+            "A covariance states regions that hold the true pose with a given probability; the curves are the shares "
+            "of true poses inside. On the diagonal: calibrated; below: "
             "overconfident; above: conservative; grey: expected scatter. The 95 % regions of "
             f"{100.0 * inside:.0f} % of the {len(nees)} edges contain the truth.",
             style="half",
