@@ -23,6 +23,8 @@ from modeler.cli import main
 from modeler.export import RunFolder, RunMeta
 from modeler.export.formats import mesh_ply
 from modeler.export.mesh import MADE_UP_RGB
+from modeler.fusion import Symmetries
+from modeler.fusion.symmetries import Axis
 from modeler.types import Array, InputError
 from sequences import bundled
 from viz import entities, reader
@@ -30,6 +32,7 @@ from viz.report import run_data, write_page
 from viz.report.evidence import CHECKS
 from viz.report.mesh import read_mesh, scene
 from viz.report.run_data import Result, recorded, surfaces
+from viz.report.symmetries import rotation_words
 from viz.stream import open_stream
 
 TRUTH = {k: se3.inverse(object_from_camera(k)) for k in range(COUNT)}
@@ -74,9 +77,10 @@ def _read_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave plots and the picture of the mesh blank, which take most of the time of a page."""
+    """Leave plots, the picture of the mesh and its symmetries blank, which take most of the time of a page."""
     monkeypatch.setattr("viz.report.plots._svg", lambda figure: b"<svg xmlns='http://www.w3.org/2000/svg'></svg>")
     monkeypatch.setattr("viz.report.page.portrait", lambda mesh, object_from_upright, size: b"")
+    monkeypatch.setattr("viz.report.page.symmetry_section", lambda mesh, report: [])
 
 
 class Elements(HTMLParser):
@@ -139,7 +143,15 @@ def test_the_page_is_whole_and_needs_no_network(page: str) -> None:
 def test_every_section_is_there(page: str) -> None:
     headings = Elements(page).headings
     assert ODD_NAME in headings
-    wanted = ["Model", "Camera poses", "Uncertainty", "Merged points", "Errors against ground truth"]
+    wanted = [
+        "Model",
+        "What was checked",
+        "Symmetries",
+        "Camera poses",
+        "Uncertainty",
+        "Merged points",
+        "Errors against ground truth",
+    ]
     assert [heading for heading in headings if heading in wanted] == wanted
     assert {"Calibration of the covariances", "Pairs", "Settings"} <= set(headings)
 
@@ -225,6 +237,22 @@ def test_without_a_closure_there_is_nothing_to_compare(run: Path, tmp_path: Path
     (tmp_path / "recording.rrd").write_bytes((run / "recording.rrd").read_bytes())
     write_page(tmp_path, tmp_path / "page.html")
     assert "Merged points" not in (tmp_path / "page.html").read_text()
+
+
+def test_symmetries_are_told_by_their_axes() -> None:
+    up = np.array([0.0, -1.0, 0.0])
+    quarters = tuple(se3.exp(np.array([0.0, turn, 0.0, 0.0, 0.0, 0.0])) for turn in (np.pi / 2, np.pi, -np.pi / 2))
+    flips = tuple(
+        se3.exp(np.array([np.pi * np.cos(a), 0.0, np.pi * np.sin(a), 0.0, 0.0, 0.0])) for a in (0.2, 0.2 + np.pi / 2)
+    )
+    said = rotation_words(Symmetries(1e-3, (*quarters, *flips)), up)
+    assert said == "90°, 180°, 270° about the vertical; 180° about level axes"
+    axis = Axis(np.array([0.0, -1.0, 0.0]), np.zeros(3))
+    assert rotation_words(Symmetries(1e-3, flips[:1], (axis,)), up).startswith(
+        "any angle about the vertical; 180° about"
+    )
+    assert rotation_words(Symmetries(1e-3, (), (axis,) * 3), up) == "every rotation about its centre"
+    assert rotation_words(Symmetries(1e-3), up) == "none"
 
 
 def test_settings_and_names_are_text_and_nothing_more(page: str) -> None:

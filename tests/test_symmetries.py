@@ -12,6 +12,7 @@ from trimesh.transformations import random_rotation_matrix
 from modeler import se3
 from modeler.export.bop import symmetry_entries
 from modeler.fusion import Symmetries, SymmetryFinder
+from modeler.fusion.paint import cielab
 from modeler.types import Array
 
 SIGMA_M = 3e-4
@@ -112,6 +113,67 @@ def test_a_small_part_on_a_body_of_revolution_counts() -> None:
     result = found(trimesh.util.concatenate([can, handle]))
     assert (result.discrete, result.continuous) == ((), ())
     assert "none" in result.words
+
+
+def test_a_can_that_lies_is_seen_in_part_and_only_its_half_turn_is_claimed() -> None:
+    """Turns about its own axis bring up what the table hid; half turns about axes beside the vertical are one."""
+    can = trimesh.creation.cylinder(0.04, 0.12, sections=96)
+    can.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2.0, [1.0, 0.0, 0.0]))
+    vertices, triangles, up = noisy(can)
+    heights = (vertices[triangles] @ up).mean(axis=1)
+    seen = triangles[heights > heights.min() + 0.008]
+    result = SymmetryFinder().find(vertices, seen, up=up, sigma_m=SIGMA_M)
+    (half_turn,), (own,) = result.discrete, result.seen_in_part
+    assert result.continuous == ()
+    assert abs(own.direction @ up) < 0.05
+    assert se3.rotation_angle(half_turn) == pytest.approx(np.pi)
+    np.testing.assert_allclose(half_turn[:3, :3] @ own.direction, -own.direction, atol=0.05)
+    assert "not seen all around" in result.words
+
+
+def checked(points: Array) -> Any:
+    """Colours (n, 3) of a print that no rotation maps onto itself: darker to one side, in stripes of three widths."""
+    stripes = np.sin(90.0 * points[:, 0]) + np.sin(151.0 * points[:, 1]) + np.sin(211.0 * points[:, 2])
+    grey = 120.0 + 60.0 * np.clip(stripes + 8.0 * points[:, 1], -1.0, 1.0)
+    return np.stack([grey, 0.8 * grey, np.full_like(grey, 60.0)], axis=1).astype(np.uint8)
+
+
+def test_colour_breaks_the_symmetries_of_a_shape_that_it_tells_apart() -> None:
+    vertices, triangles, up = noisy(SHAPES["box"][0])
+    place = vertices - vertices.mean(axis=0)
+    shades = np.random.default_rng(0).normal(0.0, 4.0, (len(vertices), 1))
+    plain = np.clip(np.array([[150.0, 120.0, 60.0]]) + shades, 0, 255).astype(np.uint8)
+    for colours, kept in ((plain, True), (checked(place), False)):
+        result = SymmetryFinder().find(vertices, triangles, up=up, sigma_m=SIGMA_M, colours=colours, closed=True)
+        assert (len(result.discrete), len(result.continuous)) == (3, 0)
+        left = result.with_colour
+        assert left is not None
+        assert (len(left.discrete), len(left.continuous)) == ((3, 0) if kept else (0, 0))
+        assert ("with colour: none" in result.words) != kept
+
+
+def test_of_an_axis_that_colour_breaks_the_turns_that_it_leaves_are_found() -> None:
+    """A can with a label on each of its four sides."""
+    can = trimesh.creation.cylinder(0.04, 0.12, sections=96)
+    rng = np.random.default_rng(0)
+    vertices, triangles = trimesh.remesh.subdivide_to_size(can.vertices, can.faces, max_edge=0.005)[:2]
+    side = np.cos(4.0 * np.arctan2(vertices[:, 1], vertices[:, 0])) > 0.2
+    label = side & (np.abs(vertices[:, 2]) < 0.05)
+    colours = np.where(label[:, None], [200, 40, 40], [220, 220, 210]).astype(np.uint8)
+    vertices = vertices + SIGMA_M * rng.normal(size=vertices.shape)
+    up = np.array([0.0, 0.0, 1.0])
+    result = SymmetryFinder().find(vertices, triangles, up=up, sigma_m=SIGMA_M, colours=colours, closed=True)
+    assert len(result.continuous) == 1
+    assert result.with_colour is not None
+    assert result.with_colour.continuous == ()
+    about_up = [pose for pose in result.with_colour.discrete if abs(pose[2, 2] - 1.0) < 0.01]
+    assert len(about_up) == 3
+
+
+def test_cielab_has_white_black_and_primaries_where_they_are() -> None:
+    srgb = np.array([[255.0, 255.0, 255.0], [0.0, 0.0, 0.0], [255.0, 0.0, 0.0], [0.0, 0.0, 255.0]])
+    known = [[100.0, 0.0, 0.0], [0.0, 0.0, 0.0], [53.24, 80.09, 67.20], [32.30, 79.19, -107.86]]
+    np.testing.assert_allclose(cielab(srgb), known, atol=0.1)
 
 
 def test_bop_entries_hold_the_symmetries_in_the_frame_and_unit_of_the_model() -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from modeler.export.checks import Checks, loaded, mesh_checks
 from modeler.export.standing import model_up
 from modeler.export.texture import TRIANGLES, Texture
 from modeler.fusion import Fuser, FusionVolume, Symmetries, SymmetryFinder
-from modeler.types import InputError, ObjectModel
+from modeler.types import Array, InputError, ObjectModel
 from sequences import write_bop
 
 _FILES: Final = {"foundationpose": ".obj", "print": ".stl"}
@@ -245,10 +245,8 @@ class Preset:
             model = files.simplified(model, self.options.triangles)
         model = solids.without_degenerate(model)
         place = files.placement(model, run.report, "bbox", "z")
-        found = self._symmetries(model)
-        axes = ((axis.direction, axis.point_m) for axis in found.continuous)
-        entries = bop.symmetry_entries(found.discrete, axes, place.object_from_mesh)
-        entries["symmetries_tolerance_mm"] = 1000.0 * found.tolerance_m
+        found = SymmetryFinder().find_in(model, model_up(run.report)[0])
+        entries = _symmetry_entries(found, place.object_from_mesh)
         files.write_bop(model, self._bop_model, place, entries)
         self._tell(place)
         say(found.words)
@@ -268,17 +266,6 @@ class Preset:
             count += len(shots)
         words = f"{count} frames with masks, boxes and poses in {len(scenes)} scene{'s' if len(scenes) > 1 else ''}"
         return mesh_checks(self._bop_model, unit_m=1e-3, most_triangles=10**7).also(self._reads_back(scenes), words)
-
-    def _symmetries(self, model: ObjectModel) -> Symmetries:
-        """Return the rotations that map a mesh of the object frame onto itself, as far as it was seen."""
-        sigmas_m = model.vertex_sigmas_m
-        known = np.zeros(0) if sigmas_m is None else sigmas_m[np.isfinite(sigmas_m)]
-        return SymmetryFinder().find(
-            model.vertices_m,
-            model.triangles,
-            up=model_up(self._reopened.report)[0],
-            sigma_m=float(np.median(known)) if len(known) else 0.0,
-        )
 
     def _sides(self) -> dict[str, list[int]]:
         """Return the frames of each scene: BOP's static onboarding has one of the object upright, one turned over."""
@@ -304,6 +291,24 @@ class Preset:
 
     def _tell(self, place: files.Placement) -> None:
         say(f"{self.options.out}: {place.words}")
+
+
+def _symmetry_entries(found: Symmetries, object_from_mesh: Array) -> dict[str, Any]:
+    """Return what `models_info.json` says of symmetries: BOP's are those that colour does not resolve.
+
+    Those of the shape alone stand beside them where colour is known, as `shape_symmetries_…`.
+    """
+
+    def entries(of: Symmetries) -> dict[str, Any]:
+        axes = ((axis.direction, axis.point_m) for axis in of.continuous)
+        return bop.symmetry_entries(of.discrete, axes, object_from_mesh)
+
+    left, of_shape = found.with_colour, entries(found)
+    if left is None:
+        told = of_shape
+    else:
+        told = {**entries(left), **{f"shape_{name}": values for name, values in of_shape.items()}}
+    return {**told, "symmetries_tolerance_mm": 1000.0 * found.tolerance_m}
 
 
 @contextlib.contextmanager

@@ -1,8 +1,8 @@
-"""Rotations that map the surface of a model onto itself, as far as it was seen."""
+"""Rotations that map a model onto itself as far as it was seen: its shape, and its shape with its colours."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,12 +10,16 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.fusion.alignment import even_rotations
-from modeler.types import Array, BoolArray
+from modeler.fusion.paint import Paint, SurfacePoints, cielab
+from modeler.types import Array, BoolArray, ObjectModel
 
 ORDERS = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 16)
 """Orders n of rotations by 360°/n that are tried about the likely axes; about the others, 2 and 3."""
+_MOST = 59  # rotations of a finite group, but for those about one axis (an icosahedron's): more belong to a ball
 _LIKELY = 6
 _NEAR = (0.2, 0.3, 0.5, 0.6, 0.7)  # of the points, within three tolerances at each step of ICP: else it is given up
+_SMALL_DEG = (5.0, 8.0, 12.0)  # turns that bring up little of what was not seen, and map no n-fold shape onto itself
+_PAINTED = 40_000  # points whose colours are looked up: 0.7 % of the diameter apart on a cube, of 1 % that is tolerated
 _GENERIC_DEG = 360.0 * (np.arange(1, 13) * 0.61803398875 % 1.0)  # no two of them, nor their differences, make an order
 
 
@@ -40,19 +44,31 @@ class Symmetries:
     out, and of those that differ by a turn about it, one is named."""
     continuous: tuple[Axis, ...] = ()
     """Axes about which any rotation maps the model onto itself; of a ball three, through its centre."""
+    seen_in_part: tuple[Axis, ...] = ()
+    """Axes about which small turns map the surface onto itself, but larger ones bring up what was not seen: of a can
+    that lies, say. No rotation about them is claimed."""
     compared: float = 1.0
     """Share of the seen surface that was compared, in the rotation for which it was least."""
+    with_colour: Symmetries | None = None
+    """Those under which colours stay as well; None where the model has no colour."""
 
     @property
     def words(self) -> str:
         """The same in a sentence."""
-        found = [f"{len(self.continuous)} axis of revolution"] if len(self.continuous) == 1 else []
-        found += ["all rotations about a centre"] if len(self.continuous) > 1 else []
-        found += [f"{len(self.discrete)} discrete rotation{'s' * (len(self.discrete) > 1)}"] if self.discrete else []
+        part = "; it looks like a body of revolution, but was not seen all around" if self.seen_in_part else ""
+        coloured = "" if self.with_colour is None else f"; with colour: {self.with_colour.count_words}"
         return (
             f"symmetries of the shape within {1000.0 * self.tolerance_m:.1f} mm, as far as it was seen: "
-            f"{' and '.join(found) or 'none'}"
+            f"{self.count_words}{part}{coloured}"
         )
+
+    @property
+    def count_words(self) -> str:
+        """How many there are of each kind, in words."""
+        found = ["1 axis of revolution"] if len(self.continuous) == 1 else []
+        found += ["all rotations about a centre"] if len(self.continuous) > 1 else []
+        found += [f"{len(self.discrete)} discrete rotation{'s' * (len(self.discrete) > 1)}"] if self.discrete else []
+        return " and ".join(found) or "none"
 
 
 @dataclass(frozen=True)
@@ -63,6 +79,10 @@ class SymmetryFinder:
     them, and directions spread evenly. Each is refined by point-to-plane ICP of the surface with itself. A rotation
     is a symmetry where fewer than `elsewhere` of the points end farther than the tolerance from the surface, and fewer
     than `unknown` end where no surface was seen; nothing is said of what was not compared.
+
+    Colour leaves a rotation where fewer than `repainted` of the points end farther than the tolerances of place and
+    colour from all points of the surface: BOP counts symmetries that the texture does not resolve (Hodaň et al., BOP
+    Challenge 2020), as far as an estimator sees them.
     """
 
     sigmas: float = 3.0
@@ -73,6 +93,10 @@ class SymmetryFinder:
     """Largest share of points farther than the tolerance from the surface, which allows for outliers."""
     unknown: float = 0.1
     """Largest share of points that end where nothing was seen."""
+    repainted: float = 0.05
+    """Largest share of points that find no place of like colour within the tolerance."""
+    colour_tolerance: float = 10.0
+    """Distance of like colours in CIELAB."""
     points: int = 4000
     """Points that are compared."""
     icp_points: int = 250
@@ -81,7 +105,14 @@ class SymmetryFinder:
     """Directions spread evenly over half a sphere."""
 
     def find(
-        self, vertices_m: Array, triangles: npt.NDArray[np.int64], *, up: Array, sigma_m: float, closed: bool = False
+        self,
+        vertices_m: Array,
+        triangles: npt.NDArray[np.int64],
+        *,
+        up: Array,
+        sigma_m: float,
+        colours: npt.NDArray[np.uint8] | None = None,
+        closed: bool = False,
     ) -> Symmetries:
         """Return the symmetries of a surface.
 
@@ -90,11 +121,37 @@ class SymmetryFinder:
             triangles: (t, 3) vertex numbers, counter-clockwise from outside.
             up: (3,) unit, normal of the support, or whatever axis is likely.
             sigma_m: standard deviation of the surface along its normal.
+            colours: (v, 3) sRGB, where they are known.
             closed: whether all of the surface was seen, so that nothing ends where it was not.
         """
         surface = _Surface.of(vertices_m, triangles, self.points, closed=closed)
         tolerance_m = max(self.sigmas * np.sqrt(2.0) * sigma_m, self.least_share * surface.diameter_m)
         search = _Search(self, surface, tolerance_m)
+        of_shape = self._of_shape(search, up)
+        if colours is None:
+            return of_shape
+        search.paint(vertices_m, triangles, cielab(colours.astype(np.float64)))
+        return replace(of_shape, with_colour=self._left_by_colour(search, of_shape))
+
+    def find_in(self, model: ObjectModel, up: Array) -> Symmetries:
+        """Return the symmetries of a model, as far as its surface was seen.
+
+        Args:
+            model: with a mesh.
+            up: (3,) unit, normal of the support, or whatever axis is likely.
+        """
+        sigmas_m = model.vertex_sigmas_m
+        seen = np.ones(len(model.vertices_m), dtype=bool) if sigmas_m is None else np.isfinite(sigmas_m)
+        return self.find(
+            model.vertices_m,
+            model.triangles[seen[model.triangles].all(axis=1)],
+            up=up,
+            sigma_m=0.0 if sigmas_m is None or not seen.any() else float(np.median(sigmas_m[seen])),
+            colours=model.vertex_colours,
+        )
+
+    def _of_shape(self, search: _Search, up: Array) -> Symmetries:
+        """Return the symmetries of the shape."""
         likely = search.likely_axes(up)
         continuous: list[Axis] = []
         for direction in likely:
@@ -109,18 +166,40 @@ class SymmetryFinder:
             centre = _meeting_point(continuous)
             axes = tuple(Axis(direction, centre) for direction in np.eye(3))
             if all(search.maps(_rotation(axis, np.radians(a))) for axis in axes for a in _GENERIC_DEG[:4]):
-                return Symmetries(tolerance_m, (), axes, search.compared)
+                return Symmetries(search.tolerance_m, (), axes, compared=search.compared)
             continuous = continuous[:1]
+        in_part = search.seen_in_part(likely, continuous)
+        sliding = [*continuous, *in_part]
         found: list[Array] = []
-        others = search.other_axes(likely)
-        for place, direction in enumerate((*likely, *others)):
-            for order in ORDERS if place < len(likely) else ORDERS[:2]:
-                axis = search.refined(direction, 360.0 / order)
-                if axis is None or any(_parallel(axis, other) for other in continuous):
-                    continue
-                search.add(found, continuous, *(_rotation(axis, 2.0 * np.pi * k / order) for k in range(1, order)))
-        search.close(found, continuous)
-        return Symmetries(tolerance_m, tuple(found), tuple(continuous), search.compared)
+        if len(sliding) < 2:  # of a ball no rotation differs from the others
+            others = search.other_axes(likely)
+            for place, direction in enumerate((*likely, *others)):
+                for order in ORDERS if place < len(likely) else ORDERS[:2]:
+                    axis = search.refined(direction, 360.0 / order)
+                    if axis is None or any(_parallel(axis, other) for other in sliding):
+                        continue
+                    search.add(found, sliding, *(_rotation(axis, 2.0 * np.pi * k / order) for k in range(1, order)))
+            search.close(found, sliding)
+        if len(found) > _MOST:
+            found, in_part = [], [Axis(direction, search.surface.points_m.mean(axis=0)) for direction in np.eye(3)]
+        return Symmetries(search.tolerance_m, tuple(found), tuple(continuous), tuple(in_part), search.compared)
+
+    def _left_by_colour(self, search: _Search, of_shape: Symmetries) -> Symmetries:
+        """Return the symmetries of the shape under which colours stay.
+
+        Of an axis of revolution that colour breaks, the turns by 360°/n about it are tried.
+        """
+        axes = of_shape.continuous
+        continuous = tuple(a for a in axes if all(search.stays(_rotation(a, np.radians(t))) for t in _GENERIC_DEG))
+        if len(axes) > 1 and len(continuous) < len(axes):
+            continuous = ()
+        discrete = [pose for pose in of_shape.discrete if search.stays(pose)]
+        if len(axes) == 1 and not continuous:
+            for order in ORDERS:
+                turns = [_rotation(axes[0], 2.0 * np.pi * k / order) for k in range(1, order)]
+                if all(search.stays(turn) for turn in turns):
+                    search.add(discrete, [], *turns)
+        return Symmetries(search.tolerance_m, tuple(discrete), continuous, compared=search.compared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +208,7 @@ class _Surface:
 
     points_m: Array
     normals: Array
+    drawn: SurfacePoints
     scene: object
     at_border: BoolArray
     """(t,) triangles beside which the surface is not known."""
@@ -139,15 +219,10 @@ class _Surface:
     def of(vertices_m: Array, triangles: npt.NDArray[np.int64], count: int, *, closed: bool) -> _Surface:
         import open3d as o3d
 
-        corners = vertices_m[triangles]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        areas = np.linalg.norm(normals, axis=1)
-        rng = np.random.default_rng(0)
-        picked = rng.choice(len(triangles), count, p=areas / areas.sum())
-        u, v = rng.random((2, count))
-        u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
-        at = corners[picked]
-        points = at[:, 0] + u[:, None] * (at[:, 1] - at[:, 0]) + v[:, None] * (at[:, 2] - at[:, 0])
+        drawn = SurfacePoints.draw(vertices_m, triangles, count, np.random.default_rng(0))
+        points = drawn.of(vertices_m)
+        one, two, three = np.moveaxis(vertices_m[drawn.corners], 1, 0)
+        normals = np.cross(two - one, three - one)
         scene = o3d.t.geometry.RaycastingScene()
         tensor = o3d.core.Tensor.from_numpy
         scene.add_triangles(tensor(vertices_m.astype(np.float32)), tensor(triangles.astype(np.uint32)))
@@ -156,9 +231,8 @@ class _Surface:
         border: BoolArray = np.zeros(len(vertices_m), dtype=bool)
         border[distinct[counts == 1].ravel()] = not closed
         extent_m = float(np.linalg.norm(np.ptp(points, axis=0)))
-        return _Surface(
-            points, normals[picked] / areas[picked, None], scene, np.any(border[triangles], axis=1), closed, extent_m
-        )
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return _Surface(points, normals, drawn, scene, np.any(border[triangles], axis=1), closed, extent_m)
 
     def nearest(self, points_m: Array) -> tuple[Array, Array, npt.NDArray[np.int64]]:
         """Return the nearest points (n, 3) on the surface, their normals (n, 3) and triangles (n,)."""
@@ -178,6 +252,8 @@ class _Search:
     surface: _Surface
     tolerance_m: float
     compared: float = field(default=1.0)
+    _paint: Paint | None = None
+    _colours: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     def likely_axes(self, up: Array) -> list[Array]:
         """Return the vertical, the principal axes and the directions in which most of the surface faces, distinct."""
@@ -260,41 +336,72 @@ class _Search:
         self.compared = min(self.compared, 1.0 - unknown)
         return True
 
+    def seen_in_part(self, likely: list[Array], continuous: list[Axis]) -> list[Axis]:
+        """Return axes about which small turns map the surface onto itself, of which larger ones are not claimed."""
+        found: list[Axis] = []
+        for direction in likely:
+            axis = self.refined(direction, _SMALL_DEG[-1])
+            if axis is None or any(_parallel(axis, other) for other in (*continuous, *found)):
+                continue
+            if all(self.maps(_rotation(axis, np.radians(sign * a))) for a in _SMALL_DEG for sign in (-1.0, 1.0)):
+                found.append(axis)
+        return found
+
+    def paint(self, vertices_m: Array, triangles: npt.NDArray[np.int64], colours: Array) -> None:
+        """Let `stays` compare colours (v, 3) in CIELAB."""
+        dense = SurfacePoints.draw(vertices_m, triangles, _PAINTED, np.random.default_rng(1))
+        places_m, at_places = dense.of(vertices_m), dense.of(colours)
+        self._paint = Paint.of(places_m, at_places, self.tolerance_m, self.finder.colour_tolerance)
+        self._colours = self.surface.drawn.of(colours)
+
+    def stays(self, pose: Array) -> bool:
+        """Return whether a motion that maps the surface onto itself maps its colours too."""
+        assert self._paint is not None
+        elsewhere, unknown = self._ends(pose, self.finder.points)
+        compared = ~elsewhere & ~unknown
+        moved = se3.transform(pose, self.surface.points_m[compared])
+        return bool(np.mean(self._paint.differs(moved, self._colours[compared])) <= self.finder.repainted)
+
     def _shares(self, pose: Array, count: int) -> tuple[float, float]:
         """Return the shares of points that end away from the surface, and where none was seen."""
+        elsewhere, unknown = self._ends(pose, count)
+        return float(np.mean(elsewhere)), float(np.mean(unknown))
+
+    def _ends(self, pose: Array, count: int) -> tuple[BoolArray, BoolArray]:
+        """Return which of the first points end away from the surface, and which where none was seen."""
         moved = se3.transform(pose, self.surface.points_m[:count])
         at, facing, numbers = self.surface.nearest(moved)
         far = np.linalg.norm(moved - at, axis=1) > self.tolerance_m
         # Beside or behind the border of what was seen there may be surface; in front of it there is none.
         ahead = np.sum(facing * (moved - at), axis=1) > self.tolerance_m
         unknown = far & self.surface.at_border[numbers] & ~ahead
-        return float(np.mean(far & ~unknown)), float(np.mean(unknown))
+        return far & ~unknown, unknown
 
-    def add(self, found: list[Array], continuous: list[Axis], *poses: Array) -> None:
+    def add(self, found: list[Array], sliding: list[Axis], *poses: Array) -> None:
         """Add motions that map the surface onto itself and are not there yet."""
         for pose in poses:
-            if self._is_new(pose, found, continuous) and self.maps(pose):
+            if self._is_new(pose, found, sliding) and self.maps(pose):
                 found.append(pose)
 
-    def _is_new(self, pose: Array, found: list[Array], continuous: list[Axis]) -> bool:
+    def _is_new(self, pose: Array, found: list[Array], sliding: list[Axis]) -> bool:
         if se3.rotation_angle(pose) < np.radians(5.0):
             return False
-        if not continuous:
+        if not sliding:
             return all(se3.rotation_angle(se3.inverse(pose) @ other) > np.radians(5.0) for other in found)
         # About an axis of revolution, what takes the axis to the same place is the same.
-        direction = continuous[0].direction
+        direction = sliding[0].direction
         ends = [direction, *(other[:3, :3] @ direction for other in found)]
         return all(pose[:3, :3] @ direction @ end < np.cos(np.radians(5.0)) for end in ends)
 
-    def close(self, found: list[Array], continuous: list[Axis]) -> None:
-        """Add products until there are no new ones: symmetries are a group, of 59 rotations at most but for axes."""
+    def close(self, found: list[Array], sliding: list[Axis]) -> None:
+        """Add products until there are no new ones, for symmetries are a group."""
         tried = 0
-        while tried < len(found) < 64:
+        while tried < len(found) <= _MOST:
             one = found[tried]
             for other in list(found):
                 product = _snapped(one @ other)
                 if product is not None:
-                    self.add(found, continuous, product)
+                    self.add(found, sliding, product)
             tried += 1
 
 

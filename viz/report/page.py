@@ -22,6 +22,7 @@ from viz.report.cards import data_address, mask_cards, pair_cards, thumbnails
 from viz.report.evidence import evidence_table
 from viz.report.mesh import Mesh, portrait, read_mesh, scene
 from viz.report.run_data import Result, Row, recorded, surfaces
+from viz.report.symmetries import symmetry_section
 
 _SHAPE_POINTS: Final = 6_000
 _CAMERA_SHARE: Final = 0.12  # length of a drawn camera, as a share of its distance
@@ -43,7 +44,7 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
     centre_m = se3.transform(result.poses[result.first].mean, np.zeros((1, 3)))[0] if mesh is None else mesh.centre_m
     rows = recorded(run / "recording.rrd")
     parts = [_head(result, mesh), *_model(result, mesh), evidence_table(result.report.get("evidence") or {})]
-    parts += [*_trajectory(result, mesh, centre_m)]
+    parts += [*symmetry_section(run / "model.ply", result.report), *_trajectory(result, mesh, centre_m)]
     parts += [*_closure(result, rows), *_accuracy(result, centre_m), *mask_cards(result, pictures := thumbnails(rows))]
     parts += pair_cards(result, pictures, centre_m)
     parts.append(_settings(result))

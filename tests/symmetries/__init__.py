@@ -1,0 +1,1 @@
+"""Whether the symmetries found are those of shapes of known class."""
