@@ -36,6 +36,7 @@ from modeler.cli.join import Join
 from modeler.cli.register import Register
 from modeler.cli.render import Render
 from modeler.cli.report import Report
+from modeler.cli.suggest import Suggest
 from modeler.cli.view import View
 
 Command = (
@@ -52,6 +53,7 @@ Command = (
     | Report
     | Export
     | Join
+    | Suggest
     | Gallery
 )
 
@@ -69,6 +71,7 @@ COMMANDS: dict[str, type[Command]] = {
     "report": Report,
     "export": Export,
     "join": Join,
+    "suggest": Suggest,
     "gallery": Gallery,
 }
 _STYLE = (

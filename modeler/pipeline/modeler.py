@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,6 +20,7 @@ from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
+from modeler.suggestion import Belief, Candidate, Goal, Suggestions, suggest
 from modeler.types import (
     AbstractPrior,
     AbstractRegistrar,
@@ -33,6 +34,7 @@ from modeler.types import (
     Reason,
     Refining,
     Searching,
+    Solution,
     Step,
 )
 
@@ -107,6 +109,35 @@ class Modeler:
             InputError: where the views lack what the prior needs.
         """
         return self._register(self.registrar, source, target, self.prior if prior is None else prior)
+
+    def suggest(
+        self, known: Step, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None
+    ) -> Suggestions:
+        """Return what to do next: the view, turn or poke that tells most of poses and surface.
+
+        Args:
+            known: the newest step of a run.
+            candidates: what can be done; None: turns either way, pokes, laying the object on its side.
+            goal: what is good enough; None: every pose known to 1°, 95 % of what can be seen was seen.
+
+        Raises:
+            InputError: where no view has a pose yet.
+        """
+        return suggest(self.belief(known.views, known.solution, known.edges_so_far), candidates, goal)
+
+    def belief(self, views: Mapping[int, RayImage], solution: Solution, edges: Sequence[Edge]) -> Belief:
+        """Return what is known after some views, and what further ones would go through.
+
+        Raises:
+            InputError: where no view has a pose.
+        """
+
+        def ready(view: RayImage) -> RayImage:
+            return view if view.layers else self.sensor.ray_image(view.frame, view.plane)
+
+        likelihood = self.registrar.likelihood if isinstance(self.registrar, VisibilityRegistrar) else None
+        prior = self.prior.learned(solution, edges)
+        return Belief.of(views, solution, edges, prior, closer=self.closer, likelihood=likelihood, ready=ready)
 
     def tracker(self, state: State) -> Tracker:
         """Return what registers the views of a run with these components."""

@@ -1,0 +1,112 @@
+"""`modeler suggest`: what to do next."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from modeler.cli.console import say
+from modeler.cli.options import MovedOptions, default
+
+if TYPE_CHECKING:
+    from modeler.suggestion import Goal
+
+_SHOWN = 8  # of the ranked list, without --all
+
+
+@dataclass(frozen=True)
+class Suggest:
+    """Say what to do next: the turn, poke or view that tells most of an object's poses and surface.
+
+    Prints a ranked list: what each action should bring, as predicted from the model, its uncertainty and what no view
+    has seen. With a goal (--until-...), the status is 0 where it is reached, and 3 where it is not.
+    """
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """Run folder, as `modeler build` makes it."""
+    candidates: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("turns, pokes, laying it down")] = None
+    """What can be done, with costs: JSON or TOML, or CSV of poses (docs/reference.md, "What to do next")."""
+    until_sigma_mm: Annotated[float | None, tyro.conf.arg(metavar="MM"), default("none")] = None
+    """Goal: the surface of every view is known to this standard deviation, by noise and pose."""
+    until_seen: Annotated[float | None, tyro.conf.arg(metavar="SHARE"), default("none")] = None
+    """Goal: this share (0 to 1) of what turns on the table can show was seen."""
+    until_pose_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("none")] = None
+    """Goal: the rotation of every pose is known to this standard deviation."""
+    all: bool = False
+    """List every action, not the best few."""
+    json: bool = False
+    """Write the list as JSON, for programs."""
+    moved: MovedOptions = field(default_factory=MovedOptions)
+
+    def run(self) -> int:
+        """Print the list; status 3 where a goal was given and is not reached.
+
+        Raises:
+            InputError: where the run or the candidates cannot be used.
+        """
+        from modeler.cli.candidate_file import read_candidates
+        from modeler.cli.inputs import reopened
+        from modeler.suggestion import suggest
+        from modeler.types import InputError
+
+        goal, asked = self._goal()
+        given = None if self.candidates is None else read_candidates(self.candidates)
+        run = reopened(self.run_folder, self.moved.sequence)
+        part, *others = run.parts
+        if others:
+            raise InputError(f"{self.run_folder}: joins several runs; ask about one of them")
+        belief = part.modeler().belief(run.views, run.solution, run.edges)
+        found = suggest(belief, given, goal)
+        if self.json:
+            print(json.dumps([each.record() for each in found.ranked], allow_nan=False, indent=1))
+        else:
+            shown = found.ranked if self.all else found.ranked[:_SHOWN]
+            for each in () if found.reached else shown:
+                print(each.words)
+        trusted = bool(run.report["trustworthy"])
+        if not asked:
+            say(found.summary)
+            return 0
+        say(_verdict(found.summary, reached=found.reached, trusted=trusted))
+        return 0 if found.reached and trusted else 3
+
+    def _goal(self) -> tuple[Goal, bool]:
+        """Return what is good enough, and whether the user said so.
+
+        Raises:
+            InputError: where a goal is out of range.
+        """
+        from modeler.suggestion import Goal
+        from modeler.types import InputError
+
+        limits = {"mm": self.until_sigma_mm, "deg": self.until_pose_deg, "share": self.until_seen}
+        names = {"mm": "--until-sigma-mm", "deg": "--until-pose-deg", "share": "--until-seen"}
+        for unit, value in limits.items():
+            largest = 1.0 if unit == "share" else math.inf
+            if value is not None and not (0.0 < value <= largest and math.isfinite(value)):
+                wanted = "a share above 0 and up to 1" if unit == "share" else f"a positive number of {unit}"
+                raise InputError(f"{names[unit]} {value:g} is out of range; give {wanted}")
+        asked = any(value is not None for value in limits.values())
+        if not asked:
+            return Goal(), False
+        return (
+            Goal(
+                pose_deg=math.inf if self.until_pose_deg is None else self.until_pose_deg,
+                seen=0.0 if self.until_seen is None else self.until_seen,
+                sigma_m=None if self.until_sigma_mm is None else 1e-3 * self.until_sigma_mm,
+            ),
+            True,
+        )
+
+
+def _verdict(summary: str, *, reached: bool, trusted: bool) -> str:
+    if reached and trusted:
+        return f"good enough: {summary}"
+    if reached:
+        return f"would be good enough, but the run is not to be trusted (see its report.json): {summary}"
+    return f"not yet good enough: {summary}"

@@ -1,0 +1,407 @@
+"""What is known of an object after some views, and how much a further view would tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import Final, final
+
+import numpy as np
+
+from modeler import se3
+from modeler.closure import Closer, MapView
+from modeler.priors import TurntablePrior
+from modeler.priors.mixtures import Gaussian
+from modeler.registration import VisibilityLikelihood
+from modeler.suggestion.candidates import Candidate
+from modeler.suggestion.edge_forecast import USUAL_NOISE, EdgeForecast, ForeseenEdge, ForeseenView
+from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information
+from modeler.suggestion.surface_cells import IntArray, Stand, SurfaceCells
+from modeler.types import (
+    AbstractPoseDensity,
+    AbstractPrior,
+    Array,
+    BoolArray,
+    Edge,
+    Frame,
+    InputError,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    Solution,
+)
+
+_POINTS: Final = 1500  # of a view by which its surface is judged
+_SPAN_STEPS: Final = 4  # whose limits hold for closures too, over any number of steps
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What an action is expected to bring."""
+
+    candidate: Candidate
+    """The action."""
+    pose_nats: float
+    """By how much ½ log det of the poses so far should fall."""
+    surface_nats: float
+    """By how much the entropy of the surface, given the poses, should fall: seen again, or for the first time."""
+    mode_nats: float
+    """Entropy of the modes of the edge that places the new view."""
+    right: float
+    """Probability (0..1) that the new view is placed at the true mode."""
+    new_surface: float
+    """Share (0..1) of the surface in the view that no view has seen."""
+    spin_deg: float
+    """Largest standard deviation afterwards of a pose's turn about the table's normal."""
+    pose_deg: float
+    """Largest standard deviation afterwards of a pose's rotation about any axis."""
+    new_covariance: Array
+    """(6, 6) of the new pose's error in object coordinates."""
+    edges: tuple[ForeseenEdge, ...]
+    """What the view would be registered with, and what that would give."""
+
+    @property
+    def gain_nats(self) -> float:
+        """The expected reduction of uncertainty: of poses and surface, if the view is placed where it belongs."""
+        return self.right * (self.pose_nats + self.surface_nats)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """Poses and surface as they are known, and the components of the run that a new view would go through."""
+
+    views: Mapping[int, RayImage]
+    """By frame number."""
+    solution: Solution
+    """The poses."""
+    edges: Sequence[Edge]
+    """Every edge judged so far."""
+    prior: AbstractPrior
+    """What is known of a motion."""
+    closer: Closer = field(default_factory=Closer)
+    """Chooses what a view is registered with."""
+    forecast: EdgeForecast = field(default_factory=EdgeForecast)
+    """Predicts edges."""
+    ready: Callable[[RayImage], RayImage] = field(default=lambda view: view)
+    """Returns a view with the images that a likelihood looks up, which are ten times as large as the frame."""
+
+    @classmethod
+    def of(
+        cls,
+        views: Mapping[int, RayImage],
+        solution: Solution,
+        edges: Sequence[Edge],
+        prior: AbstractPrior,
+        *,
+        closer: Closer | None = None,
+        likelihood: VisibilityLikelihood | None = None,
+        ready: Callable[[RayImage], RayImage] = lambda view: view,
+    ) -> Belief:
+        """Return what is known after some views, with noise and scale of predictions from the edges so far.
+
+        Arguments as the fields.
+
+        Raises:
+            InputError: where no view has a pose and surface points.
+        """
+        posed = {frame: view for frame, view in views.items() if frame in solution.trajectory and len(view.points_m)}
+        if not posed:
+            raise InputError("no view with surface points has a pose: there is nothing to go on from")
+        ready = lru_cache(maxsize=None)(ready)
+        noise_m = USUAL_NOISE * float(np.median([view.sigma_r_m for view in posed.values()]))
+        forecast = EdgeForecast(VisibilityLikelihood() if likelihood is None else likelihood, noise_m)
+        forecast = forecast.learned(edges, posed, solution, prior, ready)
+        return cls(posed, solution, edges, prior, Closer() if closer is None else closer, forecast, ready)
+
+    @property
+    def last(self) -> RayImage:
+        """The newest view that has a pose."""
+        return self.views[max(frame for frame in self.solution.trajectory if frame in self.views)]
+
+    @property
+    def object_from_last(self) -> Array:
+        """Its pose (4, 4)."""
+        return self.solution.trajectory[self.last.index]
+
+    @cached_property
+    def stand(self) -> Stand:
+        """Where the object stands."""
+        return Stand.of(self.views, self.solution)
+
+    @cached_property
+    def cells(self) -> SurfaceCells:
+        """What of the surface was seen, and what may be seen yet."""
+        return SurfaceCells.of(self.views, self.solution, self.stand)
+
+    @cached_property
+    def can_be_seen(self) -> BoolArray:
+        """Which cells (c,) some turn on the table shows to the camera."""
+        return self.cells.around(self.object_from_last) | self.cells.seen
+
+    @property
+    def seen(self) -> float:
+        """Share (0..1) of the surface that turns on the table can show that was seen."""
+        return float(np.count_nonzero(self.cells.seen) / max(np.count_nonzero(self.can_be_seen), 1))
+
+    @cached_property
+    def poses(self) -> PoseGraphBelief:
+        """The joint Gaussian of the poses."""
+        return PoseGraphBelief.of(self.edges, self.solution)
+
+    @property
+    def spin_deg(self) -> float:
+        """Largest standard deviation of a pose's turn about the table's normal."""
+        return _spin_deg(self.poses.marginals, self.stand.up)
+
+    @property
+    def pose_deg(self) -> float:
+        """Largest standard deviation of a pose's rotation about any axis."""
+        return _pose_deg(self.poses.marginals)
+
+    @cached_property
+    def sigma_m(self) -> float:
+        """Standard deviation of the surface along its normal, by noise and poses: root mean square of the worst view.
+
+        Poses err relative to the first.
+        """
+        worst_m2 = 0.0
+        for frame, covariance in self.poses.marginals.items():
+            if frame in self.views and len(self.views[frame].points_m):
+                points_m, normals, variances_m2 = self._some_points(self.views[frame])
+                variance = variances_m2 + displacement_m2(points_m, normals, covariance)
+                worst_m2 = max(worst_m2, float(np.mean(variance)))
+        return float(np.sqrt(worst_m2))
+
+    @cached_property
+    def cell_variances_m2(self) -> Array:
+        """Variance (c,) of the surface in each cell along its normal, by noise and poses; of unseen one its spread."""
+        information = np.zeros(len(self.cells.points_m))
+        for frame, covariance in self.poses.marginals.items():
+            if frame not in self.views:
+                continue
+            pose = self.solution.trajectory[frame]
+            mine, _ = self.cells.at(se3.transform(pose, self.views[frame].points_m))
+            information[mine] += 1.0 / self._measured_m2(
+                self.cells.points_m[mine], self.cells.normals[mine], covariance
+            )
+        spread_m2 = self.cells.depth_sd_m**2
+        return 1.0 / (information + 1.0 / spread_m2)
+
+    def predict(self, candidate: Candidate) -> Prediction | None:
+        """Return what an action is expected to bring; None where the prior excludes it or nothing would be seen."""
+        new_from_last = candidate.motion(self.last, self.stand, self.object_from_last)
+        object_from_new = self.object_from_last @ se3.inverse(new_from_last)
+        visible = self.cells.visible(se3.inverse(object_from_new))
+        if candidate.action == "lay":
+            return self._laid(candidate, visible)
+        visible = visible[~self.cells.under[visible]]
+        foreseen = self._foreseen(object_from_new, visible, candidate)
+        if foreseen is None or not len(visible):
+            return None
+        edges = self._edges(foreseen, object_from_new, candidate)
+        if not edges:
+            return None
+        new = foreseen.image.index
+        gain = self.poses.gain([(e.target, edge_information(object_from_new, e.covariance)) for e in edges], new)
+        return Prediction(
+            candidate=candidate,
+            pose_nats=gain.nats,
+            surface_nats=self.surface_nats(visible, gain.covariances[new]),
+            mode_nats=edges[0].mode_nats,
+            right=edges[0].right,
+            new_surface=self.new_share(visible),
+            spin_deg=_spin_deg(gain.covariances, self.stand.up),
+            pose_deg=_pose_deg(gain.covariances),
+            new_covariance=gain.covariances[new],
+            edges=edges,
+        )
+
+    def _laid(self, candidate: Candidate, visible: IntArray) -> Prediction | None:
+        """Return what the first view of an object on its side brings; joining the two runs finds its pose."""
+        if not len(visible):
+            return None
+        covariance = self.poses.marginals[self.last.index]
+        return Prediction(
+            candidate=candidate,
+            pose_nats=0.0,
+            surface_nats=self.surface_nats(visible, covariance),
+            mode_nats=0.0,
+            right=1.0,
+            new_surface=self.new_share(visible),
+            spin_deg=self.spin_deg,
+            pose_deg=self.pose_deg,
+            new_covariance=covariance,
+            edges=(),
+        )
+
+    def new_share(self, cells: IntArray) -> float:
+        """Return the share of some cells (k,) in which nothing was seen."""
+        weights = self._surface_in(cells)
+        return float(weights[~self.cells.seen[cells]].sum() / max(weights.sum(), 1e-9))
+
+    def _surface_in(self, cells: IntArray) -> Array:
+        """Return how much surface (k,), in cells, is expected in each of some cells."""
+        hidden = ~(self.cells.seen | self.cells.under)[cells]
+        return np.where(hidden, self.cells.solidity, 1.0)
+
+    def surface_nats(self, cells: IntArray, covariance: Array) -> float:
+        """Return by how much the entropy of the surface falls if a view sees some cells (docs/method.md, eq. N5).
+
+        Args:
+            cells: (k,) numbers of the cells.
+            covariance: (6, 6) of the view's pose in object coordinates.
+        """
+        points_m, normals = self.cells.points_m[cells], self.cells.normals[cells]
+        after_m2 = self._measured_m2(points_m, normals, covariance)
+        gains = 0.5 * np.log1p(self.cell_variances_m2[cells] / after_m2)
+        return self._independent_share * float(self._surface_in(cells) @ gains)
+
+    def brought(self, view: RayImage, object_from_camera: Array, covariance: Array) -> tuple[float, float]:
+        """Return what a view that was taken brought: `surface_nats`, and the share of its surface that is new.
+
+        Args:
+            view: a view that is no part of the belief.
+            object_from_camera: (4, 4) its pose.
+            covariance: (6, 6) of the pose in object coordinates.
+        """
+        points_m = se3.transform(object_from_camera, view.points_m)
+        again, first = self.cells.at(points_m)
+        normals = view.normals[first] @ object_from_camera[:3, :3].T
+        after_m2 = self._measured_m2(points_m[first], normals, covariance)
+        new_nats = self._independent_share * float(np.sum(0.5 * np.log1p(self.cells.depth_sd_m**2 / after_m2)))
+        again = np.intersect1d(again, self.cells.visible(se3.inverse(object_from_camera)))
+        share = len(first) / max(len(first) + len(again), 1)
+        return self.surface_nats(again, covariance) + new_nats, share
+
+    @cached_property
+    def _independent_share(self) -> float:
+        """Independent measurements in a cell: those of the last view, over the cells that it sees."""
+        patches = max(self.last.patches, 1.0)
+        count = 1.0 / (1.0 / self.forecast.likelihood.max_independent + 1.0 / patches)
+        cells = self.cells.visible(se3.inverse(self.object_from_last))
+        return count / max(np.count_nonzero(self.cells.seen[cells]), 1)
+
+    def _measured_m2(self, points_m: Array, normals: Array, covariance: Array) -> Array:
+        """Return the variance (k,) along normals of a view's measurement of points, by noise and its pose."""
+        return self._noise_m2 + displacement_m2(points_m, normals, covariance)
+
+    @cached_property
+    def _noise_m2(self) -> float:
+        """Variance of a point of the last view along its normal, and the noise of matching surfaces."""
+        return self._variance_m2 + self.forecast.noise_m**2
+
+    @cached_property
+    def _variance_m2(self) -> float:
+        """Variance of a point of the last view along its normal."""
+        return float(np.median(self._some_points(self.last)[2]))
+
+    def _some_points(self, view: RayImage) -> tuple[Array, Array, Array]:
+        """Return points (n, 3), normals (n, 3), in the object frame, and variances (n,) in m² of a view."""
+        chosen = np.arange(0, len(view.points_m), max(len(view.points_m) // _POINTS, 1))
+        pose = self.solution.trajectory[view.index]
+        source = view if view.layers or view is self.last else self.last  # others are as noisy as the last
+        found = np.asarray(self.ready(source).layers["variance_m2"], dtype=np.float64)
+        variances_m2 = found[chosen] if source is view else np.full(len(chosen), np.median(found))
+        return se3.transform(pose, view.points_m[chosen]), view.normals[chosen] @ pose[:3, :3].T, variances_m2
+
+    def _foreseen(self, object_from_new: Array, visible: IntArray, candidate: Candidate) -> ForeseenView | None:
+        """Return what of the model a camera would see; None where it would see next to nothing of it."""
+        camera_from_object = se3.inverse(object_from_new)
+        points_m = se3.transform(camera_from_object, self.cells.points_m[visible])
+        normals = self.cells.normals[visible] @ camera_from_object[:3, :3].T
+        seen = np.flatnonzero(self.cells.seen[visible])
+        if len(seen) < 20:  # as few as a registration takes
+            return None
+        share = 1.0 - self.new_share(visible)
+        count = int(self.forecast.likelihood.points * share)
+        some = seen[np.linspace(0, len(seen) - 1, max(min(count, len(seen)), 1)).astype(np.intp)]
+        variances_m2 = np.full((len(some), 1), self._variance_m2)
+        ahead, frame = self._frames_ahead(candidate), self.last.frame
+        frame = Frame(frame.index + ahead, frame.time_s + ahead, frame.depth_m, frame.camera)
+        image = replace(self.last, frame=frame, points_m=points_m[seen], normals=normals[seen], layers={})
+        unseen = ~self.cells.seen[visible]
+        return ForeseenView(
+            image=image,
+            points=np.hstack([points_m[some], normals[some], variances_m2]),
+            weight=self.forecast.likelihood.points * share / len(some),
+            unseen_m=points_m[unseen],
+            unseen_normals=normals[unseen],
+            unseen_share=1.0 - share,
+            normal_variance=self.cells.normal_variance,
+        )
+
+    def _frames_ahead(self, candidate: Candidate) -> int:
+        """Return the number of frames until the new one: of a turntable, whose prior counts steps, those of a turn."""
+        step_deg = turntable_step_deg(self.prior)
+        return 1 if step_deg is None else max(round(abs(candidate.turn_deg / step_deg)), 1)
+
+    def _edges(self, foreseen: ForeseenView, object_from_new: Array, candidate: Candidate) -> tuple[ForeseenEdge, ...]:
+        """Return the edges that the view would get: to the last view, and to those that the closer would choose."""
+        up = object_from_new[:3, :3].T @ self.stand.up
+
+        def edge(target: int) -> ForeseenEdge | None:
+            view, target_from_new = self.views[target], self._relative(target, object_from_new)
+            density = self._density(foreseen.image, view, candidate, target_from_new)
+            if density is None:
+                return None
+            return self.forecast.edge(foreseen, self.ready(view), target_from_new, density, up)
+
+        first = edge(self.last.index)
+        if first is None:
+            return ()
+        base = _posterior(foreseen.image.index, first, self._relative(first.target, object_from_new))
+        others = [target for target in self.closer.closure_targets(base, self._map) if target != first.target]
+        return (first, *(found for target in others if (found := edge(target)) is not None))
+
+    def _density(
+        self, source: RayImage, target: RayImage, candidate: Candidate, target_from_new: Array
+    ) -> AbstractPoseDensity | None:
+        """Return what is known of the motion between a new view and another; None where nothing is."""
+        if candidate.sigmas is not None:
+            return Gaussian(target_from_new, np.diag(np.repeat(candidate.sigmas, 3)) ** 2, source.centroid_m)
+        prior = self.prior
+        if target.index != self.last.index:  # a closure, whose motion the graph predicts: only limits count
+            prior = prior.relaxed(_SPAN_STEPS)
+        elif candidate.poke is not None:
+            prior = candidate.poke_prior
+        try:
+            return prior.between(source, target)
+        except InputError:
+            return None
+
+    @cached_property
+    def _map(self) -> MapView:
+        return MapView(self.views, self.solution, self.edges)
+
+    def _relative(self, target: int, object_from_new: Array) -> Array:
+        return se3.inverse(self.solution.trajectory[target]) @ object_from_new
+
+
+def displacement_m2(points_m: Array, normals: Array, covariance: Array) -> Array:
+    """Return variances (n,) in m² along normals (n, 3) of points (n, 3) by a pose's error (6, 6), all in one frame."""
+    levers = np.hstack([np.cross(points_m, normals), normals])
+    return np.maximum(np.einsum("ni,ij,nj->n", levers, covariance, levers), 0.0)
+
+
+def turntable_step_deg(prior: AbstractPrior) -> float | None:
+    """Return the step of a turntable in degrees from one frame number to the next; None of other priors."""
+    return prior.step_deg if isinstance(prior, TurntablePrior) else None
+
+
+def _posterior(source: int, edge: ForeseenEdge, mean: Array) -> Posterior:
+    return Posterior(source, edge.target, PoseGaussian(mean, edge.covariance), Outcome.CONVERGED, 1.0)
+
+
+def _spin_deg(covariances: Mapping[int, Array], up: Array) -> float:
+    """Return the largest standard deviation in degrees of turns about a direction (3,)."""
+    return float(np.degrees(np.sqrt(max(max(up @ c[:3, :3] @ up, 0.0) for c in covariances.values()))))
+
+
+def _pose_deg(covariances: Mapping[int, Array]) -> float:
+    """Return the largest standard deviation in degrees of a rotation about any axis."""
+    largest = max(float(np.linalg.eigvalsh(c[:3, :3])[-1]) for c in covariances.values())
+    return float(np.degrees(np.sqrt(max(largest, 0.0))))

@@ -1,0 +1,131 @@
+"""What may be done next: turns on the table, pokes, laying the object on its side, and poses that a robot can reach."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, final
+
+import numpy as np
+
+from modeler import se3
+from modeler.priors import Poke, PokePrior
+from modeler.priors.mixtures import across_axis
+from modeler.priors.poke import pushed
+from modeler.suggestion.surface_cells import Stand
+from modeler.types import Array, Plane, RayImage
+
+Action = Literal["turn", "poke", "lay", "pose"]
+
+
+@final
+@dataclass(frozen=True)
+class Candidate:
+    """One action, and where it brings the object if it succeeds."""
+
+    action: Action
+    """Its kind."""
+    turn_deg: float = 0.0
+    """Turn about the table's normal, right-handed about up."""
+    poke: Poke | None = None
+    """The push, in the coordinates of the last camera."""
+    new_from_last: tuple[tuple[float, ...], ...] | None = None
+    """Of a pose: the motion (4, 4) of the object, from its camera coordinates now to those after the action."""
+    name: str = ""
+    """What the user calls it."""
+    cost: float = 1.0
+    """What gains are divided by: time, say."""
+    sigmas: tuple[float, float] | None = None
+    """Standard deviations in rad and m with which the pose is reached; None: as the run's prior says."""
+
+    @property
+    def poke_prior(self) -> PokePrior:
+        """What is known of the motion by the push."""
+        return PokePrior(poke=self.poke)
+
+    def motion(self, last: RayImage, stand: Stand, object_from_last: Array) -> Array:
+        """Return new_from_last (4, 4), the expected motion of the object in the camera's coordinates.
+
+        Args:
+            last: the view before the action.
+            stand: where the object stands.
+            object_from_last: (4, 4) of that view.
+        """
+        if self.new_from_last is not None:
+            return np.array(self.new_from_last, dtype=np.float64)
+        if self.poke is not None:
+            assert last.plane is not None
+            return poked(self.poke, last, last.plane)
+        last_from_object = se3.inverse(object_from_last)
+        if self.action == "lay":
+            return last_from_object @ _laid(stand, object_from_last) @ object_from_last
+        return last_from_object @ stand.turned(np.radians(self.turn_deg)) @ object_from_last
+
+
+def turns(step_deg: float, largest_deg: float) -> list[Candidate]:
+    """Return turns by multiples of a step, either way."""
+    counts = range(1, int(largest_deg / step_deg + 1e-9) + 1)
+    return [Candidate("turn", turn_deg=sign * k * step_deg) for k in counts for sign in (1.0, -1.0)]
+
+
+def pokes(last: RayImage, stand: Stand, object_from_last: Array, *, length_m: float = 0.03) -> list[Candidate]:
+    """Return pushes along the table at the sides of the object that the camera sees, which turn it either way.
+
+    Args:
+        last: the view before the action, with its support plane.
+        stand: where the object stands.
+        object_from_last: (4, 4) of that view.
+        length_m: how far the finger moves.
+    """
+    if last.plane is None:
+        return []
+    last_from_stand = se3.inverse(object_from_last) @ stand.object_from_stand
+    local_m = se3.transform(se3.inverse(last_from_stand), last.points_m)
+    eye = se3.inverse(last_from_stand)[:3, 3]
+    towards = np.append(eye[:2] / max(float(np.linalg.norm(eye[:2])), 1e-9), 0.0)
+    across = np.array([-towards[1], towards[0], 0.0])
+    found = []
+    for side in (1.0, -1.0):
+        reach = side * local_m @ across
+        at_m = local_m[reach >= np.quantile(reach, 0.95)].mean(axis=0)
+        for ahead in (-1.0, 1.0):
+            direction = last_from_stand[:3, :3] @ (ahead * towards)
+            point = se3.transform(last_from_stand, at_m[None])[0]
+            push = Poke(_triple(point), _triple(direction), length_m)
+            turn_rad = _turn_rad(poked(push, last, last.plane), last.plane)
+            found.append(Candidate("poke", turn_deg=float(np.degrees(turn_rad)), poke=push))
+    return found
+
+
+def poked(poke: Poke, last: RayImage, plane: Plane) -> Array:
+    """Return the motion (4, 4) of the object in the camera by a push that goes as the prior expects it to."""
+    axes = across_axis(plane.normal)
+    seen = last.points_m @ axes.T
+    way = axes @ np.array(poke.direction)
+    step = poke.length_m / 20.0 * way / np.linalg.norm(way)  # as many steps as `pushed` takes
+    radius_m = np.sqrt(np.sum(np.var(seen, axis=0)))
+    contact = axes @ np.array(poke.point_m) - seen.mean(axis=0)
+    turn, shift = pushed(contact[None], step[None], np.array([radius_m]))
+    centre = last.centroid_m
+    turned = se3.moved(np.eye(4), np.append(turn[0] * plane.normal, np.zeros(3)), centre)
+    return se3.translation(shift[0] @ axes) @ turned
+
+
+def _turn_rad(motion: Array, plane: Plane) -> float:
+    return float(se3.log(motion)[:3] @ plane.normal)
+
+
+def _laid(stand: Stand, object_from_last: Array) -> Array:
+    """Return the motion (4, 4) in the object frame that shows the camera what the object stood on."""
+    eye = se3.inverse(stand.object_from_stand) @ object_from_last[:, 3]
+    towards = eye[:2] / max(float(np.linalg.norm(eye[:2])), 1e-9)
+    axis = np.array([towards[1], -towards[0], 0.0])  # down becomes the direction to the camera
+    tip = np.eye(4)
+    tip[:3, :3] = se3.exp(np.append(0.5 * np.pi * axis, np.zeros(3)))[:3, :3]
+    middle = se3.translation(np.array([0.0, 0.0, 0.5 * stand.height_m]))
+    lowered = se3.translation(np.array([0.0, 0.0, stand.radius_m]))
+    motion = lowered @ tip @ se3.inverse(middle)
+    return stand.object_from_stand @ motion @ se3.inverse(stand.object_from_stand)
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])

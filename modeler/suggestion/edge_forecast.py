@@ -1,0 +1,299 @@
+"""The edge that registering a view not yet taken would give: Laplace's approximation of the likelihood there.
+
+The view's points are those of the model that its camera would see; they are looked up in the images of earlier views
+by the likelihood itself. What the model does not know takes part in neither.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, final
+
+import numpy as np
+
+from modeler import se3
+from modeler.kernels import point_likelihood, point_to_plane
+from modeler.registration.posterior import PRIOR_SAMPLES, weighted_gaussian
+from modeler.registration.visibility.likelihood import (
+    DirectedLikelihood,
+    MatchNoise,
+    PairLikelihood,
+    VisibilityLikelihood,
+)
+from modeler.registration.visibility.refinement import visible_share
+from modeler.se3 import rows
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, InputError, RayImage, Solution
+
+USUAL_NOISE: Final = 0.66
+"""Noise b of matching surfaces before there is an edge, of the sensor's along the ray: 0.59 to 0.70 for 7 shapes."""
+USUAL_SCALE: Final = 1.7
+"""Information of an edge over what is predicted, before there is one: 1.6 to 1.9 for 6 shapes that determine a pose."""
+_PATCHES: Final = 32  # into which the registration divides a surface (`Refiner.halvings`)
+_STEP_DEG: Final = 3.0  # between turns at which the likelihood is asked for other modes: a posterior's usual width
+_VALLEY: Final = np.exp(-2.0)  # of a mode's peak: what separates two Gaussians two standard deviations apart each
+_MAX_EDGES: Final = 6  # newest edges by which predictions are scaled: their scatter is about a factor of two
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ForeseenView:
+    """A view that was not taken: what the model shows its camera."""
+
+    image: RayImage
+    """Its points, as far as they are known; it has no picture."""
+    points: Array
+    """(n, 7) position in m, unit normal and variance along the normal in m²."""
+    weight: float
+    """How many points of a real view each of them stands for."""
+    unseen_m: Array
+    """(u, 3) places in its camera where it may see new surface."""
+    unseen_normals: Array
+    """(u, 3) unit normals there."""
+    unseen_share: float
+    """Share (0..1) of its points that are new."""
+    normal_variance: float
+    """Variance in each tangent direction of the noise that its normals share with those of earlier views."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ForeseenEdge:
+    """What registering a foreseen view with another would give."""
+
+    target: int
+    """Frame number of the other."""
+    covariance: Array
+    """(6, 6) of target_from_source about the source's camera; of several modes, that of all about the true one."""
+    right: float
+    """Probability (0..1) that the true mode is the heaviest in what is seen: its share of all modes' mass."""
+    mode_nats: float
+    """Entropy of the modes' weights."""
+
+
+@final
+@dataclass(frozen=True)
+class EdgeForecast:
+    """Predicts edges, with what the edges so far tell of the camera and the object."""
+
+    likelihood: VisibilityLikelihood = field(default_factory=VisibilityLikelihood)
+    """That of the registration."""
+    noise_m: float = 0.0
+    """Noise b of matching surfaces (method.md, eq. 8), the median of the edges so far."""
+    scale: float = USUAL_SCALE
+    """Information of edges so far over what is predicted for them."""
+
+    def learned(
+        self,
+        edges: Sequence[Edge],
+        views: Mapping[int, RayImage],
+        solution: Solution,
+        prior: AbstractPrior,
+        ready: Callable[[RayImage], RayImage],
+    ) -> EdgeForecast:
+        """Return the forecast with noise and scale from the newest edges (method.md, eq. N4).
+
+        One edge more counts, whose information is that of usual ones: it is all that is known before the first.
+
+        Args:
+            edges: those so far.
+            views: by frame number.
+            solution: tells which edges take part.
+            prior: of the run.
+            ready: returns a view with the images that a likelihood looks up.
+        """
+        used = [
+            edge
+            for edge in edges
+            if solution.takes_part(edge) and edge.source in views and edge.target in views and not edge.posterior.modes
+        ]
+        pairs, noises_m = [], []
+        for edge in used[-_MAX_EDGES:]:
+            pair = self.likelihood.between(
+                ready(views[edge.source]), ready(views[edge.target]), np.random.default_rng(0)
+            )
+            pose = edge.posterior.pose
+            noise_m = pair.surface_noise_m(pose.mean, 0.015 * pair.size_m)  # as fine as the search
+            pairs.append((edge, pair, noise_m))
+            noises_m.append(noise_m)
+        if not pairs:
+            return self
+        scales = [np.log(USUAL_SCALE)]
+        for edge, pair, noise_m in pairs:
+            pose = edge.posterior.pose
+            _, matrix = pair.normal_equations(pose.mean[None], MatchNoise(noise_m), stride=1)
+            information = self.independent(pair.patches) / pair.points * matrix[0]
+            known = prior_information(prior, views[edge.source], views[edge.target], pair.centre_m)
+            actual = inverted(se3.covariance_about(pose.covariance, pair.centre_m))
+            scales.append(_log_scale(information, known, actual))
+        return replace(self, noise_m=float(np.median(noises_m)), scale=float(np.exp(np.mean(scales))))
+
+    def independent(self, patches: float) -> float:
+        """Return the number of independent measurements in a pair's points (method.md, eq. N3).
+
+        n of the tempered likelihood (eq. 7), and those of the refinement (eq. 14) where residuals are as stated.
+        """
+        tempered = 1.0 / (1.0 / self.likelihood.max_independent + 1.0 / patches)
+        return tempered + visible_share(patches / _PATCHES) * patches
+
+    def edge(
+        self, source: ForeseenView, target: RayImage, target_from_source: Array, density: AbstractPoseDensity, up: Array
+    ) -> ForeseenEdge | None:
+        """Return the edge between a foreseen view and another; None where the motion is beyond the prior.
+
+        Args:
+            source: what would be seen.
+            target: an earlier view with the images that a likelihood looks up.
+            target_from_source: (4, 4) expected.
+            density: of target_from_source before the images are compared.
+            up: (3,) unit normal of the table in the source's camera, about which other modes are looked for.
+        """
+        if not np.isfinite(density.log_density(target_from_source[None])[0]):
+            return None
+        centre_m = source.image.centroid_m
+        directed = DirectedLikelihood(self.likelihood, source.points, target, target.size_m)
+        points = 2.0 * self.likelihood.points
+        matrix = (
+            2.0 * source.weight * matched(directed, target_from_source, self.noise_m, centre_m, source.normal_variance)
+        )
+        patches = max(target.patches, 1.0)
+        information = self.scale * self.independent(patches) / points * matrix
+        known = density_information(density, centre_m)
+        local = inverted(information + known)
+        offsets_rad, masses = self._modes(directed, source, target_from_source, density, up)
+        turn = np.append(up, np.zeros(3))
+        spread = local + float(masses @ offsets_rad**2) * np.outer(turn, turn)
+        own = float(masses[np.argmin(np.abs(offsets_rad))])
+        entropy = float(-np.sum(masses * np.log(np.maximum(masses, 1e-12))))
+        return ForeseenEdge(target.index, se3.covariance_about(spread, -centre_m), own, entropy)
+
+    def _modes(
+        self,
+        directed: DirectedLikelihood,
+        source: ForeseenView,
+        target_from_source: Array,
+        density: AbstractPoseDensity,
+        up: Array,
+    ) -> tuple[Array, Array]:
+        """Return turns (m,) in rad from the true mode to each, itself included, and the modes' masses (m,)."""
+        steps_rad = np.radians(_STEP_DEG) * np.arange(-60, 60)
+        xi = np.hstack([steps_rad[:, None] * up, np.zeros((120, 3))])
+        poses = se3.moved(target_from_source, xi, source.image.centroid_m)
+        pair = PairLikelihood(directed, replace(directed, points=directed.points[:0]), directed.size_m)
+        parameters = directed.parameters(self.noise_m, pair.typical_misfit(target_from_source, self.noise_m))
+        projection = directed.projection(1)
+        nothing = projection._replace(points=np.ascontiguousarray(projection.points[:, :0]))
+        found = point_likelihood.log_likelihoods(rows(poses), projection, nothing, parameters, parameters)
+        sums = source.weight * found / self.likelihood.points  # a point, in the mean of both directions
+        independent = 1.0 / (1.0 / self.likelihood.max_independent + 1.0 / max(directed.image.patches, 1.0))
+        alike = sums[:, 1] + np.where(steps_rad == 0.0, 0.0, self._mistaken(source, poses))
+        costs = [np.exp(-share / self.likelihood.overlap_scale) for share in (sums[:, 1], alike)]
+        costs = [self.likelihood.no_overlap_cost * cost for cost in costs]
+        looks = np.logaddexp(-costs[0], -costs[1]) - np.log(2.0)
+        log_mass = independent * sums[:, 0] + looks + density.log_density(poses)  # method.md, eq. 7 and N6
+        return basins(steps_rad, log_mass)
+
+    def _mistaken(self, source: ForeseenView, poses: Array) -> Array:
+        """Return the share (n,) of a view's points, new surface, that could be taken for what the other view saw.
+
+        New surface that faces the other camera would match if it were like what is known; at the true pose it is
+        hidden there.
+        """
+        if not len(source.unseen_m):
+            return np.zeros(len(poses))
+        some = slice(None, None, max(len(source.unseen_m) // 100, 1))
+        points_m = np.einsum("nij,uj->nui", poses[:, :3, :3], source.unseen_m[some]) + poses[:, None, :3, 3]
+        normals = np.einsum("nij,uj->nui", poses[:, :3, :3], source.unseen_normals[some])
+        facing = -np.sum(points_m * normals, axis=2) >= 0.35 * np.linalg.norm(points_m, axis=2)
+        return source.unseen_share * facing.mean(axis=1)
+
+
+def matched(
+    directed: DirectedLikelihood, target_from_source: Array, noise_m: float, centre_m: Array, normal_variance: float
+) -> Array:
+    """Return the sensitivity (6, 6) of the matches of one direction, for ξ about a point of the source.
+
+    Args:
+        directed: the source's points looked up in the target.
+        target_from_source: (4, 4).
+        noise_m: noise b of matching surfaces.
+        centre_m: (3,).
+        normal_variance: what noise that both normals share adds to their product, in each tangent direction.
+    """
+    found = directed.matches(rows(target_from_source), noise_m)
+    used = found[found[:, point_to_plane.WEIGHT] > 0.0]
+    to_source = se3.inverse(target_from_source)
+    arms = se3.transform(to_source, used[:, point_to_plane.POSITION]) - centre_m
+    scale_m = max(float(np.sqrt(np.mean(np.sum(arms**2, axis=1)))) if len(arms) else 0.0, 1e-6)
+    own, other = (
+        np.hstack([np.cross(arms, normals) / scale_m, normals])
+        for normals in (used[:, k] @ to_source[:3, :3].T for k in (point_to_plane.OWN, point_to_plane.OTHER))
+    )
+    weights = used[:, point_to_plane.WEIGHT]
+    product = (own.T * weights) @ other  # method.md, J of eq. 14: the noise of independent normals averages out
+    tangent = np.eye(3) - own[:, 3:, None] * own[:, None, 3:]
+    levers = np.concatenate([se3.hat(arms) / scale_m @ tangent, tangent], axis=1)
+    product = product - normal_variance * np.einsum("n,nik,njk->ij", weights, levers, levers)
+    sizes, axes = np.linalg.eigh(0.5 * (product + product.T))
+    units = np.repeat([scale_m, 1.0], 3)
+    return units[:, None] * ((axes * np.maximum(sizes, 0.0)) @ axes.T) * units
+
+
+def prior_information(prior: AbstractPrior, source: RayImage, target: RayImage, centre_m: Array) -> Array:
+    """Return the information (6, 6) of a prior about a point of the source; 0 where it does not apply."""
+    try:
+        return density_information(prior.between(source, target), centre_m)
+    except InputError:
+        return np.zeros((6, 6))
+
+
+def density_information(density: AbstractPoseDensity, centre_m: Array) -> Array:
+    """Return the inverse covariance (6, 6) of a density about a point of the source."""
+    poses = density.sample(PRIOR_SAMPLES, np.random.default_rng(0))
+    wide = weighted_gaussian(poses, np.ones(len(poses)), centre_m)
+    return inverted(se3.covariance_about(wide.covariance, centre_m))
+
+
+def inverted(matrix: Array) -> Array:
+    """Return the inverse (6, 6)."""
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
+def basins(places: Array, log_mass: Array) -> tuple[Array, Array]:
+    """Return where modes of a density on a line have their peaks (m,), and their masses (m,), which sum to 1.
+
+    Peaks without a valley of e⁻² of the lower one between them are one mode, whose place is that nearest to 0.
+
+    Args:
+        places: (n,) ascending.
+        log_mass: (n,), -inf outside the support.
+    """
+    mass = np.exp(log_mass - np.max(log_mass))
+    mass = mass / mass.sum()
+    lows = [k for k in range(1, len(mass) - 1) if mass[k] < mass[k - 1] and mass[k] <= mass[k + 1]]
+    cuts = [0, *lows, len(mass)]
+    parts = [[start, stop] for start, stop in itertools.pairwise(cuts)]
+    joined = parts[:1]
+    for start, stop in parts[1:]:
+        before = mass[joined[-1][0] : joined[-1][1]].max()
+        if mass[start] > _VALLEY * min(before, mass[start:stop].max()):
+            joined[-1][1] = stop
+        else:
+            joined.append([start, stop])
+    zero = int(np.argmin(np.abs(places)))
+    peaks = [
+        0.0 if start <= zero < stop else float(places[start + np.argmax(mass[start:stop])]) for start, stop in joined
+    ]
+    return np.array(peaks), np.array([mass[start:stop].sum() for start, stop in joined])
+
+
+def _log_scale(information: Array, known: Array, actual: Array) -> float:
+    """Return log κ with log det(κ I + Λ) = log det of the actual information (6, 6), within a factor of 100."""
+    low, high = np.log(0.01), np.log(100.0)
+    wanted = np.linalg.slogdet(actual)[1]
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        found = np.linalg.slogdet(np.exp(middle) * information + known)[1]
+        low, high = (middle, high) if found < wanted else (low, middle)
+    return 0.5 * (low + high)

@@ -1,0 +1,207 @@
+"""Which action tells most, in words; and whether anything more needs to be told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from modeler.suggestion.belief import Belief, Prediction, turntable_step_deg
+from modeler.suggestion.candidates import Candidate, pokes, turns
+
+_COARSE_DEG, _FINE_DEG = 10.0, 5.0  # between turns that are compared: nobody turns by hand more exactly
+_LARGEST_DEG = 180.0
+_LYING_COST = 8.0  # a run of its own, of a full turn in steps of 45° at least
+_ALIKE = 0.9  # of the better gain: two ways of one turn that a person need not tell apart
+
+
+@final
+@dataclass(frozen=True)
+class Goal:
+    """When a model is good enough."""
+
+    pose_deg: float = 1.0
+    """Largest standard deviation of a pose's rotation."""
+    seen: float = 0.95
+    """Least share (0..1) of what turns on the table can show that was seen."""
+    sigma_m: float | None = None
+    """Largest standard deviation of the surface in a view, by noise and pose; None: any."""
+
+    def reached(self, belief: Belief) -> bool:
+        """Return whether a model is good enough."""
+        fine = self.sigma_m is None or belief.sigma_m <= self.sigma_m
+        return fine and belief.pose_deg <= self.pose_deg and belief.seen >= self.seen
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Suggestion:
+    """One action, and what it should bring, in words."""
+
+    prediction: Prediction
+    """What it should bring."""
+    words: str
+    """For people."""
+
+    def record(self) -> dict[str, Any]:
+        """Return it for programs."""
+        found = self.prediction
+        candidate = found.candidate
+        record: dict[str, Any] = {
+            "action": candidate.action,
+            "gain_nats": _rounded(found.gain_nats),
+            "pose_nats": _rounded(found.pose_nats),
+            "surface_nats": _rounded(found.surface_nats),
+            "mode_nats": _rounded(found.mode_nats),
+            "probability": _rounded(found.right),
+            "new_surface": _rounded(found.new_surface),
+            "spin_sd_deg": _rounded(found.spin_deg),
+            "pose_sd_deg": _rounded(found.pose_deg),
+            "cost": candidate.cost,
+            "words": self.words,
+        }
+        if candidate.action in ("turn", "poke"):
+            record["turn_deg"] = _rounded(candidate.turn_deg)
+        if candidate.poke is not None:
+            record["poke"] = {
+                "point_m": list(candidate.poke.point_m),
+                "direction": list(candidate.poke.direction),
+                "length_m": candidate.poke.length_m,
+            }
+        if candidate.name:
+            record["name"] = candidate.name
+        return record
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Suggestions:
+    """Actions by what they should bring for their cost, and what is known without them."""
+
+    ranked: tuple[Suggestion, ...]
+    """Best first."""
+    summary: str
+    """How well the model is known, and, where that is enough, that nothing more is to be gained."""
+    reached: bool
+    """Whether the goal is reached."""
+    seen: float
+    """Share (0..1) of what turns on the table can show that was seen."""
+    pose_deg: float
+    """Largest standard deviation of a pose's rotation."""
+    sigma_m: float
+    """Standard deviation of the surface in the worst view."""
+
+
+def suggest(belief: Belief, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None) -> Suggestions:
+    """Return what to do next.
+
+    Args:
+        belief: what is known.
+        candidates: what can be done; None: turns either way, pokes where the support is seen, laying it on its side.
+        goal: what is good enough; None: every pose known to 1°, 95 % of what can be seen was seen.
+    """
+    goal = Goal() if goal is None else goal
+    found = _default(belief) if candidates is None else _predicted(belief, candidates)
+    found.sort(key=lambda each: -each.gain_nats / each.candidate.cost)
+    reached = goal.reached(belief)
+    ranked = [Suggestion(each, words) for each, words in _in_words(belief, found)]
+    return Suggestions(tuple(ranked), _summary(belief, ranked, reached=reached), reached, *_state(belief))
+
+
+def _state(belief: Belief) -> tuple[float, float, float]:
+    return belief.seen, belief.pose_deg, belief.sigma_m
+
+
+def _predicted(belief: Belief, candidates: Sequence[Candidate]) -> list[Prediction]:
+    found = (belief.predict(candidate) for candidate in candidates)
+    return [each for each in found if each is not None]
+
+
+def _default(belief: Belief) -> list[Prediction]:
+    """Return predictions of what a person at a table can do; turns near the best ones are looked at more finely."""
+    step_deg = turntable_step_deg(belief.prior)
+    others = _predicted(
+        belief, [*pokes(belief.last, belief.stand, belief.object_from_last), Candidate("lay", cost=_LYING_COST)]
+    )
+    if step_deg is not None:
+        return others + _predicted(belief, turns(abs(step_deg), _LARGEST_DEG))
+    found = _predicted(belief, turns(_COARSE_DEG, _LARGEST_DEG))
+    fine = [
+        Candidate("turn", turn_deg=best.candidate.turn_deg + offset_deg)
+        for sign in (1.0, -1.0)
+        for best in sorted((f for f in found if f.candidate.turn_deg * sign > 0.0), key=lambda f: -f.gain_nats)[:1]
+        for offset_deg in (-_FINE_DEG, _FINE_DEG)
+    ]
+    return others + found + _predicted(belief, fine)
+
+
+def _in_words(belief: Belief, found: Sequence[Prediction]) -> list[tuple[Prediction, str]]:
+    """Return predictions with their words, a turn that is as good either way once."""
+    told, passed = [], set()
+    for place, each in enumerate(found):
+        if id(each) in passed:
+            continue
+        other = next((f for f in found[place:] if _mirrored(f.candidate, each.candidate)), None)
+        either = other is not None and other.gain_nats >= _ALIKE * each.gain_nats
+        if either:
+            passed.add(id(other))
+        told.append((each, f"{_action(each.candidate, either=either)}: {_effect(belief, each)}"))
+    return told
+
+
+def _mirrored(one: Candidate, other: Candidate) -> bool:
+    return one.action == other.action == "turn" and one.turn_deg == -other.turn_deg
+
+
+def _action(candidate: Candidate, *, either: bool) -> str:
+    if candidate.action == "pose":
+        return candidate.name
+    if candidate.action == "lay":
+        return "lay it on its side, as a run of its own to join"
+    way = (
+        "either way"
+        if either
+        else "counter-clockwise from above"
+        if candidate.turn_deg > 0.0
+        else "clockwise from above"
+    )
+    turn = f"by {abs(candidate.turn_deg):.0f}°"
+    if candidate.action == "turn":
+        return f"turn {turn} ({way})"
+    assert candidate.poke is not None
+    x, y, z = (round(1000.0 * value) for value in candidate.poke.point_m)
+    return f"poke at ({x}, {y}, {z}) mm, {1000.0 * candidate.poke.length_m:.0f} mm far (turns it {turn}, {way})"
+
+
+def _effect(belief: Belief, found: Prediction) -> str:
+    before_deg, after_deg = belief.spin_deg, found.spin_deg
+    parts = []
+    if found.edges and max(before_deg, after_deg) >= 0.05:
+        parts.append(f"spin from {_degrees(before_deg)} to {_degrees(after_deg)}")
+    parts.append(f"{100.0 * found.new_surface:.0f} % new surface")
+    if found.right < 0.9:
+        parts.append(f"placed right with {100.0 * found.right:.0f} %")
+    return ", ".join(parts)
+
+
+def _degrees(value: float) -> str:
+    return f"{value:.0f}°" if value >= 9.95 else f"{value:.1f}°"
+
+
+def _summary(belief: Belief, ranked: Sequence[Suggestion], *, reached: bool) -> str:
+    """Return in words how well the model is known, and what is left to do."""
+    state = (
+        f"every pose within {_degrees(belief.pose_deg)}, surface within {1000.0 * belief.sigma_m:.1f} mm, "
+        f"{100.0 * belief.seen:.0f} % of what can be seen was seen"
+    )
+    if not reached:
+        return state
+    lays = [each for each in ranked if each.prediction.candidate.action == "lay"]
+    rest = "; lay it on its side for the rest" if lays else ""
+    return f"nothing more is to be gained: {state}{rest}"
+
+
+def _rounded(value: float) -> float | None:
+    return float(np.round(value, 4)) if np.isfinite(value) else None

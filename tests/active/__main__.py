@@ -1,0 +1,57 @@
+"""Runs trials and prints what they show.
+
+    PYTHONPATH=tests .venv/bin/python -m active --shapes 12 --out runs/active.jsonl
+    PYTHONPATH=tests .venv/bin/python -m active --out runs/active.jsonl --shapes 0    # the tables of what is there
+
+A trial that the file holds already is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from calibration.specimens import SPECIMENS, Symmetry
+
+from active.tables import printed
+from active.trial import Trial
+
+CLASSES: tuple[Symmetry, ...] = ("asymmetric", "near-symmetric", "n-fold", "revolution")
+
+
+def chosen(half: str, count: int) -> list[str]:
+    """Return names of shapes, of each class as many."""
+    by_class = [[s.recipe for s in SPECIMENS if s.half == half and s.symmetry == kind] for kind in CLASSES]
+    longest = max(map(len, by_class))
+    mixed = [names[k] for k in range(longest) for names in by_class if k < len(names)]
+    return mixed[:count]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="active")
+    parser.add_argument("--half", choices=("tuning", "held-out"), default="held-out")
+    parser.add_argument("--shapes", type=int, default=12, help="how many; 0 = only the tables")
+    parser.add_argument("--policies", default="suggest,random,even")
+    parser.add_argument("--actions", type=int, default=5, help="most of a trial")
+    parser.add_argument("--until-done", action="store_true", help="end a trial once all is known and seen")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    done = records(options.out)
+    for shape in chosen(options.half, options.shapes):
+        for policy in options.policies.split(","):
+            if any((r["shape"], r["policy"], r["seed"]) == (shape, policy, options.seed) for r in done):
+                continue
+            trace = Trial(shape, policy, options.seed, options.actions, until_done=options.until_done).run()
+            with options.out.open("a") as file:
+                file.write(json.dumps(trace.record(), default=float) + "\n")
+    printed(records(options.out))
+
+
+def records(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,241 @@
+"""One object modelled by a simulated robot under a policy, each step's prediction beside what came of it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal, final
+
+import numpy as np
+from calibration.specimens import load_specimen
+from scipy.spatial import KDTree
+
+from modeler import se3
+from modeler.pipeline import Modeler
+from modeler.pipeline.modeler import Run
+from modeler.priors import TablePrior
+from modeler.rays import Sensor
+from modeler.suggestion import Belief, Candidate, Goal, Prediction, suggest
+from modeler.suggestion.pose_gain import edge_information
+from modeler.types import Array, Step
+from sequences.rendering.recipe import Recipe
+from sequences.rendering.stage import Stage
+
+Policy = Literal["suggest", "random", "even"]
+TURN_SIGMA_DEG, SHIFT_SIGMA_M = 2.0, 0.004
+"""Errors of the robot's turns on the table."""
+EVEN_DEG = 25.0
+REACH_DEG = 100.0
+"""Limit of the table prior, and so of turns."""
+COS = 0.35
+VOXEL_M = 0.003
+
+
+@final
+@dataclass(frozen=True)
+class Outcome:
+    """What one action was to bring, and what it brought."""
+
+    action: str
+    turn_deg: float
+    predicted_pose_nats: float
+    predicted_surface_nats: float
+    predicted_new: float
+    predicted_sigma_deg: float
+    right: float
+    accepted: bool
+    pose_nats: float = 0.0
+    surface_nats: float = 0.0
+    new: float = 0.0
+    sigma_deg: float = float("nan")
+    error_deg: float = float("nan")
+
+
+@final
+@dataclass(frozen=True)
+class Trace:
+    """A whole trial, state by state."""
+
+    shape: str
+    policy: str
+    seed: int
+    outcomes: list[Outcome] = field(default_factory=list)
+    seen: list[float] = field(default_factory=list)
+    """True share of what can be seen that was, after each frame."""
+    stated_seen: list[float] = field(default_factory=list)
+    pose_sd_deg: list[float] = field(default_factory=list)
+    worst_error_deg: list[float] = field(default_factory=list)
+    lost: int = 0
+
+    def record(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def small(recipe: Recipe, seed: int, width_px: int) -> Recipe:
+    """Return a recipe at low resolution, turned to where the seed has it."""
+    turn = float(np.random.default_rng([seed, recipe.seed]).uniform(0.0, 360.0))
+    scale = width_px / recipe.view.width
+    view = replace(
+        recipe.view, width=width_px, height=round(scale * recipe.view.height), focal_px=scale * recipe.view.focal_px
+    )
+    x, y, z = recipe.rest_rotation_deg
+    table = None if recipe.table is None else replace(recipe.table, size_m=(0.7, 0.7))
+    return replace(
+        recipe,
+        seed=seed,
+        view=view,
+        rest_rotation_deg=(x, y, z + turn),
+        colour="none",
+        photography=None,
+        label=None,
+        table=table,
+    )
+
+
+def visible_points(stage: Stage) -> Array:
+    """Return points (n, 3) of the true surface that some turn shows, in the model frame, one a voxel."""
+    points = []
+    for step in range(24):
+        turned = Stage(stage.recipe, (stage.poses[0],)).moved_on_table(15.0 * step, (0.0, 0.0))
+        exact = replace(turned.recipe, sensor=None)
+        sequence = Stage(exact, turned.poses).sequence
+        view = Sensor(*sequence.sensor()).ray_image(sequence.frame(1))
+        points.append(se3.transform(se3.inverse(sequence.truth()[1]), view.points_m))
+    return thinned(np.concatenate(points))
+
+
+def thinned(points_m: Array) -> Array:
+    _, first = np.unique(np.floor(points_m / VOXEL_M).astype(np.int64), axis=0, return_index=True)
+    return points_m[np.sort(first)]
+
+
+@final
+@dataclass(frozen=True)
+class Trial:
+    """One shape, one policy."""
+
+    shape: str
+    policy: Policy
+    seed: int = 0
+    actions: int = 5
+    width_px: int = 320
+    until_done: bool = False
+    """Whether to end once the goal is reached."""
+
+    def run(self) -> Trace:
+        recipe = small(load_specimen(self.shape), self.seed, self.width_px)
+        rng = np.random.default_rng([self.seed, recipe.seed, len(self.policy)])
+        stage = Stage(recipe)
+        modeler = Modeler(sensor=Sensor(*stage.sequence.sensor()), prior=TablePrior(max_rotation_deg=REACH_DEG))
+        wanted = KDTree(visible_points(stage))
+        covered = np.zeros(wanted.n, dtype=bool)
+        scene = modeler.segmenter.scene([stage.frame()])
+        run, trace = modeler.start(scene), Trace(self.shape, self.policy, self.seed)
+        step = shown(run, stage)
+        covered = self._states(trace, step, stage, wanted, covered, modeler)
+        for _ in range(self.actions):
+            belief = modeler.belief(step.views, step.solution, step.edges_so_far)
+            candidate, prediction = self._chosen(belief, rng)
+            stage = performed(stage, candidate, belief, rng)
+            step = shown(run, stage)
+            trace.outcomes.append(outcome(belief, candidate, prediction, step, stage))
+            covered = self._states(trace, step, stage, wanted, covered, modeler)
+            if self.until_done and trace.seen[-1] >= 0.95 and trace.pose_sd_deg[-1] <= 1.0:
+                break
+        return trace
+
+    def _chosen(self, belief: Belief, rng: np.random.Generator) -> tuple[Candidate, Prediction | None]:
+        if self.policy == "suggest":
+            ranked = suggest(belief, None, Goal()).ranked
+            best = next(each.prediction for each in ranked if each.prediction.candidate.action == "turn")
+            return best.candidate, best
+        turn_deg = EVEN_DEG if self.policy == "even" else float(rng.choice([-1.0, 1.0]) * rng.uniform(10.0, REACH_DEG))
+        candidate = Candidate("turn", turn_deg=turn_deg)
+        return candidate, belief.predict(candidate)
+
+    def _states(
+        self, trace: Trace, step: Step, stage: Stage, wanted: KDTree, covered: Array, modeler: Modeler
+    ) -> Array:
+        truth = stage.truth()
+        newest = len(stage.poses) - 1
+        if newest in step.solution.trajectory:
+            points = se3.transform(se3.inverse(truth[newest]), step.views[newest].points_m)
+            away_m, _ = KDTree(thinned(points)).query(wanted.data, distance_upper_bound=1.5 * VOXEL_M)
+            covered = covered | np.isfinite(away_m)
+        belief = modeler.belief(step.views, step.solution, step.edges_so_far)
+        trace.seen.append(float(covered.mean()))
+        trace.stated_seen.append(belief.seen)
+        trace.pose_sd_deg.append(belief.pose_deg)
+        trace.worst_error_deg.append(max(errors_deg(step, truth).values()))
+        return covered
+
+
+def shown(run: Run, stage: Stage) -> Step:
+    """Return the step of the frame that a stage shows now."""
+    return [event for event in run.track([stage.frame()]) if isinstance(event, Step)][-1]
+
+
+def performed(stage: Stage, candidate: Candidate, belief: Belief, rng: np.random.Generator) -> Stage:
+    """Return the stage after an action, with the robot's errors; a poke has those of its own prior."""
+    if candidate.poke is not None:
+        density = candidate.poke_prior.between(belief.last, replaced(belief, 1))
+        return stage.moved(density.sample(1, rng)[0] if False else se3.inverse(density.sample(1, rng)[0]))
+    x, y = rng.normal(0.0, SHIFT_SIGMA_M, 2)
+    middle = -0.5 * np.array(stage.poses[-1].offset_m[:2])  # back towards the middle of the table
+    turn_deg = candidate.turn_deg + rng.normal(0.0, TURN_SIGMA_DEG)
+    return stage.moved_on_table(turn_deg, (float(middle[0] + x), float(middle[1] + y)))
+
+
+def replaced(belief: Belief, ahead: int):
+    frame = belief.last.frame
+    return replace(belief.last, frame=replace(frame, index=frame.index + ahead))
+
+
+def errors_deg(step: Step, truth: dict[int, Array]) -> dict[int, float]:
+    """Return the true rotation error of each pose relative to the first."""
+    poses, first = step.solution.trajectory, min(step.solution.trajectory)
+    object_from_model = truth[first]
+    return {
+        k: float(np.degrees(se3.rotation_angle(se3.inverse(pose) @ object_from_model @ se3.inverse(truth[k]))))
+        for k, pose in poses.items()
+    }
+
+
+def outcome(belief: Belief, candidate: Candidate, prediction: Prediction | None, step: Step, stage: Stage) -> Outcome:
+    """Return what an action brought, by the measure of the belief before it."""
+    new = step.frame.index
+    nan = float("nan")
+    blank = Outcome(
+        candidate.action,
+        candidate.turn_deg,
+        *(
+            (nan, nan, nan, nan, 0.0)
+            if prediction is None
+            else (
+                prediction.pose_nats,
+                prediction.surface_nats,
+                prediction.new_surface,
+                sigma_deg(prediction.new_covariance),
+                prediction.right,
+            )
+        ),
+        accepted=step.accepted,
+    )
+    if not step.accepted:
+        return blank
+    pose = step.solution.trajectory[new]
+    edges = [e for e in step.edges_so_far if step.solution.takes_part(e) and e.source == new]
+    found = [(e.target, edge_information(pose, step.solution.pose_of(e).covariance)) for e in edges]
+    gain = belief.poses.gain(found, new)
+    surface_nats, share = belief.brought(step.views[new], pose, gain.covariances[new])
+    return replace(
+        blank,
+        pose_nats=gain.nats,
+        surface_nats=surface_nats,
+        new=share,
+        sigma_deg=sigma_deg(gain.covariances[new]),
+        error_deg=errors_deg(step, stage.truth())[new],
+    )
+
+
+def sigma_deg(covariance: Array) -> float:
+    return float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])))
