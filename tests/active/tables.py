@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import spearmanr
+from scipy.stats import rankdata
 
 MEASURES = {
     "gain_nats": ("predicted_gain", "gain"),
@@ -32,6 +32,11 @@ def slope(predicted: np.ndarray, realised: np.ndarray) -> float:
     return float(predicted @ realised / max(predicted @ predicted, 1e-300))
 
 
+def rank_correlation(predicted: np.ndarray, realised: np.ndarray) -> float:
+    """Return Spearman's."""
+    return float(np.corrcoef(rankdata(predicted), rankdata(realised))[0, 1])
+
+
 def interval(values: np.ndarray, statistic, rng: np.random.Generator) -> tuple[float, float]:
     """Return the 95 % interval of a statistic of rows, by the bootstrap."""
     drawn = [statistic(values[rng.integers(0, len(values), len(values))]) for _ in range(1000)]
@@ -52,10 +57,10 @@ def printed(records: Sequence[dict[str, Any]]) -> None:
             if len(pairs) < 5:
                 continue
             low, high = interval(pairs, lambda p: slope(*p.T), rng)
-            ranks = interval(pairs, lambda p: spearmanr(*p.T).statistic, rng)
+            ranks = interval(pairs, lambda p: rank_correlation(*p.T), rng)
             print(
                 f"| {policy} | {name} | {len(pairs)} | {slope(*pairs.T):.2f} ({low:.2f} to {high:.2f}) | "
-                f"{spearmanr(*pairs.T).statistic:.2f} ({ranks[0]:.2f} to {ranks[1]:.2f}) |"
+                f"{rank_correlation(*pairs.T):.2f} ({ranks[0]:.2f} to {ranks[1]:.2f}) |"
             )
     print()
     print("| policy | trials | reached | actions, mean (95 %) | with the truth within 3 sd + 1° |")
