@@ -119,7 +119,7 @@ def _rendered(name: str, condition: Condition, seed: int) -> tuple[RayImage, Ray
 
 def _far(first: int, offsets: Sequence[int], *, every: int) -> Iterator[Case]:
     """Yield pairs of the dragon's scans that lie so many steps of 24° apart, under a wide prior."""
-    views, poses = _views("dragon"), open_sequence(SHARED / "dragon").truth()
+    views, poses = recorded_views("dragon"), open_sequence(SHARED / "dragon").truth()
     assert poses is not None
     numbers = sorted(views)
     for offset in offsets:
@@ -132,7 +132,7 @@ def _far(first: int, offsets: Sequence[int], *, every: int) -> Iterator[Case]:
 
 def _steps(name: str, first: int, *, every: int) -> Iterator[Case]:
     """Yield pairs of neighbouring frames of a recording."""
-    views, poses = _views(name), open_sequence(SHARED / name).truth()
+    views, poses = recorded_views(name), open_sequence(SHARED / name).truth()
     assert poses is not None
     known, prior = [index for index in views if index in poses], _PRIORS[RECORDINGS[name]]
     for target, source in list(pairwise(known))[first::every]:
@@ -140,7 +140,7 @@ def _steps(name: str, first: int, *, every: int) -> Iterator[Case]:
         yield Case("recordings", name, "", RECORDINGS[name], views[source], views[target], density, truth, source)
 
 
-def _views(name: str) -> dict[int, RayImage]:
+def recorded_views(name: str) -> dict[int, RayImage]:
     """Return the views of a recording, by frame number; without those in which no object was found."""
     sequence, segmenter, views = open_sequence(SHARED / name), Segmenter(), {}
     noise = sequence.sensor()
