@@ -52,8 +52,9 @@ def visibility(pose, projection, parameters):
     low, high, flat, steep = projection.cosines.astype(np.float64)
     cells, points = projection.cells.reshape(int(height), int(width), -1), projection.points.T.astype(np.float64)
     blur, silhouette_px, clearance_m, max_point_cost, normal_cost, unmeasured_gain, typical_misfit = map(
-        np.float64, parameters[:-1]
+        np.float64, parameters[:7]
     )
+    support = parameters.support.astype(np.float64)
     hidden = np.exp(np.float64(parameters.table[0]))
     total, explained = 0.0, 0.0
     for point in points:
@@ -64,28 +65,29 @@ def visibility(pose, projection, parameters):
         column = int(np.floor(fx * position[0] / position[2] + cx + 0.5))
         row = int(np.floor(fy * position[1] / position[2] + cy + 0.5))
         inside = position[2] > 0 and 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]
-        if not inside or cells[row, column, planes.KIND] == planes.MISSING:
-            total += unmeasured_gain * np.clip((facing - flat) / (steep - flat), 0, 1)
-            continue
-        cell = cells[row, column].astype(np.float64)
-        if cell[planes.KIND] == planes.BACKGROUND:
+        cell = cells[row, column].astype(np.float64) if inside else None
+        gain = 0.0
+        if cell is None or cell[planes.KIND] == planes.MISSING:
+            gain = unmeasured_gain * np.clip((facing - flat) / (steep - flat), 0, 1)
+        elif cell[planes.KIND] == planes.BACKGROUND:
             beyond = cell[planes.SILHOUETTE] / silhouette_px
             if position[2] < cell[planes.DEPTH] - clearance_m:
-                total -= min(0.5 * beyond**2, max_point_cost)
-        if cell[planes.KIND] != planes.SURFACE:
-            continue
-        plane = cell[: planes.NORMAL_Z + 1]
-        in_front = plane @ position + cell[planes.DISTANCE]
-        agreement = normal @ plane
-        square = in_front**2 / (point[6] + cell[planes.VARIANCE] + blur**2)
-        match = typical_misfit - 0.5 * square - normal_cost * (1 - agreement)
-        explained += faces * (0.5 * square < 4.5 and agreement > 0.8)
-        seen = np.log((1 - hidden) * np.exp(max(match, -700)) + hidden)
-        if in_front > 0 and match < np.log(hidden):
-            seen = max(match, -max_point_cost)
-        total += faces * seen
-        if in_front > 0:
-            total -= (1 - faces) * min(0.5 * square, max_point_cost)
+                gain = -min(0.5 * beyond**2, max_point_cost)
+        elif cell[planes.KIND] == planes.SURFACE:
+            plane = cell[: planes.NORMAL_Z + 1]
+            in_front = plane @ position + cell[planes.DISTANCE]
+            agreement = normal @ plane
+            square = in_front**2 / (point[6] + cell[planes.VARIANCE] + blur**2)
+            match = typical_misfit - 0.5 * square - normal_cost * (1 - agreement)
+            explained += faces * (0.5 * square < 4.5 and agreement > 0.8)
+            seen = np.log((1 - hidden) * np.exp(max(match, -700)) + hidden)
+            if in_front > 0 and match < np.log(hidden):
+                seen = max(match, -max_point_cost)
+            gain = faces * seen
+            if in_front > 0:
+                gain -= (1 - faces) * min(0.5 * square, max_point_cost)
+        depth_below = max(-(support[:3] @ position + support[3] + clearance_m) * support[4], 0.0)
+        total += max(gain - 0.5 * depth_below**2, -max_point_cost)
     return total, explained
 
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from calibration.specimens import load_specimen
+from calibration.study import Condition, rendered_views, staged
 from prior_cases import surface
 
 from modeler import se3
-from modeler.features import fpfh, kabsch, mutual_matches
+from modeler.evaluation import rotation_error_deg, true_motion
+from modeler.features import FeatureMatcher, fpfh, kabsch, mutual_matches
+from sequences.rendering.renderer import RenderedSequence
 
 MOVED = se3.exp(np.array([0.3, -0.8, 0.5, 0.1, -0.2, 0.4]))
 
@@ -36,3 +42,14 @@ def test_three_points_or_more_fix_a_motion_and_never_a_mirror_image() -> None:
         np.testing.assert_allclose(kabsch(points_m, carried), np.tile(MOVED, (50, 1, 1)), atol=1e-9)
         mirrored = kabsch(points_m, points_m * [1.0, 1.0, -1.0])
         np.testing.assert_allclose(np.linalg.det(mirrored[:, :3, :3]), 1.0)
+
+
+def test_matches_that_fit_each_other_fix_the_motion() -> None:
+    sequence = RenderedSequence(staged(load_specimen("toy_car"), Condition(step_deg=50.0), frames=2, seed=1))
+    views, (earlier, later) = rendered_views(sequence), sequence.indices
+    motions, votes = FeatureMatcher().motions(views[later], views[earlier])
+    truth = true_motion(sequence.truth(), earlier, later)
+    assert min(rotation_error_deg(motion, truth) for motion in motions[:20]) < 10.0
+    assert (np.diff(votes) <= 0).all()
+    few = replace(views[later], points_m=views[later].points_m[:20], normals=views[later].normals[:20])
+    assert FeatureMatcher().motions(few, views[earlier])[0].shape == (0, 4, 4)

@@ -98,9 +98,11 @@ FACING = np.array([0.1, 0.35, 0.3, 0.7], dtype=np.float32)
 HIDDEN = 0.3
 
 
-def parameters(blur_m=0.004):
+def parameters(blur_m=0.004, support=(0.0, 0.0, 0.0, 0.0, 0.0)):
     numbers = [np.float32(value) for value in (blur_m, 1.5, 0.006, 10.0, 2.0, -1.2, 0.4)]
-    return point_likelihood.LikelihoodParameters(*numbers, table=point_likelihood.match_table(HIDDEN))
+    return point_likelihood.LikelihoodParameters(
+        *numbers, support=np.array(support, dtype=np.float32), table=point_likelihood.match_table(HIDDEN)
+    )
 
 
 def random_projection(rng, count=40):
@@ -129,10 +131,11 @@ def test_visibility_is_within_its_bound_of_its_twin(seed):
     poses = np.stack([random_pose(rng, 0.3) for _ in range(60)])
     poses = poses[far_from_borders(projections[0], poses) & far_from_borders(projections[1], se3.inverse(poses))]
     assert len(poses) > 20
-    got = point_likelihood.log_likelihoods(rows(poses), *projections, parameters(), parameters(0.006))
+    standing = parameters(support=(0.0, -0.8, -0.6, 0.5, 200.0))
+    got = point_likelihood.log_likelihoods(rows(poses), *projections, standing, parameters(0.006))
     want = [
         np.add(
-            naive.visibility(pose, projections[0], parameters()),
+            naive.visibility(pose, projections[0], standing),
             naive.visibility(se3.inverse(pose), projections[1], parameters(0.006)),
         )
         for pose in poses
@@ -181,10 +184,12 @@ def test_the_class_of_a_point_follows_from_where_it_lies():
         ([0.17, 0.0, 0.8], towards, point_likelihood.IN_EMPTY_SPACE),
         ([5.0, 0.0, 0.8], towards, point_likelihood.UNKNOWN),
         ([0.0, 0.0, -0.8], towards, point_likelihood.UNKNOWN),
+        ([0.0, 0.2, 0.8], towards, point_likelihood.IN_SUPPORT),
     ]
     points = np.array([[*position, *normal, 1e-6] for position, normal, _ in cases], dtype=np.float32).T.copy()
     projection = Projection(points, cells.reshape(-1, planes.CELL_SIZE), CAMERA, FACING)
-    classes = point_likelihood.classify(rows(np.eye(4)), projection, parameters(0.001))
+    table = (0.0, -1.0, 0.0, 0.15, 500.0)
+    classes = point_likelihood.classify(rows(np.eye(4)), projection, parameters(0.001, table))
     assert classes.tolist() == [want for *_, want in cases]
 
 

@@ -1,5 +1,7 @@
 """The search for modes of the posterior."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from calibration.specimens import load_specimen
@@ -50,6 +52,41 @@ def test_the_search_finds_the_motion_in_a_wide_prior(name, rng):
     assert (np.diff(found.scores) <= 0).all()
     rolled_deg = min(rotation_error_deg(pose, truth) for pose in found.poses)
     assert rolled_deg < 8.0  # a flashlight's roll is all but free
+
+
+@pytest.fixture(scope="module")
+def bracket():
+    """A rendered bracket turned by 50° on a table, and the true motion."""
+    sequence = RenderedSequence(staged(load_specimen("l_bracket"), Condition(step_deg=50.0), frames=2, seed=1))
+    made, (earlier, later) = rendered_views(sequence), sequence.indices
+    return made[later], made[earlier], true_motion(sequence.truth(), earlier, later)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_any_turn_may_be_found_from_nothing(bracket, seed):
+    source, target, truth = bracket
+    density = GeneralPrior(max_rotation_deg=180.0, max_offset_m=0.2).between(source, target)
+    posterior = VisibilityRegistrar().register(source, target, density, rng=np.random.default_rng(seed))
+    assert posterior.outcome is Outcome.CONVERGED
+    assert rotation_error_deg(posterior.pose.mean, truth) < 5.0
+
+
+def test_nothing_lies_below_the_support(bracket, rng):
+    """Turned by half a turn about an axis in the table, through it: surface that no image contradicts."""
+    source, target, truth = bracket
+    likelihood = VisibilityLikelihood()
+    flipped = truth.copy()
+    lying = np.cross(target.plane.normal, [0.0, 0.0, 1.0])
+    half = 2.0 * np.outer(lying, lying) / (lying @ lying) - np.eye(3)
+    centre = se3.transform(truth, source.centroid_m[None])[0] - target.plane.normal * 2.0 * source.size_m
+    flipped[:3, :3] = half @ truth[:3, :3]
+    flipped[:3, 3] = centre - flipped[:3, :3] @ source.centroid_m
+    poses = np.stack([truth, flipped])
+    standing = likelihood.between(source, target, np.random.default_rng(0))
+    floating = likelihood.between(replace(source, plane=None), replace(target, plane=None), np.random.default_rng(0))
+    seen, unseen = (pair.log_likelihoods(poses, 0.002, stride=1)[0] for pair in (standing, floating))
+    assert seen[0] == pytest.approx(unseen[0], abs=1.0)
+    assert seen[1] < unseen[1] - 1000.0
 
 
 def test_a_turn_beyond_the_prior_shows(rng):

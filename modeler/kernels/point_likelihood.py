@@ -27,7 +27,7 @@ from modeler.kernels.planes import (
 from modeler.kernels.threads import over_rows
 
 # Classes of a point, see `classify`.
-UNKNOWN, MATCHED, BEHIND, IN_FRONT, HIDDEN, IN_EMPTY_SPACE = 0, 1, 2, 3, 4, 5
+UNKNOWN, MATCHED, BEHIND, IN_FRONT, HIDDEN, IN_EMPTY_SPACE, IN_SUPPORT = 0, 1, 2, 3, 4, 5, 6
 
 # Columns of what `log_likelihoods` returns.
 LOG_LIKELIHOOD, EXPLAINED = 0, 1
@@ -155,7 +155,7 @@ def buffers(projection):
 
 
 class LikelihoodParameters(NamedTuple):
-    """Parameters of one direction (method.md, eq. 4 to 6); all float32."""
+    """Parameters of one direction (method.md, eq. 4 to 6 and 21); all float32."""
 
     blur_m: np.float32
     """Noise b of the surfaces."""
@@ -171,6 +171,8 @@ class LikelihoodParameters(NamedTuple):
     """Log-likelihood (nats) of a point that should be seen where nothing was measured."""
     typical_misfit: np.float32
     """Misfit μ of a typical match (nats)."""
+    support: FloatArray
+    """(5,) plane that the object stands on: unit normal, offset in m, precision of heights above it in 1/m; else 0."""
     table: FloatArray
     """`match_table` of η."""
 
@@ -206,9 +208,23 @@ def normal_agreement(transformed, looked_up, j):
     )
 
 
+@numba.njit(cache=True, inline="always")
+def depth_below(transformed, parameters, j):
+    """Return how far below the support a transformed point is, beyond the clearance (method.md, eq. 21), in sd."""
+    support = parameters.support
+    height_m = (
+        support[0] * transformed[X, j]
+        + support[1] * transformed[Y, j]
+        + support[2] * transformed[Z, j]
+        + support[3]
+        + parameters.clearance_m
+    )
+    return max(-height_m * support[4], ZERO)
+
+
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def sum_over_points(points, transformed, looked_up, parameters):
-    """Return the log-likelihood of transformed points, and the number explained (method.md, eq. 5 and 6).
+    """Return the log-likelihood of transformed points, and the number explained (method.md, eq. 5, 6 and 21).
 
     All cases are evaluated for every point, and one selected: code without branches is vectorised.
 
@@ -242,7 +258,8 @@ def sum_over_points(points, transformed, looked_up, parameters):
         gain = on_surface if kind == _OF_SURFACE else ZERO
         gain = on_background if kind == _OF_BACKGROUND else gain
         gain = parameters.unmeasured_gain * transformed[COVERAGE, j] if kind == _OF_NOTHING else gain
-        total += gain
+        below = depth_below(transformed, parameters, j)
+        total += max(gain - HALF * below * below, -max_point_cost)
         explained += faces if (kind == _OF_SURFACE) & matches else ZERO
     return total, explained
 
@@ -308,6 +325,8 @@ def classify(pose, projection, parameters):
                 classes[j] = MATCHED if in_front > -LOOSE_SIGMAS * math.sqrt(variance) else BEHIND
             else:
                 classes[j] = HIDDEN
+        if depth_below(transformed, parameters, j) > LOOSE_SIGMAS:
+            classes[j] = IN_SUPPORT
     return classes
 
 

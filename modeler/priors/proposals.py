@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.features import fpfh, kabsch, mutual_matches
+from modeler.features import FeatureMatcher
 from modeler.priors.checks import check_parameters
 from modeler.priors.general import GeneralPrior, centroid_offset
 from modeler.priors.mixtures import KernelMixture, across_axis, defensive_mixture, directions_about
@@ -18,8 +18,6 @@ from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, PoseG
 _LEAST_RAD, _LEAST_M = np.radians(2.0), 0.004  # least standard deviations: the search itself resolves less
 _WIDER = 2.0  # factor on the graph's standard deviations, which hold no systematic error
 _MOST_STEPS = 3.0  # beyond, constant velocity is no longer plausible
-_DRAWS = 20_000  # triples drawn
-_JUDGED = 1000  # largest number of poses that are scored
 
 
 @dataclass(frozen=True)
@@ -231,11 +229,7 @@ def _onto(axis: Array, directions: Array) -> Array:
 
 @dataclass(frozen=True)
 class FeaturesPrior(AbstractProposal):
-    """Poses from triples of matching FPFH features, each the centre of a kernel.
-
-    Fast Point Feature Histograms (Rusu, Blodow and Beetz 2009) of downsampled surfaces are matched. Of many triples
-    with consistent distances, the poses with the most inliers are kept.
-    """
+    """Poses on which matches of FPFH features agree, each the centre of a kernel (`modeler.features`)."""
 
     features_sigma_deg: float = 4.0
     """Standard deviation of each kernel in rotation, about each axis."""
@@ -243,30 +237,19 @@ class FeaturesPrior(AbstractProposal):
     """Standard deviation of each kernel in the position of the centroid, along each axis."""
     bumps: int = 24
     """Largest number of kernels."""
-    voxel: float = 1 / 25
-    """Voxel size for downsampling, as a share of the object's size."""
-    feature_radius: float = 5.0
-    """Radius of a feature's neighbourhood, in voxels."""
-    agreement: float = 2.0
-    """Largest distance of inliers, in voxels."""
-    min_points: int = 30
-    """Fewest points of each surface after downsampling; with fewer there is no proposal."""
+    matcher: FeatureMatcher = field(default_factory=FeatureMatcher)
+    """How features are matched."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
         check_parameters(self)
 
     def proposal(self, source: RayImage, target: RayImage, known: AbstractPoseDensity) -> KernelMixture | None:
-        """Return kernels about the poses that most matches agree with; None where no three matches agree."""
-        if min(len(source.points_m), len(target.points_m)) < self.min_points:
-            return None
-        sizes_m = [2.0 * float(np.sqrt(np.sum(np.var(view.points_m, axis=0)))) for view in (source, target)]
-        voxel_m = self.voxel * max(sizes_m)
-        (first_m, first), (second_m, second) = (self._features(view, voxel_m) for view in (source, target))
-        if min(len(first_m), len(second_m)) < self.min_points:
-            return None
-        pairs = mutual_matches(first, second)
-        motions, votes = self._motions(first_m[pairs[:, 0]], second_m[pairs[:, 1]], known, self.agreement * voxel_m)
+        """Return kernels about the poses that most matches agree with; None where too few agree."""
+        motions, votes = self.matcher.motions(source, target)
+        if len(motions):
+            possible = np.isfinite(known.log_density(motions))
+            motions, votes = motions[possible][: self.bumps], votes[possible][: self.bumps].astype(np.float64)
         if not len(motions):
             return None
         return KernelMixture(
@@ -277,48 +260,3 @@ class FeaturesPrior(AbstractProposal):
             sigma_m=self.features_sigma_m,
             evidence=False,
         )
-
-    def _features(self, view: RayImage, voxel_m: float) -> tuple[Array, Array]:
-        """Return the points (n, 3) of a downsampled surface and their features (n, 33)."""
-        import open3d as o3d  # slow to load, and only needed here
-
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(view.points_m))
-        cloud.normals = o3d.utility.Vector3dVector(view.normals)
-        cloud = cloud.voxel_down_sample(voxel_m)
-        cloud.normalize_normals()
-        points_m, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
-        order = np.lexsort(points_m.T)  # Open3D's order is that of a hash table
-        points_m, normals = points_m[order], normals[order]
-        return points_m, fpfh(points_m, normals, self.feature_radius * voxel_m)
-
-    def _motions(
-        self, source_m: Array, target_m: Array, known: AbstractPoseDensity, reach_m: float
-    ) -> tuple[Array, Array]:
-        """Return poses (k, 4, 4) from triples of matches, and their numbers of inliers (k,).
-
-        Args:
-            source_m: (m, 3) points of the source.
-            target_m: (m, 3) their matches.
-            known: density whose support holds the poses.
-            reach_m: largest distance of inliers.
-        """
-        if len(source_m) < 3:
-            return np.zeros((0, 4, 4)), np.zeros(0)
-        rng = np.random.default_rng(0)  # equal views give equal densities
-        triples = rng.integers(len(source_m), size=(_DRAWS, 3))
-        sides, others = (
-            np.linalg.norm(points[triples] - points[np.roll(triples, 1, axis=1)], axis=2)
-            for points in (source_m, target_m)
-        )
-        triples = triples[
-            ((np.abs(sides - others) < reach_m) & (np.minimum(sides, others) > 3.0 * reach_m)).all(axis=1)
-        ]
-        if not len(triples):
-            return np.zeros((0, 4, 4)), np.zeros(0)
-        motions = kabsch(source_m[triples], target_m[triples])
-        motions = motions[np.isfinite(known.log_density(motions))][:_JUDGED]
-        carried = source_m @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
-        votes = np.sum(np.sum((carried - target_m) ** 2, axis=2) < reach_m**2, axis=1).astype(np.float64)
-        best = np.argsort(-votes, kind="stable")[: self.bumps]
-        best = best[votes[best] >= 3.0]  # at least its own three
-        return motions[best], votes[best]

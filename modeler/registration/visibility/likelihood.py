@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import chdtri
 
 from modeler import se3
 from modeler.kernels import gauss_newton, point_likelihood, point_to_plane
@@ -25,6 +26,7 @@ _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).a
 IntArray = npt.NDArray[np.int64]
 _DESCENT_STRIDE, _STRIDE = 4, 2  # every fourth point is used for descent, every second for scores
 _COLOUR_STRIDE = 2  # every second of the points that are used for depth is used for colour
+_CHANCE = 0.01  # with which a right pose is taken for one that the images contradict
 _STATED_MISFIT = 0.5  # mean of r² / 2τ² if variances are as stated
 
 
@@ -124,7 +126,7 @@ class DirectedLikelihood:
         return self._projections[stride]
 
     def parameters(self, blur_m: float, typical_misfit: float = _STATED_MISFIT) -> LikelihoodParameters:
-        """Return the parameters of the kernel under a blur of the surfaces, see method.md, eq. 4 to 6."""
+        """Return the parameters of the kernel under a blur of the surfaces, see method.md, eq. 4 to 6 and 21."""
         fx = self.image.frame.camera.fx
         lateral_px = max(self.image.sigma_wh * fx, 1.0)
         return LikelihoodParameters(
@@ -135,6 +137,7 @@ class DirectedLikelihood:
             normal_cost=np.float32(self.model.normal_cost),
             unmeasured_gain=np.float32(np.log(max(self.model.hidden_share, 1.0 - self._measured_share))),
             typical_misfit=np.float32(typical_misfit),
+            support=self._support(blur_m),
             table=self._table,
         )
 
@@ -162,6 +165,14 @@ class DirectedLikelihood:
         """Least noise of matching surfaces."""
         detail_m = self.model.surface_detail * self.size_m
         return float(np.hypot(detail_m, self.model.surface_noise * self.image.sigma_r_m))
+
+    def _support(self, blur_m: float) -> np.ndarray:
+        """Return the support plane as the kernel takes it, for surfaces with a blur (method.md, eq. 21)."""
+        plane = self.image.plane
+        if plane is None:
+            return np.zeros(5, dtype=np.float32)
+        sigma_m = np.linalg.norm([plane.sigma_offset_m, plane.sigma_tilt_rad * self.size_m, blur_m, self._min_blur_m])
+        return np.array([*plane.normal, plane.offset_m, 1.0 / sigma_m], dtype=np.float32)
 
     @cached_property
     def _measured_share(self) -> float:
@@ -323,10 +334,25 @@ class PairLikelihood:
                 self.backward.classify(rows(se3.inverse(target_from_source))),
             ]
         )
-        contradicting = (point_likelihood.BEHIND, point_likelihood.IN_FRONT, point_likelihood.IN_EMPTY_SPACE)
+        contradicting = (
+            point_likelihood.BEHIND,
+            point_likelihood.IN_FRONT,
+            point_likelihood.IN_EMPTY_SPACE,
+            point_likelihood.IN_SUPPORT,
+        )
         wrong = np.isin(classes, contradicting).sum()
         matched = (classes == point_likelihood.MATCHED).sum()
         return float(matched / max(matched + wrong, 1))
+
+    def fits(self, target_from_source: Array, blur_m: float) -> bool:
+        """Return whether the images contradict a pose (4, 4) no more than 99 of 100 right ones (method.md, eq. 22).
+
+        `blur_m` is the blur at which matches are selected, and the least at which they are judged.
+        """
+        noise_m = max(self.surface_noise_m(target_from_source, blur_m), blur_m)
+        plain, _ = self.log_likelihoods(target_from_source[None], noise_m, stride=1)
+        independent = self.temper * self.points
+        return bool(self.temper * plain[0] >= 0.5 * (independent - chdtri(independent, _CHANCE)))
 
     def colour_matches(self, carried: Array, matches: Array, noise: MatchNoise, *, forward: bool) -> Array:
         """Return equations of the colours of matches, as `DirectedLikelihood.matches` has those of surface."""

@@ -95,7 +95,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         refined = [self._refined(pair, density, samples, rng) for samples in compared]
         modes = weigh_modes(refined)
         at_limit = self._share_at_limit(pair, density, found, modes[0][1], rng)
-        posterior = self._judged(pair, modes, at_limit=at_limit, seconds=time.perf_counter() - started)
+        posterior = self._judged(pair, modes, found, at_limit=at_limit, seconds=time.perf_counter() - started)
         return replace(posterior, beyond=found.beyond) if _leads_beyond(found) else posterior
 
     def _sampled(
@@ -137,7 +137,13 @@ class VisibilityRegistrar(AbstractRegistrar):
         return share_at_limit(density, heaviest.poses, heaviest.weights, pair.centre_m, rng)
 
     def _judged(
-        self, pair: PairLikelihood, weighed: list[tuple[float, WeightedSamples]], *, at_limit: float, seconds: float
+        self,
+        pair: PairLikelihood,
+        weighed: list[tuple[float, WeightedSamples]],
+        found: Candidates,
+        *,
+        at_limit: float,
+        seconds: float,
     ) -> Posterior:
         """Return the posterior of weighted modes, and its outcome (method.md, "Result")."""
         samples = np.concatenate([mode.poses for _, mode in weighed])
@@ -148,12 +154,14 @@ class VisibilityRegistrar(AbstractRegistrar):
         separate = len(modes) == 1 or are_separate(modes)
         pose = pooled(modes) if separate else weighted_gaussian(samples, weights, pair.centre_m)
         overlap = pair.overlap(modes[0].pose.mean)
+        # Of very many poses, some match by chance; of few, the likeliest is right though a mask be cut off.
+        matches = not found.wide or pair.fits(modes[0].pose.mean, self.search.fine_m(pair))
         effective = 1.0 / sum(share**2 / mode.effective_samples for share, mode in weighed)
         return Posterior(
             source=pair.backward.image.index,
             target=pair.forward.image.index,
             pose=pose,
-            outcome=self._outcome(effective, pose, overlap, at_limit=at_limit),
+            outcome=self._outcome(effective, pose, overlap if matches else 0.0, at_limit=at_limit),
             overlap=overlap,
             least_overlap=self.min_overlap,
             samples=samples,

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
+from modeler.features import FeatureMatcher
 from modeler.kernels import mixture
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration.posterior import MIN_MODE_SHARE, PRIOR_SAMPLES
@@ -25,6 +26,8 @@ class Candidates:
     """(k,) tempered log-likelihoods (nats)."""
     spreads: Array
     """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid (method.md, eq. 11)."""
+    wide: bool = False
+    """Whether the prior holds more basins than the search has starts for."""
     beyond_gain: float = -np.inf
     """How much better (nats) than the best candidate a pose beyond the prior's support is."""
     beyond: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
@@ -80,6 +83,10 @@ class Search:
     """each the best of so many samples of the prior on average."""
     finest: float = 0.015
     """Blur of the surfaces in the last stage of the descent, as a share of the object's size."""
+    max_recognised: int = 100
+    """Largest number of starts on which features agree, where the prior holds more basins than `max_starts` reach."""
+    matcher: FeatureMatcher = field(default_factory=FeatureMatcher)
+    """How features are matched."""
     stages: int = 4
     """Stages of the descent, each with half the blur of the one before."""
     steps: int = 4
@@ -102,11 +109,11 @@ class Search:
         return self.basin * np.repeat([1.0, pair.size_m], 3)
 
     def starts(self, pair: PairLikelihood, prior: PoseGaussian) -> int:
-        """Return the number of starts for the width of the prior (method.md, eq. 9)."""
+        """Return the number of starts for the width of the prior, however many that is (method.md, eq. 9)."""
         extent = self.extent(pair)
         variances = np.linalg.eigvalsh(prior.covariance / np.outer(extent, extent))
         basins = np.sqrt(np.prod(np.maximum(variances, 1.0)))
-        return int(np.clip(self.per_basin * basins, self.min_starts, self.max_starts))
+        return max(int(self.per_basin * basins), self.min_starts)
 
     def run(
         self, pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator, *, min_overlap: float
@@ -121,7 +128,11 @@ class Search:
                 count only within a basin of the support.
         """
         prior, fine_m = _moments(pair, density, rng), self.fine_m(pair)
-        started = self._drawn(pair, density, self.starts(pair, prior), rng)
+        wanted = self.starts(pair, prior)
+        wide = wanted > self.max_starts
+        started = self._drawn(pair, density, min(wanted, self.max_starts), rng)
+        if wide:
+            started = np.concatenate([started, self._recognised(pair, density)])
         poses, regulariser = started, self._regulariser(pair, prior)
         for blur_m in self.blurs_m(pair):
             poses = pair.descend(poses, blur_m, regulariser, steps=self.steps)
@@ -132,7 +143,7 @@ class Search:
         order = np.argsort(-scores, kind="stable")
         # The volumes of two modes may outweigh their likelihoods as much as a negligible mode is outweighed.
         order = order[scores[order] > scores.max() + 2.0 * np.log(MIN_MODE_SHARE)]
-        found = Candidates(poses[order], scores[order], _spreads(pair, prior, poses[order], fine_m))
+        found = Candidates(poses[order], scores[order], _spreads(pair, prior, poses[order], fine_m), wide)
         if pair.overlap(found.poses[0]) > min_overlap:
             outside = self._near_support(pair, prior, density, outside)
         found = found.distinct(pair.centre_m)
@@ -150,6 +161,17 @@ class Search:
         scores = plain - np.log(blur) * share * pair.points
         scores += pair.colour_gain(poses, blur * pair.size_m, stride=8) / pair.temper
         return poses[np.argsort(-scores, kind="stable")[:count]]
+
+    def _recognised(self, pair: PairLikelihood, density: AbstractPoseDensity) -> Array:
+        """Return starting poses (n, 4, 4) on which features agree, no two in a basin, those with most matches first."""
+        motions, _ = self.matcher.motions(pair.backward.image, pair.forward.image)
+        motions = motions[np.isfinite(density.log_density(motions))] if len(motions) else motions
+        kept, left = [], np.ones(len(motions), dtype=bool)
+        while left.any() and len(kept) < self.max_recognised:
+            kept.append(int(np.argmax(left)))
+            apart = se3.difference(motions, motions[kept[-1]], pair.centre_m) / self.extent(pair)
+            left &= np.linalg.norm(apart, axis=1) > 1.0
+        return motions[kept]
 
     def _regulariser(self, pair: PairLikelihood, prior: PoseGaussian) -> Regulariser:
         """Return the regulariser of a descent: the prior's Gaussian, and damping (method.md, eq. 10).
