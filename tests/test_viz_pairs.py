@@ -13,7 +13,7 @@ from streamed import Recording, drawn
 from turning_box import CENTRE_M, COUNT, COVARIANCE, HALF_M, LOST, object_from_camera
 
 from modeler import se3
-from modeler.types import Mode, PoseGaussian, Step, loop_opening
+from modeler.types import Mode, Plane, PoseGaussian, Step, loop_opening
 from viz import entities, images, pair_view, readings
 
 
@@ -85,6 +85,8 @@ def test_points_hang_in_front_only_where_the_motion_is_wrong(run: list[Step]) ->
     assert share(images.VIOLATION, [0.25, 0.0, 0.0]) > 0.9  # before the background
     beyond = images.projection(source, target, se3.translation(np.array([5.0, 0.0, 0.0])) @ truth)
     assert len(beyond.pixels) == 0
+    before = Plane(np.array([0.0, 0.0, -1.0]), 0.1, sigma_tilt_rad=0.001, sigma_offset_m=0.001)
+    assert np.all(images.projection(source, replace(target, plane=before), truth).verdicts == images.VIOLATION)
 
 
 def test_points_are_drawn_by_what_is_said_of_them(run: list[Step]) -> None:

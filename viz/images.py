@@ -115,10 +115,10 @@ AGREES, HIDDEN, VIOLATION, NO_SAY = 0, 1, 2, 3
 """Verdicts on a point: on the measured surface, behind it, in front of it, or without a measurement."""
 
 _PROJECTED_POINTS: Final = 1_200
-_VERDICT: Final = np.zeros(6, dtype=np.int8)  # by that of the likelihood
+_VERDICT: Final = np.zeros(len(kernel.CLASSES), dtype=np.int8)  # by that of the likelihood
 _VERDICT[[kernel.MATCHED, kernel.UNKNOWN]] = AGREES, NO_SAY
 _VERDICT[[kernel.HIDDEN, kernel.BEHIND]] = HIDDEN
-_VERDICT[[kernel.IN_FRONT, kernel.IN_EMPTY_SPACE]] = VIOLATION
+_VERDICT[[kernel.IN_FRONT, kernel.IN_EMPTY_SPACE, kernel.IN_SUPPORT]] = VIOLATION
 _PATHS: Final = {
     AGREES: (entities.VISIBILITY_AGREES, entities.AGREES_RGB, 1.25),
     HIDDEN: (entities.VISIBILITY_HIDDEN, entities.HIDDEN_RGB, 1.0),

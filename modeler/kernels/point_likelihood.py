@@ -27,7 +27,7 @@ from modeler.kernels.planes import (
 from modeler.kernels.threads import over_rows
 
 # Classes of a point, see `classify`.
-UNKNOWN, MATCHED, BEHIND, IN_FRONT, HIDDEN, IN_EMPTY_SPACE, IN_SUPPORT = 0, 1, 2, 3, 4, 5, 6
+UNKNOWN, MATCHED, BEHIND, IN_FRONT, HIDDEN, IN_EMPTY_SPACE, IN_SUPPORT = CLASSES = 0, 1, 2, 3, 4, 5, 6
 
 # Columns of what `log_likelihoods` returns.
 LOG_LIKELIHOOD, EXPLAINED = 0, 1
