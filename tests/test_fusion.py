@@ -337,6 +337,24 @@ def test_differences_of_exposure_are_evened_out(brick):
     assert np.exp(ratio.mean()) == pytest.approx(0.79, abs=0.05)
 
 
+def test_colours_count_less_where_they_may_be_those_of_the_background(monkeypatch):
+    """Colour that is 4 px beside its depth: what one view sees at its silhouette, another sees within."""
+    poses, views = tabletop.trajectory(POSES), tabletop.views(PLATE, POSES)
+    true = FUSER.fuse(views, poses)
+    assert true.vertex_colours is not None
+    for index, view in views.items():
+        assert view.frame.colour is not None
+        views[index] = replace(view, frame=replace(view.frame, colour=np.roll(view.frame.colour, 4, axis=1)))
+    off = {}
+    for bleeding_px in (10.0, 0.01):
+        monkeypatch.setattr("modeler.fusion.depth_views.BLEEDING_PX", bleeding_px)
+        model = FUSER.fuse(views, poses)
+        assert same(replace(model, vertex_colours=None, colours=None), replace(true, vertex_colours=None, colours=None))
+        assert model.vertex_colours is not None
+        off[bleeding_px] = float(np.abs(model.vertex_colours.astype(int) - true.vertex_colours).mean())
+    assert off[10.0] < 0.9 * off[0.01]
+
+
 def test_a_view_without_colour_leaves_the_colours_to_others(brick):
     views = tabletop.views(BRICK, POSES)
     views[4] = replace(views[4], frame=replace(views[4].frame, colour=None))

@@ -69,6 +69,18 @@ def test_pixels_beside_a_silhouette_or_a_step_in_depth_count_little(step_m: floa
     np.testing.assert_allclose(weights[50:110, [99, 100]], share, rtol=0.1)
 
 
+def test_colours_count_less_towards_silhouettes_and_steps_but_not_beside_holes_in_the_depth() -> None:
+    view = stepped(0.1)
+    depth_m = view.frame.depth_m.copy()
+    depth_m[60:64, 80:84] = np.nan
+    view = replace(view, frame=replace(view.frame, depth_m=depth_m, mask=view.frame.mask & np.isfinite(depth_m)))
+    part = part_of(view)
+    clear = np.where(part.index >= 0, part.clearance[part.index], np.nan)
+    np.testing.assert_allclose(clear[80, 60:70], (np.arange(10) + 1.5).clip(max=10.0) / 10.0)
+    assert clear[80, 99] == pytest.approx(0.05)
+    assert (clear[58:66, [78, 85]] == 1.0).all()
+
+
 def test_a_view_counts_as_little_as_noise_grows_with_distance() -> None:
     """By the square of z², as the noise of a triangulating camera grows."""
     ball = tabletop.Sphere(0.05)

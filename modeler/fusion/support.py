@@ -104,6 +104,7 @@ def _observed(
             near_m,
             tau_m,
             *views.lookup,
+            views.colour_weights,
             views.colour,
             gains,
             focus,
@@ -139,7 +140,8 @@ def exposure_gains(views: ViewBlocks, *, tau_m: float, near_m: float) -> Array:
     for some in views:
         for view in np.flatnonzero(some.coloured):
             one = some.only(int(view))
-            _, colours = tsdf.observe(points_m, normals, near_m, tau_m, *one.lookup, one.colour, unit_gain, 1.0)
+            images = one.colour_weights, one.colour, unit_gain, 1.0
+            _, colours = tsdf.observe(points_m, normals, near_m, tau_m, *one.lookup, *images)
             levels[row], weights[row] = colours[:, :3], colours[:, 3]
             row += 1
     weights[np.any((levels < DARK) | (levels > BRIGHT), axis=2)] = 0.0

@@ -177,8 +177,9 @@ def observe(queries, directions, tolerance_m, tau_m, *views):
         tolerance_m: largest distance along the normal.
         tau_m: least distance of empty points from the end of the empty space.
         views: index (f, h, w) int32; free_m (f, h, w) float32; poses (f, 3, 4) camera_from_object; intrinsics (f, 4);
-            points (p, 3), normals (p, 3) and weights (p,); colour (f, h, w, 3) uint8; gains (f, 4) of red, green and
-            blue, and the weight of a view's colours, 0 = none; exponent of the view weights for colours.
+            points (p, 3), normals (p, 3) and weights (p,); weights of their colours (p,); colour (f, h, w, 3) uint8;
+            gains (f, 4) of red, green and blue, and the weight of a view's colours, 0 = none; exponent of the view
+            weights for colours.
 
     Returns:
         (n, 5): sum of the supporting views' weights w, number of views that see the point empty, number of supporting
@@ -189,7 +190,20 @@ def observe(queries, directions, tolerance_m, tau_m, *views):
 
 @njit(cache=True, nogil=True)
 def _observe(
-    queries, tolerance_m, tau_m, index, free_m, poses, intrinsics, points, normals, weights, colour, gains, focus
+    queries,
+    tolerance_m,
+    tau_m,
+    index,
+    free_m,
+    poses,
+    intrinsics,
+    points,
+    normals,
+    weights,
+    colour_weights,
+    colour,
+    gains,
+    focus,
 ):
     frames, height, width = index.shape
     observed, colours = np.zeros((len(queries), 5)), np.zeros((len(queries), 4))
@@ -216,7 +230,7 @@ def _observe(
             left, top = math.floor(u), math.floor(v)
             if gains[f, 3] == 0.0 or left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
                 continue
-            share = gains[f, 3] * weights[n] ** focus  # (F9)
+            share = gains[f, 3] * colour_weights[n] ** focus  # (F9)
             colours[q, 3] += share
             for c in range(3):
                 colours[q, c] += share * gains[f, c] * between(colour[f], u, v, c)
