@@ -28,6 +28,7 @@ from modeler.cli.calibrate_camera import CalibrateCamera
 from modeler.cli.calibrate_sensor import CalibrateSensor
 from modeler.cli.console import INTERRUPTED, interruptible_at_once, say, terminable
 from modeler.cli.convert import Convert
+from modeler.cli.demo_active import DemoActive
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
 from modeler.cli.gallery import Gallery
@@ -54,6 +55,7 @@ Command = (
     | Export
     | Join
     | Suggest
+    | DemoActive
     | Gallery
 )
 
@@ -72,6 +74,7 @@ COMMANDS: dict[str, type[Command]] = {
     "export": Export,
     "join": Join,
     "suggest": Suggest,
+    "demo-active": DemoActive,
     "gallery": Gallery,
 }
 _STYLE = (

@@ -354,7 +354,9 @@ class Belief:
         if first is None:
             return ()
         base = _posterior(foreseen.image.index, first, self._relative(first.target, object_from_new))
-        others = [target for target in self.closer.closure_targets(base, self._map) if target != first.target]
+        others = [
+            target for target in self.closer.closure_targets(base, self._map, last=True) if target != first.target
+        ]
         return (first, *(found for target in others if (found := edge(target)) is not None))
 
     def _density(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from calibration.specimens import SPECIMENS, Symmetry
@@ -20,9 +21,9 @@ from active.trial import Trial
 CLASSES: tuple[Symmetry, ...] = ("asymmetric", "near-symmetric", "n-fold", "revolution")
 
 
-def chosen(half: str, count: int) -> list[str]:
+def chosen(half: str, count: int, classes: Sequence[str]) -> list[str]:
     """Return names of shapes, of each class as many."""
-    by_class = [[s.recipe for s in SPECIMENS if s.half == half and s.symmetry == kind] for kind in CLASSES]
+    by_class = [[s.recipe for s in SPECIMENS if s.half == half and s.symmetry == kind] for kind in classes]
     longest = max(map(len, by_class))
     mixed = [names[k] for k in range(longest) for names in by_class if k < len(names)]
     return mixed[:count]
@@ -32,6 +33,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="active")
     parser.add_argument("--half", choices=("tuning", "held-out"), default="held-out")
     parser.add_argument("--shapes", type=int, default=12, help="how many; 0 = only the tables")
+    parser.add_argument("--classes", default=",".join(CLASSES))
     parser.add_argument("--policies", default="suggest,random,even")
     parser.add_argument("--actions", type=int, default=5, help="most of a trial")
     parser.add_argument("--until-done", action="store_true", help="end a trial once all is known and seen")
@@ -39,7 +41,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     done = records(options.out)
-    for shape in chosen(options.half, options.shapes):
+    for shape in chosen(options.half, options.shapes, options.classes.split(",")):
         for policy in options.policies.split(","):
             if any((r["shape"], r["policy"], r["seed"]) == (shape, policy, options.seed) for r in done):
                 continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, final
 
@@ -10,6 +11,7 @@ from calibration.specimens import load_specimen
 from scipy.spatial import KDTree
 
 from modeler import se3
+from modeler.cli.simulated_robot import SimulatedRobot
 from modeler.pipeline import Modeler
 from modeler.pipeline.modeler import Run
 from modeler.priors import TablePrior
@@ -21,8 +23,6 @@ from sequences.rendering.recipe import Recipe
 from sequences.rendering.stage import Stage
 
 Policy = Literal["suggest", "random", "even"]
-TURN_SIGMA_DEG, SHIFT_SIGMA_M = 2.0, 0.004
-"""Errors of the robot's turns on the table."""
 EVEN_DEG = 25.0
 REACH_DEG = 100.0
 """Limit of the table prior, and so of turns."""
@@ -48,6 +48,9 @@ class Outcome:
     new: float = 0.0
     sigma_deg: float = float("nan")
     error_deg: float = float("nan")
+    """True error of the rotation from the last view to the new one."""
+    edge_sigma_deg: float = float("nan")
+    """Standard deviation that the edge between them states."""
 
 
 @final
@@ -123,7 +126,7 @@ class Trial:
 
     def run(self) -> Trace:
         recipe = small(load_specimen(self.shape), self.seed, self.width_px)
-        rng = np.random.default_rng([self.seed, recipe.seed, len(self.policy)])
+        rng = np.random.default_rng([self.seed, zlib.crc32(self.shape.encode()), len(self.policy)])
         stage = Stage(recipe)
         modeler = Modeler(sensor=Sensor(*stage.sequence.sensor()), prior=TablePrior(max_rotation_deg=REACH_DEG))
         wanted = KDTree(visible_points(stage))
@@ -131,14 +134,13 @@ class Trial:
         scene = modeler.segmenter.scene([stage.frame()])
         run, trace = modeler.start(scene), Trace(self.shape, self.policy, self.seed)
         step = shown(run, stage)
-        covered = self._states(trace, step, stage, wanted, covered, modeler)
+        covered, belief = self._states(trace, step, stage, wanted, covered, modeler)
         for _ in range(self.actions):
-            belief = modeler.belief(step.views, step.solution, step.edges_so_far)
             candidate, prediction = self._chosen(belief, rng)
-            stage = performed(stage, candidate, belief, rng)
+            stage = SimulatedRobot(stage).after(candidate, belief, rng).stage
             step = shown(run, stage)
             trace.outcomes.append(outcome(belief, candidate, prediction, step, stage))
-            covered = self._states(trace, step, stage, wanted, covered, modeler)
+            covered, belief = self._states(trace, step, stage, wanted, covered, modeler)
             if self.until_done and trace.seen[-1] >= 0.95 and trace.pose_sd_deg[-1] <= 1.0:
                 break
         return trace
@@ -154,7 +156,7 @@ class Trial:
 
     def _states(
         self, trace: Trace, step: Step, stage: Stage, wanted: KDTree, covered: Array, modeler: Modeler
-    ) -> Array:
+    ) -> tuple[Array, Belief]:
         truth = stage.truth()
         newest = len(stage.poses) - 1
         if newest in step.solution.trajectory:
@@ -166,28 +168,12 @@ class Trial:
         trace.stated_seen.append(belief.seen)
         trace.pose_sd_deg.append(belief.pose_deg)
         trace.worst_error_deg.append(max(errors_deg(step, truth).values()))
-        return covered
+        return covered, belief
 
 
 def shown(run: Run, stage: Stage) -> Step:
     """Return the step of the frame that a stage shows now."""
     return [event for event in run.track([stage.frame()]) if isinstance(event, Step)][-1]
-
-
-def performed(stage: Stage, candidate: Candidate, belief: Belief, rng: np.random.Generator) -> Stage:
-    """Return the stage after an action, with the robot's errors; a poke has those of its own prior."""
-    if candidate.poke is not None:
-        density = candidate.poke_prior.between(belief.last, replaced(belief, 1))
-        return stage.moved(density.sample(1, rng)[0] if False else se3.inverse(density.sample(1, rng)[0]))
-    x, y = rng.normal(0.0, SHIFT_SIGMA_M, 2)
-    middle = -0.5 * np.array(stage.poses[-1].offset_m[:2])  # back towards the middle of the table
-    turn_deg = candidate.turn_deg + rng.normal(0.0, TURN_SIGMA_DEG)
-    return stage.moved_on_table(turn_deg, (float(middle[0] + x), float(middle[1] + y)))
-
-
-def replaced(belief: Belief, ahead: int):
-    frame = belief.last.frame
-    return replace(belief.last, frame=replace(frame, index=frame.index + ahead))
 
 
 def errors_deg(step: Step, truth: dict[int, Array]) -> dict[int, float]:
@@ -198,6 +184,12 @@ def errors_deg(step: Step, truth: dict[int, Array]) -> dict[int, float]:
         k: float(np.degrees(se3.rotation_angle(se3.inverse(pose) @ object_from_model @ se3.inverse(truth[k]))))
         for k, pose in poses.items()
     }
+
+
+def relative_error_deg(step: Step, truth: dict[int, Array], last: int, new: int) -> float:
+    """Return the true error of the rotation between two frames."""
+    true = truth[last] @ se3.inverse(truth[new])
+    return float(np.degrees(se3.rotation_angle(se3.inverse(step.solution.relative(last, new)) @ true)))
 
 
 def outcome(belief: Belief, candidate: Candidate, prediction: Prediction | None, step: Step, stage: Stage) -> Outcome:
@@ -233,7 +225,8 @@ def outcome(belief: Belief, candidate: Candidate, prediction: Prediction | None,
         surface_nats=surface_nats,
         new=share,
         sigma_deg=sigma_deg(gain.covariances[new]),
-        error_deg=errors_deg(step, stage.truth())[new],
+        error_deg=relative_error_deg(step, stage.truth(), belief.last.index, new),
+        edge_sigma_deg=sigma_deg(step.solution.relative_covariance(belief.last.index, new)),
     )
 
 

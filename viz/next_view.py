@@ -1,0 +1,77 @@
+"""What to do next, in the viewer: the ranked list, what was seen and what may be seen yet, and how both develop."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from modeler.suggestion import Belief, Suggestions
+from modeler.types import RayImage
+from viz import entities
+from viz.blueprint import FROM_THE_SIDE
+from viz.drawings import Drawing
+
+WORDS: Final = "next/words"
+SEEN_CELLS: Final = "world/cells/seen"
+UNSEEN_CELLS: Final = "world/cells/unseen"
+SEEN: Final = "next/seen_percent"
+POSE_SD: Final = "next/pose_sd_deg"
+_GREY, _ORANGE = (150, 155, 165), (240, 140, 40)
+_SHOWN: Final = 8
+
+
+def draw_next(belief: Belief, found: Suggestions, done: str) -> Drawing:
+    """Yield what is known and what to do next.
+
+    Args:
+        belief: what is known.
+        found: what to do next.
+        done: the action that led here, in words.
+    """
+    lines = [f"**{found.summary}**", "", f"Done: {done}", "", *(f"1. {each.words}" for each in found.ranked[:_SHOWN])]
+    yield WORDS, rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
+    cells, size_m = belief.cells, 0.5 * belief.cells.cell_m
+    open_ = belief.can_be_seen & ~cells.seen & ~cells.under
+    yield SEEN_CELLS, rr.Points3D(cells.points_m[cells.seen], colors=_GREY, radii=size_m)
+    yield UNSEEN_CELLS, rr.Points3D(cells.points_m[open_], colors=_ORANGE, radii=size_m)
+    yield SEEN, rr.Scalars(100.0 * found.seen)
+    yield POSE_SD, rr.Scalars(found.pose_deg)
+
+
+def layout(first: RayImage) -> rrb.Blueprint:
+    """Return the layout: seen and unseen surface among the cameras, the frame, the list, and both over time.
+
+    Args:
+        first: the first view, which tells where to look from.
+    """
+    centre_m, size_m = first.centroid_m, max(first.size_m, 0.02)
+    eye = rrb.EyeControls3D(
+        position=centre_m + 7.0 * size_m * FROM_THE_SIDE / np.linalg.norm(FROM_THE_SIDE),
+        look_target=centre_m,
+        eye_up=np.array([0.0, -1.0, 0.0]),
+    )
+    cells = rrb.Spatial3DView(
+        origin=entities.WORLD,
+        contents=[SEEN_CELLS, UNSEEN_CELLS, entities.CAMERAS, entities.POSITION_3_SIGMA],
+        name="Seen (grey), and where unseen surface may be (orange)",
+        eye_controls=eye,
+    )
+    frame = rrb.Spatial2DView(
+        origin=entities.CAMERA, contents=[entities.COLOUR, entities.OUTLINE], name="Frame, object outlined"
+    )
+    words = rrb.TextDocumentView(origin=WORDS, name="What to do next")
+    times = rrb.Horizontal(
+        rrb.TimeSeriesView(origin=SEEN, name="Seen, % of what can be seen"),
+        rrb.TimeSeriesView(origin=POSE_SD, name="Largest standard deviation of a rotation, °"),
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(rrb.Vertical(cells, times, row_shares=[2.0, 1.0]), rrb.Vertical(frame, words)),
+        rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=1.0),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
+    )
