@@ -256,9 +256,17 @@ class Belief:
             covariance: (6, 6) of the view's pose in object coordinates.
         """
         points_m, normals = self.cells.points_m[cells], self.cells.normals[cells]
-        after_m2 = self._measured_m2(points_m, normals, covariance)
-        gains = 0.5 * np.log1p(self.cell_variances_m2[cells] / after_m2)
+        gains = self._nats(self.cell_variances_m2[cells], self._measured_m2(points_m, normals, covariance))
         return self._independent_share * float(self._surface_in(cells) @ gains)
+
+    def _nats(self, before_m2: Array, measured_m2: Array) -> Array:
+        """Return by how much the entropy (k,) of surface of known variance falls by a further measurement.
+
+        Known to the noise of a single view, surface is known well enough: looking again and again is no aim.
+        """
+        after_m2 = 1.0 / (1.0 / before_m2 + 1.0 / measured_m2)
+        enough_m2 = self._noise_m2
+        return 0.5 * np.log(np.maximum(before_m2, enough_m2) / np.maximum(after_m2, enough_m2))
 
     def brought(self, view: RayImage, object_from_camera: Array, covariance: Array) -> tuple[float, float]:
         """Return what a view that was taken brought: `surface_nats`, and the share of its surface that is new.
@@ -271,8 +279,9 @@ class Belief:
         points_m = se3.transform(object_from_camera, view.points_m)
         again, first = self.cells.at(points_m)
         normals = view.normals[first] @ object_from_camera[:3, :3].T
-        after_m2 = self._measured_m2(points_m[first], normals, covariance)
-        new_nats = self._independent_share * float(np.sum(0.5 * np.log1p(self.cells.depth_sd_m**2 / after_m2)))
+        measured_m2 = self._measured_m2(points_m[first], normals, covariance)
+        unseen_m2 = np.full(len(first), self.cells.depth_sd_m**2)
+        new_nats = self._independent_share * float(np.sum(self._nats(unseen_m2, measured_m2)))
         again = np.intersect1d(again, self.cells.visible(se3.inverse(object_from_camera)))
         share = len(first) / max(len(first) + len(again), 1)
         return self.surface_nats(again, covariance) + new_nats, share

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
+from active.trial import done
+
 MEASURES = {
     "gain_nats": ("predicted_gain", "gain"),
     "pose_nats": ("predicted_pose_nats", "pose_nats"),
@@ -17,13 +19,14 @@ MEASURES = {
 
 
 def steps(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return all actions with their gains: 0 where the view was left out."""
+    """Return all actions with their gains: none where the view was left out, or its pose is wrong by the truth."""
     found = []
     for record in records:
         for one in record["outcomes"]:
             predicted = one["right"] * (one["predicted_pose_nats"] + one["predicted_surface_nats"])
-            gain = one["pose_nats"] + one["surface_nats"] if one["accepted"] else 0.0
-            found.append({**one, "shape": record["shape"], "predicted_gain": predicted, "gain": gain})
+            right = one["accepted"] and one["error_deg"] <= 3.0 * one["edge_sigma_deg"] + 3.0
+            gain = one["pose_nats"] + one["surface_nats"] if right else 0.0
+            found.append({**one, "shape": record["shape"], "predicted_gain": predicted, "gain": gain, "placed": right})
     return found
 
 
@@ -63,25 +66,30 @@ def printed(records: Sequence[dict[str, Any]]) -> None:
                 f"{rank_correlation(*pairs.T):.2f} ({ranks[0]:.2f} to {ranks[1]:.2f}) |"
             )
     print()
-    print("| policy | trials | reached | actions, mean (95 %) | with the truth within 3 sd + 1° |")
-    print("|---|---|---|---|---|")
+    print("| policy | trials | reached | actions, mean (95 %); one more than the most where never |")
+    print("|---|---|---|---|")
+    most = 1 + max(len(record["outcomes"]) for record in records)
+    means = {}
     for policy in dict.fromkeys(record["policy"] for record in records):
-        some = [record for record in records if record["policy"] == policy]
-        reached = [needed(record) for record in some]
-        counts = np.array([len(r["outcomes"]) + 1 if n is None else n for r, n in zip(some, reached, strict=True)])
-        low, high = interval(counts.astype(float), np.mean, rng)
-        right = sum(
-            r["worst_error_deg"][-1] <= 3.0 * r["pose_sd_deg"][-1] + 1.0 for r, n in zip(some, reached, strict=True)
-        )
+        counts = {(r["shape"], r["seed"]): needed(r) for r in records if r["policy"] == policy}
+        means[policy] = counts
+        values = np.array([most if n is None else n for n in counts.values()], dtype=np.float64)
+        low, high = interval(values, np.mean, rng)
         print(
-            f"| {policy} | {len(some)} | {sum(n is not None for n in reached)} | "
-            f"{counts.mean():.1f} ({low:.1f} to {high:.1f}) | {right} |"
+            f"| {policy} | {len(values)} | {sum(n is not None for n in counts.values())} | "
+            f"{values.mean():.1f} ({low:.1f} to {high:.1f}) |"
         )
+    print()
+    for policy in ("random", "even"):
+        common = sorted(means.get("suggest", {}).keys() & means.get(policy, {}).keys())
+        pairs = np.array([[means[p][key] or most for p in ("suggest", policy)] for key in common], dtype=np.float64)
+        if len(pairs) > 1:
+            low, high = interval(pairs, lambda p: p[:, 0].mean() / p[:, 1].mean(), rng)
+            share = pairs[:, 0].mean() / pairs[:, 1].mean()
+            print(f"suggest / {policy}: {share:.2f} ({low:.2f} to {high:.2f}) over {len(pairs)} shapes")
 
 
 def needed(record: dict[str, Any]) -> int | None:
-    """Return the actions until every pose was stated to 1° and 95 % of what can be seen was; None: never."""
-    for count, (seen, sd_deg) in enumerate(zip(record["seen"], record["pose_sd_deg"], strict=True)):
-        if seen >= 0.95 and sd_deg <= 1.0:
-            return count
-    return None
+    """Return the actions until every pose was within 1° of the truth and 95 % of what can be seen was; None: never."""
+    pairs = zip(record["seen"], record["worst_error_deg"], strict=True)
+    return next((count for count, (seen, error_deg) in enumerate(pairs) if done(seen, error_deg)), None)
