@@ -90,7 +90,7 @@ def shown(name: str, turns_deg: list[float], *, spin_sd_deg: float = 0.3, reach_
         recipe.object,
         name,
         rest_rotation_deg=recipe.rest_rotation_deg,
-        view=type(view)(320, 240, 287.5, view.distance_m, view.elevation_deg, view.look_height_m),
+        view=type(view)(200, 150, 180.0, 0.5, view.elevation_deg, view.look_height_m),
         trajectory=Places(places),
     )
     sequence = RenderedSequence(small)
@@ -124,7 +124,7 @@ def box() -> Belief:
 
 
 def test_more_views_show_more_and_a_whole_turn_shows_what_can_be_seen(box: Belief) -> None:
-    once, round_ = shown("l_bracket", [0.0]), shown("l_bracket", [45.0 * k for k in range(8)])
+    once, round_ = shown("l_bracket", [0.0]), shown("l_bracket", [60.0 * k for k in range(6)])
     assert once.seen < box.seen < round_.seen
     assert once.seen < 0.7
     assert round_.seen > 0.9

@@ -24,9 +24,9 @@ _REACH_DEG = 100.0  # of turns, and limit of the table prior: beyond it views ha
 
 @dataclass(frozen=True)
 class DemoActive:
-    """Show a simulated robot that models an object: it does what `modeler suggest` says until the model is good enough.
+    """Show a simulated robot that turns an object as `modeler suggest` says until its model is good enough.
 
-    The renderer is its camera; turns and pokes have errors. Makes OUT/scene, the sequence, and OUT/run, its run folder,
+    The renderer is its camera; turns have errors of 2°. Makes OUT/scene, the sequence, and OUT/run, its run folder,
     whose recording shows at each step what was seen, what may be seen yet, and the ranked list.
     """
 
@@ -158,8 +158,8 @@ class _Demo:
 
 
 def _best(found: Suggestions) -> Suggestion | None:
-    """Return the best action that goes on with the run: not one that begins another."""
-    return next((each for each in found.ranked if each.prediction.candidate.action != "lay"), None)
+    """Return the best turn: the run's prior knows nothing of pokes, and laying the object down begins another run."""
+    return next((each for each in found.ranked if each.prediction.candidate.action == "turn"), None)
 
 
 def _say(found: Suggestions, done: str, step: Step) -> None:

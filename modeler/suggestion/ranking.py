@@ -197,7 +197,9 @@ def _summary(belief: Belief, ranked: Sequence[Suggestion], *, reached: bool) -> 
         f"{100.0 * belief.seen:.0f} % of what can be seen was seen"
     )
     if not reached:
-        return state
+        kinds = [each.prediction.candidate.action for each in ranked]
+        useless = "poke" in kinds and "turn" in kinds and kinds.index("turn") < kinds.index("poke")
+        return f"{state}; no poke tells more than a turn" if useless else state
     lays = [each for each in ranked if each.prediction.candidate.action == "lay"]
     rest = "; lay it on its side for the rest" if lays else ""
     return f"nothing more is to be gained: {state}{rest}"

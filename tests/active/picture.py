@@ -39,7 +39,7 @@ def main() -> None:
         step = [event for event in run.track([robot.stage.frame()]) if isinstance(event, Step)][-1]
         belief = modeler.belief(step.views, step.solution, step.edges_so_far)
         found = suggest(belief, None, Goal())
-        best = next(each for each in found.ranked if each.prediction.candidate.action != "lay")
+        best = next(each for each in found.ranked if each.prediction.candidate.action == "turn")
         action = best.words.split(" (")[0]
         wanted = "good enough" if found.reached else f"next: {action}"
         shown.append((belief, f"{100.0 * found.seen:.0f} % seen, poses to {found.pose_deg:.1f}°\n{wanted}"))
