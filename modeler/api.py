@@ -17,6 +17,7 @@ from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.cli.outputs import check_run_folder
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.pipeline import Modeler
+from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.types import AbstractPrior, Camera, Frame, InputError, ObjectModel, Posterior, Solution, Step
@@ -65,7 +66,8 @@ def register(
         source_depth_m: (h, w) depth in m; 0 or NaN where nothing was measured.
         target_depth_m: (h, w), of the same camera.
         intrinsics: a `Camera`, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix.
-        prior: what is known of the motion; None: rotations up to 50° and shifts of up to 4 cm, as `GeneralPrior`.
+        prior: what is known of the motion; None: rotations up to 50° and shifts of up to 4 cm, as `GeneralPrior`,
+            and any motion where none of these matches.
         masks: (h, w) of source and target, true on the object; None: the object is segmented.
         colours: (h, w, 3) 8-bit RGB of source and target, aligned to depth; None: only depth is compared.
         sensor: noise of the camera; None: the first Kinect's.
@@ -93,7 +95,8 @@ def register(
         depth_m[~(depth_m > 0.0) | np.isinf(depth_m)] = np.nan
         frames.append(Frame(index, float(index), depth_m, camera, mask=mask, colour=colour))
     registrar = VisibilityRegistrar(VisibilityLikelihood(colour=colours is not None))
-    modeler = Modeler(sensor=sensor or Sensor(), registrar=registrar, seed=seed)
+    usual = GeneralPrior(limits_assumed=True)
+    modeler = Modeler(sensor=sensor or Sensor(), prior=usual, registrar=registrar, seed=seed)
     scene = modeler.segmenter.scene(frames)
     views = []
     for name, frame in zip(("source", "target"), frames, strict=True):

@@ -9,6 +9,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors import (
+    AnyMotion,
     AxesPrior,
     FeaturesPrior,
     GeneralPrior,
@@ -179,6 +180,7 @@ def foreseen(camera: Array) -> AbstractPrior:
 
 CASES: dict[str, Case] = {
     "general": Case(lambda _: GeneralPrior(max_rotation_deg=30, max_offset_m=0.03)),
+    "any motion": Case(lambda _: AnyMotion()),
     "table": Case(lambda _: TablePrior(max_rotation_deg=40, max_shift_m=0.03)),
     "turntable": Case(turntable),
     "turntable on its table": Case(lambda _: TurntablePrior(24.0, 2.0, needs_table=True)),

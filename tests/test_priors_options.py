@@ -18,6 +18,7 @@ from modeler.cli import main
 from modeler.cli.compose import chosen_prior, prior_name
 from modeler.cli.options import PriorOptions
 from modeler.priors import (
+    AnyMotion,
     AxesPrior,
     FeaturesPrior,
     GeneralPrior,
@@ -110,18 +111,25 @@ def test_the_sequence_says_what_is_known_unless_it_is_asked_otherwise(
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("general", GeneralPrior()),
+        ("general", GeneralPrior(limits_assumed=True)),
         ("table", TablePrior()),
-        ("axes", AxesPrior()),
+        ("axes", AxesPrior(GeneralPrior(limits_assumed=True))),
         ("features+table", FeaturesPrior(TablePrior())),
         ("table+velocity+axes", AxesPrior(VelocityPrior(TablePrior()))),
         ("turntable", TurntablePrior(25.0, 3.0)),
         ("table+turntable", TurntablePrior(25.0, 3.0, needs_table=True)),
-        ("table+general", ProductPrior(TablePrior(), GeneralPrior())),
+        ("table+general", ProductPrior(TablePrior(), GeneralPrior(limits_assumed=True))),
     ],
 )
 def test_names_joined_by_plus_hold_together(name: str, expected: object) -> None:
     assert chosen_prior(PriorOptions(prior=name), TURNTABLE) == expected
+
+
+@pytest.mark.parametrize("given", [{"max_rotation_deg": 40.0}, {"max_offset_m": 0.1}])
+def test_limits_that_are_told_hold(given: dict[str, Any]) -> None:
+    assert chosen_prior(PriorOptions(), None).unlimited() == AnyMotion()
+    assert chosen_prior(PriorOptions(**given), None).unlimited() is None
+    assert chosen_prior(PriorOptions(prior="features"), None).unlimited() == FeaturesPrior(AnyMotion())
 
 
 @pytest.mark.parametrize(

@@ -57,12 +57,16 @@ class Limited(AbstractPoseDensity):
 @dataclass(frozen=True)
 class Limits(AbstractPrior):
     limit_deg: float = LIMIT_DEG
+    assumed: bool = False
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         return Limited(self.limit_deg)
 
     def relaxed(self, steps: float) -> AbstractPrior:
         return replace(self, limit_deg=steps * self.limit_deg)
+
+    def unlimited(self) -> AbstractPrior | None:
+        return Limits(180.0) if self.assumed else None
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
         return self
@@ -120,6 +124,35 @@ def test_beyond_the_limits_only_what_matches_far_better_is_believed(
 @pytest.mark.parametrize("overlap", [0.27, 0.5])
 def test_a_place_within_the_limits_that_matches_far_less_does_not_count(overlap: float) -> None:
     assert found(Outcome.AT_LIMIT, -65.0, 4.0, overlap=overlap) == pytest.approx(-65.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("assumed", "anywhere", "placed"),
+    [
+        (True, Outcome.CONVERGED, True),
+        (True, Outcome.AMBIGUOUS, False),  # several places, none of which is usual
+        (True, Outcome.NO_OVERLAP, False),
+        (False, Outcome.CONVERGED, False),  # the limits are known
+    ],
+)
+def test_limits_that_are_assumed_hold_while_something_within_them_matches(
+    *, assumed: bool, anywhere: Outcome, placed: bool
+) -> None:
+    asked: list[float] = []
+
+    def register(source: RayImage, target: RayImage, prior: AbstractPrior) -> Posterior:
+        assert isinstance(prior, Limits)
+        asked.append(prior.limit_deg)
+        outcome = anywhere if prior.limit_deg == 180.0 else Outcome.NO_OVERLAP
+        pose = PoseGaussian(turned(120.0), COVARIANCE)
+        return Posterior(source.index, target.index, pose, outcome, 0.8, seconds=1.0)
+
+    state = State(views={0: view(0)}, places={0: 0, 1: 1})
+    tracker = Tracker(state, Limits(assumed=assumed), Closer(), Sensor(), register)
+    (posterior,) = result(tracker.locate(view(1), 0, again=False))
+    assert posterior.usable == placed
+    assert asked == [LIMIT_DEG, 2.0 * LIMIT_DEG, *([180.0] if assumed else [])]
+    assert posterior.seconds == len(asked)
 
 
 def of_modes(*modes: tuple[float, float]) -> Posterior:

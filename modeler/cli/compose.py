@@ -225,7 +225,7 @@ def _known(name: str, given: dict[str, Any], sequence: AbstractSequence | None) 
         case "poke":
             return _poke(given, sequence)
         case _:
-            return GeneralPrior(**given)
+            return GeneralPrior(**given, limits_assumed=not given)
 
 
 def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:

@@ -13,7 +13,7 @@ import numpy as np
 from modeler.closure import Closer
 from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances
 from modeler.graph import CommonAxis, shared_noise
-from modeler.pipeline.pairs import Prepared, prepare, register
+from modeler.pipeline.pairs import Prepared, anywhere, prepare, register
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
 from modeler.priors import GeneralPrior
@@ -103,12 +103,17 @@ class Modeler:
         Args:
             source: one view.
             target: another.
-            prior: what is known of the motion; None: the modeler's own.
+            prior: what is known of the motion; None: the modeler's own, and any motion where its limits are assumed and
+                nothing within them matches.
 
         Raises:
             InputError: where the views lack what the prior needs.
         """
-        return self._register(self.registrar, source, target, self.prior if prior is None else prior)
+        found = self._register(self.registrar, source, target, self.prior if prior is None else prior)
+        unlimited = self.prior.unlimited() if prior is None and not found.usable else None
+        return (
+            found if unlimited is None else anywhere(found, self._register(self.registrar, source, target, unlimited))
+        )
 
     def suggest(
         self, known: Step, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None

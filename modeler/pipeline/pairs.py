@@ -75,3 +75,16 @@ def register(
     """
     rng = np.random.default_rng([seed, source.index, target.index])
     return registrar.register(source, target, density, rng=rng)
+
+
+def anywhere(within: Posterior, unlimited: Posterior) -> Posterior:
+    """Return which registration counts where nothing within assumed limits matched, with the time of both.
+
+    Of several places, none within the usual limits, none is known to be right.
+
+    Args:
+        within: the registration in the limits, not usable.
+        unlimited: that without limits.
+    """
+    found = unlimited if unlimited.outcome is Outcome.CONVERGED else within
+    return replace(found, seconds=within.seconds + unlimited.seconds)

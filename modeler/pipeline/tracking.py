@@ -16,6 +16,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.closure import Closer
+from modeler.pipeline.pairs import anywhere
 from modeler.pipeline.state import State
 from modeler.priors import PredictedProposal
 from modeler.rays import Sensor
@@ -186,6 +187,9 @@ class Tracker:
             seconds = odometry.seconds + wider.seconds
             known = prior.between(view, self.state.views[odometry.target])
             odometry = replace(preferred(odometry, wider, known), seconds=seconds)
+        unlimited = prior.unlimited()
+        if unlimited is not None and not odometry.usable and not again:
+            odometry = anywhere(odometry, self._pair(view, odometry.target, unlimited))
         posteriors = (odometry,)
         while not again and not self._placed(posteriors):
             target = self.closer.relocalisation_target(posteriors, self.state.map_view)

@@ -1,5 +1,6 @@
 """Nonvisual information about the motion between two views: models of evidence, and proposals that guide the search."""
 
+from modeler.priors.general import AnyMotion as AnyMotion
 from modeler.priors.general import GeneralPrior as GeneralPrior
 from modeler.priors.held import HeldPrior as HeldPrior
 from modeler.priors.poke import Poke as Poke

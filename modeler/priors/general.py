@@ -24,6 +24,8 @@ class GeneralPrior(AbstractPrior):
     """Largest rotation between the two views."""
     max_offset_m: float = 0.04
     """Largest distance between the target's centroid and the source's, transformed."""
+    limits_assumed: bool = False
+    """Whether the limits are usual, but not known: where nothing within them matches, any motion is possible."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -39,6 +41,30 @@ class GeneralPrior(AbstractPrior):
         """Return the prior with limits for several steps."""
         rotation_deg, offset_m = relaxed_limits(self.max_rotation_deg, self.max_offset_m, steps)
         return replace(self, max_rotation_deg=rotation_deg, max_offset_m=offset_m)
+
+    def unlimited(self) -> AnyMotion | None:
+        """Return the prior of any motion where limits are assumed, else None."""
+        return AnyMotion() if self.limits_assumed else None
+
+
+@dataclass(frozen=True)
+class AnyMotion(AbstractPrior):
+    """Any rotation; two centroids of one object's surface are no farther apart than its size allows."""
+
+    max_offset: float = 2.0
+    """Largest distance between the target's centroid and the source's, transformed, as a share of the object's size.
+
+    What opposite sides of a ball show, and the end and the side of a rod, have centroids 1.2 and 1.7 sizes apart.
+    """
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        check_parameters(self)
+
+    def between(self, source: RayImage, target: RayImage) -> GeneralDensity:
+        """Return the density of target_from_source."""
+        offset_m = min(self.max_offset * max(source.size_m, target.size_m, 1e-3), MAX_LENGTH_M)
+        return GeneralDensity(source.centroid_m, target.centroid_m, np.pi, offset_m)
 
 
 @dataclass(frozen=True, eq=False)

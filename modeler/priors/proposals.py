@@ -59,6 +59,11 @@ class AbstractProposal(AbstractPrior):
         """Return the prior with limits for several steps."""
         return replace(self, known=self.known.relaxed(steps))
 
+    def unlimited(self) -> AbstractPrior | None:
+        """Return the prior without limits on the motion, where those of its independent part are assumed."""
+        known = self.known.unlimited()
+        return None if known is None else replace(self, known=known)
+
 
 @dataclass(frozen=True)
 class PredictedProposal(AbstractPrior):

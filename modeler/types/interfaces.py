@@ -99,6 +99,13 @@ class AbstractPrior(ABC):
         """
         return self
 
+    def unlimited(self) -> AbstractPrior | None:
+        """Return the prior without limits on the motion, where these are assumed; by default None: they are known.
+
+        Used where nothing within the limits matches.
+        """
+        return None
+
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
         """Return the prior updated with the sequence so far (a common axis, a velocity); by default the prior itself.
 
