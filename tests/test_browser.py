@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import http.server
+import shutil
+import subprocess
+import tarfile
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +19,9 @@ import pytest
 from turning_box import object_from_camera, steps
 
 from modeler import se3
+from modeler.cli import main
 from modeler.export import RunFolder, RunMeta
+from sequences import bundled
 from viz import viewer
 from viz.report import write_page
 from viz.stream import open_stream
@@ -94,3 +102,52 @@ def test_the_web_viewer_draws_the_run(run: Path, page: chromium.Page) -> None:
     # The viewer asks its makers' servers for fonts and news; without a network that is an error, but none of ours.
     theirs = ("https://", "TypeError: Failed to fetch")
     assert [words for words in page.complaints if not any(mark in words for mark in theirs)] == []
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[tuple[Path, str]]:
+    """A folder with a viewer of GLB files from npm, and its address."""
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip("npm is not installed")
+    folder = tmp_path / "site"
+    folder.mkdir()
+    got = subprocess.run([npm, "pack", "@google/model-viewer@4.4.0"], cwd=tmp_path, capture_output=True, check=False)
+    if got.returncode:
+        pytest.skip("npm's registry cannot be reached")
+    with tarfile.open(next(tmp_path.glob("*.tgz"))) as archive:
+        script = archive.extractfile("package/dist/model-viewer.min.js")
+        assert script is not None
+        (folder / "viewer.js").write_bytes(script.read())
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield folder, f"http://127.0.0.1:{server.server_port}/"
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.slow
+def test_a_viewer_in_the_browser_draws_an_exported_model_with_its_texture(
+    site: tuple[Path, str], tmp_path: Path, page: chromium.Page
+) -> None:
+    folder, address = site
+    assert main(["build", str(bundled("box")), "--prior", "table", "--out", str(tmp_path / "run")]) == 0
+    assert main(["export", str(tmp_path / "run"), "--out", str(folder / "box.glb"), "--texture"]) == 0
+    (folder / "index.html").write_text(
+        "<!DOCTYPE html><script type='module' src='viewer.js'></script><body style='margin:0'>"
+        "<model-viewer id='v' src='box.glb' camera-orbit='30deg 60deg auto' style='width:800px;height:800px'>"
+        "</model-viewer>"
+    )
+    page.open(f"{address}index.html")
+    page.wait_for("document.getElementById('v')?.loaded === true")
+    box = page.value("JSON.stringify(document.getElementById('v').getDimensions())")
+    assert '"y":0.1' in box  # 0.18 m high, and y is up
+    deadline = time.monotonic() + 60.0
+    while (seen := coloured(page.picture())[:800, :800]).mean() < 0.05:  # its print is yellow
+        assert time.monotonic() < deadline, page.complaints
+        time.sleep(0.5)
+    rows, columns = np.nonzero(seen)
+    assert abs(rows.mean() - 400.0) < 80.0
+    assert abs(columns.mean() - 400.0) < 80.0
+    assert [words for words in page.complaints if "favicon" not in words] == []

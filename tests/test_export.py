@@ -202,7 +202,10 @@ def test_texture_shows_each_point_its_colour(tmp_path: Path, suffix: str) -> Non
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
         return np.rint(255.0 * ((points - [0.0, 0.0, 0.8]) / 0.1 + 0.5)).astype(np.uint8)
 
-    model, texture = textured(ball(), paint, 1e-3)
+    model, texture = textured(ball(), paint, 256)
+    assert texture.image.shape == (256, 256, 3)
+    areas_m2 = np.pi * 0.1**2, (256.0 * texture.texel_m) ** 2  # of the ball, and of all of the image
+    assert 0.4 < areas_m2[0] / areas_m2[1] < 0.9
     out = tmp_path / f"a ball.{suffix}"  # other programs end names at spaces
     write_mesh(model, out, texture)
     assert {path.name for path in tmp_path.iterdir()} - {out.name} <= {"a_ball.mtl", "a_ball.png"}
@@ -222,7 +225,7 @@ def test_texture_shows_each_point_its_colour(tmp_path: Path, suffix: str) -> Non
 
 
 def test_texture_needs_a_format_that_holds_it(tmp_path: Path) -> None:
-    model, texture = textured(ball(), lambda points, _: np.full((len(points), 3), 7, dtype=np.uint8), 2e-3)
+    model, texture = textured(ball(), lambda points, _: np.full((len(points), 3), 7, dtype=np.uint8), 64)
     with pytest.raises(InputError, match="holds no texture"):
         write_mesh(model, tmp_path / "ball.stl", texture)
     assert not list(tmp_path.iterdir())

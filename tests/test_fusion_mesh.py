@@ -197,7 +197,7 @@ def test_a_mesh_of_many_triangles_is_unwrapped_in_pieces_without_overlap() -> No
     def paint(points_m: Array, _: Array) -> npt.NDArray[np.uint8]:
         return np.rint(127.5 + 2400.0 * points_m).clip(0.0, 255.0).astype(np.uint8)
 
-    wrapped, texture = textured(model, paint, 5e-4)
+    wrapped, texture = textured(model, paint, 512)
     corners, before = wrapped.vertices_m[wrapped.triangles], model.vertices_m[model.triangles]
     assert sorted(map(tuple, corners.mean(axis=1).round(9))) == sorted(map(tuple, before.mean(axis=1).round(9)))
     # Were two charts on top of each other, the image would show the colours of one of them only.

@@ -16,6 +16,7 @@ Up = Literal["z", "y"]
 Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "print"]
 
 if TYPE_CHECKING:
+    from modeler.export.texture import Texture
     from modeler.fusion import FusionVolume
     from modeler.types import ObjectModel
 
@@ -50,6 +51,8 @@ class Export:
     """Simplify the mesh to N triangles. With --texture 8000 unless given: the detail is in the image."""
     texture: bool = False
     """Colour by an image wrapped around the mesh, from the sharpest frontal views (OBJ with MTL and PNG, GLB)."""
+    texture_px: int = 2048
+    """Side of that image, a square."""
     bop: bool = False
     """Write a BOP model: PLY in mm, origin in the centre of its box, and its entry in models_info.json."""
     tint: Annotated[Literal["views", "sigma"] | None, default("none")] = None
@@ -101,7 +104,8 @@ class Export:
         if self.texture and volume is not None:
             if not volume.views.coloured:
                 raise InputError(f"{self.run_folder}: its frames have no colour; leave out --texture")
-            model, texture = files.textured(model, volume.texture_colours, volume.texel_m)
+            model, texture = files.textured(model, volume.texture_colours, self.texture_px)
+            say(texture_words(texture, volume))
         if self.bop:
             files.write_bop(model, self.out)
             _tell(model, self)
@@ -128,6 +132,14 @@ class Export:
 
         _check_numbers(self)
         return Preset(self, purpose).run()
+
+
+def texture_words(texture: Texture, volume: FusionVolume) -> str:
+    """Return how fine a texture is, beside the images that it comes from."""
+    side_px = len(texture.image)
+    words = f"texture of {side_px} x {side_px} px, {1000.0 * texture.texel_m:.2g} mm each"
+    coarse = texture.texel_m > volume.pixel_m
+    return f"{words}, coarser than the images: --texture-px {2 * side_px} keeps their detail" if coarse else words
 
 
 def _check(options: Export) -> None:
@@ -160,6 +172,8 @@ def _check_numbers(options: Export) -> None:
 
     if options.triangles is not None and options.triangles < 4:
         raise InputError(f"--triangles {options.triangles} is too few for a solid; give at least 4")
+    if not 64 <= options.texture_px <= 8192:
+        raise InputError(f"--texture-px {options.texture_px} is out of range; give 64 to 8192")
     if options.voxel_m is not None and not MIN_VOXEL_M <= options.voxel_m < 1.0:
         raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
     for name, value in (("density-kg-m3", options.density_kg_m3), ("mass-kg", options.mass_kg)):

@@ -128,7 +128,7 @@ class Preset:
         model = solids.without_degenerate(files.simplified(model, count))
         if not coloured:
             return model, None
-        return files.textured(model, self._volume.texture_colours, self._volume.texel_m)
+        return files.textured(model, self._volume.texture_colours, self.options.texture_px)
 
     def _foundationpose(self) -> Checks:
         out = self.options.out

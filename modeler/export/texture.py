@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from modeler.types import Array, ObjectModel
 
-LARGEST_PX = 4096
+SIDE_PX = 2048  # of the image: what programs that read textures are made for
 PADDING_PX = 4  # charts keep this distance, so that colours do not bleed when the image is shrunk
 TRIANGLES = 8_000  # of a mesh whose detail is in the image
+_FILLED = 0.6  # share of the image that charts fill
 PIECE = 1_000  # triangles that are unwrapped at once: the time grows with more than the square of their number
 
 Paint = Callable[[Array, Array], npt.NDArray[np.uint8]]
@@ -27,21 +28,23 @@ class Texture:
     """(v, 2) places in the image, 0..1: u to the right, v upwards from the lower edge."""
     image: npt.NDArray[np.uint8]
     """(h, w, 3) RGB."""
+    texel_m: float
+    """Side of a pixel of the image on the surface."""
 
 
-def textured(model: ObjectModel, paint: Paint, texel_m: float) -> tuple[ObjectModel, Texture]:
+def textured(model: ObjectModel, paint: Paint, side_px: int = SIDE_PX) -> tuple[ObjectModel, Texture]:
     """Return the model with vertices doubled along seams, and its texture.
 
     Args:
         model: the mesh.
         paint: gives points of the surface their colours.
-        texel_m: side of a pixel of the image on the surface, larger where the image would become too large.
+        side_px: of the image, a square that the surface fills.
     """
     import xatlas
 
     corners = model.vertices_m[model.triangles]
     area_m2 = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-    texel_m = max(texel_m, float(np.sqrt(area_m2 / 0.6)) / LARGEST_PX)
+    texel_m = float(np.sqrt(area_m2 / _FILLED)) / side_px  # about: how much room the charts leave, packing tells
     atlas = xatlas.Atlas()
     # In texels and from the origin: the library compares lengths with constants.
     texels = ((model.vertices_m - model.vertices_m.mean(axis=0)) / texel_m).astype(np.float32)
@@ -67,9 +70,10 @@ def textured(model: ObjectModel, paint: Paint, texel_m: float) -> tuple[ObjectMo
         vertex_views=None if model.vertex_views is None else model.vertex_views[origin],
         vertex_sigmas_m=None if model.vertex_sigmas_m is None else model.vertex_sigmas_m[origin],
     )
-    size = np.array([atlas.width, atlas.height])
-    image = _baked(wrapped, places.astype(np.float64) * size, size, paint)
-    return wrapped, Texture(np.stack([places[:, 0], 1.0 - places[:, 1]], axis=1).astype(np.float64), image)
+    packed = max(atlas.width, atlas.height)
+    shares = places.astype(np.float64) * np.array([atlas.width, atlas.height]) / packed
+    image = _baked(wrapped, shares * side_px, side_px, paint)
+    return wrapped, Texture(np.stack([shares[:, 0], 1.0 - shares[:, 1]], axis=1), image, texel_m * packed / side_px)
 
 
 def _pieces(centres_m: Array, most: int) -> list[npt.NDArray[np.int64]]:
@@ -86,13 +90,13 @@ def _pieces(centres_m: Array, most: int) -> list[npt.NDArray[np.int64]]:
     return pieces
 
 
-def _baked(model: ObjectModel, places_px: Array, size: npt.NDArray[np.int64], paint: Paint) -> npt.NDArray[np.uint8]:
-    """Return the image (h, w, 3): every pixel in or beside a chart shows the point of the surface nearest to it.
+def _baked(model: ObjectModel, places_px: Array, side_px: int, paint: Paint) -> npt.NDArray[np.uint8]:
+    """Return the image (s, s, 3): every pixel in or beside a chart shows the point of the surface nearest to it.
 
     Args:
         model: the mesh.
         places_px: (v, 2) column and row of its vertices, pixel centres at halves.
-        size: (2,) width and height.
+        side_px: s.
         paint: gives points their colours.
     """
     import open3d as o3d
@@ -100,7 +104,7 @@ def _baked(model: ObjectModel, places_px: Array, size: npt.NDArray[np.int64], pa
     flat = np.concatenate([places_px, np.zeros((len(places_px), 1))], axis=1).astype(np.float32)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor.from_numpy(flat), o3d.core.Tensor.from_numpy(model.triangles.astype(np.uint32)))
-    columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    columns, rows = np.meshgrid(np.arange(side_px) + 0.5, np.arange(side_px) + 0.5)
     pixels = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3).astype(np.float32)
     found = scene.compute_closest_points(o3d.core.Tensor.from_numpy(pixels))
     off = np.linalg.norm(found["points"].numpy() - pixels, axis=1)
@@ -114,4 +118,4 @@ def _baked(model: ObjectModel, places_px: Array, size: npt.NDArray[np.int64], pa
     colours = paint(points, normals)
     image = np.full((len(pixels), 3), np.rint(colours.mean(axis=0)) if len(colours) else 128, dtype=np.uint8)
     image[near] = colours
-    return image.reshape(int(size[1]), int(size[0]), 3)
+    return image.reshape(side_px, side_px, 3)

@@ -194,10 +194,10 @@ class FusionVolume:
         return meshing.filled_colours(found.colours, found.coloured, points_m)
 
     @property
-    def texel_m(self) -> float:
-        """Length on the surface that half a pixel of the views covers."""
+    def pixel_m(self) -> float:
+        """Length on the surface that a pixel of the views covers."""
         depth_m = float(np.median(self.views.thinned(_ranges_m)))
-        return 0.5 * depth_m / float(np.median(np.concatenate([block.intrinsics[:, 0] for block in self.views])))
+        return depth_m / float(np.median(np.concatenate([block.intrinsics[:, 0] for block in self.views])))
 
     @cached_property
     def _gains(self) -> Array:
