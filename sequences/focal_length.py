@@ -1,4 +1,4 @@
-"""Sequences with another focal length than they say: as `modeler calibrate-camera` estimated it."""
+"""Sequences with another focal length and depth scale than they say: as `modeler calibrate-camera` estimated them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
-from typing import final
+from typing import Literal, final
+
+import numpy as np
 
 from modeler.types import Frame, InputError
 from sequences.base import AbstractDerived
@@ -19,16 +21,34 @@ _ALIKE = 1e-3  # relative: files round what they say
 @final
 @dataclass(frozen=True)
 class FocalFactor:
-    """The focal length of a camera, relative to what its sequences say."""
+    """The focal length and the depth scale of a camera, relative to what its sequences say."""
 
     factor: float
     """True focal length relative to the stated one, the same for fx and fy."""
     stated_px: float
     """fx as the sequence states it."""
+    depth_scale: float = 1.0
+    """True depth relative to the stated one: scales the model and the distances of its poses alike."""
+    depth_scale_sigma: float = 0.0
+    """Standard deviation of the depth scale's logarithm; 0 = known, or not asked about."""
+    factor_sigma: float = 0.0
+    """Standard deviation of the factor's logarithm, as far as loops tell it; 0 = not asked about."""
+    told_by: Literal["loop", "prior"] = "prior"
+    """Whether loops determined the factor."""
+
+    def values(self) -> dict[str, float | str]:
+        """Return what it says, under the names of its file and of report.json."""
+        return {
+            "focal_factor": self.factor,
+            "focal_factor_sigma": self.factor_sigma,
+            "depth_scale": self.depth_scale,
+            "depth_scale_sigma": self.depth_scale_sigma,
+            "told_by": self.told_by,
+        }
 
     def text(self, facts: Mapping[str, object]) -> str:
         """Return the file of the factor, with what else is known; null for numbers that are not."""
-        said = {"schema": 1, "focal_factor": self.factor, "stated_fx_px": self.stated_px}
+        said = {"schema": 1, "stated_fx_px": self.stated_px, **self.values()}
         known = {name: None if isinstance(fact, float) and not isfinite(fact) else fact for name, fact in facts.items()}
         return json.dumps(said | known, indent=1, allow_nan=False) + "\n"
 
@@ -40,13 +60,20 @@ def read_focal_factor(path: Path) -> FocalFactor:
         InputError: where the file is missing or says something else.
     """
     node = read_tree(path)
-    return FocalFactor(node.need("focal_factor").number(0.5, 2.0), node.need("stated_fx_px").number(1.0, 1e6))
+    return FocalFactor(
+        node.need("focal_factor").number(0.5, 2.0),
+        node.need("stated_fx_px").number(1.0, 1e6),
+        1.0 if (scale := node.get("depth_scale")) is None else scale.number(0.5, 2.0),
+        0.0 if (sigma := node.get("depth_scale_sigma")) is None else sigma.number(0.0, 1.0),
+        0.0 if (error := node.get("focal_factor_sigma")) is None else error.number(0.0, 1.0),
+        "loop" if (teller := node.get("told_by")) is not None and teller.text() == "loop" else "prior",
+    )
 
 
 @final
 @dataclass(frozen=True)
 class RefocusedSequence(AbstractDerived):
-    """Another sequence, whose camera has this focal length."""
+    """Another sequence, whose camera has this focal length and depth scale."""
 
     focal: FocalFactor
     """The focal length."""
@@ -74,4 +101,5 @@ class RefocusedSequence(AbstractDerived):
                 f"{self.name}: frame {frame.index} has fx {camera.fx:g} px where the calibrated camera states "
                 f"{focal.stated_px:g}; give the calibration of this camera"
             )
-        return replace(frame, camera=replace(camera, fx=camera.fx * focal.factor, fy=camera.fy * focal.factor))
+        refocused = replace(camera, fx=camera.fx * focal.factor, fy=camera.fy * focal.factor)
+        return replace(frame, camera=refocused, depth_m=frame.depth_m * np.float32(focal.depth_scale))

@@ -70,9 +70,41 @@ def test_a_run_without_a_loop_is_calibrated_with_what_was_given(scene: Path, tmp
 
 
 def test_the_file_of_a_focal_length_is_read_as_it_was_written(tmp_path: Path) -> None:
-    focal = FocalFactor(1.0 / 3.0 + 0.5, 597.522)
-    (tmp_path / "camera.json").write_text(focal.text({"sigma": 0.01}))
+    focal = FocalFactor(1.0 / 3.0 + 0.5, 597.522, 1.0 / 3.0 + 0.6, 0.1 / 3.0)
+    (tmp_path / "camera.json").write_text(focal.text({"focal_factor_sigma": 0.01}))
     assert read_focal_factor(tmp_path / "camera.json") == focal
+    (tmp_path / "older.json").write_text('{"focal_factor": 1.1, "stated_fx_px": 597.522}')
+    assert read_focal_factor(tmp_path / "older.json") == FocalFactor(1.1, 597.522)
+
+
+@pytest.mark.parametrize(
+    ("known", "depth_scale", "sigma"),
+    [(None, 0.95, -0.5 * np.log(0.9025)), ("focal-length", 0.9025, 0.0), ("depth", 1.0, 0.0)],
+)
+def test_what_is_known_of_the_camera_decides_the_scale_of_its_depth(
+    known: str | None, depth_scale: float, sigma: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: Path
+) -> None:
+    """A loop tells the product of two factors, of the focal length and of the depth's relief."""
+    told = FocalLength(0.9025, 0.01, "loop", 5.0, 1.0, 1)
+    monkeypatch.setattr(FocalCalibrator, "estimate", lambda *_: told)
+    run, file = tmp_path / "run", tmp_path / "camera.json"
+    assert main(["build", str(scene), "--out", str(run), "--prior", "table", "--method", "icp", "--frames", "0:2"]) == 0
+    options = [] if known is None else ["--known", known]
+    assert main(["calibrate-camera", str(run), "--out", str(file), *options]) == 0
+    found = read_focal_factor(file)
+    assert (found.factor, found.depth_scale, found.depth_scale_sigma) == pytest.approx((0.9025, depth_scale, sigma))
+
+
+def test_depth_stretched_with_the_focal_length_leaves_what_pixels_show_across_the_ray() -> None:
+    """So that a camera of known focal length keeps its widths, and relief alone is stretched."""
+    whole = open_sequence(bundled("box"))
+    before = whole.frame(3)
+    after = RefocusedSequence(whole, FocalFactor(1.1, before.camera.fx, depth_scale=1.1)).frame(3)
+    w, h = before.camera.rays()
+    stretched_w, stretched_h = after.camera.rays()
+    np.testing.assert_allclose(stretched_w * after.depth_m, w * before.depth_m, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(stretched_h * after.depth_m, h * before.depth_m, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(after.depth_m, 1.1 * before.depth_m, rtol=1e-6)
 
 
 def test_a_sequence_is_seen_with_the_focal_length_that_was_measured() -> None:
@@ -105,6 +137,6 @@ def test_a_run_with_a_wrong_focal_length_tells_the_right_one(tmp_path: Path, cap
     main(["build", str(bundled("box")), "--prior", "table", "--camera", str(wrong), "--out", str(run)])
     assert main(["calibrate-camera", str(run), "--out", str(right)]) == 0
     found = json.loads(right.read_text())
-    assert found["focal_factor"] == pytest.approx(1.0, abs=max(0.01, 3.0 * found["sigma"]))
+    assert found["focal_factor"] == pytest.approx(1.0, abs=max(0.01, 3.0 * found["focal_factor_sigma"]))
     assert main(["calibrate-camera", str(run), "--out", str(right)]) == 2  # is there
     assert "--overwrite" in capfd.readouterr().err

@@ -132,6 +132,15 @@ def test_a_part_that_one_frame_alone_shows_is_not_there() -> None:
     assert free_space(views, poses).absent.holds  # pyright: ignore[reportOptionalMemberAccess]
 
 
+@pytest.mark.parametrize(("sigma", "codes"), [(0.0, []), (0.04, []), (0.12, ["unsure_size"])])
+def test_a_size_that_is_open_by_more_than_5_mm_is_not_to_be_trusted(sigma: float, codes: list[str]) -> None:
+    """The ellipsoid's surface lies within 80 mm of its centre."""
+    found, holds = whole_run(STEPS_DEG, prior=TurntablePrior(-25.0), depth_scale_sigma=sigma)
+    assert found == codes
+    assert holds.get("size_m", True) == (not codes)
+    assert ("size_m" in holds) == (sigma > 0.0)
+
+
 def test_surface_that_never_moved_more_than_noise_shows_no_motion() -> None:
     views = views_of(STEPS_DEG)
     moved, stayed = (displacement(views, Solution(poses_of(angles))) for angles in (STEPS_DEG, [0.0, 0.3, 0.1, 0.4]))
@@ -300,6 +309,7 @@ def whole_run(
     last: bool = True,
     refused: Reason | None = None,
     expected: bool = False,
+    depth_scale_sigma: float = 0.0,
 ) -> tuple[list[str], dict[str, bool]]:
     """Codes of what is wrong with a run whose poses are true, and which figures hold."""
     views, poses = views_of(angles_deg), poses_of(angles_deg)
@@ -323,7 +333,7 @@ def whole_run(
         views=views,
         last=last,
     )
-    verdict = judged(step, frames, prior=prior, closure_expected=expected)
+    verdict = judged(step, frames, prior=prior, closure_expected=expected, depth_scale_sigma=depth_scale_sigma)
     assert verdict.trustworthy == (not verdict.shortcomings)
     return [found.code for found in verdict.shortcomings], {name: fig.holds for name, fig in verdict.evidence.items()}
 

@@ -179,6 +179,7 @@ def remedy(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
         **dict.fromkeys(("seen_through", "absent"), _surface),
         **dict.fromkeys(("little_overlap", "other_modes"), _more_known),
         **dict.fromkeys(("unsure_rotation", "unsure_place"), _more_known),
+        "unsure_size": _known_camera,
     }
     found = (by_code[code](report, prior) for code in codes if code in by_code)
     return next((each for each in found if each is not None), None)
@@ -203,6 +204,13 @@ def _camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
         return _more_known(report, prior)
     first = "modeler calibrate-camera {run} --out camera.json"
     return Remedy("estimate the focal length from the loop, and build with it", {"camera": "camera.json"}, first)
+
+
+def _known_camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
+    """Return how to say which of focal length and depth is right."""
+    first = "modeler calibrate-camera {run} --known focal-length --out known.json"
+    words = "if the sequence's focal length is a calibrated one, say so (if its depth is right, --known depth)"
+    return Remedy(words, {"camera": "known.json"}, first)
 
 
 def _without_prior(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:

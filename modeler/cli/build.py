@@ -71,6 +71,7 @@ class Build:
         """
         from modeler.cli import compose
         from modeler.cli.advice import comes_back
+        from modeler.cli.inputs import estimated_camera
         from modeler.cli.outputs import check_run_folder
         from modeler.export import Remembered, RunFolder, RunMeta, alone
         from viz.stream import ends_whole
@@ -90,6 +91,7 @@ class Build:
             known=modeler.prior,
             settings=self.settings(),
             closure_expected=comes_back(frames, modeler.prior, modeler.closer.max_angle_deg),
+            camera=estimated_camera(self.model.camera),
         )
         if self.resume and RunFolder(self.out).finished(meta):
             RunFolder(self.out).pairs.drop()  # what a kill at the very end left of them
@@ -119,7 +121,7 @@ class Build:
         parts = asdict(self.prior) | asdict(self.method) | asdict(self.selection) | asdict(self.where)
         parts["voxel_m"] = self.model.voxel_m
         files = {"sensor": self.model.sensor, "camera": self.model.camera}
-        parts |= {name: None if path is None else str(path) for name, path in files.items()}
+        parts |= {name: None if path is None else str(path.absolute()) for name, path in files.items()}
         return {
             name: value for name, value in parts.items() if name not in ("prior", "seed") and value not in (None, ())
         }
@@ -127,6 +129,7 @@ class Build:
     def command(self, changes: Mapping[str, str]) -> str:
         """Return the command line that replaces the run by one with other options, by name without dashes."""
         given = {"prior": self.prior.prior, **self.settings(), "seed": self.method.seed}
+        given |= {name: getattr(self.model, name) for name in ("sensor", "camera")}  # named as they were
         usual = {"every": 1, "frames": ":", "method": "visibility", "colour": False, "seed": 0}
         words = {
             name.replace("_", "-"): shlex.join(map(str, value if isinstance(value, tuple) else (value,)))

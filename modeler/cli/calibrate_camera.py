@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -15,12 +16,17 @@ if TYPE_CHECKING:
     from modeler.self_calibration import FocalLength
 
 
+_OPEN = 0.005  # of sizes: less is not worth a line
+
+
 @dataclass(frozen=True)
 class CalibrateCamera:
     """Estimate a depth camera's focal length from a run in which the object came back to its first view.
 
-    Under a wrong focal length every turn comes out too small or too large, and a full turn does not close. `modeler
-    build SEQUENCE --camera FILE` uses the result for any sequence of the same camera.
+    Under a wrong focal length every turn comes out too small or too large, and a full turn does not close. Depth whose
+    relief is too flat or too deep, as smoothing and hole filling make it, does the same: loops tell the two together,
+    and the size of the model depends on which it is. `modeler build SEQUENCE --camera FILE` uses the result for any
+    sequence of the same camera.
     """
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
@@ -30,6 +36,10 @@ class CalibrateCamera:
     """JSON file to write."""
     overwrite: bool = False
     """Replace the file where there is one."""
+    known: Literal["neither", "focal-length", "depth"] = "neither"
+    """What the sequence states rightly: focal-length (a calibrated camera: it is the depth that is stretched), depth
+    (unfiltered, of a camera whose focal length is nominal). neither: half of it is ascribed to each, and a model that
+    could be wrong by more than 5 mm for that is not trusted."""
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:
@@ -55,11 +65,20 @@ class CalibrateCamera:
         used_px = run.views[min(run.views)].frame.camera.fx
         file = run.report["settings"].get("camera")
         factor = found.factor * (1.0 if file is None else read_focal_factor(Path(file)).factor)
+        share = {"neither": 0.5, "focal-length": 1.0, "depth": 0.0}[self.known]
+        open_by = abs(math.log(factor)) if self.known == "neither" else 0.0
         stated_px = used_px * found.factor / factor
-        facts = {**asdict(found), "fx_px": found.factor * used_px, "run": str(self.run_folder)}
-        del facts["factor"]
-        write_atomically(self.out, FocalFactor(factor, stated_px).text(facts))
+        stated = FocalFactor(factor, stated_px, factor**share, 0.5 * open_by, found.sigma, found.told_by)
+        facts = {
+            name: value for name, value in asdict(found).items() if name in ("sigmas_before", "sigmas_after", "loops")
+        }
+        write_atomically(self.out, stated.text({**facts, "fx_px": found.factor * used_px, "run": str(self.run_folder)}))
         say(f"{_said(found, used_px)}: {self.out}")
+        if found.told_by == "loop" and stated.depth_scale_sigma >= _OPEN:
+            say(
+                f"or the relief of its depth is wrong by {100.0 * open_by:.0f} %; sizes are known to "
+                f"{100.0 * stated.depth_scale_sigma:.0f} %: say with --known which of the two is right"
+            )
         return 0 if found.told_by == "loop" else 3
 
 

@@ -229,6 +229,18 @@ def calibrated(sequence: AbstractSequence, sensor: Path | None, camera: Path | N
     return sequence if sensor is None else CalibratedSequence(sequence, read_noise(sensor))
 
 
+def estimated_camera(file: Path | None) -> dict[str, float | str] | None:
+    """Return what the file of a camera says, as report.json has it; None without one.
+
+    Args:
+        file: as `modeler calibrate-camera` wrote it.
+
+    Raises:
+        InputError: where it cannot be read.
+    """
+    return None if file is None else read_focal_factor(file).values()
+
+
 def renumbered(view: RayImage, offset: int) -> RayImage:
     """Return a view with another frame number."""
     return replace(view, frame=replace(view.frame, index=view.frame.index + offset))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,7 +15,7 @@ from modeler.cli.console import say
 from modeler.cli.options import SEED
 
 if TYPE_CHECKING:
-    from modeler.cli.inputs import Reopened
+    from modeler.cli.inputs import Part, Reopened
     from modeler.export import RunFolder, RunMeta
     from modeler.fusion import Match
     from modeler.graph import PoseGraph
@@ -92,6 +92,7 @@ class Join:
                 "pairs": self.pairs,
             },
             doubts=_doubts(matches),
+            camera=_least_known([*first.parts, *second.parts]),
         )
         with alone(self.out):
             folder = RunFolder.open(self.out, overwrite=self.overwrite)
@@ -152,6 +153,15 @@ def _doubts(matches: list[Match]) -> list[str]:
         f"another alignment of the models fits as well, turned by {math.degrees(angle):.0f}°: the object "
         "looks the same from several sides"
     ]
+
+
+def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
+    """Return what was estimated of the camera whose depth scale is known least; None where all are as stated."""
+    from modeler.cli.inputs import estimated_camera
+
+    files = (part.report["settings"].get("camera") for part in parts)
+    cameras = [camera for file in files if file is not None and (camera := estimated_camera(Path(file))) is not None]
+    return max(cameras, key=lambda camera: float(camera["depth_scale_sigma"]), default=None)
 
 
 def _edges(first: Reopened, second: Reopened, match: Match, options: Join) -> tuple[Edge, ...]:

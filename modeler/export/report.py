@@ -62,6 +62,9 @@ class RunMeta:
     """Whether the object is known to come back to its start, so that a run without closure is not to be trusted."""
     doubts: Sequence[str] = ()
     """Further reasons in words not to trust the model."""
+    camera: Mapping[str, float | str] | None = None
+    """What was estimated of the camera, as report.json has it: `focal_factor`, `focal_factor_sigma`, `depth_scale`,
+    `depth_scale_sigma` and `told_by`; None: it is as the sequence says."""
     interrupted: bool = False
     """Whether the user ended the run before its last frame."""
     seconds: Mapping[str, float] = field(default_factory=dict)
@@ -96,6 +99,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         interrupted=meta.interrupted,
         closure_expected=meta.closure_expected,
         prior=meta.known,
+        depth_scale_sigma=0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"]),
     )
     support = _support(solution, views)
     report = {
@@ -109,6 +113,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "complete": step.last and not meta.interrupted,
         "closed": loops_closed(_taking_part(step)) > 0,
         "loop": _loop(step.edges_so_far, solution, views),
+        "camera": None if meta.camera is None else dict(meta.camera),
         "trustworthy": verdict.trustworthy,
         "reasons": [shortcoming.words for shortcoming in verdict.shortcomings],
         "reason_codes": [shortcoming.code for shortcoming in verdict.shortcomings],

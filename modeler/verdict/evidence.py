@@ -277,6 +277,27 @@ def _widest(sigmas: Mapping[int, float], wrong: float) -> Spread | None:
     return Spread(worst, Figure(sigmas[worst], limit), sum(sigma > limit for sigma in sigmas.values()))
 
 
+def size_figure(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], depth_scale_sigma: float) -> Figure:
+    """Return by how much in m the surface may be off, because nothing tells the scale of depth so well.
+
+    A model is called wrong where less than 90 % of its surface lies within `WRONG_M`: its reach is the distance from
+    its centre within which 90 % of the points lie.
+
+    Args:
+        views: by frame number.
+        trajectory: object_from_camera (4, 4) by frame number.
+        depth_scale_sigma: standard deviation of the depth scale's logarithm.
+    """
+    surfaces_m = [
+        se3.transform(trajectory[frame], view.points_m[:: max(len(view.points_m) // _MAX_POINTS, 1)])
+        for frame, view in views.items()
+        if frame in trajectory
+    ]
+    surface_m = np.concatenate(surfaces_m) if surfaces_m else np.zeros((1, 3))
+    reach_m = np.quantile(np.linalg.norm(surface_m - surface_m.mean(axis=0), axis=1), 1.0 - MAX_SEEN_THROUGH)
+    return Figure(depth_scale_sigma * float(reach_m), WRONG_M)
+
+
 @dataclass(frozen=True)
 class FreeSpace:
     """What other frames say of the surface of those that they contradict most."""

@@ -40,6 +40,7 @@ from modeler.verdict.evidence import (
     other_modes,
     prior_distances,
     prior_figure,
+    size_figure,
     spread_of_places,
     spread_of_rotations,
 )
@@ -78,8 +79,8 @@ class Shortcoming:
     code: str
     """For programs: `doubt`, `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
     `prior_contradicted`, `loop_open`, `edges_disagree`, `closures_refused`, `unconfirmed`, `never_came_back`,
-    `not_tried`, `seen_through`, `absent`, `little_overlap`, `other_modes`, `unsure_rotation` or
-    `unsure_place`."""
+    `not_tried`, `seen_through`, `absent`, `little_overlap`, `other_modes`, `unsure_rotation`,
+    `unsure_place` or `unsure_size`."""
     words: str
     """For people."""
 
@@ -92,7 +93,8 @@ class Verdict:
     """Why not; empty where it can be."""
     evidence: Mapping[str, Figure] = field(default_factory=dict)
     """Figures by name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `prior_chi2`, `loop_sigmas`,
-    `graph_chi2`, `seen_through`, `absent`, `other_modes`, `pose_sd_deg` and `pose_sd_m`, those that the run has."""
+    `graph_chi2`, `seen_through`, `absent`, `other_modes`, `pose_sd_deg`, `pose_sd_m` and `size_m`, those that the run
+    has."""
 
     @property
     def trustworthy(self) -> bool:
@@ -108,6 +110,7 @@ def judged(
     interrupted: bool = False,
     closure_expected: bool = False,
     prior: AbstractPrior | None = None,
+    depth_scale_sigma: float = 0.0,
 ) -> Verdict:
     """Judge the model of a run. Evidence is gathered after the last step, when all edges are in.
 
@@ -118,6 +121,7 @@ def judged(
         interrupted: whether the user ended the run before its last frame.
         closure_expected: whether the object is known to come back to its start.
         prior: what was known of motions before the images were compared; None: not known here.
+        depth_scale_sigma: standard deviation of the depth scale's logarithm; 0 = taken for known.
     """
     reasons = [Shortcoming("doubt", words) for words in doubts]
     if interrupted:
@@ -133,7 +137,7 @@ def judged(
     reasons += _against(found)
     reasons += _open_loop(step, edges, closure_expected=closure_expected)
     reasons += _little_overlap(edges)
-    spreads = _spreads(step, edges) if step.last else []
+    spreads = [*_spreads(step, edges), *_size(step, depth_scale_sigma)] if step.last else []
     reasons += _against(spreads)
     return Verdict(tuple(reasons), {finding.name: finding.figure for finding in (*found, *spreads)})
 
@@ -232,6 +236,18 @@ def _spreads(step: Step, edges: Sequence[Edge]) -> list[_Finding]:
         words += f", {place.count - 1} more over {limit_mm:.1f} mm" if place.count > 1 else ""
         found.append(_Finding("pose_sd_m", place.figure, "unsure_place", words))
     return found
+
+
+def _size(step: Step, depth_scale_sigma: float) -> list[_Finding]:
+    """Return how uncertain the size of the model is, where the scale of depth is not taken for known."""
+    if depth_scale_sigma == 0.0:
+        return []
+    figure = size_figure(step.views, step.solution.trajectory, depth_scale_sigma)
+    words = (
+        f"the model's size is known to {100.0 * depth_scale_sigma:.0f} % only, {1000.0 * figure.value:.0f} mm of its "
+        "surface: its loops tell the focal length and the relief of its depth together"
+    )
+    return [_Finding("size_m", figure, "unsure_size", words)]
 
 
 def _left_out(frames: Sequence[FrameRecord]) -> list[str]:

@@ -79,6 +79,12 @@ CHECKS: Final = {
         1000.0,
         " mm",
     ),
+    "size_m": Check(
+        "error of the surface that the camera's scale leaves open",
+        "Loops cannot tell a wrong focal length from depth of too flat a relief, and sizes depend on which it is.",
+        1000.0,
+        " mm",
+    ),
     "other_modes": Check(
         "probability of another mode",
         "Where several poses explain a pair of images, as for symmetric objects, each is a mode: the probability that "
