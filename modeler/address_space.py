@@ -1,7 +1,20 @@
-"""Whether there is room for libraries that end the process, or wait for ever, where there is none."""
+"""Memory as the system gives it: room for libraries that cannot do without, and one heap for all threads."""
 
+import ctypes
 import mmap
 import sys
+
+_M_ARENA_MAX = -8  # of mallopt(3)
+
+
+def share_one_heap() -> None:
+    """Let all threads that begin from now on allocate from one heap, where the C library has one for each.
+
+    What a thread frees stays in its heap. With two threads, 500 frames took 210 MiB more than with one heap; kernels
+    allocate too seldom to wait for each other.
+    """
+    if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
+        mallopt(_M_ARENA_MAX, 1)
 
 
 def check_room(size: int) -> None:

@@ -89,7 +89,7 @@ class ViewStore:
     cannot be written, they stay in memory too.
     """
 
-    def __init__(self, memory_bytes: int = 256 * 2**20, chunk_bytes: int = 128 * 2**20) -> None:
+    def __init__(self, memory_bytes: int = 64 * 2**20, chunk_bytes: int = 64 * 2**20) -> None:
         """Open a store.
 
         Args:

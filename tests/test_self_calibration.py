@@ -70,8 +70,8 @@ def test_a_run_without_a_loop_is_calibrated_with_what_was_given(scene: Path, tmp
 
 
 def test_the_file_of_a_focal_length_is_read_as_it_was_written(tmp_path: Path) -> None:
-    focal = FocalFactor(1.0 / 3.0 + 0.5, 597.522, 1.0 / 3.0 + 0.6, 0.1 / 3.0)
-    (tmp_path / "camera.json").write_text(focal.text({"focal_factor_sigma": 0.01}))
+    focal = FocalFactor(1.0 / 3.0 + 0.5, 597.522, 1.0 / 3.0 + 0.6, 0.1 / 3.0, 0.01 / 3.0, "loop")
+    (tmp_path / "camera.json").write_text(focal.text({"loops": 1}))
     assert read_focal_factor(tmp_path / "camera.json") == focal
     (tmp_path / "older.json").write_text('{"focal_factor": 1.1, "stated_fx_px": 597.522}')
     assert read_focal_factor(tmp_path / "older.json") == FocalFactor(1.1, 597.522)

@@ -21,7 +21,7 @@ from typing import Annotated, Any, Union
 
 import tyro
 
-from modeler.address_space import check_room
+from modeler.address_space import check_room, share_one_heap
 from modeler.cli.batch import Batch
 from modeler.cli.build import Build
 from modeler.cli.calibrate_camera import CalibrateCamera
@@ -98,6 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: what follows the program's name; those of the process without it.
     """
     _open_standard_streams()
+    share_one_heap()
     logging.basicConfig(level=logging.WARNING, format="modeler: %(message)s")  # to stderr
     logging.raiseExceptions = False  # stderr may be full
     # Rerun complains in its own way of a viewer that was closed, which is nobody's error, and of a disk that is full;

@@ -192,7 +192,7 @@ def _region(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
 
 def _surface(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
     """Return a look at the masks where a loop and all else confirm the poses, else a stronger prior."""
-    if report["closed"] and set(report["reason_codes"]) <= {"seen_through", "absent"}:
+    if report["closed"] and set(report["reason_codes"]) <= {"seen_through", "absent", "unsure_size"}:
         words = "the loop confirms the poses; see in the report whether masks or filled holes hold more than the object"
         return Remedy(words, first="modeler report {run}")
     return _more_known(report, prior)
