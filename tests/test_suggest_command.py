@@ -42,7 +42,7 @@ def test_programs_get_json_of_the_same_list(cli: Run, built: Path, tmp_path: Pat
     found = json.loads(ended.out)
     assert {each["action"] for each in found} == {"turn", "poke", "lay", "pose"}
     assert all(each.keys() >= FIELDS for each in found)
-    gains = [each["gain_nats"] / each["cost"] for each in found]
+    gains = [each["worth_nats"] / each["cost"] for each in found]
     assert gains == sorted(gains, reverse=True)
     assert next(each for each in found if each["action"] == "turn")["turn_deg"] == 20
     assert "grasp 3" in next(each for each in found if each["action"] == "pose")["words"]

@@ -180,10 +180,10 @@ def test_a_poke_is_expected_to_go_as_its_prior_says(box: Belief) -> None:
     assert np.isfinite(density.log_density(se3.inverse(expected)[None])).all()
 
 
-def test_actions_are_ranked_by_their_gain_for_their_cost(box: Belief) -> None:
+def test_actions_are_ranked_by_their_worth_for_their_cost(box: Belief) -> None:
     turns = [Candidate("turn", turn_deg=angle, cost=cost) for angle, cost in ((30.0, 1.0), (-40.0, 100.0), (20.0, 1.0))]
     found = suggest(box, turns)
-    per_cost = [each.prediction.gain_nats / each.prediction.candidate.cost for each in found.ranked]
+    per_cost = [each.prediction.worth_nats / each.prediction.candidate.cost for each in found.ranked]
     assert per_cost == sorted(per_cost, reverse=True)
     assert found.ranked[-1].prediction.candidate.turn_deg == -40.0
 

@@ -68,6 +68,11 @@ class Prediction:
         """The expected reduction of uncertainty: of poses and surface, if the view is placed where it belongs."""
         return self.right * (self.pose_nats + self.surface_nats)
 
+    @property
+    def worth_nats(self) -> float:
+        """What actions are ranked by: a view placed wrongly misleads by as much as one placed rightly tells."""
+        return (2.0 * self.right - 1.0) * (self.pose_nats + self.surface_nats)
+
 
 @final
 @dataclass(frozen=True, eq=False)

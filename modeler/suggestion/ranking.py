@@ -52,6 +52,7 @@ class Suggestion:
         record: dict[str, Any] = {
             "action": candidate.action,
             "gain_nats": _rounded(found.gain_nats),
+            "worth_nats": _rounded(found.worth_nats),
             "pose_nats": _rounded(found.pose_nats),
             "surface_nats": _rounded(found.surface_nats),
             "mode_nats": _rounded(found.mode_nats),
@@ -104,7 +105,7 @@ def suggest(belief: Belief, candidates: Sequence[Candidate] | None = None, goal:
     """
     goal = Goal() if goal is None else goal
     found = _default(belief) if candidates is None else _predicted(belief, candidates)
-    found.sort(key=lambda each: -each.gain_nats / each.candidate.cost)
+    found.sort(key=lambda each: -each.worth_nats / each.candidate.cost)
     reached = goal.reached(belief)
     ranked = [Suggestion(each, words) for each, words in _in_words(belief, found)]
     return Suggestions(tuple(ranked), _summary(belief, ranked, reached=reached), reached, *_state(belief))
@@ -131,7 +132,7 @@ def _default(belief: Belief) -> list[Prediction]:
     fine = [
         Candidate("turn", turn_deg=best.candidate.turn_deg + offset_deg)
         for sign in (1.0, -1.0)
-        for best in sorted((f for f in found if f.candidate.turn_deg * sign > 0.0), key=lambda f: -f.gain_nats)[:1]
+        for best in sorted((f for f in found if f.candidate.turn_deg * sign > 0.0), key=lambda f: -f.worth_nats)[:1]
         for offset_deg in (-_FINE_DEG, _FINE_DEG)
     ]
     return others + found + _predicted(belief, fine)
@@ -144,7 +145,7 @@ def _in_words(belief: Belief, found: Sequence[Prediction]) -> list[tuple[Predict
         if id(each) in passed:
             continue
         other = next((f for f in found[place:] if _mirrored(f.candidate, each.candidate)), None)
-        either = other is not None and other.gain_nats >= _ALIKE * each.gain_nats
+        either = other is not None and other.worth_nats >= _ALIKE * each.worth_nats > 0.0
         if either:
             passed.add(id(other))
         told.append((each, f"{_action(each.candidate, either=either)}: {_effect(belief, each)}"))
