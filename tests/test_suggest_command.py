@@ -48,6 +48,14 @@ def test_programs_get_json_of_the_same_list(cli: Run, built: Path, tmp_path: Pat
     assert "grasp 3" in next(each for each in found if each["action"] == "pose")["words"]
 
 
+def test_what_the_prior_excludes_is_said(cli: Run, built: Path, tmp_path: Path) -> None:
+    given = tmp_path / "candidates.json"
+    given.write_text('[{"kind": "turn", "turn_deg": 170}]')
+    ended = cli("suggest", built, "--candidates", given)
+    assert (ended.status, ended.out) == (0, "")
+    assert "1 of 1 candidates are beyond what the run's prior allows" in ended.err
+
+
 def test_a_goal_decides_the_status(cli: Run, built: Path) -> None:
     near, far = cli("suggest", built, "--until-seen", "0.1"), cli("suggest", built, "--until-seen", "1")
     assert (near.status, far.status) == (0, 3)

@@ -68,6 +68,8 @@ class Suggest:
             shown = found.ranked if self.all else found.ranked[:_SHOWN]
             for each in () if found.reached else shown:
                 print(each.words)
+        if given is not None and (excluded := sum(belief.predict(each) is None for each in given)):
+            say(f"{excluded} of {len(given)} candidates are beyond what the run's prior allows, or show nothing")
         trusted = bool(run.report["trustworthy"])
         if not asked:
             say(found.summary)
