@@ -20,6 +20,7 @@ from typing import Final
 import numpy as np
 import trimesh
 from calibration.specimens import SPECIMENS, Specimen, load_specimen
+from scipy import ndimage
 
 import modeler
 from modeler.export.standing import upright
@@ -29,7 +30,9 @@ from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.trajectory import Turntable
 
 NOISE_M: Final = 4e-4
-"""Standard deviation of the vertices of a true mesh."""
+"""Standard deviation of the places of a true mesh."""
+GRAIN_M: Final = 5e-3
+"""Distance over which that noise is even."""
 FRAMES: Final = 15
 STEP_DEG: Final = 24.0
 DISTANCE_M: Final = 0.6
@@ -73,7 +76,10 @@ def _of_mesh(recipe: Recipe) -> Symmetries:
     """Return the symmetries of the true surface, all of it seen with noise."""
     mesh = RenderedSequence(recipe).model()
     vertices, triangles = trimesh.remesh.subdivide_to_size(mesh.vertices_m, mesh.triangles, max_edge=0.005)[:2]
-    noisy = vertices + NOISE_M * np.random.default_rng(0).normal(size=vertices.shape)
+    # As even as the noise of fused surfaces: noise of each vertex by itself would turn the normals of slivers.
+    cells = ((vertices - vertices.min(axis=0)) / GRAIN_M).T
+    field = np.random.default_rng(0).normal(size=(3, *(np.ceil(cells.max(axis=1)).astype(int) + 2)))
+    noisy = vertices + NOISE_M * np.stack([ndimage.map_coordinates(along, cells, order=1) for along in field], axis=1)
     up = np.array([0.0, 0.0, 1.0])
     return SymmetryFinder().find(noisy, triangles, up=up, sigma_m=NOISE_M, closed=True)
 
