@@ -314,7 +314,8 @@ def _unseen(
     padded = np.pad(empty, 1, constant_values=True)
     padded[:, :, 0] = False  # the table
     touching = np.asarray(ndimage.binary_dilation(padded), dtype=bool)[1:-1, 1:-1, 1:-1]
-    outward = np.stack(np.gradient(ndimage.gaussian_filter(padded.astype(np.float32), 1.0)), axis=-1)
+    smooth = ndimage.gaussian_filter(padded.astype(np.float32), 1.0)
+    outward = np.stack([np.gradient(smooth, axis=k) for k in range(3)], axis=-1)
     return hidden & touching & ~seen, outward[1:-1, 1:-1, 1:-1].astype(np.float64)
 
 
