@@ -14,6 +14,7 @@ from modeler.suggestion.candidates import Candidate, pokes, turns
 _COARSE_DEG, _FINE_DEG = 10.0, 5.0  # between turns that are compared: nobody turns by hand more exactly
 _LARGEST_DEG = 180.0
 _LYING_COST = 8.0  # a run of its own, of a full turn in steps of 45° at least
+_TENTH_DEG = 0.1  # what words resolve
 _ALIKE = 0.9  # of the better gain: two ways of one turn that a person need not tell apart
 
 
@@ -179,8 +180,10 @@ def _action(candidate: Candidate, *, either: bool) -> str:
 def _effect(belief: Belief, found: Prediction) -> str:
     before_deg, after_deg = belief.spin_deg, found.spin_deg
     parts = []
-    if found.edges and max(before_deg, after_deg) >= 0.05:
+    if found.edges and after_deg < before_deg - _TENTH_DEG:
         parts.append(f"spin from {_degrees(before_deg)} to {_degrees(after_deg)}")
+    elif found.edges:
+        parts.append(f"spin known to {_degrees(after_deg)}")
     parts.append(f"{100.0 * found.new_surface:.0f} % new surface")
     if found.right < 0.9:
         parts.append(f"placed right with {100.0 * found.right:.0f} %")
