@@ -217,6 +217,7 @@ class Run:
         self._solve()
         if self.state.views:
             yield Fusing()
+            self.state = replace(self.state, growing=None)  # so that its memory serves the fusion
             sure = conditional_covariances(self.state.solution, self.state.graph.edges)
             model = self.modeler.fuser.fuse(self.state.views, self.state.solution.trajectory, sure)
             self.state = replace(self.state, model=model)
