@@ -196,7 +196,7 @@ def test_every_preset_ends_with_what_was_checked(
     cli: Run, built: Path, tmp_path: Path, purpose: str, name: str, files: set[str]
 ) -> None:
     out = tmp_path / name
-    ended = cli("export", built, "--for", purpose, "--out", out)
+    ended = cli("export", built, "--for", purpose, "--out", out, "--texture-px", "256")
     last = ended.err.splitlines()[-1]
     assert (ended.status, ended.out) == (0, ""), ended.err
     assert last.startswith("modeler: checked: ")
@@ -213,7 +213,7 @@ def test_every_preset_ends_with_what_was_checked(
         assert 20.0 < mesh.extents.max() < 400.0  # mm
     if purpose == "bop":
         _check_bop(out, built)
-    again = cli("export", built, "--for", purpose, "--out", out)
+    again = cli("export", built, "--for", purpose, "--out", out, "--texture-px", "256")
     assert (again.status, again.err.count("\n")) == (2, 1)
     assert "exists already" in again.err
 
