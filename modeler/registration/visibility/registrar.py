@@ -155,7 +155,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         pose = pooled(modes) if separate else weighted_gaussian(samples, weights, pair.centre_m)
         overlap = pair.overlap(modes[0].pose.mean)
         # Of very many poses, some match by chance; of few, the likeliest is right though a mask be cut off.
-        matches = not found.wide or pair.fits(modes[0].pose.mean, self.search.fine_m(pair))
+        matches = not found.anywhere or pair.fits(modes[0].pose.mean, self.search.fine_m(pair))
         effective = 1.0 / sum(share**2 / mode.effective_samples for share, mode in weighed)
         return Posterior(
             source=pair.backward.image.index,

@@ -15,6 +15,9 @@ from modeler.registration.posterior import MIN_MODE_SHARE, PRIOR_SAMPLES
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 
+ANY_ROTATION_RAD = 1.0
+"""Standard deviation of a rotation that may be any: 1.33 where all are alike, 1.0 within limits of 130°."""
+
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
@@ -26,8 +29,8 @@ class Candidates:
     """(k,) tempered log-likelihoods (nats)."""
     spreads: Array
     """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid (method.md, eq. 11)."""
-    wide: bool = False
-    """Whether the prior holds more basins than the search has starts for."""
+    anywhere: bool = False
+    """Whether the prior leaves the rotation open: in every direction by `ANY_ROTATION_RAD` or more."""
     beyond_gain: float = -np.inf
     """How much better (nats) than the best candidate a pose beyond the prior's support is."""
     beyond: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
@@ -129,9 +132,8 @@ class Search:
         """
         prior, fine_m = _moments(pair, density, rng), self.fine_m(pair)
         wanted = self.starts(pair, prior)
-        wide = wanted > self.max_starts
         started = self._drawn(pair, density, min(wanted, self.max_starts), rng)
-        if wide:
+        if wanted > self.max_starts:
             started = np.concatenate([started, self._recognised(pair, density)])
         poses, regulariser = started, self._regulariser(pair, prior)
         for blur_m in self.blurs_m(pair):
@@ -143,7 +145,7 @@ class Search:
         order = np.argsort(-scores, kind="stable")
         # The volumes of two modes may outweigh their likelihoods as much as a negligible mode is outweighed.
         order = order[scores[order] > scores.max() + 2.0 * np.log(MIN_MODE_SHARE)]
-        found = Candidates(poses[order], scores[order], _spreads(pair, prior, poses[order], fine_m), wide)
+        found = Candidates(poses[order], scores[order], _spreads(pair, prior, poses[order], fine_m), _anywhere(prior))
         if pair.overlap(found.poses[0]) > min_overlap:
             outside = self._near_support(pair, prior, density, outside)
         found = found.distinct(pair.centre_m)
@@ -204,6 +206,11 @@ def _moments(pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.
     poses = density.sample(PRIOR_SAMPLES, rng)
     mean, covariance = se3.mean(poses, np.ones(len(poses)), about_m=pair.centre_m, iterations=4)
     return PoseGaussian(mean, covariance + np.diag(np.repeat([1e-4, 1e-5], 3) ** 2))
+
+
+def _anywhere(prior: PoseGaussian) -> bool:
+    """Return whether a prior leaves the rotation open."""
+    return bool(np.linalg.eigvalsh(prior.covariance[:3, :3])[0] > ANY_ROTATION_RAD**2)
 
 
 def _spreads(pair: PairLikelihood, prior: PoseGaussian, poses: Array, blur_m: float) -> Array:
