@@ -84,7 +84,10 @@ class CalibrateCamera:
 
 def _said(found: FocalLength, used_px: float) -> str:
     if found.told_by == "prior":
-        return "no loop determines the focal length; turn the object fully, with steps that overlap"
+        return (
+            "no loop determines the focal length; turn the object fully, with steps that overlap, and say what is "
+            "known of its motion (--prior table)"
+        )
     focal_px, sigma_px = used_px * found.factor, used_px * found.factor * found.sigma
     loops = "1 loop" if found.loops == 1 else f"{found.loops} loops"
     return (
