@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 
 from modeler import se3
-from modeler.priors import GeneralPrior, TablePrior, TurntablePrior
+from modeler.priors import GeneralPrior, TablePrior, TurntablePrior, turntable_in
 from modeler.types import AbstractPrior, Failed, Outcome, Posterior, Reason, advice
 from modeler.verdict.evidence import MAX_UNSURE
 from sequences import AbstractSequence
@@ -66,20 +66,11 @@ def comes_back(frames: AbstractSequence, prior: AbstractPrior, reach_deg: float)
         prior: of the run, whose turntable counts more.
         reach_deg: how near to a view another must look for them to be registered.
     """
-    table = turntable(prior)
+    table = turntable_in(prior)
     step_deg = (frames.motion or {}).get("step_deg") if table is None else table.step_deg
     if not isinstance(step_deg, int | float):
         return False
     return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
-
-
-def turntable(prior: AbstractPrior) -> TurntablePrior | None:
-    """Return the turntable in a prior, of which it may be one of several parts; None where there is none."""
-    if isinstance(prior, TurntablePrior):
-        return prior
-    values = [getattr(prior, field.name) for field in fields(prior)] if is_dataclass(prior) else []
-    parts = (turntable(value) for value in values if isinstance(value, AbstractPrior))
-    return next((part for part in parts if part is not None), None)
 
 
 def sense_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
@@ -91,7 +82,7 @@ def sense_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
     """
     little = "little_overlap" in (report.get("reason_codes") or ())
     little = little or any(frame.get("cause") == Outcome.NO_OVERLAP.label for frame in report["frames"])
-    table = turntable(prior)
+    table = turntable_in(prior)
     return little and table is not None and table.step_sign == "known"
 
 
@@ -102,7 +93,7 @@ def other_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
         edges: of the report.
         prior: of the run.
     """
-    table, turns = turntable(prior), step_angles_deg(edges)
+    table, turns = turntable_in(prior), step_angles_deg(edges)
     if table is None or len(turns) < _SURE_STEPS:
         return ""
     found_deg, stated_deg = float(np.median(turns)), abs(table.step_deg)
@@ -224,7 +215,7 @@ def _without_prior(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | 
 
 def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
     """Return a stronger prior."""
-    if turntable(prior) is not None:
+    if turntable_in(prior) is not None:
         return None
     turns = step_angles_deg(report["edges"])
     if report.get("up") is not None and isinstance(prior, GeneralPrior):

@@ -12,3 +12,4 @@ from modeler.priors.proposals import PredictedProposal as PredictedProposal
 from modeler.priors.proposals import VelocityPrior as VelocityPrior
 from modeler.priors.table import TablePrior as TablePrior
 from modeler.priors.turntable import TurntablePrior as TurntablePrior
+from modeler.priors.turntable import turntable_in as turntable_in

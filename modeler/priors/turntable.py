@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -400,3 +400,12 @@ class TurntablePrior(AbstractPrior):
 def _on_circle(turn_deg: float) -> float:
     """Return a turn wrapped to -180 to 180 degrees."""
     return (turn_deg + 180.0) % 360.0 - 180.0
+
+
+def turntable_in(prior: AbstractPrior) -> TurntablePrior | None:
+    """Return the turntable in a prior, of which it may be one of several parts; None where there is none."""
+    if isinstance(prior, TurntablePrior):
+        return prior
+    values = [getattr(prior, field.name) for field in fields(prior)] if is_dataclass(prior) else []
+    parts = (turntable_in(value) for value in values if isinstance(value, AbstractPrior))
+    return next((part for part in parts if part is not None), None)

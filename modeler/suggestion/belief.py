@@ -11,7 +11,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.closure import Closer, MapView
-from modeler.priors import TurntablePrior
+from modeler.priors import turntable_in
 from modeler.priors.mixtures import Gaussian
 from modeler.registration import VisibilityLikelihood
 from modeler.suggestion.candidates import Candidate
@@ -350,8 +350,8 @@ class Belief:
 
     def _frames_ahead(self, candidate: Candidate) -> int:
         """Return the number of frames until the new one: of a turntable, whose prior counts steps, those of a turn."""
-        step_deg = turntable_step_deg(self.prior)
-        return 1 if step_deg is None else max(round(abs(candidate.turn_deg / step_deg)), 1)
+        table = turntable_in(self.prior)
+        return 1 if table is None else max(round(abs(candidate.turn_deg / table.step_deg)), 1)
 
     def _edges(self, foreseen: ForeseenView, object_from_new: Array, candidate: Candidate) -> tuple[ForeseenEdge, ...]:
         """Return the edges that the view would get: to the last view, and to those that the closer would choose."""
@@ -401,11 +401,6 @@ def displacement_m2(points_m: Array, normals: Array, covariance: Array) -> Array
     """Return variances (n,) in m² along normals (n, 3) of points (n, 3) by a pose's error (6, 6), all in one frame."""
     levers = np.hstack([np.cross(points_m, normals), normals])
     return np.maximum(np.einsum("ni,ij,nj->n", levers, covariance, levers), 0.0)
-
-
-def turntable_step_deg(prior: AbstractPrior) -> float | None:
-    """Return the step of a turntable in degrees from one frame number to the next; None of other priors."""
-    return prior.step_deg if isinstance(prior, TurntablePrior) else None
 
 
 def _posterior(source: int, edge: ForeseenEdge, mean: Array) -> Posterior:

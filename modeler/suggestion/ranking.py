@@ -8,7 +8,8 @@ from typing import Any, final
 
 import numpy as np
 
-from modeler.suggestion.belief import Belief, Prediction, turntable_step_deg
+from modeler.priors import turntable_in
+from modeler.suggestion.belief import Belief, Prediction
 from modeler.suggestion.candidates import Candidate, pokes, turns
 
 _COARSE_DEG, _FINE_DEG = 10.0, 5.0  # between turns that are compared: nobody turns by hand more exactly
@@ -123,12 +124,12 @@ def _predicted(belief: Belief, candidates: Sequence[Candidate]) -> list[Predicti
 
 def _default(belief: Belief) -> list[Prediction]:
     """Return predictions of what a person at a table can do; turns near the best ones are looked at more finely."""
-    step_deg = turntable_step_deg(belief.prior)
+    table = turntable_in(belief.prior)
     others = _predicted(
         belief, [*pokes(belief.last, belief.stand, belief.object_from_last), Candidate("lay", cost=_LYING_COST)]
     )
-    if step_deg is not None:
-        return others + _predicted(belief, turns(abs(step_deg), _LARGEST_DEG))
+    if table is not None:
+        return others + _predicted(belief, turns(abs(table.step_deg), _LARGEST_DEG))
     found = _predicted(belief, turns(_COARSE_DEG, _LARGEST_DEG))
     fine = [
         Candidate("turn", turn_deg=best.candidate.turn_deg + offset_deg)
