@@ -31,7 +31,7 @@ class SimulatedRobot:
         return cls(Stage(recipe))
 
     def after(self, candidate: Candidate, belief: Belief, rng: np.random.Generator) -> SimulatedRobot:
-        """Return the robot after an action; a poke goes as its own prior says, with that's spread.
+        """Return the robot after an action; a poke goes as its own prior says, with the prior's spread.
 
         Args:
             candidate: the action.

@@ -60,16 +60,15 @@ class Suggest:
         part, *others = run.parts
         if others:
             raise InputError(f"{self.run_folder}: joins several runs; ask about one of them")
-        belief = part.modeler().belief(run.views, run.solution, run.edges)
-        found = suggest(belief, given, goal)
+        found = suggest(part.modeler().belief(run.views, run.solution, run.edges), given, goal)
         if self.json:
             print(json.dumps([each.record() for each in found.ranked], allow_nan=False, indent=1))
         else:
             shown = found.ranked if self.all else found.ranked[:_SHOWN]
             for each in () if found.reached else shown:
                 print(each.words)
-        if given is not None and (excluded := sum(belief.predict(each) is None for each in given)):
-            say(f"{excluded} of {len(given)} candidates are beyond what the run's prior allows, or show nothing")
+        if given is not None and found.excluded:
+            say(f"{found.excluded} of {len(given)} candidates are beyond what the run's prior allows, or show nothing")
         trusted = bool(run.report["trustworthy"])
         if not asked:
             say(found.summary)

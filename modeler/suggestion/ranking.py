@@ -95,6 +95,8 @@ class Suggestions:
     """Largest standard deviation of a pose's rotation."""
     sigma_m: float
     """Standard deviation of the surface in the worst view."""
+    excluded: int = 0
+    """How many of the candidates that were given are not ranked: the prior excludes them, or they show nothing."""
 
 
 def suggest(belief: Belief, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None) -> Suggestions:
@@ -110,7 +112,8 @@ def suggest(belief: Belief, candidates: Sequence[Candidate] | None = None, goal:
     found.sort(key=lambda each: -each.worth_nats / each.candidate.cost)
     reached = goal.reached(belief)
     ranked = [Suggestion(each, words) for each, words in _in_words(belief, found)]
-    return Suggestions(tuple(ranked), _summary(belief, ranked, reached=reached), reached, *_state(belief))
+    excluded = 0 if candidates is None else len(candidates) - len(found)
+    return Suggestions(tuple(ranked), _summary(belief, ranked, reached=reached), reached, *_state(belief), excluded)
 
 
 def _state(belief: Belief) -> tuple[float, float, float]:
