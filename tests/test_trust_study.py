@@ -1,6 +1,9 @@
 """The study of the verdict: its design, its faults, and how it judges and counts."""
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -165,3 +168,14 @@ def test_a_run_is_judged_and_the_same_again(tmp_path: Path) -> None:
     assert [one.fault for one in first] == [SOUND, FAULTS[0].name]
     assert not first[0].wrong
     assert first[0].evidence
+
+
+@pytest.mark.slow
+def test_runs_side_by_side_from_the_command_line(tmp_path: Path) -> None:
+    """Workers are processes of their own: what they are sent must be found there."""
+    folder = Path(__file__).parent
+    environment = os.environ | {"PYTHONPATH": f"{folder}:{folder.parent}"}
+    command = [sys.executable, "-m", "trust", "--runs", "2", "--jobs", "2", "--out", str(tmp_path)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    assert len((tmp_path / "tuning.jsonl").read_text().splitlines()) == 2

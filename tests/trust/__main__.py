@@ -16,6 +16,8 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
+import numba
+
 from trust.plan import HALVES, Half, Plan
 from trust.study import Outcome, outcome
 from trust.tables import text
@@ -57,22 +59,16 @@ def run(half: Half, runs: int, jobs: int, path: Path) -> list[Outcome]:
 
 
 def _outcomes(plans: Sequence[Plan], jobs: int) -> Iterator[Outcome]:
-    """Yield the outcomes of plans as they come."""
+    """Yield the outcomes of plans as they come; each run has one thread, to leave the cores to runs side by side."""
     if jobs == 1:
-        _single_threaded()
+        numba.set_num_threads(1)
         yield from map(outcome, plans)
         return
     context = multiprocessing.get_context("spawn")  # kernels' threads do not survive a fork
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_single_threaded) as pool:
+    # A function of this module would not be found: workers do not import the `__main__` of a package.
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=numba.set_num_threads, initargs=(1,)) as pool:
         for future in as_completed([pool.submit(outcome, plan) for plan in plans]):
             yield future.result()
-
-
-def _single_threaded() -> None:
-    """Leave the cores to runs side by side."""
-    import numba
-
-    numba.set_num_threads(1)
 
 
 if __name__ == "__main__":
