@@ -6,13 +6,14 @@
 # make trust      whether status 0 can be trusted: 150 rendered runs, half with a fault (some 20 minutes a core)
 # make ablation   what each stage and each constant of the default registration is worth (many hours)
 # make bench      speed, against Open3D and the committed baseline
+# make bench-gpu  speed on an NVIDIA GPU, against the CPU of the same machine
 # make same       COMMIT=…: whether the results are those of another commit, byte by byte
 # make audit      locked packages against published advisories, where these can be reached
 
 BIN := .venv/bin
 TWO := -n 2 --dist loadfile  # processes; kernels have threads of their own
 
-.PHONY: setup demo test test-slow calibrate trust ablation bench same audit
+.PHONY: setup demo test test-slow calibrate trust ablation bench bench-gpu same audit
 
 setup: .venv/.installed
 
@@ -50,6 +51,9 @@ ablation: setup
 
 bench: setup
 	$(BIN)/python tests/bench
+
+bench-gpu: setup
+	$(BIN)/python tests/bench/gpu.py
 
 same: setup
 	PYTHONPATH=tests $(BIN)/python -m same_bytes $(COMMIT)

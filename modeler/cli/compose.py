@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from modeler import registration
 from modeler.cli.options import Method, MethodOptions, ObjectOptions, PriorOptions
 from modeler.closure import Closer
 from modeler.fusion import Fuser
+from modeler.kernels import gpu
 from modeler.pipeline import Modeler, glancing
 from modeler.priors import (
     AxesPrior,
@@ -70,7 +71,7 @@ def modeler(
         InputError: where an option cannot be used.
     """
     check_region(where, sequence)
-    noise, chosen = sequence.sensor(), registrar(method.method, colour=method.colour)
+    noise, chosen = sequence.sensor(), registrar(method.method, colour=method.colour, device=method.device)
     return Modeler(
         segmenter=segmenter(where),
         sensor=Sensor() if noise is None else Sensor(*noise),
@@ -109,13 +110,31 @@ def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
     return modeler.segmenter.scene([sequence.frame(index) for index in telling(sequence.indices)])
 
 
-def registrar(method: Method, *, colour: bool = False) -> AbstractRegistrar:
-    """Return the registration method of a name; `colour`: whether it may compare colours."""
+def registrar(
+    method: Method, *, colour: bool = False, device: Literal["cpu", "cuda"] | None = None
+) -> AbstractRegistrar:
+    """Return the registration method of a name.
+
+    Args:
+        method: its name.
+        colour: whether it may compare colours.
+        device: where it samples and scores poses; None = chosen for each job.
+
+    Raises:
+        InputError: where it cannot be there.
+    """
+    if device == "cuda":
+        if method not in ("visibility", "paper"):
+            raise InputError(f"--device cuda: --method {method} runs on the CPU only; leave --device out")
+        if (fault := gpu.missing()) is not None:
+            raise InputError(f"--device cuda: {fault}")
     match method:
         case "visibility":
-            return registration.VisibilityRegistrar(registration.VisibilityLikelihood(colour=colour))
+            return registration.VisibilityRegistrar(
+                registration.VisibilityLikelihood(colour=colour, device=device or "auto")
+            )
         case "paper":
-            return registration.PaperRegistrar()
+            return registration.PaperRegistrar(device=device or "auto")
         case "icp":
             return registration.IcpRegistrar()
         case "gicp":

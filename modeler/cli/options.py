@@ -222,6 +222,8 @@ class MethodOptions:
     """visibility: ours. paper: Wüthrich et al. 2012. The others are baselines."""
     colour: bool = False
     """Compare the colours of matching surface too, where frames have them: for labels on what shape leaves open."""
+    device: Annotated[Literal["cpu", "cuda"] | None, default("cuda where one is present and pays, else cpu")] = None
+    """Where poses are sampled and scored: cuda needs an NVIDIA GPU and the extra gpu (visibility, paper)."""
     seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same result, to the bit."""
 

@@ -89,7 +89,7 @@ def timings(pairs: int | None) -> Iterator[Timing]:
     """
     for name in SEQUENCES:
         sequence = open_sequence(bundled(name))
-        frames, sensor = _segmented(sequence), Sensor(*(sequence.sensor() or ()))
+        frames, sensor = segmented(sequence), Sensor(*(sequence.sensor() or ()))
         truth = sequence.truth()
         assert truth is not None
         table = methods(sensor)
@@ -128,7 +128,7 @@ def timings(pairs: int | None) -> Iterator[Timing]:
 def paper_seconds() -> float:
     """Return the seconds that the paper's brute force takes for 10⁸ samples of the general prior, by its rate."""
     sequence = open_sequence(bundled("box"))
-    frames, sensor = _segmented(sequence), Sensor(*(sequence.sensor() or ()))
+    frames, sensor = segmented(sequence), Sensor(*(sequence.sensor() or ()))
     source, target = (sensor.ray_image(*frames[k]) for k in (1, 0))
     density = PRIORS["general"].between(source, target)
     samples = 100_000
@@ -147,10 +147,10 @@ def cores() -> int:
     return numba.get_num_threads()
 
 
-def _segmented(sequence: AbstractSequence) -> list[tuple[Frame, Plane | None]]:
-    """Return the frames with masks, and the support plane in each: neither is part of what is timed."""
+def segmented(sequence: AbstractSequence, most: int | None = None) -> list[tuple[Frame, Plane | None]]:
+    """Return all or the first frames with masks, and the support plane in each: neither is part of what is timed."""
     segmenter = Segmenter()
-    frames = [sequence.frame(index) for index in sequence.indices]
+    frames = [sequence.frame(index) for index in sequence.indices[:most]]
     scene = segmenter.scene([sequence.frame(index) for index in telling(sequence.indices)])
     found = [segmenter.segment(frame, scene) for frame in frames]
     return [(replace(frame, mask=look.mask), look.plane) for frame, look in zip(frames, found, strict=True)]

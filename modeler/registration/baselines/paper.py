@@ -9,10 +9,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
 from modeler import se3
+from modeler.kernels import gpu
 from modeler.kernels import paper as kernel
 from modeler.priors.general import GeneralDensity
 from modeler.registration.posterior import effective_samples, failed, intrinsics, pareto_tail, weighted_gaussian
@@ -47,6 +49,8 @@ class PaperRegistrar(AbstractRegistrar):
     """A sample is rejected as soon as a point's density falls below this share of that of a hidden point."""
     min_effective: float = 10.0
     """Effective sample size below which the outcome is DEGENERATE."""
+    device: gpu.Device = "auto"
+    """Where samples are drawn, tested and weighted."""
 
     def register(
         self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
@@ -57,9 +61,9 @@ class PaperRegistrar(AbstractRegistrar):
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         views = measured(source, self.points, rng), measured(target, self.points, rng)
         kept_poses, kept_weights, drawn = [], [], 0
-        for tried, passing in self._passing(views, density, rng):
+        for tried, passing, log_likelihoods in self._weighed(views, density, rng):
             drawn += tried
-            log_weights = self.log_weights(passing, views) + _log_correction(density, passing)
+            log_weights = log_likelihoods + _log_correction(density, passing)
             alive = np.isfinite(log_weights)
             kept_poses.append(matrices(passing[alive]))
             kept_weights.append(log_weights[alive])
@@ -99,19 +103,41 @@ class PaperRegistrar(AbstractRegistrar):
             )
         return total
 
-    def _passing(
+    def _weighed(
         self, views: tuple[Measured, Measured], density: AbstractPoseDensity, rng: np.random.Generator
-    ) -> Iterator[tuple[int, Array]]:
-        """Yield, batch by batch, the number of samples drawn and those (n, 12) that pass the free-space test."""
-        free = FreeSpace.of(*views, self.reach_sigmas, self.reject_below)
+    ) -> Iterator[tuple[int, Array, Array]]:
+        """Yield the number of samples drawn, those (n, 12) that pass the free-space test, and their log w (n,)."""
         draws = NumberedDraws.of(density, rng)
         samples = self.samples or (_SAMPLES if draws is None else _UNIFORM_SAMPLES)
+        device = gpu.chosen(self.device, samples * sum(len(view.points_m) for view in views))
+        free = FreeSpace.of(*views, self.reach_sigmas, self.reject_below, device=device)
+        batches = self._drawn(density if draws is None else draws, samples, rng)
+        first = next(batches)
+        free = free.ordered(first[:_PILOT])
+        if device is None:
+            for poses in chain([first], batches):
+                passing = poses[free.passes(poses)]
+                yield len(poses), passing, self.log_weights(passing, views)
+            return
+        from modeler.kernels.gpu.paper import OnDevice
+
+        seen = [(view.points_m, view.ranges_m, view.intrinsics, view.noise) for view in views]
+        tests = free.checks, free.near_m, free.images
+        there = OnDevice.of(device, seen, tests, (self.reach_sigmas, self.reject_below))
+        if draws is not None:
+            yield from there.weighed_draws(samples, draws.seed, draws.limits)
+            return
+        for poses in chain([first], batches):
+            yield len(poses), *there.weighed(poses)
+
+    def _drawn(
+        self, density: AbstractPoseDensity | NumberedDraws, samples: int, rng: np.random.Generator
+    ) -> Iterator[Array]:
+        """Yield samples (n, 12), batch by batch."""
         for first in range(0, samples, self.batch):
             count = min(self.batch, samples - first)
-            poses = rows(density.sample(count, rng)) if draws is None else draws.poses(first, count)
-            if first == 0:
-                free = free.ordered(poses[:_PILOT])
-            yield count, poses[free.passes(poses)]
+            numbered = isinstance(density, NumberedDraws)
+            yield density.poses(first, count) if numbered else rows(density.sample(count, rng))
 
 
 def _log_correction(density: AbstractPoseDensity, poses: Array) -> Array | float:
@@ -182,9 +208,15 @@ class FreeSpace:
     """Their images, see `kernels.paper.forbidden`."""
 
     @staticmethod
-    def of(source: Measured, target: Measured, reach_sigmas: float, reject_below: float) -> FreeSpace:
-        """Return the test for two views; with an infinite reach or no threshold every pose passes it."""
-        sides = _side(source, target, reach_sigmas, reject_below), _side(target, source, reach_sigmas, reject_below)
+    def of(
+        source: Measured, target: Measured, reach_sigmas: float, reject_below: float, *, device: str | None = None
+    ) -> FreeSpace:
+        """Return the test for two views; with an infinite reach or no threshold every pose passes it.
+
+        Nearest ranges are found on a device of Warp, or by the kernels of Numba.
+        """
+        limits = reach_sigmas, reject_below
+        sides = _side(source, target, limits, device), _side(target, source, limits, device)
         checks = np.concatenate([np.insert(side[0], kernel.BACKWARD, k, axis=1) for k, side in enumerate(sides)])
         return FreeSpace(checks, (sides[0][1], sides[1][1]), (sides[0][2], sides[1][2]))
 
@@ -226,8 +258,11 @@ class NumberedDraws:
         return kernel.drawn(np.arange(first, first + count), self.seed, self.limits)
 
 
-def _side(own: Measured, other: Measured, reach_sigmas: float, reject_below: float) -> tuple[Array, np.ndarray, Array]:
+def _side(
+    own: Measured, other: Measured, limits: tuple[float, float], device: str | None
+) -> tuple[Array, np.ndarray, Array]:
     """Return checks (n, 4) of one view's points against the other, and the other's nearest ranges and image."""
+    reach_sigmas, reject_below = limits
     fx, fy, cx, cy = other.intrinsics
     noise = other.noise
     inverses = np.stack([kernel.ray_jacobian_inverse(point) for point in own.points_m])
@@ -239,7 +274,7 @@ def _side(own: Measured, other: Measured, reach_sigmas: float, reject_below: flo
     reach_px = reach_sigmas * np.sqrt(lateral + spread_m2.max() * widening) * np.array([fx, fy]) + 1e-6
     if not (reject_below > 0.0 and np.all(reach_px < max(other.ranges_m.shape))):
         return np.zeros((0, 4)), np.zeros((1, 1), dtype=np.float32), np.zeros(7)
-    near_m = kernel.nearest_ranges(other.ranges_m, reach_px)
+    near_m = _nearest_ranges(other.ranges_m, reach_px, device)
     across, down = (
         (near - full) // 2 for near, full in zip(near_m.shape[::-1], other.ranges_m.shape[::-1], strict=True)
     )
@@ -250,3 +285,12 @@ def _side(own: Measured, other: Measured, reach_sigmas: float, reject_below: flo
     height, width = near_m.shape
     image = np.array([fx, fy, cx + across, cy + down, width, height, widening])
     return np.column_stack([own.points_m, margins_m]), near_m, image
+
+
+def _nearest_ranges(ranges_m: Array, reach_px: Array, device: str | None) -> np.ndarray:
+    """Return `kernels.paper.nearest_ranges`."""
+    if device is None:
+        return kernel.nearest_ranges(ranges_m, reach_px)
+    from modeler.kernels.gpu.paper import nearest_ranges
+
+    return nearest_ranges(ranges_m, reach_px, device)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.special import chdtri
 
 from modeler import se3
-from modeler.kernels import gauss_newton, point_likelihood, point_to_plane
+from modeler.kernels import gauss_newton, gpu, point_likelihood, point_to_plane
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.kernels.photometric import ColourProjection, no_colour
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
@@ -72,6 +72,8 @@ class VisibilityLikelihood:
 
     Not by default: the error by which a camera aligns colour to depth, or takes it at another moment, is not modelled.
     """
+    device: gpu.Device = "auto"
+    """Where poses are scored; descent and refinement stay on the CPU."""
 
     def between(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> PairLikelihood:
         """Return the likelihood of target_from_source, at surface points drawn with `rng`."""
@@ -241,12 +243,20 @@ class PairLikelihood:
             stride: every `stride`-th point is used, and counts for as many.
             typical_misfit: misfit μ of a typical match (nats).
         """
-        projections = self.forward.projection(stride), self.backward.projection(stride)
-        parameters = (
+        sides = (
+            self.forward.projection(stride),
+            self.backward.projection(stride),
             self.forward.parameters(blur_m, typical_misfit),
             self.backward.parameters(blur_m, typical_misfit),
         )
-        found = stride * point_likelihood.log_likelihoods(rows(poses), *projections, *parameters)
+        lookups = len(poses) * sum(side.points.shape[1] for side in sides[:2])
+        if (device := gpu.chosen(self.forward.model.device, lookups)) is None:
+            found = stride * point_likelihood.log_likelihoods(rows(poses), *sides)
+        else:
+            from modeler.kernels.gpu import visibility
+
+            one = np.zeros(len(poses), dtype=np.int32)
+            found = stride * visibility.log_likelihoods(rows(poses), one, [sides], device)
         return found[:, point_likelihood.LOG_LIKELIHOOD], found[:, point_likelihood.EXPLAINED] / self.points
 
     def tempered(self, poses: Array, blur_m: float, *, typical_misfit: float = _STATED_MISFIT) -> Array:

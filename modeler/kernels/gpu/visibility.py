@@ -1,0 +1,168 @@
+"""The likelihood of `modeler.kernels.point_likelihood` by Warp, for poses of any number of pairs in one launch.
+
+A thread takes one pose in one direction and adds up its points in their order: the same device gives the same bits.
+Neighbouring threads read the same points.
+"""
+# pyright: reportInvalidTypeForm=false
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler.kernels import planes
+from modeler.kernels import point_likelihood as twin
+from modeler.kernels.gpu.memory import sent
+from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
+
+if TYPE_CHECKING:
+    wp = cast("Any", None)  # what Warp compiles is no Python to a type checker
+else:
+    import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+Pose = wp.types.vector(length=12, dtype=wp.float64)
+Rows = wp.types.matrix(shape=(3, 4), dtype=wp.float32)
+Camera = wp.types.vector(length=6, dtype=wp.float32)
+Cell = wp.types.vector(length=planes.CELL_SIZE, dtype=wp.float32)
+Support = wp.types.vector(length=5, dtype=wp.float32)
+
+SURFACE, BACKGROUND, MISSING = wp.constant(planes.SURFACE), wp.constant(planes.BACKGROUND), wp.constant(planes.MISSING)
+VARIANCE, KIND, DEPTH, SILHOUETTE = (
+    wp.constant(field) for field in (planes.VARIANCE, planes.KIND, planes.DEPTH, planes.SILHOUETTE)
+)
+DISTANCE, POINT_VARIANCE = wp.constant(planes.DISTANCE), wp.constant(twin.VARIANCE_M2)
+TABLE_LOW, TABLE_HIGH = wp.constant(float(twin.TABLE_LOW)), wp.constant(float(twin.TABLE_HIGH))
+LAST, PER_STEP = wp.constant(twin.TABLE_STEPS - 1), wp.constant(float(twin._PER_STEP))
+MIN_AGREEMENT, MAX_SIGMAS = wp.constant(float(twin.MIN_AGREEMENT)), wp.constant(float(twin.MAX_SIGMAS))
+
+Pair = tuple[Projection, Projection, LikelihoodParameters, LikelihoodParameters]
+
+
+@wp.struct
+class Direction:
+    """A `Projection` with its `LikelihoodParameters`."""
+
+    points: wp.array2d[wp.float32]
+    cells: wp.array[Cell]
+    camera: Camera
+    cosines: wp.vec4
+    blur_m: wp.float32
+    silhouette_px: wp.float32
+    clearance_m: wp.float32
+    max_point_cost: wp.float32
+    normal_cost: wp.float32
+    unmeasured_gain: wp.float32
+    typical_misfit: wp.float32
+    support: Support
+    table: wp.array[wp.float32]
+
+
+@wp.func
+def of_surface(of: Direction, cell: Cell, position: wp.vec3, normal: wp.vec3, variance: wp.float32, faces: wp.float32):
+    """Return what a point that falls on surface adds (method.md, eq. 5), and f if the surface explains it, else 0."""
+    plane = wp.vec3(cell[0], cell[1], cell[2])
+    in_front = cell[DISTANCE] + wp.dot(plane, position)
+    agreement = wp.dot(plane, normal)
+    half_square = 0.5 * in_front * in_front / (variance + cell[VARIANCE] + of.blur_m * of.blur_m)
+    match = of.typical_misfit - half_square - of.normal_cost * (1.0 - agreement)
+    step = (wp.clamp(match, TABLE_LOW, TABLE_HIGH) - TABLE_LOW) * PER_STEP
+    node = wp.min(wp.int32(step), LAST)
+    seen = of.table[node] + (step - wp.float32(node)) * (of.table[node + 1] - of.table[node])
+    hidden = wp.float32(0.0)
+    if in_front > 0.0:
+        hidden = wp.min(half_square, of.max_point_cost)
+        if match < of.table[0]:
+            seen = wp.max(match, -of.max_point_cost)
+    explained = wp.float32(0.0)
+    if half_square < 0.5 * MAX_SIGMAS * MAX_SIGMAS and agreement > MIN_AGREEMENT:
+        explained = faces
+    return faces * seen - (1.0 - faces) * hidden, explained
+
+
+@wp.kernel
+def sum_over_points(
+    poses: wp.array[Pose], pair_of: wp.array[wp.int32], directions: wp.array[Direction], found: wp.array2d[wp.vec2]
+):
+    """Write the log-likelihood of each pose's points in each direction, and the number explained, see the twin."""
+    side, i = wp.tid()
+    of = directions[2 * pair_of[i] + side]
+    pose = poses[i]
+    turn = wp.mat33d(pose[0], pose[1], pose[2], pose[4], pose[5], pose[6], pose[8], pose[9], pose[10])
+    shift = wp.vec3d(pose[3], pose[7], pose[11])
+    if side == 1:
+        turn = wp.transpose(turn)
+        shift = -(turn * shift)
+    rotation, shift_m = wp.mat33(turn), wp.vec3(shift)
+    total, explained = wp.float32(0.0), wp.float32(0.0)
+    for j in range(of.points.shape[1]):
+        position = rotation * wp.vec3(of.points[0, j], of.points[1, j], of.points[2, j]) + shift_m
+        normal = rotation * wp.vec3(of.points[3, j], of.points[4, j], of.points[5, j])
+        cosine = -wp.dot(normal, position) / wp.length(position)
+        faces = wp.clamp((cosine - of.cosines[0]) / (of.cosines[1] - of.cosines[0]), 0.0, 1.0)
+        column = of.camera[0] * position[0] / position[2] + of.camera[2] + 0.5
+        row = of.camera[1] * position[1] / position[2] + of.camera[3] + 0.5
+        cell = Cell()
+        kind = MISSING
+        if position[2] > 0.0 and column >= 0.0 and column < of.camera[4] and row >= 0.0 and row < of.camera[5]:
+            cell = of.cells[wp.int32(row) * wp.int32(of.camera[4]) + wp.int32(column)]
+            kind = cell[KIND]
+        gain, by_surface = wp.float32(0.0), wp.float32(0.0)
+        if kind == SURFACE:
+            gain, by_surface = of_surface(of, cell, position, normal, of.points[POINT_VARIANCE, j], faces)
+        elif kind == BACKGROUND:
+            if position[2] < cell[DEPTH] - of.clearance_m:
+                beyond = cell[SILHOUETTE] / of.silhouette_px
+                gain = -wp.min(0.5 * beyond * beyond, of.max_point_cost)
+        elif kind == MISSING:
+            covered = wp.clamp((cosine - of.cosines[2]) / (of.cosines[3] - of.cosines[2]), 0.0, 1.0)
+            gain = of.unmeasured_gain * covered
+        standing = wp.vec3(of.support[0], of.support[1], of.support[2])
+        height_m = wp.dot(standing, position) + of.support[3] + of.clearance_m
+        below = wp.max(-height_m * of.support[4], 0.0)
+        total += wp.max(gain - 0.5 * below * below, -of.max_point_cost)
+        explained += by_surface
+    found[side, i] = wp.vec2(total, explained)
+
+
+def log_likelihoods(
+    poses: npt.NDArray[np.float64], pair_of: npt.NDArray[np.int32], pairs: Sequence[Pair], device: str
+) -> npt.NDArray[np.float64]:
+    """Return what `point_likelihood.log_likelihoods` returns, (m, 2), for poses of several pairs.
+
+    The sums differ from the twin's by rounding only, unless a point falls within 1e-3 px of a pixel's border.
+
+    Args:
+        poses: (m, 12) rows of the 3×4 matrices of target_from_source.
+        pair_of: (m,) number of each pose's pair.
+        pairs: the arguments of the twin after the poses.
+        device: Warp's name of it.
+    """
+    sides = [
+        _direction(projection, parameters, device)
+        for forward, backward, *both in pairs
+        for projection, parameters in zip((forward, backward), both, strict=True)
+    ]
+    found = wp.empty((2, len(poses)), dtype=wp.vec2, device=device)
+    inputs = [
+        wp.array(np.ascontiguousarray(poses), dtype=Pose, device=device),
+        wp.array(pair_of, dtype=wp.int32, device=device),
+        wp.array(sides, dtype=Direction, device=device),
+    ]
+    wp.launch(sum_over_points, dim=found.shape, inputs=inputs, outputs=[found], device=device)
+    return found.numpy().astype(np.float64).sum(axis=0)
+
+
+def _direction(projection: Projection, parameters: LikelihoodParameters, device: str) -> Any:
+    """Return the struct of one direction; points, cells and table are sent to the device once."""
+    direction = Direction()
+    direction.points = sent(projection.points, device)
+    direction.cells = sent(projection.cells, device, Cell)
+    direction.table = sent(parameters.table, device)
+    direction.camera, direction.cosines = Camera(*projection.camera), wp.vec4(*projection.cosines)
+    direction.support = Support(*parameters.support)
+    for name in LikelihoodParameters._fields[:7]:
+        setattr(direction, name, float(getattr(parameters, name)))
+    return direction

@@ -1,0 +1,211 @@
+"""What Warp evaluates against the kernels of Numba: on the CPU wherever Warp is, and on a CUDA device where one is."""
+
+import ctypes
+import importlib.util
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tabletop
+from test_free_space import NOISES, scene
+from test_kernels import far_from_borders, parameters, random_pose, random_projection
+
+from modeler import se3
+from modeler.kernels import gpu, paper, point_likelihood
+from modeler.priors import GeneralPrior, TablePrior
+from modeler.rays import Sensor
+from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
+from modeler.registration.baselines.paper import FreeSpace, NumberedDraws, measured
+from modeler.se3 import rows
+from modeler.types import Plane
+from sequences import bundled
+
+with_warp = pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="warp-lang is not installed")
+BOX, POSES = tabletop.Box((0.05, 0.08, 0.035)), tabletop.turntable(24)[2:4]
+
+
+def standing(index):
+    """Return a view of the box on its table, with depth noise, in which the table is known."""
+    pose = POSES[index]
+    up = pose[:3, 2]
+    plane = Plane(up, -float(up @ (pose @ [0.0, 0.0, -BOX.depth_m, 1.0])[:3]), 5e-3, 5e-4)
+    frame = tabletop.view(BOX, pose, index, rng=np.random.default_rng(index)).frame
+    return Sensor(sigma_wh=0.002, sigma_r_m=0.001).ray_image(frame, plane)
+
+
+@pytest.fixture(params=["warp-cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request):
+    """Where registrars evaluate."""
+    pytest.importorskip("warp", exc_type=ImportError)
+    if request.param == "cuda" and (fault := gpu.missing()) is not None:
+        pytest.skip(fault)
+    gpu.warp()
+    return request.param
+
+
+def test_visibility_is_that_of_numba_for_poses_of_several_pairs(device):
+    from modeler.kernels.gpu import visibility
+
+    rng = np.random.default_rng(0)
+    pairs, poses, pair_of, want = [], [], [], []
+    for number in range(4):
+        projections = random_projection(rng, 40), random_projection(rng, 30)
+        pairs.append((*projections, parameters(support=(0.0, -0.8, -0.6, 0.5, 200.0)), parameters(0.006)))
+        tried = np.stack([random_pose(rng, 0.3) for _ in range(60)])
+        tried = tried[far_from_borders(projections[0], tried) & far_from_borders(projections[1], se3.inverse(tried))]
+        assert len(tried) > 20
+        poses.append(rows(tried))
+        pair_of += [number] * len(tried)
+        want.append(point_likelihood.log_likelihoods(rows(tried), *pairs[-1]))
+    mixed = rng.permutation(len(pair_of))
+    got = visibility.log_likelihoods(
+        np.concatenate(poses)[mixed], np.array(pair_of, dtype=np.int32)[mixed], pairs, gpu.chosen(device, 1) or ""
+    )
+    assert np.concatenate(want)[:, point_likelihood.EXPLAINED].max() > 0.5  # something matches
+    np.testing.assert_allclose(got, np.concatenate(want)[mixed], rtol=0, atol=1e-4 * 70)
+
+
+def test_on_images_visibility_is_that_of_numba_but_where_a_point_meets_a_pixels_border(device, rng):
+    target, source = standing(0), standing(1)
+    poses = se3.moved(
+        POSES[0] @ se3.inverse(POSES[1]), rng.normal(0, 0.02, (2000, 6)), np.array([0, 0, tabletop.DISTANCE_M])
+    )
+    numba, warp = (
+        VisibilityLikelihood(device=where).between(source, target, np.random.default_rng(0))
+        for where in ("cpu", device)
+    )
+    (want, explained), (got, explained_there) = (pair.log_likelihoods(poses, 0.002, stride=1) for pair in (numba, warp))
+    same = np.abs(got - want) < 1e-4 * numba.points
+    assert same.mean() > 0.99
+    assert np.mean(np.abs(explained_there - explained) < 1e-6) > 0.99
+    assert explained.max() > 0.5
+
+
+def test_a_pair_registered_on_a_device_is_that_of_the_cpu_within_its_uncertainty(device):
+    target, source = standing(0), standing(1)
+    density = TablePrior().between(source, target)
+    cpu, there, again = (
+        VisibilityRegistrar(VisibilityLikelihood(device=where)).register(
+            source, target, density, rng=np.random.default_rng(1)
+        )
+        for where in ("cpu", device, device)
+    )
+    apart = se3.difference(there.pose.mean, cpu.pose.mean, source.centroid_m)
+    assert there.outcome is cpu.outcome
+    # Both estimate one posterior from 600 effective samples: their means differ by 1 in 20 standard deviations.
+    assert np.sqrt(apart @ np.linalg.solve(cpu.pose.covariance, apart)) < 0.5
+    np.testing.assert_array_equal(again.samples, there.samples)
+
+
+@pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES.keys())
+def test_the_papers_likelihood_and_nearest_ranges_are_those_of_numba(device, noise, rng):
+    from modeler.kernels.gpu.paper import OnDevice, nearest_ranges
+
+    there = gpu.chosen(device, 1) or ""
+    source, target = (scene(rng, noise, gaps=0.5) for _ in range(2))
+    reach_px = np.array([3.7, 5.2])
+    np.testing.assert_array_equal(
+        nearest_ranges(target.ranges_m, reach_px, there), paper.nearest_ranges(target.ranges_m, reach_px)
+    )
+    poses = rows(np.stack([random_pose(rng, 0.1) for _ in range(200)]))
+    free = FreeSpace.of(source, target, 4.0, 1e-6)
+    views = [(view.points_m, view.ranges_m, view.intrinsics, view.noise) for view in (source, target)]
+    on_device = OnDevice.of(there, views, (free.checks, free.near_m, free.images), (4.0, 0.0))
+    want, got = PaperRegistrar(reject_below=0.0).log_weights(poses, (source, target)), on_device.log_likelihoods(poses)
+    assert np.isfinite(want).any()
+    np.testing.assert_allclose(got, want, rtol=1e-9)  # -inf where it is -inf
+
+
+def test_the_papers_draws_that_pass_are_those_of_numba_in_their_order(device, rng, monkeypatch):
+    from modeler.kernels.gpu import paper as on_gpu
+
+    monkeypatch.setattr(on_gpu, "AT_ONCE", 3000)  # several launches, the last one short
+    source, target = (measured(standing(index), 12, rng) for index in (1, 0))
+    draws = NumberedDraws.of(GeneralPrior(25.0, 0.02).between(standing(1), standing(0)), np.random.default_rng(3))
+    assert draws is not None
+    free = FreeSpace.of(source, target, 4.0, 1e-6).ordered(draws.poses(0, 500))
+    views = [(view.points_m, view.ranges_m, view.intrinsics, view.noise) for view in (source, target)]
+    there = on_gpu.OnDevice.of(gpu.chosen(device, 1) or "", views, (free.checks, free.near_m, free.images), (4.0, 1e-6))
+    tried, got, found = zip(*there.weighed_draws(10_000, draws.seed, draws.limits), strict=True)
+    poses = draws.poses(0, 10_000)
+    passing = poses[free.passes(poses)]
+    values = PaperRegistrar().log_weights(passing, (source, target))
+    assert sum(tried) == 10_000
+    assert 10 < np.isfinite(values).sum() < len(passing) < 5000
+    np.testing.assert_allclose(np.concatenate(got), passing[np.isfinite(values)], atol=1e-12)
+    np.testing.assert_allclose(np.concatenate(found), values[np.isfinite(values)], rtol=1e-9)
+
+
+@pytest.mark.parametrize("prior", [GeneralPrior(25.0, 0.02), TablePrior()], ids=["general", "table"])
+def test_the_paper_registers_alike_on_a_device(device, prior):
+    target, source = standing(0), standing(1)
+    cpu, there = (
+        PaperRegistrar(samples=100_000, points=25, device=where).register(
+            source, target, prior.between(source, target), rng=np.random.default_rng(0)
+        )
+        for where in ("cpu", device)
+    )
+    assert len(cpu.samples) > 1
+    np.testing.assert_allclose(there.samples, cpu.samples, atol=1e-12)
+    np.testing.assert_allclose(there.weights, cpu.weights, rtol=1e-8)
+
+
+def test_a_device_is_chosen_for_large_work_only(monkeypatch):
+    monkeypatch.setattr(gpu, "missing", lambda: None)
+    assert gpu.chosen("auto", gpu.LARGE) == "cuda"
+    assert gpu.chosen("auto", gpu.LARGE - 1) is None
+    assert gpu.chosen("cpu", gpu.LARGE) is None
+    monkeypatch.setattr(gpu, "missing", lambda: "nothing there")
+    assert gpu.chosen("auto", gpu.LARGE) is None
+
+
+@pytest.mark.parametrize(
+    ("absent", "line"),
+    [("warp", "warp-lang is not installed; pip install 'modeler[gpu]'"), ("driver", "there is no NVIDIA driver")],
+)
+def test_a_device_that_is_not_there_is_refused_in_one_line(cli, monkeypatch, absent, line):
+    load = ctypes.CDLL
+
+    def no_driver(name, *arguments):
+        if name == "libcuda.so.1":
+            raise OSError(name)
+        return load(name, *arguments)
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if absent == "warp" else object())
+    monkeypatch.setattr(ctypes, "CDLL", no_driver)
+    gpu.missing.cache_clear()
+    ended = cli("register", bundled("box"), "1", "0", "--device", "cuda")
+    gpu.missing.cache_clear()
+    assert ended.status == 2
+    assert len(ended.err.splitlines()) == 1
+    assert f"--device cuda: {line}" in ended.err
+
+
+def test_methods_that_run_on_the_cpu_only_say_so(cli):
+    ended = cli("register", bundled("box"), "1", "0", "--device", "cuda", "--method", "icp")
+    assert ended.status == 2
+    assert "--method icp runs on the CPU only" in ended.err
+
+
+@with_warp
+@pytest.mark.slow
+def test_the_source_compiles_for_a_gpu(tmp_path):
+    from modeler.kernels.gpu import paper as on_gpu
+    from modeler.kernels.gpu import visibility
+
+    for module, kernel in ((on_gpu, "weigh"), (visibility, "sum_over_points")):
+        gpu.warp().compile_aot_module(module, arch=90, module_dir=str(tmp_path), use_ptx=True)
+        assert any(kernel in path.read_text() for path in tmp_path.glob(f"*{module.__name__}*.ptx"))
+
+
+@with_warp
+def test_the_programme_of_measurements_runs_at_small_sizes(capsys, monkeypatch):
+    arguments = ["bench-gpu", "--device", "warp-cpu", "--samples", "20000", "--pairs", "3", "--runs", "1"]
+    monkeypatch.setattr("sys.argv", arguments)
+    path = Path(__file__).parent / "bench" / "gpu.py"
+    monkeypatch.syspath_prepend(str(path.parent))
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(path), run_name="__main__")
+    assert not ended.value.code
+    assert "20,000 samples of the general prior" in capsys.readouterr().out
