@@ -101,7 +101,7 @@ class ViewStore:
     def keep(self, view: RayImage) -> RayImage:
         """Return a view without layers, its arrays in memory or on disk."""
         light, frame = replace(view, layers={}), view.frame
-        arrays = (frame.depth_m, frame.mask, frame.colour, view.points_m, view.normals, view.pixels)
+        arrays = (frame.depth_m, frame.mask, frame.colour, frame.occluder, view.points_m, view.normals, view.pixels)
         size = sum(array.nbytes for array in arrays if array is not None)
         if size <= self._left_bytes:
             self._left_bytes -= size
@@ -109,9 +109,16 @@ class ViewStore:
         try:
             mask = None if frame.mask is None else self._disk.written(frame.mask)
             colour = None if frame.colour is None else self._disk.written(frame.colour)
+            occluder = None if frame.occluder is None else self._disk.written(frame.occluder)
             return replace(
                 light,
-                frame=replace(frame, depth_m=self._disk.written(frame.depth_m), mask=mask, colour=colour),
+                frame=replace(
+                    frame,
+                    depth_m=self._disk.written(frame.depth_m),
+                    mask=mask,
+                    colour=colour,
+                    occluder=occluder,
+                ),
                 points_m=self._disk.written(view.points_m),
                 normals=self._disk.written(view.normals),
                 pixels=self._disk.written(view.pixels),

@@ -38,9 +38,11 @@ class Sensor:
         """Make a segmented frame ready for registration; without object pixels it has no points.
 
         Args:
-            frame: with its mask; without one, every measured pixel is the object's.
+            frame: with its mask; without one, every measured pixel is the object's. Where an occluder is, nothing is
+                known of the object.
             plane: the support plane, where one is seen.
         """
+        frame = frame.unoccluded
         camera = frame.camera
         depth_m = np.ascontiguousarray(frame.depth_m, dtype=np.float32)
         seen = (depth_m > 0) & (depth_m < np.inf)  # not NaN either
@@ -62,15 +64,19 @@ class Sensor:
             surface = outline & (depth_m > 0)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         ball, sigma_inverse, sharing = self._smoothing(frame, mask, outline)
+        # The object may go on behind what hides it, so its silhouette is known only beyond.
+        covered = outline if frame.occluder is None else outline | frame.occluder
         cells = planes.local_planes(
             depth_m,
             surface,
-            planes.silhouette_distance(outline, self.max_silhouette_px),
+            planes.silhouette_distance(covered, self.max_silhouette_px),
             intrinsics,
             ball,
             sigma_inverse,
             None if surface is mask else mask,
         )
+        if frame.occluder is not None:
+            cells[frame.occluder, planes.KIND] = planes.RAGGED  # counts 0: it neither confirms nor contradicts
         points_m, normals, pixels, variance_m2 = planes.frontal_points(cells, surface, intrinsics, self.min_cosine)
         if surface is not mask:  # all measured pixels take part, and most points lie between them
             sharing *= max(len(points_m), 1) / max(np.count_nonzero(mask), 1)

@@ -24,8 +24,10 @@ from sequences.image_files import (
     check_size,
     metres,
     no_depth,
+    object_and_occluder,
     read_colour,
     read_depth,
+    read_labels,
     read_mask,
     write_image,
 )
@@ -88,6 +90,8 @@ def pose_entry(pose: Array) -> dict[str, object]:
 
 MASKS = "mask_visib"
 """Folder of the masks."""
+OCCLUDERS = "mask_hand"
+"""Folder of the masks of what hides the object: a hand, a gripper."""
 
 
 @final
@@ -126,8 +130,9 @@ class BopSequence(AbstractRecording):
         if alike != path:
             check_same_size(path, raw.shape, alike, "with the same cam_K; give each size its own in scene_camera.json")
         camera = Camera(raw.shape[1], raw.shape[0], *matrix)
-        mask, colour = self._mask(index, raw.shape), self._colour(index, raw.shape)
-        return Frame(index, self._times_s[index], metres(raw, scale_mm), camera, mask, colour)
+        mask, occluder = self._masks(index, raw.shape)
+        colour = self._colour(index, raw.shape)
+        return Frame(index, self._times_s[index], metres(raw, scale_mm), camera, mask, colour, occluder)
 
     def truth(self) -> dict[int, Array] | None:
         """Return the true camera_from_model (4, 4), in m, by frame number; None without `scene_gt.json`."""
@@ -178,6 +183,13 @@ class BopSequence(AbstractRecording):
             )
         elif not masks and (other := first_folder(self.path, ("mask", "masks"))) is not None:
             notes.append(f"masks are read from {MASKS}/; those in {other.name}/ are left out")
+        hands = [path for path in entries(self.path / OCCLUDERS) if path.suffix.lower() == ".png"]
+        lone = [path.name for path in hands if re.sub(r"_\d+$", "", path.stem) not in stems]
+        if lone:
+            notes.append(
+                f"{len(lone)} of {len(hands)} masks in {OCCLUDERS}/ belong to no depth image and are left out "
+                f"({lone[0]})"
+            )
         scales = {scale for _, scale in self._intrinsics.values()}
         if len(scales) > 1:
             notes.append(
@@ -236,13 +248,21 @@ class BopSequence(AbstractRecording):
         """The first frame with each intrinsics: all of them must have its size."""
         return {self._intrinsics[index][0]: index for index in reversed(self.indices)}
 
-    def _mask(self, index: int, size: tuple[int, ...]) -> BoolArray | None:
-        path = self.path / MASKS / f"{self._depth_paths[index].stem}_000000.png"
-        if not is_there(path):
-            return None
-        mask = read_mask(path)
-        check_size(path, mask.shape, size)
-        return mask
+    def _masks(self, index: int, size: tuple[int, ...]) -> tuple[BoolArray | None, BoolArray | None]:
+        """Return the masks (h, w) of object and occluder; None where there is no file."""
+        stem = self._depth_paths[index].stem
+        path = self.path / MASKS / f"{stem}_000000.png"
+        labels = read_labels(path) if is_there(path) else None
+        if labels is not None:
+            check_size(path, labels.shape, size)
+        named = (self.path / OCCLUDERS / name for name in (f"{stem}.png", f"{stem}_000000.png"))
+        hand = next((one for one in named if is_there(one)), None)
+        occluder = None if hand is None else read_mask(hand)
+        if hand is not None and occluder is not None:
+            check_size(hand, occluder.shape, size)
+        if labels is None:
+            return None, occluder
+        return object_and_occluder(labels, occluder)
 
     def _colour(self, index: int, size: tuple[int, ...]) -> npt.NDArray[np.uint8] | None:
         path = self._colour_paths.get(index)
@@ -327,6 +347,8 @@ def _fill(
         _image(folder / "depth" / f"{stem}.png", _raw_depth(frame, depth_scale_mm))
         if frame.mask is not None:
             _image(folder / "mask_visib" / f"{stem}_000000.png", frame.mask.astype(np.uint8) * np.uint8(255))
+        if frame.occluder is not None:
+            _image(folder / OCCLUDERS / f"{stem}.png", frame.occluder.astype(np.uint8) * np.uint8(255))
         if frame.colour is not None:
             _image(folder / "rgb" / f"{stem}{colour_suffix}", frame.colour)
     _json(folder / "scene_camera.json", cameras)

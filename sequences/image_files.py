@@ -151,14 +151,43 @@ def read_depth(path: Path | EmbeddedImage) -> npt.NDArray[np.uint16]:
 
 
 def read_mask(path: Path) -> BoolArray:
-    """Return a mask (h, w), True where the image is not black.
+    """Return a mask (h, w), True where the image is not black. Of `read_labels`, occluders count too.
+
+    Raises:
+        InputError: where the file is missing, broken or too large.
+    """
+    return read_labels(path) != 0
+
+
+OCCLUDED = 128
+"""Value of a mask's pixels at which a hand or a gripper is seen, before the object or beside it."""
+
+
+def read_labels(path: Path) -> npt.NDArray[np.uint8]:
+    """Return the values of a mask (h, w): 0 or `OCCLUDED` of 8-bit images of those values, else 255.
 
     Raises:
         InputError: where the file is missing, broken or too large.
     """
     image = _open(path, ("PNG",))
     pixels = np.asarray(image if image.mode in ("1", "L", "I;16", "I") else image.convert("L"))
-    return pixels != 0
+    occluded = (pixels == OCCLUDED) & (image.mode == "L")  # a palette numbers things
+    return np.where(occluded, OCCLUDED, np.where(pixels != 0, 255, 0)).astype(np.uint8)
+
+
+def object_and_occluder(
+    labels: npt.NDArray[np.uint8], occluder: BoolArray | None
+) -> tuple[BoolArray, BoolArray | None]:
+    """Return the masks (h, w) of an object and of what hides it, None where nobody said.
+
+    Args:
+        labels: (h, w), of `read_labels`.
+        occluder: (h, w) of a file of its own.
+    """
+    marked = labels == OCCLUDED
+    if not marked.any():
+        return labels != 0, occluder
+    return (labels != 0) & ~marked, marked if occluder is None else marked | occluder
 
 
 def read_colour(path: Path | EmbeddedImage) -> npt.NDArray[np.uint8]:

@@ -21,8 +21,10 @@ from sequences.image_files import (
     is_finer,
     metres,
     no_depth,
+    object_and_occluder,
     read_colour,
     read_depth,
+    read_labels,
     read_mask,
     resize_to_depth,
 )
@@ -43,7 +45,9 @@ class FrameFiles:
     colour: Path | None = None
     """Colour aligned to depth, in its size or finer."""
     mask: Path | None = None
-    """Non-zero = object."""
+    """Non-zero = object, `OCCLUDED` = something before it."""
+    occluder: Path | None = None
+    """Non-zero = something before the object."""
 
 
 @final
@@ -87,14 +91,17 @@ class ImageFolderSequence(AbstractRecording):
         raw = read_depth(files.depth)
         first = self.files[self.indices[0]].depth
         check_same_size(files.depth, raw.shape, first, "and one camera took them all; convert each size by itself")
-        mask = None if files.mask is None else read_mask(files.mask)
+        labels = None if files.mask is None else read_labels(files.mask)
+        occluder = None if files.occluder is None else read_mask(files.occluder)
         colour = None if files.colour is None else read_colour(files.colour)
-        if files.mask is not None and mask is not None:
-            check_size(files.mask, mask.shape, raw.shape)
+        for path, image in ((files.mask, labels), (files.occluder, occluder)):
+            if path is not None and image is not None:
+                check_size(path, image.shape, raw.shape)
         if files.colour is not None and colour is not None:
             colour = resize_to_depth(files.colour, colour, raw.shape)
         camera = Camera(raw.shape[1], raw.shape[0], *self.intrinsics)
-        return Frame(index, files.time_s, metres(raw, self.depth_scale_mm), camera, mask, colour)
+        mask, occluder = (None, occluder) if labels is None else object_and_occluder(labels, occluder)
+        return Frame(index, files.time_s, metres(raw, self.depth_scale_mm), camera, mask, colour, occluder)
 
     def truth(self) -> dict[int, Array] | None:
         """Return the true camera_from_model (4, 4), in m, by frame number; None where it is not known."""
@@ -145,13 +152,18 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
     colour = _list(path / "rgb.txt", 2) if is_there(path / "rgb.txt") else []
     folder = first_folder(path, ("mask", "masks"))
     masks = {} if folder is None else list_images(folder, (".png",))
+    occluding = first_folder(path, OCCLUDER_FOLDERS)
+    occluders = {} if occluding is None else list_images(occluding, (".png",))
     pairs, remarks = paired(depth, colour)
     files: dict[int, FrameFiles] = {}
     for index, pair in pairs.items():
         image = _listed(path, "depth.txt", pair.depth[0])
         colour_path = None if pair.colour is None else _listed(path, "rgb.txt", pair.colour[0])
-        mask = masks.get(image.stem) or (None if colour_path is None else masks.get(colour_path.stem))
-        files[index] = FrameFiles(pair.time_s, image, colour_path, mask)
+        mask, occluder = (
+            some.get(image.stem) or (None if colour_path is None else some.get(colour_path.stem))
+            for some in (masks, occluders)
+        )
+        files[index] = FrameFiles(pair.time_s, image, colour_path, mask, occluder)
     used = {one.mask for one in files.values()}
     strange = [mask.name for mask in masks.values() if mask not in used]
     if strange:
@@ -266,6 +278,7 @@ def _listed(root: Path, by: str, name: str) -> Path:
 
 COLOUR_FOLDERS = ("color", "rgb", "colour", "image")
 MASK_FOLDERS = ("masks", "mask")
+OCCLUDER_FOLDERS = ("mask_hand", "masks_hand")
 POSES = "annotated_poses"
 
 
@@ -290,6 +303,9 @@ def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
     remarks = found.doubts(image_size(next(iter(depth.values()))))
     colour, left = _partners(path, COLOUR_FOLDERS, (".png", ".jpg", ".jpeg"), depth)
     masks, left_masks = _partners(path, MASK_FOLDERS, (".png",), depth)
+    occluders, left_occluders = _partners(path, OCCLUDER_FOLDERS, (".png",), depth)
+    if left_occluders:
+        remarks.append(f"{len(left_occluders)} masks of hands belong to no depth image and are left out")
     for what, partners, others in (("colour image", colour, left), ("mask", masks, left_masks)):
         lacking = sum(stem not in partners for stem in depth)
         if partners and lacking:
@@ -297,7 +313,9 @@ def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
         if others:
             remarks.append(f"{len(others)} {what}s belong to no depth image and are left out ({others[0]})")
     files = {
-        numbers[stem]: FrameFiles(_time_s(stem, numbers[stem]), image, colour.get(stem), masks.get(stem))
+        numbers[stem]: FrameFiles(
+            _time_s(stem, numbers[stem]), image, colour.get(stem), masks.get(stem), occluders.get(stem)
+        )
         for stem, image in depth.items()
     }
     unit_mm, who = found.unit(overrides, (1.0, "the default"))

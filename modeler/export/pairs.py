@@ -147,7 +147,7 @@ class Remembered(AbstractRegistrar):
         for view in views:
             frame = view.frame
             digest.update(f"{frame.camera!r} {view.plane!r} {view.sigma_wh!r} {view.sigma_r_m!r}".encode())
-            for pixels in (frame.depth_m, frame.mask, frame.colour, view.points_m):
+            for pixels in (frame.depth_m, frame.mask, frame.colour, frame.occluder, view.points_m):
                 digest.update(b"none" if pixels is None else np.ascontiguousarray(pixels).tobytes())
         drawn = density.sample(_DRAWN, np.random.default_rng(0))
         for numbers in (drawn, density.log_density(drawn), density.log_evidence(drawn)):

@@ -110,6 +110,8 @@ def crop(view: RayImage, where: tuple[slice, slice], cropping: Cropping) -> Crop
         step = far - near > 2.0 * depth_m / camera.fx * np.tan(STEEPEST_RAD) + 4.0 * view.sigma_r_m
     edges = step | np.logical_not(minimum_filter(mask, size=3))
     within = np.asarray(binary_fill_holes(mask), dtype=bool) & ~step  # where depth is missing, colours may be good
+    if frame.occluder is not None:  # but not where it is a hand that has them
+        within &= ~frame.occluder[where]
     away_px = np.asarray(distance_transform_edt(np.pad(within, 1)))[1:-1, 1:-1]
     clearance = np.minimum((away_px + 0.5) / BLEEDING_PX, 1.0)
     cosine = -np.sum(points_m * normals, axis=1) / np.linalg.norm(points_m, axis=1)

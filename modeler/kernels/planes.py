@@ -17,7 +17,8 @@ SILHOUETTE = 7  # distance of a pixel outside the object from its silhouette, px
 CELL_SIZE = 8
 
 _NOWHERE_M = 1e9  # outside every ball
-MISSING, SURFACE, RAGGED, BACKGROUND = 0.0, 1.0, 2.0, 3.0  # RAGGED: object, but no plane to be trusted
+# RAGGED: object, but no plane to be trusted; or hidden by something else.
+MISSING, SURFACE, RAGGED, BACKGROUND = 0.0, 1.0, 2.0, 3.0
 
 
 @numba.njit(cache=True)

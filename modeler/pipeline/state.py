@@ -131,8 +131,8 @@ class State:
         if prepared.view is None:
             return prepared
         view = self.store.keep(prepared.view)
-        frame = replace(prepared.frame, depth_m=view.frame.depth_m, colour=view.frame.colour)
-        assert view.frame.mask is not None
-        return replace(
-            prepared, frame=frame, segmentation=replace(prepared.segmentation, mask=view.frame.mask), view=view
-        )
+        images = view.frame
+        frame = replace(prepared.frame, depth_m=images.depth_m, colour=images.colour, occluder=images.occluder)
+        assert images.mask is not None
+        found = replace(prepared.segmentation, mask=images.mask, occluder=images.occluder)
+        return replace(prepared, frame=frame, segmentation=found, view=view)

@@ -37,6 +37,7 @@ _ELSEWHERE = 0.3  # share of the moving pieces' score elsewhere from which the o
 _WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
 _IN_FRONT_SHARE = 0.9  # share of the object that is in front of a wall
 _TOUCHING_PX = 3
+_CUT_WEIGHT = 0.2  # of a moving piece that comes from the image's edge: an arm, or a person
 _MOST = 0.5  # share of measured pixels; with more there is a background
 _ON_BORDER = 0.005  # share of measured pixels along the image's edge; with more the scene extends beyond it
 _ON_PLANE, _ABOVE, _BELOW = 0.1, 0.01, 0.2  # shares of the points: at least, at least, and at most for a support plane
@@ -114,6 +115,8 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     depth = layers.front_m[..., 2]
     labels = pieces(depth, layers.moved & allowed)
     merit = _central(labels, depth, layers.front_share)
+    cut = np.bincount(labels[edge_of(np.isfinite(depth))], minlength=len(merit)) >= _TOUCHING_PX
+    merit[cut] *= _CUT_WEIGHT
     if merit.max() <= 0.0:
         return np.zeros_like(layers.moved), True
     low, high = np.percentile(layers.front_m[labels == int(merit.argmax())], [2.0, 98.0], axis=0)

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from modeler.segmentation.depth_images import (
     DepthNoise,
+    Labels,
     edge_of,
     mixed_pixels,
     noise_ratio,
@@ -28,7 +29,9 @@ from modeler.types import Array, BoolArray, Camera, Float32Array, Frame, InputEr
 Window = tuple[slice, slice]
 _ZONE_MARGIN_M = 0.1  # distance from the object's zone at which it may still be
 _ZONE_MARGIN_SHARE = 0.3  # share of the zone's size, if that is more
-_STRAY_WEIGHT = 0.2  # weight of what lies outside the zone
+_MOSTLY_IN_ZONE = 0.5  # share of a piece beside the object that is in the zone, for it to be part of the object
+_LEAST_PIECE = 0.07  # of the object; what cameras fill in around a figure's limbs comes in pieces of up to 6 %
+_STRAY_WEIGHT = 0.2  # weight of what lies outside the zone, or comes from the image's edge as arms do
 _FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
 _CLEARANCE_M = 0.001
 _LOW_M = 0.01  # creases of the support are at most so high, and apart from the object
@@ -44,6 +47,7 @@ _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support pl
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
 _RING_PX = (1.5, 2.5)  # distance from a mask at which nothing of the object is left, where it is right to a pixel
 _THIN_SHARE = 0.5  # share of that ring on the object's surface: beyond, most of the rim is missing
+_HIDING_PX = 60  # distance from the object beyond which nothing that is nearer hides it: as far as silhouettes count
 _STEEPEST_SLOPE = np.tan(np.radians(70.0))  # of surfaces that depth cameras measure
 
 
@@ -58,23 +62,62 @@ class Found:
     """Area visible to the camera."""
     rival: float = 0.0
     """Score of the second-best cluster relative to the best."""
+    occluder: BoolArray | None = None
+    """(h, w) True = nearer than the object, but no part of it."""
 
 
-def find(depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, gap_m: float) -> Found:
-    """Find the object in a depth image, NaN where nothing was measured or no object may be.
+def find(
+    depth_m: Float32Array,
+    camera: Camera,
+    scene: Scene,
+    noise: DepthNoise,
+    *,
+    gap_m: float,
+    occluder: BoolArray | None = None,
+) -> Found:
+    """Find the object in a depth image, NaN where nothing was measured or no object may be, and what hides it.
 
     On a downsampled image, what is above the support and in front of the background is clustered in space, and the
-    cluster with the largest area in the object's zone is chosen. Its pixels are then taken at full resolution.
+    cluster with the largest area in the object's zone is chosen, with those that an occluder separates from it. Its
+    pixels are then taken at full resolution.
     """
     if scene.zone_m is None:
         return Found(np.zeros(depth_m.shape, dtype=np.bool_))
-    chosen = _choose(depth_m, camera, scene, noise, zone_m=scene.zone_m, gap_m=gap_m)
-    mask = _refine(depth_m, camera, scene, noise, chosen=chosen.mask, reach_m=_reach_m(scene.zone_m))
+    found = _found(depth_m, camera, scene, noise, zone_m=scene.zone_m, gap_m=gap_m, occluder=occluder)
+    before = _in_front(depth_m, camera, scene, noise, mask=found.mask, gap_m=gap_m)
+    if before is None:
+        return replace(found, occluder=occluder)
+    occluder, rival = before if occluder is None else occluder | before, found.rival
+    depth_m = np.where(occluder, np.float32(np.nan), depth_m)
+    found = _found(depth_m, camera, scene, noise, zone_m=scene.zone_m, gap_m=gap_m, occluder=occluder)
+    return replace(found, occluder=occluder, rival=max(found.rival, rival))
+
+
+def _found(
+    depth_m: Float32Array,
+    camera: Camera,
+    scene: Scene,
+    noise: DepthNoise,
+    *,
+    zone_m: Array,
+    gap_m: float,
+    occluder: BoolArray | None,
+) -> Found:
+    """Return the object, without looking for what hides it."""
+    chosen = _choose(depth_m, camera, scene, noise, zone_m=zone_m, gap_m=gap_m, occluder=occluder)
+    mask = _refine(depth_m, camera, scene, noise, chosen=chosen.mask, reach_m=_reach_m(zone_m), gap_m=gap_m)
     return replace(chosen, mask=mask)
 
 
 def _choose(
-    depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, zone_m: Array, gap_m: float
+    depth_m: Float32Array,
+    camera: Camera,
+    scene: Scene,
+    noise: DepthNoise,
+    *,
+    zone_m: Array,
+    gap_m: float,
+    occluder: BoolArray | None,
 ) -> Found:
     """Return the object in the downsampled image."""
     stride = planning_stride(camera)
@@ -93,20 +136,65 @@ def _choose(
     in_zone = _inside(candidates, *zone_m)
     area = candidates[:, 2] ** 2 * (stride**2 / (camera.fx * camera.fy))
     merit = np.bincount(labels, area * np.where(in_zone, 1.0, _STRAY_WEIGHT))
+    on_edge = np.bincount(labels, edge_of(np.isfinite(thin))[window][fore])
+    merit[on_edge > _CUT_SHARE * np.sqrt(np.bincount(labels))] *= _STRAY_WEIGHT
     best = int(merit.argmax())
     chosen[window][fore] = labels == best
-    rival = float(np.delete(merit, best).max(initial=0.0) / merit[best])
-    return Found(chosen, float(area[labels == best].sum()), rival)
+    blocking = chosen if occluder is None else chosen | occluder[::stride, ::stride]
+    own = _joined(best, labels, in_zone, _beside(blocking)[window][fore])
+    chosen[window][fore] = own[labels]
+    rival = float(merit[~own].max(initial=0.0) / merit[best])
+    return Found(chosen, float(area[own[labels]].sum()), rival)
+
+
+def _beside(region: BoolArray) -> Labels:
+    """Label the pieces (h, w) of a region, and the pixels within 2 px of them; 0 elsewhere."""
+    near = np.asarray(ndimage.binary_dilation(region, np.ones((3, 3)), iterations=2), dtype=np.bool_)
+    labels = np.zeros(near.shape, dtype=np.int32)
+    ndimage.label(near, output=labels)
+    return labels
+
+
+def _joined(best: int, labels: Labels, in_zone: BoolArray, beside: Labels) -> BoolArray:
+    """Return which clusters (k,) are the object: the best one, and what it or an occluder hides the connection to.
+
+    That is beside one of the two in the image, and mostly where the object is in other frames.
+
+    Args:
+        best: number of a cluster.
+        labels: (n,) of points.
+        in_zone: (n,) whether they are where the object is in other frames.
+        beside: (n,) piece of best cluster and occluder that they are beside; 0 = none.
+    """
+    pieces = np.unique(beside[labels == best])
+    touching = np.bincount(labels[np.isin(beside, pieces)], minlength=int(labels.max()) + 1) > 0
+    sizes = np.bincount(labels)
+    own: BoolArray = touching & (np.bincount(labels, in_zone) > _MOSTLY_IN_ZONE * sizes)
+    own &= sizes > _LEAST_PIECE * sizes[best]
+    own[best] = True
+    return own
 
 
 def _refine(
-    depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, chosen: BoolArray, reach_m: Array
+    depth_m: Float32Array,
+    camera: Camera,
+    scene: Scene,
+    noise: DepthNoise,
+    *,
+    chosen: BoolArray,
+    reach_m: Array,
+    gap_m: float,
 ) -> BoolArray:
-    """Return the object's pixels at full resolution, given those in the downsampled image."""
+    """Return the object's pixels at full resolution, given those in the downsampled image.
+
+    What is beside these and not far behind or before them is the object's, too.
+    """
     stride = planning_stride(camera)
     mask = np.zeros(depth_m.shape, dtype=np.bool_)
     rows, columns = _window(chosen, margin=2)
-    near = np.asarray(ndimage.binary_dilation(chosen[rows, columns], np.ones((3, 3))), dtype=np.bool_)
+    own_m = np.where(chosen, depth_m[::stride, ::stride], np.float32(np.nan))[rows, columns]
+    low_m = ndimage.minimum_filter(np.nan_to_num(own_m, nan=np.inf), 3) - np.float32(gap_m)
+    high_m = ndimage.maximum_filter(np.nan_to_num(own_m, nan=-np.inf), 3) + np.float32(gap_m)
     height, width = depth_m.shape
     window = (
         slice(rows.start * stride, min(rows.stop * stride, height)),
@@ -115,7 +203,11 @@ def _refine(
     depth: Float32Array = depth_m[window]
     points = point_image(depth, camera, row=window[0].start, column=window[1].start)
     fore, above_m = _foreground(points, window, scene, noise, thinning=stride)
-    fore &= np.repeat(np.repeat(near, stride, axis=0), stride, axis=1)[: depth.shape[0], : depth.shape[1]]
+    low_m, high_m = (
+        np.repeat(np.repeat(limit_m, stride, axis=0), stride, axis=1)[: depth.shape[0], : depth.shape[1]]
+        for limit_m in (low_m, high_m)
+    )
+    fore &= (depth > low_m) & (depth < high_m)
     fore &= (depth > reach_m[0, 2]) & (depth < reach_m[1, 2])
     if not fore.any():
         return mask
@@ -125,6 +217,26 @@ def _refine(
     fore &= ~mixed_pixels(depth, tolerance_m=noise.tolerance_m(depth), pixel_m=pixel)
     mask[window] = without_specks(fore, _SPECK_SHARE)
     return mask
+
+
+def _in_front(
+    depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, mask: BoolArray, gap_m: float
+) -> BoolArray | None:
+    """Return what stands or moves before the object, and is no part of it, near its mask (h, w); None = nothing.
+
+    The object may go on behind that. What is farther away than the object hides nothing of it.
+    """
+    window = _window(mask, margin=_HIDING_PX)
+    depth, body = depth_m[window], mask[window] & np.isfinite(depth_m[window])
+    if not body.any():
+        return None
+    points = point_image(depth, camera, row=window[0].start, column=window[1].start)
+    fore, _ = _foreground(points, window, scene, noise, thinning=planning_stride(camera))
+    nearest = np.asarray(ndimage.distance_transform_edt(~body, return_distances=False, return_indices=True))
+    nearer = depth < depth[tuple(nearest)] - np.float32(gap_m)
+    occluder = np.zeros_like(mask)
+    occluder[window] = without_specks(fore & ~mask[window] & nearer, 0.0)
+    return occluder if occluder.any() else None
 
 
 def _inside(points: Float32Array, low: Array, high: Array) -> BoolArray:
@@ -251,6 +363,7 @@ class Segmenter:
         or if the object's surface goes on beyond most of its rim. Where measurements are sparse, the mask holds what
         lies between those of the object.
         """
+        given = frame.occluder
         frame = _interpolated(frame)
         if frame.mask is not None:
             mask = frame.mask & self._allowed(frame.depth_m)
@@ -259,24 +372,24 @@ class Segmenter:
             loose = plane is not None and self._share_on(plane, frame, mask) > _LOOSE_SHARE
             thin = not few and self._share_beyond(plane, frame, mask) > _THIN_SHARE
             outcome = Outcome.UNSURE_MASK if loose or thin else Outcome.CONVERGED
-            return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome)
+            return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome, given)
         if scene.alone:
             mask = clean(self._kept(frame), frame.camera, self.noise)
             few = np.count_nonzero(mask) < self.min_points
             sure = is_island(_measured(frame))
             outcome = Outcome.CONVERGED if sure else Outcome.UNSURE_MASK
-            return Segmentation(mask, None, Outcome.TOO_FEW_POINTS if few else outcome)
+            return Segmentation(mask, None, Outcome.TOO_FEW_POINTS if few else outcome, given)
         if not (scene.still and self._holds(frame, scene)):
             scene = self._learn([frame])
         found = self._find(frame, scene)
         count = np.count_nonzero(found.mask)
         if count < self.min_points:
-            return Segmentation(found.mask, scene.plane, Outcome.TOO_FEW_POINTS)
+            return Segmentation(found.mask, scene.plane, Outcome.TOO_FEW_POINTS, given)
         sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < _RIVAL
         if scene.areas_m2 is not None:
             sure &= scene.areas_m2[0] / _AREA_FACTOR < found.area_m2 < scene.areas_m2[1] * _AREA_FACTOR
         sure &= np.count_nonzero(found.mask & edge_of(frame.depth_m > 0.0)) < _CUT_SHARE * np.sqrt(count)
-        return Segmentation(found.mask, scene.plane, Outcome.CONVERGED if sure else Outcome.UNSURE_MASK)
+        return Segmentation(found.mask, scene.plane, Outcome.CONVERGED if sure else Outcome.UNSURE_MASK, found.occluder)
 
     def _learn(self, frames: Sequence[Frame]) -> Scene:
         """Return the scene that frames without masks show, if their camera is static."""
@@ -295,7 +408,8 @@ class Segmenter:
 
     def _find(self, frame: Frame, scene: Scene) -> Found:
         """Return the object in a frame without a mask."""
-        return find(self._kept(frame), frame.camera, scene, scene.noise or self.noise, gap_m=self.gap_m)
+        noise = scene.noise or self.noise
+        return find(self._kept(frame), frame.camera, scene, noise, gap_m=self.gap_m, occluder=frame.occluder)
 
     def _kept(self, frame: Frame) -> Float32Array:
         """Return the depth (h, w) within region and largest depth, NaN elsewhere."""
@@ -338,6 +452,8 @@ class Segmenter:
         away_px = np.asarray(ndimage.distance_transform_edt(outside))
         nearest = np.asarray(ndimage.distance_transform_edt(outside, return_distances=False, return_indices=True))
         ring = (away_px > _RING_PX[0]) & (away_px <= _RING_PX[1]) & ~inside
+        if frame.occluder is not None:
+            ring &= ~frame.occluder[rows, columns]
         if not ring.any():
             return 0.0
         rim_m = depth_m[tuple(nearest)][ring]
@@ -362,8 +478,9 @@ class Segmenter:
 
 
 def _interpolated(frame: Frame) -> Frame:
-    """Return a frame with depth between measurements, where they are sparse."""
-    return replace(frame, depth_m=interpolated(frame.depth_m, frame.camera))
+    """Return a frame without what occluders measure, and with depth between measurements, where they are sparse."""
+    known = frame.unoccluded
+    return replace(known, depth_m=interpolated(known.depth_m, frame.camera)).unoccluded
 
 
 def _measured(frame: Frame) -> Float32Array:

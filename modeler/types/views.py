@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -52,6 +52,19 @@ class Frame:
     """(h, w) True = object; None = not segmented."""
     colour: npt.NDArray[np.uint8] | None = None
     """(h, w, 3) RGB aligned to depth."""
+    occluder: BoolArray | None = None
+    """(h, w) True where a hand or a gripper is seen, which may hide the object; None = nobody said."""
+
+    @property
+    def unoccluded(self) -> Frame:
+        """The frame with nothing known of where an occluder is: no depth, and no object.
+
+        It hides whether the object or empty space is behind it. All that compares views goes by this.
+        """
+        if self.occluder is None or not self.occluder.any():
+            return self
+        depth_m = np.where(self.occluder, np.float32(np.nan), self.depth_m)
+        return replace(self, depth_m=depth_m, mask=None if self.mask is None else self.mask & ~self.occluder)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +95,8 @@ class Segmentation:
     """The support plane, where one is seen."""
     outcome: Outcome
     """CONVERGED, or UNSURE_MASK / TOO_FEW_POINTS where a person should look."""
+    occluder: BoolArray | None = None
+    """(h, w) True where something else is nearer than the object and may hide it; None = nowhere."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,6 +53,8 @@ class Stage:
     """What else is in view, each with a pose for every frame."""
     mask_of: Callable[[int, BoolArray, Sequence[BoolArray]], BoolArray] = lambda index, own, others: own
     """Returns the mask that is handed over from frame number and the masks (h, w) of object and others."""
+    occluder_of: Callable[[int, Sequence[BoolArray]], BoolArray | None] = lambda index, others: None
+    """Returns what is handed over as hiding the object (h, w), from frame number and the masks of all others."""
     spoil: Callable[[Sequence[Frame]], Sequence[Frame]] = lambda frames: frames
     """Changes the frames that are handed over."""
 
@@ -147,7 +149,10 @@ class Recorded(AbstractSequence):
         for frame, others in self._layered:
             assert frame.mask is not None
             mask = self.stage.mask_of(frame.index, frame.mask, others) if self.stage.masks else None
-            handed.append(replace(frame, mask=mask))
+            occluder = self.stage.occluder_of(frame.index, others)
+            handed.append(
+                replace(frame, mask=mask) if occluder is None else replace(frame, mask=mask, occluder=occluder)
+            )
         return tuple(self.stage.spoil(handed))
 
     def _layers(self, index: int) -> tuple[Frame, tuple[BoolArray, ...]]:

@@ -178,13 +178,19 @@ class DirectedLikelihood:
 
     @cached_property
     def _measured_share(self) -> float:
-        """Share of the pixels around the surface that carry a measurement: low for very sparse images."""
+        """Share of the pixels around the surface that carry a measurement: low for very sparse images.
+
+        Without pixels of which an occluder leaves nothing known: points that fall there count 0.
+        """
         rows_, columns = self.image.pixels[:: max(len(self.image.pixels) // 500, 1)].T
         height, width = self.image.frame.depth_m.shape
         steps = np.arange(-2, 3)
         near_rows = np.clip(rows_[:, None, None] + steps[:, None], 0, height - 1)
         near_columns = np.clip(columns[:, None, None] + steps, 0, width - 1)
-        return float(np.mean(self.image.frame.depth_m[near_rows, near_columns] > 0))
+        measured = self.image.frame.depth_m[near_rows, near_columns] > 0
+        if self.image.frame.occluder is None:
+            return float(np.mean(measured))
+        return float(np.mean(measured[~self.image.frame.occluder[near_rows, near_columns]]))
 
     @cached_property
     def _distance_m(self) -> float:
