@@ -16,8 +16,8 @@ TRIANGLES = 8_000  # of a mesh whose detail is in the image
 _FILLED = 0.6  # share of the image that charts fill
 PIECE = 1_000  # triangles that are unwrapped at once: the time grows with more than the square of their number
 
-Paint = Callable[[Array, Array], npt.NDArray[np.uint8]]
-"""From points (n, 3) and normals (n, 3) in the object frame to RGB (n, 3)."""
+Paint = Callable[[Array, Array, npt.NDArray[np.uint8]], npt.NDArray[np.uint8]]
+"""From points (n, 3) and normals (n, 3) in the object frame, and RGB (n, 3) of the vertices there, to RGB (n, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,9 @@ def _baked(model: ObjectModel, places_px: Array, side_px: int, paint: Paint) -> 
     points = np.einsum("nk,nkc->nc", shares, model.vertices_m[triangle])
     normals = np.einsum("nk,nkc->nc", shares, model.vertex_normals[triangle])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    colours = paint(points, normals)
+    at_vertices = np.full_like(model.vertices_m, 128.0) if model.vertex_colours is None else model.vertex_colours
+    between = np.rint(np.einsum("nk,nkc->nc", shares, at_vertices[triangle])).astype(np.uint8)
+    colours = paint(points, normals, between)
     image = np.full((len(pixels), 3), np.rint(colours.mean(axis=0)) if len(colours) else 128, dtype=np.uint8)
     image[near] = colours
     return image.reshape(side_px, side_px, 3)

@@ -188,10 +188,16 @@ class FusionVolume:
         """Return what the views observe at oriented points (n, 3) of the object frame."""
         return self._support(points_m, normals, self._gains)
 
-    def texture_colours(self, points_m: Array, normals: Array) -> npt.NDArray[np.uint8]:
-        """Return the RGB (n, 3) of surface points (n, 3) from the most frontal and sharpest views."""
+    def texture_colours(self, points_m: Array, normals: Array, unseen: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """Return the RGB (n, 3) of surface points (n, 3) from the most frontal and sharpest views.
+
+        Args:
+            points_m: (n, 3) in the object frame.
+            normals: (n, 3) unit.
+            unseen: (n, 3) RGB of those that no view with colour sees.
+        """
         found = self._support(points_m, normals, self._gains, focus=SHARP)
-        return meshing.filled_colours(found.colours, found.coloured, points_m)
+        return np.where(found.coloured[:, None], found.colours, unseen)
 
     @property
     def pixel_m(self) -> float:
