@@ -198,7 +198,7 @@ def test_simplified_keeps_the_shape_and_what_is_known_of_it() -> None:
 
 @pytest.mark.parametrize("suffix", ["obj", "glb"])
 def test_texture_shows_each_point_its_colour(tmp_path: Path, suffix: str) -> None:
-    def paint(points: Array, normals: Array, _: Array) -> npt.NDArray[np.uint8]:
+    def paint(points: Array, normals: Array, _: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
         return np.rint(255.0 * ((points - [0.0, 0.0, 0.8]) / 0.1 + 0.5)).astype(np.uint8)
 

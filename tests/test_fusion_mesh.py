@@ -194,7 +194,7 @@ def test_a_mesh_of_many_triangles_is_unwrapped_in_pieces_without_overlap() -> No
     )
     assert len(model.triangles) > 3 * PIECE
 
-    def paint(points_m: Array, *_: Array) -> npt.NDArray[np.uint8]:
+    def paint(points_m: Array, *_: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8]:
         return np.rint(127.5 + 2400.0 * points_m).clip(0.0, 255.0).astype(np.uint8)
 
     wrapped, texture = textured(model, paint, 512)
