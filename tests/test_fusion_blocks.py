@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 
 from modeler.disk_arrays import DiskArrays, ViewStore
 from modeler.fusion import Fuser, depth_views
+from modeler.fusion.exposure import _solved
 from modeler.fusion.fuser import downsampled, voxel_means
-from modeler.fusion.support import _solved
 
 VOXEL_M = 0.002
 BRICK = tabletop.Box((0.07, 0.05, 0.04))
@@ -96,7 +96,7 @@ def test_clouds_are_averaged_together_as_they_are_at_once() -> None:
 def test_gains_solve_their_equations_whichever_side_is_smaller(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(0)
     left, right = rng.uniform(size=shape), rng.uniform(size=shape)
-    diagonal, values = rng.uniform(20.0, 30.0, shape[0]), rng.normal(size=shape[0])
+    diagonal, values = rng.uniform(20.0, 30.0, shape[0]), rng.normal(size=(shape[0], 2))
     found = _solved(diagonal, left, right, values)
     np.testing.assert_allclose((np.diag(diagonal) - left @ right.T) @ found, values, rtol=1e-9)
 

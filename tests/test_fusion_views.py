@@ -22,7 +22,7 @@ from modeler.fusion.depth_views import (
     posed_views,
     view_blocks,
 )
-from modeler.fusion.support import exposure_gains
+from modeler.fusion.exposure import exposure_of
 from modeler.types import (
     Array,
     Edge,
@@ -177,6 +177,6 @@ def test_sharp_views_have_more_say_in_colours_than_blurred_ones(rng):
 
     views = {k: textured(view, 60 if k % 3 else 20) for k, view in tabletop.views(BRICK, POSES).items()}
     seen = view_blocks(posed_views(views, tabletop.trajectory(POSES)), CORNERS_M, CROPPING)
-    say = exposure_gains(seen, tau_m=0.005, near_m=0.003)[:, 3]
+    say = exposure_of(seen, tau_m=0.005, near_m=0.003).gains[:, 3]
     sharp = np.arange(len(POSES)) % 3 > 0
     np.testing.assert_allclose(say[~sharp] / say[sharp].mean(), 20.0 / 60.0, rtol=0.15)

@@ -23,7 +23,8 @@ from modeler.fusion.depth_views import (
     view_blocks,
 )
 from modeler.fusion.distance_field import DistanceField, VoxelGrid, filled, grid_around, measured
-from modeler.fusion.support import ViewSupport, exposure_gains, view_support
+from modeler.fusion.exposure import Exposure, exposure_of
+from modeler.fusion.support import ViewSupport, view_support
 from modeler.kernels import point_clouds
 from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage
 
@@ -186,7 +187,7 @@ class FusionVolume:
 
     def support(self, points_m: Array, normals: Array) -> ViewSupport:
         """Return what the views observe at oriented points (n, 3) of the object frame."""
-        return self._support(points_m, normals, self._gains)
+        return self._support(points_m, normals, self._exposure)
 
     def texture_colours(self, points_m: Array, normals: Array, unseen: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
         """Return the RGB (n, 3) of surface points (n, 3) from the most frontal and sharpest views.
@@ -196,7 +197,7 @@ class FusionVolume:
             normals: (n, 3) unit.
             unseen: (n, 3) RGB of those that no view with colour sees.
         """
-        found = self._support(points_m, normals, self._gains, focus=SHARP)
+        found = self._support(points_m, normals, self._exposure, focus=SHARP)
         return np.where(found.coloured[:, None], found.colours, unseen)
 
     @property
@@ -206,11 +207,11 @@ class FusionVolume:
         return depth_m / float(np.median(np.concatenate([block.intrinsics[:, 0] for block in self.views])))
 
     @cached_property
-    def _gains(self) -> Array:
-        """Exposure gains and colour weights of the views, (f, 4)."""
-        return exposure_gains(self.views, tau_m=self.tau_m, near_m=self.near_m)
+    def _exposure(self) -> Exposure:
+        """What makes the views' colours alike."""
+        return exposure_of(self.views, tau_m=self.tau_m, near_m=self.near_m)
 
-    def _support(self, points_m: Array, normals: Array, gains: Array, *, focus: float = SOFT) -> ViewSupport:
+    def _support(self, points_m: Array, normals: Array, exposure: Exposure, *, focus: float = SOFT) -> ViewSupport:
         return view_support(
             self.views,
             points_m,
@@ -218,7 +219,7 @@ class FusionVolume:
             tau_m=self.tau_m,
             near_m=self.near_m,
             sigma_m=self.sigma_m,
-            gains=gains,
+            exposure=exposure,
             focus=focus,
         )
 
@@ -248,7 +249,7 @@ class FusionVolume:
         Surface is supported, not seen empty by several views, and does not fold over at a border.
         """
         normals = meshing.normals_of(vertices, triangles)
-        found = self._support(vertices, normals, np.zeros((self.views.count, 4)))
+        found = self._support(vertices, normals, Exposure.blind(self.views.count))
         # Closing gaps in the support must not add what several views see empty.
         empty = found.empty_views * self.fuser.empty_weight > found.weight + self.fuser.empty_weight
         seen = (found.weight > self.fuser.min_support) & self._supported(found)  # (F7)

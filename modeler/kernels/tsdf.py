@@ -16,6 +16,7 @@ from numba import njit
 
 from modeler.kernels.threads import over_rows
 
+HARMONICS = 8  # up to the second degree, without the constant
 SIDE = 4  # voxels along the side of a block
 SAME_SIDE = 0.3  # least cosine between normals on the same side of the object; chosen by hand
 MAJORITY = 3  # a side is rejected if this many times as many votes contradict it; chosen by hand
@@ -178,8 +179,8 @@ def observe(queries, directions, tolerance_m, tau_m, *views):
         tau_m: least distance of empty points from the end of the empty space.
         views: index (f, h, w) int32; free_m (f, h, w) float32; poses (f, 3, 4) camera_from_object; intrinsics (f, 4);
             points (p, 3), normals (p, 3) and weights (p,); weights of their colours (p,); colour (f, h, w, 3) uint8;
-            gains (f, 4) of red, green and blue, and the weight of a view's colours, 0 = none; exponent of the view
-            weights for colours.
+            gains (f, 4) of red, green and blue, and the weight of a view's colours, 0 = none; shading (8, 3), the
+            coefficients of the logarithm of another gain by channel; exponent of the view weights for colours.
 
     Returns:
         (n, 5): sum of the supporting views' weights w, number of views that see the point empty, number of supporting
@@ -203,6 +204,7 @@ def _observe(
     colour_weights,
     colour,
     gains,
+    shading,
     focus,
 ):
     frames, height, width = index.shape
@@ -232,12 +234,40 @@ def _observe(
                 continue
             share = gains[f, 3] * colour_weights[n] ** focus  # (F9)
             colours[q, 3] += share
+            turned = harmonics(poses[f], normals[n, 0], normals[n, 1], normals[n, 2])
             for c in range(3):
-                colours[q, c] += share * gains[f, c] * between(colour[f], u, v, c)
+                shade = 0.0
+                for h in range(HARMONICS):
+                    shade += shading[h, c] * turned[h]
+                colours[q, c] += share * gains[f, c] * math.exp(shade) * between(colour[f], u, v, c)
         if colours[q, 3] > 0.0:
             for c in range(3):
                 colours[q, c] = min(255.0, colours[q, c] / colours[q, 3])
     return observed, colours
+
+
+@njit(cache=True)
+def harmonics(pose, x, y, z):
+    """Return the spherical harmonics of degrees 1 and 2 (8,), unscaled, of a direction turned into a camera's frame.
+
+    They hold nearly all of how lamps far away shade a matt surface (Basri and Jacobs 2003, "Lambertian reflectance and
+    linear subspaces").
+    """
+    a = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z
+    b = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z
+    c = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z
+    return a, b, c, a * b, b * c, a * c, a * a - b * b, 3.0 * c * c - 1.0
+
+
+@njit(cache=True)
+def harmonics_of(normals, pose):
+    """Return the harmonics (n, 8) of normals (n, 3), see `harmonics`."""
+    result = np.empty((len(normals), HARMONICS))
+    for n in range(len(normals)):
+        turned = harmonics(pose, normals[n, 0], normals[n, 1], normals[n, 2])
+        for h in range(HARMONICS):
+            result[n, h] = turned[h]
+    return result
 
 
 @njit(cache=True)
