@@ -187,7 +187,7 @@ class FusionVolume:
 
     def support(self, points_m: Array, normals: Array) -> ViewSupport:
         """Return what the views observe at oriented points (n, 3) of the object frame."""
-        return self._support(points_m, normals, self._exposure)
+        return self._support(points_m, normals, self.exposure)
 
     def texture_colours(self, points_m: Array, normals: Array, unseen: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
         """Return the RGB (n, 3) of surface points (n, 3) from the most frontal and sharpest views.
@@ -197,7 +197,7 @@ class FusionVolume:
             normals: (n, 3) unit.
             unseen: (n, 3) RGB of those that no view with colour sees.
         """
-        found = self._support(points_m, normals, self._exposure, focus=SHARP)
+        found = self._support(points_m, normals, self.exposure, focus=SHARP)
         return np.where(found.coloured[:, None], found.colours, unseen)
 
     @property
@@ -207,7 +207,7 @@ class FusionVolume:
         return depth_m / float(np.median(np.concatenate([block.intrinsics[:, 0] for block in self.views])))
 
     @cached_property
-    def _exposure(self) -> Exposure:
+    def exposure(self) -> Exposure:
         """What makes the views' colours alike."""
         return exposure_of(self.views, tau_m=self.tau_m, near_m=self.near_m)
 
