@@ -99,9 +99,12 @@ def fpfh_icp(source: FeatureView, target: FeatureView) -> Array:
     return _refined(source.whole, target.whole, found.transformation, reach_m=0.4 * FEATURE_VOXEL_M, iterations=30)
 
 
-def tsdf(frames: Sequence[Frame], poses: Sequence[Array], voxel_m: float, tau_m: float) -> o3d.t.geometry.TriangleMesh:
+def tsdf(
+    frames: Sequence[Frame], poses: Sequence[Array], voxel_m: float, tau_m: float, *, above: float = 1.0
+) -> o3d.t.geometry.TriangleMesh:
     """Return the mesh of object pixels, object_from_camera (4, 4) given.
 
+    Surface is where the weight is `above` that number: at 1, the recipe's, what a single frame sees is left out.
     By VoxelBlockGrid, which replaces ScalableTSDFVolume: that gives empty meshes in Open3D 0.20.
     """
     single, scalar = o3d.core.float32, o3d.core.SizeVector([1])
@@ -118,7 +121,7 @@ def tsdf(frames: Sequence[Frame], poses: Sequence[Array], voxel_m: float, tau_m:
         pose = o3d.core.Tensor.from_numpy(np.ascontiguousarray(se3.inverse(object_from_camera)))
         blocks = volume.compute_unique_block_coordinates(image, lens, pose, 1.0, 5.0, band)
         volume.integrate(blocks, image, lens, pose, 1.0, 5.0, band)
-    return volume.extract_triangle_mesh(weight_threshold=1.0)
+    return volume.extract_triangle_mesh(weight_threshold=above)
 
 
 def _thinned(whole: o3d.geometry.PointCloud, voxel_m: float) -> o3d.geometry.PointCloud:

@@ -48,8 +48,8 @@ def ours(volume: FusionVolume, views: Mapping[int, RayImage], poses: Mapping[int
 
 
 def tsdf(volume: FusionVolume, views: Mapping[int, RayImage], poses: Mapping[int, Array]) -> Surface:
-    """Integrate with Open3D, on our voxels and band."""
-    return open3d_tsdf(views, poses, volume.grid.voxel_m, volume.tau_m)
+    """Integrate with Open3D, on our voxels and band; as with us, what a single view saw is surface."""
+    return open3d_tsdf(views, poses, volume.grid.voxel_m, volume.tau_m, above=0.5)
 
 
 def poisson(volume: FusionVolume, views: Mapping[int, RayImage], poses: Mapping[int, Array]) -> Surface:
@@ -100,9 +100,10 @@ def compared(
     matched[tuple(part[same & seen] for part in here)] = True
     normals = scene.of(drawn, meshing.normals_of(*mesh))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    unseen = np.zeros(normals.shape, dtype=np.uint8)
+    shown_m, unseen = scene.of(drawn, mesh[0]), np.zeros(normals.shape, dtype=np.uint8)
+    matched[drawn.hit] &= volume.support(shown_m, normals).coloured
     painted = np.zeros((*drawn.hit.shape, 3))
-    painted[drawn.hit] = volume.texture_colours(scene.of(drawn, mesh[0]), normals, unseen)
+    painted[drawn.hit] = volume.texture_colours(shown_m, normals, unseen)
     lamps = np.ones(painted.shape)
     lamps[drawn.hit] = np.exp(-harmonics_of(normals @ object_from_camera[:3, :3], np.eye(4)) @ volume.exposure.shading)
     for name, shown in (("", painted), ("_lit", painted * lamps)):

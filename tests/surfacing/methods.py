@@ -25,9 +25,12 @@ def ours(views: Mapping[int, RayImage], poses: Mapping[int, Array], voxel_m: flo
     return model.vertices_m, model.triangles
 
 
-def open3d_tsdf(views: Mapping[int, RayImage], poses: Mapping[int, Array], voxel_m: float, tau_m: float) -> Surface:
-    """Integrate with Open3D."""
-    mesh = tsdf([view.frame for view in views.values()], [poses[frame] for frame in views], voxel_m, tau_m)
+def open3d_tsdf(
+    views: Mapping[int, RayImage], poses: Mapping[int, Array], voxel_m: float, tau_m: float, *, above: float = 1.0
+) -> Surface:
+    """Integrate with Open3D; surface is where the weight is `above` that number."""
+    frames = [view.frame for view in views.values()]
+    mesh = tsdf(frames, [poses[frame] for frame in views], voxel_m, tau_m, above=above)
     return mesh.vertex.positions.numpy().astype(np.float64), mesh.triangle.indices.numpy().astype(np.int64)
 
 
