@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from modeler.types import (
 )
 
 _DRAWN = 64  # poses at which priors are compared
+_digests: WeakKeyDictionary[RayImage, bytes] = WeakKeyDictionary()  # of views, each part of several questions
 
 
 @final
@@ -145,14 +147,22 @@ class Remembered(AbstractRegistrar):
         asked = (self.registrar, sorted(self.versions.items()), rng.bit_generator.state, density.evidence)
         digest.update(" ".join(map(str, asked)).encode())
         for view in views:
-            frame = view.frame
-            digest.update(f"{frame.camera!r} {view.plane!r} {view.sigma_wh!r} {view.sigma_r_m!r}".encode())
-            for pixels in (frame.depth_m, frame.mask, frame.colour, frame.occluder, view.points_m):
-                digest.update(b"none" if pixels is None else np.ascontiguousarray(pixels).tobytes())
+            if view not in _digests:
+                _digests[view] = _digest(view)
+            digest.update(_digests[view])
         drawn = density.sample(_DRAWN, np.random.default_rng(0))
         for numbers in (drawn, density.log_density(drawn), density.log_evidence(drawn)):
             digest.update(np.ascontiguousarray(numbers).tobytes())
         return digest.hexdigest()
+
+
+def _digest(view: RayImage) -> bytes:
+    """Return a digest of a view."""
+    frame, digest = view.frame, hashlib.blake2b()
+    digest.update(f"{frame.camera!r} {view.plane!r} {view.sigma_wh!r} {view.sigma_r_m!r}".encode())
+    for pixels in (frame.depth_m, frame.mask, frame.colour, frame.occluder, view.points_m):
+        digest.update(b"none" if pixels is None else np.ascontiguousarray(pixels).tobytes())
+    return digest.digest()
 
 
 def _arrays(posterior: Posterior) -> dict[str, np.ndarray]:

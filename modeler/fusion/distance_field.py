@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -64,8 +65,11 @@ class DistanceField:
     """(x, y, z) distance at voxel centres, positive outside."""
     weights: npt.NDArray[np.float32]
     """(x, y, z) weight; 0 = unknown."""
-    known: npt.NDArray[np.int64]
-    """(n, 3) voxels with a weight, in ascending order."""
+
+    @cached_property
+    def cells(self) -> npt.NDArray[np.int64]:
+        """(n, 3) cells that the surface may cross, see `crossed`."""
+        return crossed(self.values_m)
 
 
 def measured(grid: VoxelGrid, views: ViewBlocks, *, tau_m: float, empty_weight: float) -> DistanceField:
@@ -92,7 +96,7 @@ def measured(grid: VoxelGrid, views: ViewBlocks, *, tau_m: float, empty_weight: 
     weights = weights.transpose(0, 3, 1, 4, 2, 5).reshape(grid.shape)
     for axis in range(3):
         np.moveaxis(weights, axis, 0)[[0, -1]] = 0.0
-    return DistanceField(grid, values, weights, voxels_where(weights > 0.0))
+    return DistanceField(grid, values, weights)
 
 
 def voxels_where(mask: BoolArray) -> npt.NDArray[np.int64]:
@@ -102,13 +106,13 @@ def voxels_where(mask: BoolArray) -> npt.NDArray[np.int64]:
 
 def filled(field: DistanceField) -> DistanceField:
     """Return the field with unknown voxels filled whose neighbours are mostly known: the mean of these."""
-    cells, means = marching_cubes.fill(field.values_m, field.weights, field.known, LEAST_NEIGHBOURS)
+    cells, means = marching_cubes.fill(field.values_m, field.weights, LEAST_NEIGHBOURS)
     if not len(cells):
         return field
     values, weights = field.values_m.copy(), field.weights.copy()
     values[tuple(cells.T)] = means
     weights[tuple(cells.T)] = FAINT
-    return DistanceField(field.grid, values, weights, voxels_where(weights > 0.0))
+    return DistanceField(field.grid, values, weights)
 
 
 def crossed(values_m: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:

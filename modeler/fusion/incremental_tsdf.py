@@ -11,7 +11,7 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.fusion import meshing
 from modeler.fusion.depth_views import GREY, free_of, posed_views
-from modeler.fusion.distance_field import voxels_where
+from modeler.fusion.distance_field import crossed
 from modeler.fusion.fuser import Fuser
 from modeler.kernels import marching_cubes, tsdf
 from modeler.types import Array, ObjectModel, RayImage
@@ -99,7 +99,7 @@ class IncrementalTsdf:
             np.moveaxis(weights, axis, 0)[[0, -1]] = 0.0
         known = weights > 0.0
         values = np.where(known, self.sums[..., 1] / np.where(known, weights, 1.0), 0.0).astype(np.float32)
-        positions, triangles = marching_cubes.extract(values, weights, voxels_where(known))
+        positions, triangles = marching_cubes.extract(values, weights, crossed(values))
         shown = triangles[meshing.large_pieces(positions, triangles, self.fuser.min_piece)]
         used, shown = meshing.used_vertices(shown, len(positions))
         positions = positions[used]

@@ -8,7 +8,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from modeler.fusion.distance_field import DistanceField, voxels_where
+from modeler.fusion.distance_field import DistanceField
 from modeler.kernels import marching_cubes
 from modeler.types import Array, BoolArray
 
@@ -26,30 +26,27 @@ PINCH_DEPTH = 1e-2  # how far inside a voxel is put to resolve a pinch, in voxel
 
 def without_pinches(field: DistanceField) -> DistanceField:
     """Return the field with sheets of the zero level set joined that touch along an edge."""
-    values, cells, known = field.values_m, field.known, np.zeros(field.values_m.shape, dtype=bool)
+    values, cells = field.values_m, field.cells
     for _ in range(PINCH_ROUNDS):
         voxels = marching_cubes.pinched_voxels(values, field.weights, cells)
         if not len(voxels):
             break
         if values is field.values_m:
             values = values.copy()
-            known[tuple(field.known.T)] = True
         values[tuple(voxels.T)] = -PINCH_DEPTH * field.grid.voxel_m
-        # Only cells around a changed voxel can be crossed that were not before; they and those that share a face with
-        # them can have new pinches.
+        # Only cells around a changed voxel, and those that share a face with them, can have new pinches.
         around = (voxels[:, None] - np.indices((2, 2, 2)).reshape(3, -1).T).reshape(-1, 3)
-        known[tuple(around.T)] = True
         cells = np.unique(np.concatenate([around, *(around - side for side in np.eye(3, dtype=np.int64))]), axis=0)
         cells = cells[cells.min(axis=1) >= 0]
     if values is field.values_m:
         return field
-    return DistanceField(field.grid, values, field.weights, voxels_where(known))
+    return DistanceField(field.grid, values, field.weights)
 
 
 def extracted_mesh(field: DistanceField) -> tuple[Array, Triangles]:
     """Return vertices (v, 3) in m and triangles (t, 3) of the zero level set; no edge has more than two triangles."""
     field = without_pinches(field)
-    vertices, triangles = marching_cubes.extract(field.values_m, field.weights, field.known)
+    vertices, triangles = marching_cubes.extract(field.values_m, field.weights, field.cells)
     return field.grid.origin_m + (vertices + 0.5) * field.grid.voxel_m, triangles
 
 

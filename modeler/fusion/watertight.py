@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from modeler.fusion import meshing
 from modeler.fusion.depth_views import DepthViews, ViewBlocks
-from modeler.fusion.distance_field import FAINT, DistanceField, crossed, voxels_where
+from modeler.fusion.distance_field import FAINT, DistanceField
 from modeler.kernels import occupancy
 from modeler.types import Array, BoolArray
 
@@ -36,7 +36,7 @@ def without_rejected(field: DistanceField, rejected_m: Array, kept_m: Array, rea
     size = 2 * reach + 1
     erased = maximum_filter(near[0], size=size) & np.logical_not(maximum_filter(near[1], size=size))
     weights = np.where(erased, np.float32(0.0), field.weights)
-    return DistanceField(grid, field.values_m, weights, voxels_where(weights > 0.0))
+    return DistanceField(grid, field.values_m, weights)
 
 
 def closed_field(field: DistanceField, seen: ViewBlocks, tau_m: float) -> DistanceField:
@@ -84,7 +84,7 @@ def closed_field(field: DistanceField, seen: ViewBlocks, tau_m: float) -> Distan
         np.maximum(whole, -((a * x + offset_m)[:, None, None] + (b * y)[:, None] + c * z), out=whole, dtype=np.float32)
     whole[_outer_layers(grid.shape, OUTER_LAYERS)] = tau_m
     whole[whole == 0.0] = FAINT * grid.voxel_m
-    return DistanceField(grid, whole, np.maximum(field.weights, np.float32(FAINT)), crossed(whole))
+    return DistanceField(grid, whole, np.maximum(field.weights, np.float32(FAINT)))
 
 
 def support_planes(seen: ViewBlocks, corners_m: Array, tau_m: float) -> Array:
@@ -151,7 +151,7 @@ def _without_deep_voids(field: DistanceField, deep: BoolArray, stride: int) -> D
     inside = tuple(slice(int(n)) for n in field.grid.shape)
     deep = deep.repeat(stride, 0).repeat(stride, 1).repeat(stride, 2)[inside]
     weights = np.where(deep & (field.values_m > 0.0), np.float32(0.0), field.weights)
-    return DistanceField(field.grid, field.values_m, weights, voxels_where(weights > 0.0))
+    return DistanceField(field.grid, field.values_m, weights)
 
 
 def _block_means(

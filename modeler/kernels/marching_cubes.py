@@ -65,25 +65,27 @@ _PIECE_COUNTS = PIECES.max(axis=1).astype(np.int64) + 1
 
 
 @njit(cache=True)
-def fill(values, totals, cells, least):
+def fill(values, totals, least):
     """Return the unknown voxels (m, 3) with at least `least` known ones among their 26 neighbours, and the means (m,).
 
     Args:
         values: (x, y, z) float32.
         totals: (x, y, z) float32, 0 = unknown; the outermost voxels are unknown.
-        cells: (n, 3) known voxels, in ascending order.
         least: least number of known neighbours; with more than half of them, open borders do not grow.
     """
     counts = np.zeros(values.shape, dtype=np.uint8)
     sums = np.zeros(values.shape, dtype=np.float32)
-    for n in range(len(cells)):
-        i, j, k = cells[n, 0], cells[n, 1], cells[n, 2]
-        for di in range(-1, 2):
-            for dj in range(-1, 2):
-                for dk in range(-1, 2):
-                    if totals[i + di, j + dj, k + dk] == 0.0:
-                        counts[i + di, j + dj, k + dk] += 1
-                        sums[i + di, j + dj, k + dk] += values[i, j, k]
+    for i in range(1, values.shape[0] - 1):
+        for j in range(1, values.shape[1] - 1):
+            for k in range(1, values.shape[2] - 1):
+                if totals[i, j, k] == 0.0:
+                    continue
+                for di in range(-1, 2):
+                    for dj in range(-1, 2):
+                        for dk in range(-1, 2):
+                            if totals[i + di, j + dj, k + dk] == 0.0:
+                                counts[i + di, j + dj, k + dk] += 1
+                                sums[i + di, j + dj, k + dk] += values[i, j, k]
     count = 0
     filled = np.empty((np.sum(counts >= least), 3), dtype=np.int64)
     means = np.empty(len(filled), dtype=np.float32)
@@ -105,7 +107,8 @@ def extract(values, totals, cells):
     Args:
         values: (x, y, z) float32, negative inside.
         totals: (x, y, z) float32, 0 = unknown; the outermost voxels are unknown.
-        cells: (n, 3) known voxels, in ascending order.
+        cells: (n, 3) voxels of which each is the lowest corner of a cell, in ascending order: all that are crossed,
+            and as many others.
     """
     cells = np.ascontiguousarray(cells)  # of one layout only: compiling is slow
     first, cases, count = _numbered(values, totals, cells)
