@@ -17,7 +17,7 @@ _OUTLIERS_IN = 7  # one measurement in this many may lie behind the background b
 _FEW_FRAMES = 4  # with more frames, evidence from a single frame is ignored
 _STILL_SHARE = 0.7  # share of agreeing measurements at a static pixel
 _MOVED_SHARE = 0.15  # share of measurements in front of the background at a pixel that moved
-_MOVING_CAMERA_SHARE = 0.5  # share of changing pixels from which the camera moves, not the object
+_MOVING_CAMERA_SHARE = 0.5  # of the pixels that change in so many of the frames: then the camera moves, not the object
 _QUARTERS_APART = 1.35  # standard deviations from the lower to the upper quartile of a Gaussian
 Labels = npt.NDArray[np.int32]
 _JUMP_SHARE = 0.03  # relative depth difference of neighbours beyond which they lie on two surfaces
@@ -74,10 +74,20 @@ class Layers:
     """(h, w) share of the measurements in front of the background."""
 
     @property
+    def changes_widely(self) -> bool:
+        """Whether much of the image changes: the camera moves, depth is noisier than expected, or people walk past."""
+        return bool(np.count_nonzero(self.moved) > _MOVING_CAMERA_SHARE * self._seen)
+
+    @property
     def camera_moves(self) -> bool:
-        """Whether the share of the image that changes shows that the camera moves."""
-        seen = np.count_nonzero(np.isfinite(self.back_m[..., 2]))
-        return bool(np.count_nonzero(self.moved) > _MOVING_CAMERA_SHARE * max(1, seen))
+        """Whether much of the image changes, and often: who walks past changes each pixel in few of the frames."""
+        often = float(self.front_share[self.moved].sum()) > _MOVING_CAMERA_SHARE**2 * self._seen
+        return self.changes_widely and often
+
+    @property
+    def _seen(self) -> int:
+        """Number of pixels with a background."""
+        return max(1, int(np.count_nonzero(np.isfinite(self.back_m[..., 2]))))
 
 
 def planning_stride(camera: Camera) -> int:

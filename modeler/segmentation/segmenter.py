@@ -15,6 +15,7 @@ from modeler.segmentation.depth_images import (
     edge_of,
     mixed_pixels,
     noise_ratio,
+    pieces,
     planning_stride,
     point_image,
     separate_layers,
@@ -64,6 +65,8 @@ class Found:
     """Score of the second-best cluster relative to the best."""
     occluder: BoolArray | None = None
     """(h, w) True = nearer than the object, but no part of it."""
+    goes_on: bool = False
+    """Whether it goes on beyond where the object may be, as an arm that touches it does."""
 
 
 def find(
@@ -128,12 +131,16 @@ def _choose(
     row, column = window[0].start * stride, window[1].start * stride
     points = point_image(thin[window], camera, stride=stride, row=row, column=column)
     fore, _ = _foreground(points, window, scene, noise, thinning=1)
-    fore &= _inside(points, low, high)
+    inside = _inside(points, low, high)
+    goes_on = _goes_on(points[..., 2], fore, inside, gap_m)
+    fore &= inside
     if not fore.any():
         return Found(chosen)
     candidates = points[fore]
-    labels = voxel_clusters(candidates, low_m=low, high_m=high, gap_m=gap_m)
     in_zone = _inside(candidates, *zone_m)
+    labels = voxel_clusters(candidates, low_m=low, high_m=high, gap_m=gap_m)
+    strays = np.bincount(labels, in_zone) < _MOSTLY_IN_ZONE * np.bincount(labels)
+    labels = _split(labels, strays, points[..., 2], fore)
     area = candidates[:, 2] ** 2 * (stride**2 / (camera.fx * camera.fy))
     merit = np.bincount(labels, area * np.where(in_zone, 1.0, _STRAY_WEIGHT))
     on_edge = np.bincount(labels, edge_of(np.isfinite(thin))[window][fore])
@@ -144,7 +151,41 @@ def _choose(
     own = _joined(best, labels, in_zone, _beside(blocking)[window][fore])
     chosen[window][fore] = own[labels]
     rival = float(merit[~own].max(initial=0.0) / merit[best])
-    return Found(chosen, float(area[own[labels]].sum()), rival)
+    ends = np.count_nonzero(goes_on[fore] & own[labels]) > _CUT_SHARE * np.sqrt(np.count_nonzero(own[labels]))
+    return Found(chosen, float(area[own[labels]].sum()), rival, goes_on=bool(ends))
+
+
+def _goes_on(depth_m: Float32Array, fore: BoolArray, inside: BoolArray, gap_m: float) -> BoolArray:
+    """Return the pixels (h, w) at which something in the foreground goes on from the inside of a box to its outside.
+
+    Args:
+        depth_m: (h, w).
+        fore: (h, w) the foreground.
+        inside: (h, w) what is in the box.
+        gap_m: largest difference of depth between neighbours that are one thing.
+    """
+    outside = fore & ~inside
+    low_m = ndimage.minimum_filter(np.where(outside, depth_m, np.float32(np.inf)), 3)
+    high_m = ndimage.maximum_filter(np.where(outside, depth_m, np.float32(-np.inf)), 3)
+    found: BoolArray = fore & inside & (depth_m > low_m - gap_m) & (depth_m < high_m + gap_m)
+    return found
+
+
+def _split(labels: Labels, chosen: BoolArray, depth_m: Float32Array, fore: BoolArray) -> Labels:
+    """Return labels (n,) with the chosen clusters split at depth jumps: an arm that touches the object is before it.
+
+    Args:
+        labels: (n,) of the pixels in `fore`.
+        chosen: (k,) which clusters.
+        depth_m: (h, w).
+        fore: (h, w) which pixels are labelled.
+    """
+    if not chosen.any():
+        return labels
+    within = np.zeros_like(fore)
+    within[fore] = chosen[labels]
+    parts = pieces(depth_m, within)[fore]
+    return np.where(parts > 0, len(chosen) + parts, labels).astype(np.int32)
 
 
 def _beside(region: BoolArray) -> Labels:
@@ -166,8 +207,8 @@ def _joined(best: int, labels: Labels, in_zone: BoolArray, beside: Labels) -> Bo
         in_zone: (n,) whether they are where the object is in other frames.
         beside: (n,) piece of best cluster and occluder that they are beside; 0 = none.
     """
-    pieces = np.unique(beside[labels == best])
-    touching = np.bincount(labels[np.isin(beside, pieces)], minlength=int(labels.max()) + 1) > 0
+    own_pieces = np.unique(beside[labels == best])
+    touching = np.bincount(labels[np.isin(beside, own_pieces)], minlength=int(labels.max()) + 1) > 0
     sizes = np.bincount(labels)
     own: BoolArray = touching & (np.bincount(labels, in_zone) > _MOSTLY_IN_ZONE * sizes)
     own &= sizes > _LEAST_PIECE * sizes[best]
@@ -350,6 +391,9 @@ class Segmenter:
         looks = [(frame, look) for frame, look in looks if np.count_nonzero(look.mask) >= self.min_points]
         if not looks:
             return scene
+        # An arm that touches the object in some frames makes it larger there.
+        usual_m2 = float(np.median([look.area_m2 for _, look in looks]))
+        looks = [(frame, look) for frame, look in looks if look.area_m2 < _AREA_FACTOR * usual_m2]
         boxes = np.array([np.percentile(_points(frame)[look.mask], [0.5, 99.5], axis=0) for frame, look in looks])
         areas, rivals = [look.area_m2 for _, look in looks], [look.rival for _, look in looks]
         zone = np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
@@ -385,7 +429,7 @@ class Segmenter:
         count = np.count_nonzero(found.mask)
         if count < self.min_points:
             return Segmentation(found.mask, scene.plane, Outcome.TOO_FEW_POINTS, given)
-        sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < _RIVAL
+        sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < _RIVAL and not found.goes_on
         if scene.areas_m2 is not None:
             sure &= scene.areas_m2[0] / _AREA_FACTOR < found.area_m2 < scene.areas_m2[1] * _AREA_FACTOR
         sure &= np.count_nonzero(found.mask & edge_of(frame.depth_m > 0.0)) < _CUT_SHARE * np.sqrt(count)
@@ -395,10 +439,12 @@ class Segmenter:
         """Return the scene that frames without masks show, if their camera is static."""
         camera, depths_m, noise = frames[0].camera, [_measured(frame) for frame in frames], self.noise
         layers, noisier = separate_layers(depths_m, camera, noise), None
-        if layers.camera_moves:  # or its depth is noisier than expected
+        if layers.changes_widely:
             factor = noise_ratio(depths_m, camera, noise)
+            if factor > _NOISIEST:
+                return Scene()
             noisier = noise = noise.times(factor)
-            layers = layers if factor > _NOISIEST else separate_layers(depths_m, camera, noise)
+            layers = separate_layers(depths_m, camera, noise)
         if layers.camera_moves:
             return Scene()
         stride = planning_stride(camera)
