@@ -83,13 +83,18 @@ class CalibrateCamera:
 
 
 def _said(found: FocalLength, used_px: float) -> str:
+    loops = "1 loop" if found.loops == 1 else f"{found.loops} loops"
+    if found.told_by == "prior" and math.isfinite(found.sigmas_after):
+        return (
+            f"{loops} do not determine the focal length: as given they close to {found.sigmas_before:.1f} sd, with the "
+            f"best one to {found.sigmas_after:.1f} sd; rather an edge is wrong, see the worst pairs in the run's report"
+        )
     if found.told_by == "prior":
         return (
             "no loop determines the focal length; turn the object fully, with steps that overlap, and say what is "
             "known of its motion (--prior table)"
         )
     focal_px, sigma_px = used_px * found.factor, used_px * found.factor * found.sigma
-    loops = "1 loop" if found.loops == 1 else f"{found.loops} loops"
     return (
         f"the focal length is {focal_px:.1f} ± {sigma_px:.1f} px, {used_px:.1f} px was given; "
         f"{loops} close to {found.sigmas_after:.1f} sd with it, to {found.sigmas_before:.1f} sd as given"
