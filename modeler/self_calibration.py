@@ -27,6 +27,7 @@ Register = Callable[[RayImage, RayImage, AbstractPrior], Posterior]
 """Returns the posterior of target_from_source of a source and a target view under a prior."""
 
 _STEP = 0.002  # of log c, for the curvature of the graph's error: half a standard error of a good loop
+_LIMIT_STEPS = 2.0  # steps for which limits hold, as where a run places a view that one step's do not
 _MAX_ROUNDS = 5  # of registering the edges again about the estimate; on captures two to four are enough
 _CONVERGED = 0.25  # standard deviations by which the last round moved the estimate
 
@@ -82,6 +83,7 @@ class FocalCalibrator:
             register: as the run did.
             prior: of the run.
         """
+        known = prior.relaxed(_LIMIT_STEPS)
         taking_part = [edge for edge in edges if {edge.source, edge.target} <= views.keys() and _counts(edge)]
 
         def solved(centre: float) -> _Graph:
@@ -91,7 +93,7 @@ class FocalCalibrator:
             ]
             found = [
                 # The solution of the run proposes where to search: another focal length changes it by a few degrees.
-                self._moving(edge, centre, nodes, register, PredictedProposal(prior, collapse_modes(edge.posterior)))
+                self._moving(edge, centre, nodes, register, PredictedProposal(known, collapse_modes(edge.posterior)))
                 for edge in taking_part
             ]
             return _Graph([edge for edge in found if edge is not None], min(views), 0.5 * self.outlier_distance**2)

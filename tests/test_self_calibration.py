@@ -13,6 +13,7 @@ import tabletop
 
 from modeler.cli import main
 from modeler.pipeline import Modeler
+from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.self_calibration import FocalCalibrator, FocalLength
 from modeler.types import Edge, RayImage, Stated
@@ -54,6 +55,13 @@ def test_a_closed_turn_tells_the_focal_length(stated: float) -> None:
     assert abs(found.factor * stated - 1.0) < 0.01
     assert abs(np.log(found.factor * stated)) < 3.0 * found.sigma
     assert found.sigmas_after < 1.5
+
+
+def test_limits_on_one_step_do_not_cut_off_what_a_run_found_beyond_them() -> None:
+    views, edges = seen(1.0)
+    found = FocalCalibrator().estimate(views, edges, SENSOR, MODELER.register, GeneralPrior(max_rotation_deg=25.0))
+    assert (found.told_by, found.loops) == ("loop", 1)
+    assert abs(found.factor - 1.0) < 0.01
 
 
 def test_an_open_chain_tells_nothing() -> None:
