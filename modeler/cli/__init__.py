@@ -17,7 +17,6 @@ from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from itertools import takewhile
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any, Union
 
 import tyro
@@ -105,9 +104,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Rerun complains in its own way of a viewer that was closed, which is nobody's error, and of a disk that is full;
     # we tell what matters.
     os.environ.setdefault("RUST_LOG", "warn,re_sdk=off,re_grpc_client=off,re_log_encoding=off")
-    if "dash" not in sys.modules:  # Open3D imports it, for drawings in a browser that no command makes, in 0.8 s
-        sys.modules["dash"] = ModuleType("dash")
-        vars(sys.modules["dash"]).update(html=None, dcc=None, Dash=None)
     # Our matrices are small: to wake BLAS threads takes longer than what they would do.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if isinstance(sys.stdout, io.TextIOWrapper):
