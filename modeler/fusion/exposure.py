@@ -9,6 +9,7 @@ from scipy.ndimage import laplace, minimum_filter
 
 from modeler.fusion.depth_views import DepthViews, ViewBlocks
 from modeler.kernels import tsdf
+from modeler.kernels.shading import HARMONICS, harmonics_of
 from modeler.types import Array, BoolArray
 
 DARK, BRIGHT = 12.0, 243.0  # levels (of 255) beyond which a pixel may be clipped: 5 % at either end
@@ -27,12 +28,12 @@ class Exposure:
     gains: Array
     """(f, 4) of red, green and blue, and the weight of each view's colours; 0 = it has none."""
     shading: Array
-    """(8, 3) coefficients of the logarithm of a factor common to all views, as `tsdf.harmonics` orders them."""
+    """(8, 3) coefficients of the logarithm of a factor common to all views, as `harmonics` orders them."""
 
     @classmethod
     def blind(cls, count: int) -> Exposure:
         """Return that of a number of views whose colours are of no interest."""
-        return cls(np.zeros((count, 4)), np.zeros((tsdf.HARMONICS, 3)))
+        return cls(np.zeros((count, 4)), np.zeros((HARMONICS, 3)))
 
     def of(self, start: int, stop: int) -> Exposure:
         """Return that of some of the views."""
@@ -53,7 +54,7 @@ def exposure_of(views: ViewBlocks, *, tau_m: float, near_m: float) -> Exposure:
     """
     coloured = np.concatenate([some.coloured for some in views.blocks])
     gains = np.concatenate([np.ones((len(coloured), 3)), _sharpness(views, coloured)[:, None]], axis=1)
-    shading = np.zeros((tsdf.HARMONICS, 3))
+    shading = np.zeros((HARMONICS, 3))
     with_colour = np.flatnonzero(coloured)
     if len(with_colour) < 2:
         return Exposure(gains, shading)
@@ -61,7 +62,7 @@ def exposure_of(views: ViewBlocks, *, tau_m: float, near_m: float) -> Exposure:
     step = max(1, points * len(with_colour) // LOOKUPS)
     points_m = np.concatenate([some.points_m[::step] for some in views])
     normals = np.concatenate([some.normals[::step] for some in views])
-    levels, basis = (np.zeros((len(with_colour), len(points_m), k)) for k in (3, tsdf.HARMONICS))
+    levels, basis = (np.zeros((len(with_colour), len(points_m), k)) for k in (3, HARMONICS))
     weights = np.zeros(levels.shape[:2])
     row = 0
     for some in views:
@@ -70,7 +71,7 @@ def exposure_of(views: ViewBlocks, *, tau_m: float, near_m: float) -> Exposure:
             images = one.colour_weights, one.colour, np.ones((1, 4)), shading, 1.0
             _, colours = tsdf.observe(points_m, normals, near_m, tau_m, *one.lookup, *images)
             levels[row], weights[row] = colours[:, :3], colours[:, 3]
-            basis[row] = tsdf.harmonics_of(normals, one.poses[0])
+            basis[row] = harmonics_of(normals, one.poses[0])
             row += 1
     weights[np.any((levels < DARK) | (levels > BRIGHT), axis=2)] = 0.0
     weights[:, np.count_nonzero(weights, axis=0) < 2] = 0.0

@@ -14,9 +14,9 @@ import math
 import numpy as np
 from numba import njit
 
+from modeler.kernels.shading import HARMONICS, harmonics
 from modeler.kernels.threads import over_rows
 
-HARMONICS = 8  # up to the second degree, without the constant
 SIDE = 4  # voxels along the side of a block
 SAME_SIDE = 0.3  # least cosine between normals on the same side of the object; chosen by hand
 MAJORITY = 3  # a side is rejected if this many times as many votes contradict it; chosen by hand
@@ -244,30 +244,6 @@ def _observe(
             for c in range(3):
                 colours[q, c] = min(255.0, colours[q, c] / colours[q, 3])
     return observed, colours
-
-
-@njit(cache=True)
-def harmonics(pose, x, y, z):
-    """Return the spherical harmonics of degrees 1 and 2 (8,), unscaled, of a direction turned into a camera's frame.
-
-    They hold nearly all of how lamps far away shade a matt surface (Basri and Jacobs 2003, "Lambertian reflectance and
-    linear subspaces").
-    """
-    a = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z
-    b = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z
-    c = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z
-    return a, b, c, a * b, b * c, a * c, a * a - b * b, 3.0 * c * c - 1.0
-
-
-@njit(cache=True)
-def harmonics_of(normals, pose):
-    """Return the harmonics (n, 8) of normals (n, 3), see `harmonics`."""
-    result = np.empty((len(normals), HARMONICS))
-    for n in range(len(normals)):
-        turned = harmonics(pose, normals[n, 0], normals[n, 1], normals[n, 2])
-        for h in range(HARMONICS):
-            result[n, h] = turned[h]
-    return result
 
 
 @njit(cache=True)

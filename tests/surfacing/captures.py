@@ -26,7 +26,7 @@ from modeler.cli.inputs import Reopened, reopened
 from modeler.export import write_atomically
 from modeler.fusion import Fuser, FusionVolume, meshing
 from modeler.fusion.depth_views import free_of
-from modeler.kernels.tsdf import harmonics_of
+from modeler.kernels.shading import harmonics_of
 from modeler.types import Array, BoolArray, RayImage
 from surfacing.drawing import Scene
 from surfacing.methods import Surface, open3d_poisson, open3d_tsdf

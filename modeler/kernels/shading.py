@@ -1,0 +1,30 @@
+"""How lamps that stay with the camera shade a matt surface: harmonics of its normal in the camera's frame."""
+
+import numpy as np
+from numba import njit
+
+HARMONICS = 8  # up to the second degree, without the constant
+
+
+@njit(cache=True)
+def harmonics(pose, x, y, z):
+    """Return the spherical harmonics of degrees 1 and 2 (8,), unscaled, of a direction turned into a camera's frame.
+
+    They hold nearly all of how lamps far away shade a matt surface (Basri and Jacobs 2003, "Lambertian reflectance and
+    linear subspaces").
+    """
+    a = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z
+    b = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z
+    c = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z
+    return a, b, c, a * b, b * c, a * c, a * a - b * b, 3.0 * c * c - 1.0
+
+
+@njit(cache=True)
+def harmonics_of(normals, pose):
+    """Return the harmonics (n, 8) of normals (n, 3), see `harmonics`."""
+    result = np.empty((len(normals), HARMONICS))
+    for n in range(len(normals)):
+        turned = harmonics(pose, normals[n, 0], normals[n, 1], normals[n, 2])
+        for h in range(HARMONICS):
+            result[n, h] = turned[h]
+    return result
