@@ -57,8 +57,7 @@ def prepare(frame: Frame, scene: Scene, segmenter: Segmenter, sensor: Sensor) ->
     segmentation = segmenter.segment(frame, scene)
     if segmentation.outcome not in (Outcome.CONVERGED, Outcome.UNSURE_MASK):
         return Prepared(frame, segmentation, None)
-    segmented = replace(frame, mask=segmentation.mask, occluder=segmentation.occluder)
-    view = sensor.ray_image(segmented.unoccluded, segmentation.plane)
+    view = sensor.ray_image(replace(frame, mask=segmentation.mask), segmentation.plane)
     return Prepared(frame, segmentation, view if len(view.points_m) else None)
 
 

@@ -134,5 +134,5 @@ class State:
         images = view.frame
         frame = replace(prepared.frame, depth_m=images.depth_m, colour=images.colour, occluder=images.occluder)
         assert images.mask is not None
-        found = replace(prepared.segmentation, mask=images.mask, occluder=images.occluder)
+        found = replace(prepared.segmentation, mask=images.mask)
         return replace(prepared, frame=frame, segmentation=found, view=view)

@@ -48,7 +48,6 @@ _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support pl
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
 _RING_PX = (1.5, 2.5)  # distance from a mask at which nothing of the object is left, where it is right to a pixel
 _THIN_SHARE = 0.5  # share of that ring on the object's surface: beyond, most of the rim is missing
-_HIDING_PX = 60  # distance from the object beyond which nothing that is nearer hides it: as far as silhouettes count
 _STEEPEST_SLOPE = np.tan(np.radians(70.0))  # of surfaces that depth cameras measure
 
 
@@ -63,8 +62,6 @@ class Found:
     """Area visible to the camera."""
     rival: float = 0.0
     """Score of the second-best cluster relative to the best."""
-    occluder: BoolArray | None = None
-    """(h, w) True = nearer than the object, but no part of it."""
     goes_on: bool = False
     """Whether it goes on beyond where the object may be, as an arm that touches it does."""
 
@@ -78,7 +75,7 @@ def find(
     gap_m: float,
     occluder: BoolArray | None = None,
 ) -> Found:
-    """Find the object in a depth image, NaN where nothing was measured or no object may be, and what hides it.
+    """Find the object in a depth image, NaN where nothing was measured or no object may be.
 
     On a downsampled image, what is above the support and in front of the background is clustered in space, and the
     cluster with the largest area in the object's zone is chosen, with those that an occluder separates from it. Its
@@ -86,29 +83,8 @@ def find(
     """
     if scene.zone_m is None:
         return Found(np.zeros(depth_m.shape, dtype=np.bool_))
-    found = _found(depth_m, camera, scene, noise, zone_m=scene.zone_m, gap_m=gap_m, occluder=occluder)
-    before = _in_front(depth_m, camera, scene, noise, mask=found.mask, gap_m=gap_m)
-    if before is None:
-        return replace(found, occluder=occluder)
-    occluder, rival = before if occluder is None else occluder | before, found.rival
-    depth_m = np.where(occluder, np.float32(np.nan), depth_m)
-    found = _found(depth_m, camera, scene, noise, zone_m=scene.zone_m, gap_m=gap_m, occluder=occluder)
-    return replace(found, occluder=occluder, rival=max(found.rival, rival))
-
-
-def _found(
-    depth_m: Float32Array,
-    camera: Camera,
-    scene: Scene,
-    noise: DepthNoise,
-    *,
-    zone_m: Array,
-    gap_m: float,
-    occluder: BoolArray | None,
-) -> Found:
-    """Return the object, without looking for what hides it."""
-    chosen = _choose(depth_m, camera, scene, noise, zone_m=zone_m, gap_m=gap_m, occluder=occluder)
-    mask = _refine(depth_m, camera, scene, noise, chosen=chosen.mask, reach_m=_reach_m(zone_m), gap_m=gap_m)
+    chosen = _choose(depth_m, camera, scene, noise, zone_m=scene.zone_m, gap_m=gap_m, occluder=occluder)
+    mask = _refine(depth_m, camera, scene, noise, chosen=chosen.mask, reach_m=_reach_m(scene.zone_m), gap_m=gap_m)
     return replace(chosen, mask=mask)
 
 
@@ -260,26 +236,6 @@ def _refine(
     return mask
 
 
-def _in_front(
-    depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, mask: BoolArray, gap_m: float
-) -> BoolArray | None:
-    """Return what stands or moves before the object, and is no part of it, near its mask (h, w); None = nothing.
-
-    The object may go on behind that. What is farther away than the object hides nothing of it.
-    """
-    window = _window(mask, margin=_HIDING_PX)
-    depth, body = depth_m[window], mask[window] & np.isfinite(depth_m[window])
-    if not body.any():
-        return None
-    points = point_image(depth, camera, row=window[0].start, column=window[1].start)
-    fore, _ = _foreground(points, window, scene, noise, thinning=planning_stride(camera))
-    nearest = np.asarray(ndimage.distance_transform_edt(~body, return_distances=False, return_indices=True))
-    nearer = depth < depth[tuple(nearest)] - np.float32(gap_m)
-    occluder = np.zeros_like(mask)
-    occluder[window] = without_specks(fore & ~mask[window] & nearer, 0.0)
-    return occluder if occluder.any() else None
-
-
 def _inside(points: Float32Array, low: Array, high: Array) -> BoolArray:
     """Return which points (..., 3) lie in a box."""
     inside = np.ones(points.shape[:-1], dtype=np.bool_)
@@ -407,7 +363,6 @@ class Segmenter:
         or if the object's surface goes on beyond most of its rim. Where measurements are sparse, the mask holds what
         lies between those of the object.
         """
-        given = frame.occluder
         frame = _interpolated(frame)
         if frame.mask is not None:
             mask = frame.mask & self._allowed(frame.depth_m)
@@ -416,24 +371,24 @@ class Segmenter:
             loose = plane is not None and self._share_on(plane, frame, mask) > _LOOSE_SHARE
             thin = not few and self._share_beyond(plane, frame, mask) > _THIN_SHARE
             outcome = Outcome.UNSURE_MASK if loose or thin else Outcome.CONVERGED
-            return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome, given)
+            return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome)
         if scene.alone:
             mask = clean(self._kept(frame), frame.camera, self.noise)
             few = np.count_nonzero(mask) < self.min_points
             sure = is_island(_measured(frame))
             outcome = Outcome.CONVERGED if sure else Outcome.UNSURE_MASK
-            return Segmentation(mask, None, Outcome.TOO_FEW_POINTS if few else outcome, given)
+            return Segmentation(mask, None, Outcome.TOO_FEW_POINTS if few else outcome)
         if not (scene.still and self._holds(frame, scene)):
             scene = self._learn([frame])
         found = self._find(frame, scene)
         count = np.count_nonzero(found.mask)
         if count < self.min_points:
-            return Segmentation(found.mask, scene.plane, Outcome.TOO_FEW_POINTS, given)
+            return Segmentation(found.mask, scene.plane, Outcome.TOO_FEW_POINTS)
         sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < _RIVAL and not found.goes_on
         if scene.areas_m2 is not None:
             sure &= scene.areas_m2[0] / _AREA_FACTOR < found.area_m2 < scene.areas_m2[1] * _AREA_FACTOR
         sure &= np.count_nonzero(found.mask & edge_of(frame.depth_m > 0.0)) < _CUT_SHARE * np.sqrt(count)
-        return Segmentation(found.mask, scene.plane, Outcome.CONVERGED if sure else Outcome.UNSURE_MASK, found.occluder)
+        return Segmentation(found.mask, scene.plane, Outcome.CONVERGED if sure else Outcome.UNSURE_MASK)
 
     def _learn(self, frames: Sequence[Frame]) -> Scene:
         """Return the scene that frames without masks show, if their camera is static."""

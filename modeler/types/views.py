@@ -53,7 +53,7 @@ class Frame:
     colour: npt.NDArray[np.uint8] | None = None
     """(h, w, 3) RGB aligned to depth."""
     occluder: BoolArray | None = None
-    """(h, w) True where a hand or a gripper is seen, which may hide the object; None = nobody said."""
+    """(h, w) True where a hand or a gripper is marked, which may hide the object; None = none is."""
 
     @property
     def unoccluded(self) -> Frame:
@@ -95,8 +95,6 @@ class Segmentation:
     """The support plane, where one is seen."""
     outcome: Outcome
     """CONVERGED, or UNSURE_MASK / TOO_FEW_POINTS where a person should look."""
-    occluder: BoolArray | None = None
-    """(h, w) True where something else is nearer than the object and may hide it; None = nowhere."""
 
 
 @dataclass(frozen=True, eq=False)
