@@ -82,6 +82,11 @@ def camera_entry(matrix: Array, scale_mm: float) -> dict[str, object]:
     return {"cam_K": [float(value) for value in matrix.ravel()], "depth_scale": scale_mm}
 
 
+def _occluder_names(stem: str) -> tuple[str, str]:
+    """Return the names that the mask of an occluder may have, given that of the depth image without its suffix."""
+    return f"{stem}.png", f"{stem}_000000.png"
+
+
 def pose_entry(pose: Array) -> dict[str, object]:
     """Return the entry of `scene_gt.json` for camera_from_model (4, 4) in m."""
     rotation, shift = pose[:3, :3].ravel(), pose[:3, 3] * 1000.0
@@ -183,12 +188,13 @@ class BopSequence(AbstractRecording):
             )
         elif not masks and (other := first_folder(self.path, ("mask", "masks"))) is not None:
             notes.append(f"masks are read from {MASKS}/; those in {other.name}/ are left out")
-        hands = [path for path in entries(self.path / OCCLUDERS) if path.suffix.lower() == ".png"]
-        lone = [path.name for path in hands if re.sub(r"_\d+$", "", path.stem) not in stems]
-        if lone:
+        hands = [path.name for path in entries(self.path / OCCLUDERS)]
+        readable = {name for stem in stems for name in _occluder_names(stem)}
+        unread = [name for name in hands if name not in readable]
+        if unread:
             notes.append(
-                f"{len(lone)} of {len(hands)} masks in {OCCLUDERS}/ belong to no depth image and are left out "
-                f"({lone[0]})"
+                f"{len(unread)} of {len(hands)} files in {OCCLUDERS}/ belong to no depth image and are left out "
+                f"({unread[0]}; a name such as {min(readable)} is expected)"
             )
         scales = {scale for _, scale in self._intrinsics.values()}
         if len(scales) > 1:
@@ -255,7 +261,7 @@ class BopSequence(AbstractRecording):
         labels = read_labels(path) if is_there(path) else None
         if labels is not None:
             check_size(path, labels.shape, size)
-        named = (self.path / OCCLUDERS / name for name in (f"{stem}.png", f"{stem}_000000.png"))
+        named = (self.path / OCCLUDERS / name for name in _occluder_names(stem))
         hand = next((one for one in named if is_there(one)), None)
         occluder = None if hand is None else read_mask(hand)
         if hand is not None and occluder is not None:

@@ -141,7 +141,7 @@ MAX_GAP_S = 0.2
 
 
 def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
-    """Open a folder with `depth.txt` and, where they are there, `rgb.txt`, `groundtruth.txt` and `mask/`.
+    """Open a folder with `depth.txt` and, where they are there, `rgb.txt`, `groundtruth.txt`, `mask/` and `mask_hand/`.
 
     Raises:
         InputError: where it is not readable as such.
@@ -164,13 +164,14 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
             for some in (masks, occluders)
         )
         files[index] = FrameFiles(pair.time_s, image, colour_path, mask, occluder)
-    used = {one.mask for one in files.values()}
-    strange = [mask.name for mask in masks.values() if mask not in used]
-    if strange:
-        remarks.append(
-            f"{len(strange)} of {len(masks)} masks belong to no depth image and are left out ({strange[0]}; give each "
-            "the name of its depth image)"
-        )
+    used = {path for one in files.values() for path in (one.mask, one.occluder)}
+    for what, images in (("masks", masks), ("masks of hands", occluders)):
+        strange = [image.name for image in images.values() if image not in used]
+        if strange:
+            remarks.append(
+                f"{len(strange)} of {len(images)} {what} belong to no depth image and are left out ({strange[0]}; give "
+                "each the name of its depth image)"
+            )
     found, (width, height) = find_intrinsics(path, overrides), image_size(files[0].depth)
     if found is None:
         if (width, height) != (640, 480):
@@ -283,7 +284,7 @@ POSES = "annotated_poses"
 
 
 def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
-    """Open a folder with `depth/` and intrinsics, and where they are there `color/` or `rgb/`, and `masks/`.
+    """Open a folder with `depth/` and intrinsics, and where they are there, colour, masks and masks of hands.
 
     Depth is in mm unless the file of intrinsics or the user gives another unit, as in both programs.
 
@@ -304,14 +305,13 @@ def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
     colour, left = _partners(path, COLOUR_FOLDERS, (".png", ".jpg", ".jpeg"), depth)
     masks, left_masks = _partners(path, MASK_FOLDERS, (".png",), depth)
     occluders, left_occluders = _partners(path, OCCLUDER_FOLDERS, (".png",), depth)
-    if left_occluders:
-        remarks.append(f"{len(left_occluders)} masks of hands belong to no depth image and are left out")
-    for what, partners, others in (("colour image", colour, left), ("mask", masks, left_masks)):
+    for what, partners in (("colour image", colour), ("mask", masks)):  # not every frame has a hand
         lacking = sum(stem not in partners for stem in depth)
         if partners and lacking:
             remarks.append(f"{lacking} of {len(depth)} depth images have no {what}")
+    for what, others in (("colour images", left), ("masks", left_masks), ("masks of hands", left_occluders)):
         if others:
-            remarks.append(f"{len(others)} {what}s belong to no depth image and are left out ({others[0]})")
+            remarks.append(f"{len(others)} {what} belong to no depth image and are left out ({others[0]})")
     files = {
         numbers[stem]: FrameFiles(
             _time_s(stem, numbers[stem]), image, colour.get(stem), masks.get(stem), occluders.get(stem)

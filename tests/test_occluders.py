@@ -193,7 +193,7 @@ def test_a_hand_of_another_size_or_of_no_frame_is_reported(tmp_path: Path) -> No
     Image.fromarray(np.zeros((20, 40), np.uint8)).save(path)
     (note,) = BopSequence(tmp_path / "s").notes
     assert "mask_hand" in note
-    assert "left.png" in note
+    assert "left.png; a name such as" in note
     path.rename(path.with_name(f"{INDICES[0]:06d}_000000.png"))
     with pytest.raises(InputError, match="40 x 20"):
         BopSequence(tmp_path / "s").frame(INDICES[0])

@@ -86,8 +86,9 @@ def _said(found: FocalLength, used_px: float) -> str:
     loops = "1 loop" if found.loops == 1 else f"{found.loops} loops"
     if found.told_by == "prior" and math.isfinite(found.sigmas_after):
         return (
-            f"{loops} do not determine the focal length: as given they close to {found.sigmas_before:.1f} sd, with the "
-            f"best one to {found.sigmas_after:.1f} sd; rather an edge is wrong, see the worst pairs in the run's report"
+            f"the focal length stays uncertain after {loops}: {found.sigmas_before:.1f} sd open as given, "
+            f"{found.sigmas_after:.1f} sd with the best one; if that is much, an edge is wrong, see the worst pairs in "
+            "the run's report"
         )
     if found.told_by == "prior":
         return (

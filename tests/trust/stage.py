@@ -150,9 +150,7 @@ class Recorded(AbstractSequence):
             assert frame.mask is not None
             mask = self.stage.mask_of(frame.index, frame.mask, others) if self.stage.masks else None
             occluder = self.stage.occluder_of(frame.index, others)
-            handed.append(
-                replace(frame, mask=mask) if occluder is None else replace(frame, mask=mask, occluder=occluder)
-            )
+            handed.append(replace(frame, mask=mask, occluder=occluder))
         return tuple(self.stage.spoil(handed))
 
     def _layers(self, index: int) -> tuple[Frame, tuple[BoolArray, ...]]:
