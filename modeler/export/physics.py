@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -203,7 +204,7 @@ def settled_in_mujoco(scene: Path) -> Settled:
         ImportError: where MuJoCo is not installed.
         ValueError: where it refuses the file.
     """
-    import mujoco  # pyright: ignore[reportMissingImports]
+    mujoco: Any = importlib.import_module("mujoco")  # its types are known only where it is installed
 
     model = mujoco.MjModel.from_xml_path(str(scene))
     data = mujoco.MjData(model)

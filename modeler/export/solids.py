@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +20,7 @@ HULL_TRIANGLES = 500
 PART_TRIANGLES = 1_500
 """Triangles of the mesh from which convex parts are found."""
 _CONCAVITY = 0.08
-_SEARCH = {"resolution": 800, "mcts_nodes": 10, "mcts_iterations": 30}
+_SEARCH: Mapping[str, Any] = {"resolution": 800, "mcts_nodes": 10, "mcts_iterations": 30}
 _LEAST_AREA_M2 = 1e-12  # of a triangle: (1 µm)², below what a 32-bit file resolves at a distance of 10 m
 
 
