@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from modeler.types import Array, RayImage
 
 _USED = ("planes", "lie_group", "point_likelihood", "photometric", "point_to_plane", "gauss_newton", "mixture")
-_USED_TO_FUSE = ("tsdf", "marching_cubes", "point_clouds")
+_USED_TO_FUSE = ("tsdf", "shading", "marching_cubes", "point_clouds")
 
 
 def compile_kernels() -> None:
