@@ -16,7 +16,7 @@ DARK, BRIGHT = 12.0, 243.0  # levels (of 255) beyond which a pixel may be clippe
 LOOKUPS = 100_000  # points times views at which colours are compared, which bounds time
 ROUNDS = 8  # of iteratively reweighted least squares
 GAIN_SIGMA = 0.05  # prior sd of log gains; chosen by hand
-LEAST = 1e-3  # weight of the shading itself beside that of what it explains; chosen by hand
+LEAST = 1e-3  # weight of the shading itself beside that of what it explains; see method.md, λ of (F10)
 COLOUR_SIGMA = 0.1  # scale of the Cauchy weights on log colours, against highlights; chosen by hand
 LARGEST_GAIN = 2.5  # largest factor between exposures; chosen by hand
 
