@@ -4,6 +4,7 @@ from pathlib import Path
 
 from modeler.types import InputError
 from sequences.base import AbstractSequence as AbstractSequence
+from sequences.base import KeptSequence as KeptSequence
 from sequences.base import frame_range as frame_range
 from sequences.bop import BopSequence as BopSequence
 from sequences.bop import true_mesh as true_mesh

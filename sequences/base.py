@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import final
 
@@ -230,6 +230,35 @@ class SelectedSequence(AbstractDerived):
         """Return the true camera_from_model (4, 4) by frame number; None where it is not known."""
         truth = self.whole.truth()
         return None if truth is None else {index: truth[index] for index in self.kept if index in truth} or None
+
+
+@final
+@dataclass(frozen=True)
+class KeptSequence(AbstractDerived):
+    """Another sequence, of which frames stay in memory once they were read: to decode them takes milliseconds each.
+
+    The first do, until they fill `memory_bytes`; the rest are read whenever they are asked for.
+    """
+
+    memory_bytes: int = 64 * 2**20
+    """Of frames that stay: those that a run keeps in memory as well, so that it takes little more."""
+    kept: dict[int, Frame] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """By frame number."""
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`."""
+        found = self.kept.get(index)
+        if found is None:
+            found = self.whole.frame(index)
+            if sum(map(_size_bytes, self.kept.values())) + _size_bytes(found) <= self.memory_bytes:
+                self.kept[index] = found
+        return found
+
+
+def _size_bytes(frame: Frame) -> int:
+    """Return the memory that a frame's images take."""
+    images = (frame.depth_m, frame.mask, frame.colour, frame.occluder)
+    return sum(image.nbytes for image in images if image is not None)
 
 
 def check_every(every: int) -> None:

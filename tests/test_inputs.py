@@ -17,7 +17,7 @@ from small_scene import CAMERA, INDICES
 from modeler import se3
 from modeler.cli import main
 from modeler.types import Frame, InputError
-from sequences import AbstractSequence, bundled, frame_range, open_sequence, write_bop
+from sequences import AbstractSequence, KeptSequence, bundled, frame_range, open_sequence, write_bop
 
 
 @pytest.fixture(params=WRITERS)
@@ -227,6 +227,14 @@ def test_selection_is_a_slice_of_frame_numbers(every: int, start: int | None, st
     for index in set(INDICES) - set(wanted):
         with pytest.raises(InputError, match="not among the selected"):
             part.frame(index)
+
+
+def test_frames_that_were_read_stay_as_far_as_memory_allows() -> None:
+    size = Numbers(INDICES).frame(INDICES[0]).depth_m.nbytes
+    kept = KeptSequence(Numbers(INDICES), memory_bytes=2 * size + 1)
+    first, second = list(kept), list(kept)
+    assert [frame.index for frame in second] == list(INDICES)
+    assert [one is other for one, other in zip(first, second, strict=True)] == [k < 2 for k in range(len(INDICES))]
 
 
 class Numbers(AbstractSequence):

@@ -172,10 +172,11 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
     """
     from modeler.cli.inputs import calibrated, watched
     from modeler.types import InputError
-    from sequences import Overrides, frame_range, open_sequence, survey
+    from sequences import KeptSequence, Overrides, frame_range, open_sequence, survey
 
     path, overrides = options.sequence, Overrides(strict_paths=options.model.strict_paths)
     whole = watched(path, overrides, options.idle_s) if options.watch else open_sequence(path, overrides)
+    whole = whole if whole.live else KeptSequence(whole)
     whole = calibrated(whole, options.model.sensor, options.model.camera)
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     if not frames.live:

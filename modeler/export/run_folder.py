@@ -23,7 +23,7 @@ _OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "g
 """The report, without which nothing is resumed, goes first."""
 PAGE = "report.html"
 """What `modeler report` makes of a run; it goes with it."""
-_NO_TIME_S = 0.1
+_NO_TIME_S = 0.01
 
 
 @dataclass

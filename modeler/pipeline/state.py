@@ -13,7 +13,7 @@ from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.pipeline.pairs import Prepared
 from modeler.types import Edge, InputError, ObjectModel, RayImage, Solution
 
-_READY = 8  # views kept ready for registration; of others the images that a likelihood looks up are made again
+READY = 8  # views kept ready for registration; of others the images that a likelihood looks up are made again
 _REVISITED = 3  # frames at most between a lost one and a view that followed it, to which it is registered again
 
 
@@ -98,7 +98,7 @@ class State:
             smoother=self.smoother.to(graph),
             views={**self.views, number: light.view},
             network=self.map_view.network,
-            ready=dict(list(ready.items())[-_READY:]),
+            ready=dict(list(ready.items())[-READY:]),
             newest=newest,
             vain=0 if found else self.vain,
             lost={frame: other for frame, other in self.lost.items() if frame != number},

@@ -17,7 +17,7 @@ import numpy as np
 from modeler import se3
 from modeler.closure import Closer
 from modeler.pipeline.pairs import anywhere
-from modeler.pipeline.state import State
+from modeler.pipeline.state import READY, State
 from modeler.priors import PredictedProposal
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
@@ -72,6 +72,8 @@ class Tracker:
     """Where pairs are registered side by side; None: one after the other."""
     refusals: dict[tuple[int, int], PriorRefused] = field(default_factory=dict)
     """Why the prior does not apply to a pair, by (source, target): filled as pairs are registered."""
+    made: dict[int, RayImage] = field(default_factory=dict)
+    """The views made ready again last, by frame number: pairs registered one after the other share them."""
 
     @cached_property
     def known(self) -> AbstractPrior:
@@ -157,9 +159,13 @@ class Tracker:
 
     def ready(self, view: RayImage) -> RayImage:
         """Return a view with the images that a likelihood looks up."""
-        if view.layers:
-            return view
-        return self.state.ready.get(view.index) or self.sensor.ray_image(view.frame, view.plane)
+        known = view if view.layers else self.state.ready.get(view.index)
+        if known is None:
+            known = self.made.pop(view.index, None) or self.sensor.ray_image(view.frame, view.plane)
+            self.made[view.index] = known
+            if len(self.made) > READY:
+                del self.made[next(iter(self.made))]
+        return known
 
     def _glances(
         self, view: RayImage, previous: int, *, again: bool
