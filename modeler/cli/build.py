@@ -203,6 +203,7 @@ def _run(
         InputError: where a frame cannot be read or a file cannot be written.
         KeyboardInterrupt: where somebody asked for an end before the first frame.
     """
+    from modeler.beside import behind
     from modeler.cli.inputs import while_it_lasts
     from modeler.types import Step
     from viz.stream import open_stream
@@ -219,7 +220,11 @@ def _run(
     seconds = {"scene": time.perf_counter() - began_s, "registration": 0.0, "total": 0.0}
     report: Mapping[str, Any] = {}
     try:
-        with Interrupt() as interrupt, Console(len(frames), stream.address, modeler.prior) as console:
+        with (
+            behind(stream) as draw,
+            Interrupt() as interrupt,
+            Console(len(frames), stream.address, modeler.prior) as console,
+        ):
             wanted = frames.until(lambda: interrupt.asked)
             coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
             for event in _events(modeler.start(scene), coming, interrupt):
@@ -229,7 +234,10 @@ def _run(
                     seconds["total"] = time.perf_counter() - began_s
                     meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
                     report = folder.write(event, meta)
-                    stream(event)
+                    # Worked out here, before the next frame: when they are first asked for decides what later ones
+                    # are linearised about, and so their last digits.
+                    event.solution.covariances.values()
+                    draw(event)
     finally:
         stream.close()
     if not report:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
+from modeler.beside import both
 from modeler.fusion import meshing, watertight
 from modeler.fusion.depth_views import (
     SMOOTHED,
@@ -160,23 +161,16 @@ class FusionVolume:
         Args:
             watertight: close the mesh with surface that no view saw; the standard deviation of its vertices is inf.
         """
-        vertices, triangles, seen = self._mesh(watertight=watertight)
+        mesh, (points, point_normals, colours) = both(lambda: self._mesh(watertight=watertight), self._cloud)
+        vertices, triangles, seen = mesh
         normals = meshing.normals_of(vertices, triangles)
         at_vertices = self.support(vertices, normals)
-        points, point_normals = voxel_means(
-            ((block.points_m, block.normals, block.weights) for block in self.views),
-            np.array([_extent_m(block.points_m) for block in self.views]),
-            voxel_m=self.grid.voxel_m,
-            max_voxels=8 * self.fuser.max_voxels,
-        )
-        at_points = self.support(points, point_normals)
-        kept = self._supported(at_points) & ~_outliers(points, 2.0 * self.grid.voxel_m)
         coloured = self.views.coloured
         known = at_vertices.coloured & seen
         return ObjectModel(
-            points_m=points[kept],
-            normals=point_normals[kept],
-            colours=at_points.colours[kept] if coloured else None,
+            points_m=points,
+            normals=point_normals,
+            colours=colours if coloured else None,
             vertices_m=vertices,
             triangles=triangles,
             vertex_normals=normals,
@@ -226,6 +220,18 @@ class FusionVolume:
     def _supported(self, found: ViewSupport) -> BoolArray:
         """Return which points (n,) have more support than views that see them empty."""
         return found.weight > self.fuser.empty_weight * found.empty_views
+
+    def _cloud(self) -> tuple[Array, Array, npt.NDArray[np.uint8]]:
+        """Return the merged points (n, 3), their normals (n, 3) and colours (n, 3)."""
+        points, normals = voxel_means(
+            ((block.points_m, block.normals, block.weights) for block in self.views),
+            np.array([_extent_m(block.points_m) for block in self.views]),
+            voxel_m=self.grid.voxel_m,
+            max_voxels=8 * self.fuser.max_voxels,
+        )
+        found = self.support(points, normals)
+        kept = self._supported(found) & ~_outliers(points, 2.0 * self.grid.voxel_m)
+        return points[kept], normals[kept], found.colours[kept]
 
     def _mesh(self, *, watertight: bool) -> tuple[Array, meshing.Triangles, BoolArray]:
         """Return vertices (v, 3) and triangles (t, 3) of the surface, and which vertices the views support."""

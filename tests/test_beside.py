@@ -1,0 +1,47 @@
+"""Work beside other work: the same results in the same order, whatever the number of threads."""
+
+import threading
+
+import pytest
+
+from modeler.beside import behind, both
+
+
+@pytest.fixture(params=[1, 2])
+def threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
+    """How many threads there may be."""
+    monkeypatch.setenv("NUMBA_NUM_THREADS", str(request.param))
+    return request.param
+
+
+def test_two_results_come_in_their_order(threads: int) -> None:
+    where = both(threading.get_ident, threading.get_ident)
+    assert where[0] == threading.get_ident()
+    assert (where[1] == where[0]) == (threads == 1)
+    with pytest.raises(ZeroDivisionError):
+        both(lambda: 1, lambda: 1 / 0)
+
+
+def test_what_is_used_behind_is_one_late_at_most(threads: int) -> None:
+    go, used = threading.Event(), list[int]()
+
+    def use(item: int) -> None:
+        assert threads == 1 or go.wait(5.0)
+        used.append(item)
+
+    with behind(use) as put:
+        put(0)
+        assert used == ([0] if threads == 1 else [])
+        go.set()
+        put(1)
+        assert used[0] == 0
+    assert used == [0, 1]
+
+
+@pytest.mark.usefixtures("threads")
+def test_what_fails_behind_is_raised_at_the_end_at_the_latest() -> None:
+    def use(item: int) -> None:
+        raise OSError(f"{item} cannot be drawn")
+
+    with pytest.raises(OSError, match="1 cannot"), behind(use) as put:
+        put(1)
