@@ -50,8 +50,8 @@ class Fuser:
     """Side of a voxel in m; None: the footprint of a pixel, or half the sensor's noise if that is larger."""
     max_voxels: int = 192**3
     """Memory bound: voxels are enlarged until the object's box holds at most this many."""
-    preview_voxels: float = 2.0
-    """Side of a voxel of the preview, in voxels of the model."""
+    preview_voxels: float = 2.5
+    """Side of a voxel of the preview, in voxels of the model: as many points as the viewer shows of an object."""
     preview_limit: int = 128**3
     """Memory bound of the preview, as `max_voxels`."""
     preview_moves: int = 8
