@@ -1,10 +1,11 @@
 """Measure a batch.
 
-    PYTHONPATH=tests python -m scale builds FOLDER --sequences 200 --alone 40
-    PYTHONPATH=tests python -m scale tasks FOLDER --count 10000 [--executor dask:ADDRESS]
+    PYTHONPATH=tests python -m scale builds FOLDER [--sequences 200] [--alone 8] [--rounds 5]
+    PYTHONPATH=tests python -m scale tasks FOLDER [--count 10000] [--executor dask:ADDRESS]
 
-`builds` renders small sequences, builds some one by one, each by a `modeler build` with one thread, and all of them by
-`modeler batch` with two workers. `tasks` has an engine do nothing many times, and a batch find everything done.
+`builds` renders small sequences and builds them in rounds: some one by one, each by a `modeler build` with one thread,
+then its share of all of them by a `modeler batch` with two workers. So a busy machine slows both alike. `tasks` has an
+engine do nothing many times, and a batch find everything done.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from collections.abc import Sequence
 from concurrent.futures import wait
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 
 from modeler.cli.engines import engine
 from modeler.cli.jobs import NOTES, Job, fingerprint, write_note
@@ -70,19 +72,33 @@ def timed(commands: Sequence[Sequence[object]]) -> tuple[float, float]:
     return time.monotonic() - began_s, used_s
 
 
-def builds(folder: Path, count: int, alone: int) -> None:
-    """Print what sequences cost one by one and in a batch of two workers."""
+def builds(folder: Path, count: int, *, alone: int, rounds: int) -> None:
+    """Print what sequences cost one by one and in batches of two workers, medians over rounds and their range."""
     paths = rendered(folder, count)
-    singles = [("build", path, "--out", folder / "alone" / path.name, "--overwrite", *OPTIONS) for path in paths]
-    options = (*OPTIONS, "--workers", "2", "--seed", str(int(time.time())))  # nothing is done yet
-    first = timed(singles[: alone // 2])
-    batch = timed([("batch", *paths, "--out", folder / "batch", "--overwrite", *options)])
-    last = timed(singles[alone // 2 : alone])
-    wall_s, used_s = ((one + other) / alone for one, other in zip(first, last, strict=True))
-    print(f"one by one, {alone}: {wall_s:.2f} s, {used_s:.2f} s of a processor each")
-    print(f"batch of {count}: {batch[0] / count:.2f} s, {batch[1] / count:.2f} s of a processor each")
-    print(f"throughput of two workers over twice that of one: {wall_s / (2.0 * batch[0] / count):.2f}")
-    print(f"load of the machine: {os.getloadavg()}")
+    seed = int(time.time())  # nothing is done yet
+    options = (*OPTIONS, "--workers", "2", "--seed", str(seed), "--overwrite")
+    found: dict[str, list[float]] = {}
+    for turn in range(rounds):
+        share = paths[turn::rounds]
+        singles = [("build", path, "--out", folder / "alone" / path.name, "--overwrite", *OPTIONS) for path in share]
+        one_s, one_used_s = (total / alone for total in timed(singles[:alone]))
+        each_s, used_s = (
+            total / len(share) for total in timed([("batch", *share, "--out", folder / "batch", *options)])
+        )
+        figures = {
+            "one by one, s a sequence": one_s,
+            "one by one, s of a processor": one_used_s,
+            "batch, s a sequence": each_s,
+            "batch, s of a processor": used_s,
+            "throughput of two workers over twice that of one": one_s / (2.0 * each_s),
+            "processors busy with it while the batch ran": used_s / each_s,
+            "processor time one by one over that in the batch": one_used_s / used_s,
+        }
+        for name, value in figures.items():
+            found.setdefault(name, []).append(value)
+        print(f"round {turn + 1} of {rounds}: {one_s:.2f} s, {each_s:.2f} s, load {os.getloadavg()[0]:.1f}", flush=True)
+    for name, values in found.items():
+        print(f"{name}: {median(values):.2f} ({min(values):.2f} to {max(values):.2f})")
 
 
 def nothing(job: Job) -> str:
@@ -127,12 +143,13 @@ def main() -> None:
     parser.add_argument("what", choices=["builds", "tasks"])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--sequences", type=int, default=200)
-    parser.add_argument("--alone", type=int, default=40)
+    parser.add_argument("--alone", type=int, default=8, help="built one by one in each round")
+    parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--count", type=int, default=10_000)
     parser.add_argument("--executor", default="processes")
     options = parser.parse_args()
     if options.what == "builds":
-        builds(options.folder, options.sequences, options.alone)
+        builds(options.folder, options.sequences, alone=options.alone, rounds=options.rounds)
     else:
         tasks(options.folder, options.count, options.executor)
 
