@@ -1,13 +1,17 @@
 """From a segmented frame to the image that registration uses: smoothed surface points, local planes, silhouette."""
 
+from __future__ import annotations
+
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from modeler.kernels import planes
 from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
 from modeler.types import BoolArray, Frame, Plane, RayImage
+
+_ALIKE = 3.0  # areas of correlated noise that err alike: measured, see method.md
 
 
 @dataclass(frozen=True)
@@ -27,12 +31,19 @@ class Sensor:
     """
     min_neighbours: float = 25.0
     """The ball grows until it holds about this many pixels of a surface that faces the camera."""
-    correlation_px: float = 0.5
-    """Correlation length of the sensor's noise in px, added to the ball's radius: depth cameras compare windows."""
+    noise_area_px: float = 12.5
+    """Integral of the autocorrelation of the sensor's noise over the image in px: depth cameras compare windows.
+
+    The default is that of noise smoothed over 1 px, as our renderer's. `measured` has that of a scene.
+    """
     min_cosine: float = 0.35
     """Least cosine between normal and viewing ray: surface seen at a flatter angle gives no points."""
     max_silhouette_px: float = 60.0
     """Distance from the silhouette at which its transform is cut off."""
+
+    def measured(self, noise_area_px: float | None) -> Sensor:
+        """Return the sensor with the correlated area of its noise that a scene shows; None where it shows none."""
+        return self if noise_area_px is None else replace(self, noise_area_px=noise_area_px)
 
     def ray_image(self, frame: Frame, plane: Plane | None = None) -> RayImage:
         """Make a segmented frame ready for registration; without object pixels it has no points.
@@ -121,7 +132,8 @@ class Sensor:
         # A stride of 2 px is enough where a wide window holds many pixels.
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours
         ball = (radius_m, reach_px, 2 if reach_px > 4 and enough else 1)
-        sharing = max(density * np.pi * (radius_m / metres_per_px + self.correlation_px) ** 2, 1.0)
+        # method.md, eq. 23
+        sharing = max(density * (np.pi * (radius_m / metres_per_px) ** 2 + _ALIKE * self.noise_area_px), 1.0)
         # A tenth of the sensor's noise: neighbouring pixels err alike, so that residuals understate it.
         return ball, 0.1 * self.sigma_r_m / middle_m**2, float(sharing)
 

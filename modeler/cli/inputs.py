@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, final
 
@@ -18,6 +19,7 @@ from modeler.fusion import Fuser, FusionVolume, conditional_covariances
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline import Modeler
 from modeler.rays import Sensor
+from modeler.segmentation import Scene
 from modeler.types import ACCEPTED, Array, Edge, Frame, InputError, RayImage, Solution
 from sequences import (
     AbstractSequence,
@@ -150,11 +152,7 @@ class Part:
         Raises:
             InputError: where the sequence shows something else than when the run was made.
         """
-        settings = self.report["settings"]
-        roi = settings.get("roi")
-        limits = ObjectOptions(roi=None if roi is None else tuple(roi), max_depth_m=settings.get("max_depth_m"))
-        modeler = compose.modeler(self.sequence, PriorOptions(prior="general"), MethodOptions(), limits)
-        scene, views = compose.scene(modeler, self.sequence), {}
+        (modeler, scene), views = self._looking, {}
         points = {record["id"]: record["points"] for record in self.report["frames"]}
         for frame in frames:
             view = modeler.prepare(self.sequence.frame(frame), scene).view
@@ -166,6 +164,21 @@ class Part:
                 )
             views[frame + self.offset] = renumbered(view, self.offset)
         return views
+
+    @property
+    def sensor(self) -> Sensor:
+        """Noise of the camera that took the sequence."""
+        modeler, scene = self._looking
+        return modeler.sensor.measured(scene.noise_area_px)
+
+    @cached_property
+    def _looking(self) -> tuple[Modeler, Scene]:
+        """What finds the object, and what that learnt from the sequence."""
+        settings = self.report["settings"]
+        roi = settings.get("roi")
+        limits = ObjectOptions(roi=None if roi is None else tuple(roi), max_depth_m=settings.get("max_depth_m"))
+        modeler = compose.modeler(self.sequence, PriorOptions(prior="general"), MethodOptions(), limits)
+        return modeler, compose.scene(modeler, self.sequence)
 
     def check(self) -> None:
         """Look at the first and the last frame.
@@ -287,9 +300,8 @@ def reopened(run: Path, moved: Sequence[Path] = ()) -> Reopened:
     views = {frame: view for part in parts for frame, view in part.views(part.accepted).items()}
     if not poses.keys() <= views.keys():
         raise InputError(f"{run}: its parts have changed since they were joined; join them again")
-    edges, noise = edges_of(report), parts[0].sequence.sensor()
-    sensor = Sensor() if noise is None else Sensor(*noise)
-    return Reopened(parts[0].sequence.name, report, sensor, views, edges, solved(edges, poses), parts)
+    edges = edges_of(report)
+    return Reopened(parts[0].sequence.name, report, parts[0].sensor, views, edges, solved(edges, poses), parts)
 
 
 def solved(edges: tuple[Edge, ...], poses: Mapping[int, Array]) -> Solution:

@@ -172,8 +172,8 @@ class Experiment:
     def _viewing(self, recorded: Recorded, indices: Sequence[int]) -> Callable[[int], RayImage | Outcome]:
         """Return what makes the view of a frame, or tells why there is none."""
         noise = recorded.sensor()
-        sensor = Sensor() if noise is None else Sensor(*noise)
         scene = self.segmenter.scene([recorded.frame(index) for index in telling(indices)])
+        sensor = (Sensor() if noise is None else Sensor(*noise)).measured(scene.noise_area_px)
         return lambda index: self._view(recorded.frame(index), scene, sensor)
 
     def _view(self, frame: Frame, scene: Scene, sensor: Sensor) -> RayImage | Outcome:

@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 from scipy import ndimage
 
+from modeler.range_noise import noise_area
 from modeler.segmentation.depth_images import (
     DepthNoise,
     Labels,
@@ -330,12 +331,13 @@ class Segmenter:
 
         Args:
             frames: about a dozen, spread over the sequence; those with masks or of another size than the first are
-                ignored.
+                ignored. Where all have masks, they tell of the camera only over how many pixels it errs alike.
         """
+        masked = [(frame, frame.mask) for frame in frames if frame.mask is not None]
+        if len(masked) == len(frames):
+            return Scene(noise_area_px=noise_area(masked))
         shown = [frame for frame in frames if frame.mask is None]
         shown = [frame for frame in shown if frame.depth_m.shape == shown[0].depth_m.shape]
-        if not shown:
-            return Scene()
         shown = [_interpolated(frame) for frame in shown]
         if shows_object_alone([_measured(frame) for frame in shown], shown[0].camera, self.noise):
             return Scene(alone=True)
@@ -354,7 +356,8 @@ class Segmenter:
         areas, rivals = [look.area_m2 for _, look in looks], [look.rival for _, look in looks]
         zone = np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
         sure = scene.sure and float(np.median(rivals)) < _RIVAL
-        return replace(scene, zone_m=zone, areas_m2=(min(areas), max(areas)), sure=sure)
+        area_px = noise_area([(frame, look.mask) for frame, look in looks])
+        return replace(scene, zone_m=zone, areas_m2=(min(areas), max(areas)), sure=sure, noise_area_px=area_px)
 
     def segment(self, frame: Frame, scene: Scene) -> Segmentation:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.

@@ -127,7 +127,7 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
     silhouette = _module(likelihood, _SILHOUETTE_NOISE=0.5 * factor)
     cosines = _module(likelihood, _COSINES=(factor * np.array([0.1, 0.35, 0.35, 0.6])).astype(np.float32))
     plain = {
-        "independent points (70)": _scaled(factor, "likelihood.max_independent"),
+        "independent points (300)": _scaled(factor, "likelihood.max_independent"),
         "cost of no overlap (50 nats)": _scaled(factor, "likelihood.no_overlap_cost"),
         "scale of overlap (0.1)": _scaled(factor, "likelihood.overlap_scale"),
         "blurs (0.12 to 0.015)": _scaled(factor, "search.finest"),

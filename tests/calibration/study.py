@@ -190,9 +190,11 @@ class Study:
 
 def rendered_views(sequence: RenderedSequence) -> dict[int, RayImage]:
     """Return the views of a sequence, masked by the truth, by frame number."""
-    segmenter, sensor = Segmenter(), Sensor(*sequence.sensor())
+    segmenter = Segmenter()
     frames = {index: sequence.frame(index) for index in sequence.indices}
     scene = segmenter.scene([frames[index] for index in telling(sequence.indices)])
+    # By one frame, so that what is made of a pair does not depend on how many there are.
+    sensor = Sensor(*sequence.sensor()).measured(segmenter.scene([frames[sequence.indices[0]]]).noise_area_px)
     return {index: sensor.ray_image(frame, segmenter.segment(frame, scene).plane) for index, frame in frames.items()}
 
 

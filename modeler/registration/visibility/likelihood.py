@@ -61,8 +61,10 @@ class VisibilityLikelihood:
     """Upper bound K (nats) of the cost of one point."""
     normal_cost: float = 2.0
     """Cost κ (nats) of a match whose normals are at right angles."""
-    max_independent: float = 70.0
+    max_independent: float = 300.0
     """Largest number of independent measurements in the points of both views, whose common errors limit it."""
+    max_independent_colours: float = 70.0
+    """The same of their colours."""
     no_overlap_cost: float = 50.0
     """Cost (nats) of a pose under which no surface matches."""
     overlap_scale: float = 0.1
@@ -233,8 +235,8 @@ class PairLikelihood:
     def temper(self) -> float:
         """Share n / N of independent measurements in the points (method.md, eq. 7).
 
-        Errors common to distant points limit their number on an object that covers much of the image, smoothing limits
-        it to the number of patches on a small one.
+        Smoothing and the sensor's correlated noise limit their number to that of the patches, errors common to distant
+        points that on an object that covers much of the image.
         """
         return 1.0 / (1.0 / self.forward.model.max_independent + 1.0 / self.patches) / self.points
 
@@ -285,7 +287,7 @@ class PairLikelihood:
         return self.colour.log_likelihoods(
             poses,
             blur_m,
-            self.forward.model.max_independent,
+            self.forward.model.max_independent_colours,
             surface_m=blur_m,
             stride=_COLOUR_STRIDE * stride,
         )

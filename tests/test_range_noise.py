@@ -1,0 +1,70 @@
+"""Over how many pixels a depth camera errs alike, from what surrounds the object."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from modeler.range_noise import noise_area
+from modeler.rays import Sensor
+from modeler.segmentation import Segmenter
+from modeler.types import Camera, Frame
+
+CAMERA = Camera(width=480, height=360, fx=500.0, fy=500.0, cx=239.5, cy=179.5)
+MASK = np.zeros((360, 480), dtype=bool)
+MASK[150:230, 200:280] = True
+NORMAL = np.array([0.1, -0.5, -0.8])
+
+
+def plane_frame(sigma_inverse: float, width_px: float, *, bend: float = 0.0, index: int = 0) -> Frame:
+    """A slanted plane behind a box at 0.7 m, with noise of inverse depth that is smooth over a width (sd) in px."""
+    rng = np.random.default_rng(index)
+    w, h = CAMERA.rays()
+    inverse = -(NORMAL[0] * w + NORMAL[1] * h + NORMAL[2]) / 0.9 + bend * (w**2 + h**2)
+    noise = rng.normal(size=inverse.shape)
+    if width_px:
+        noise = gaussian_filter(noise, width_px, mode="wrap")
+        noise /= noise.std()
+    depth_m = 1.0 / (inverse + sigma_inverse * noise)
+    return Frame(index, float(index), np.where(MASK, 0.7, depth_m).astype(np.float32), CAMERA, MASK)
+
+
+@pytest.mark.parametrize("sigma_inverse", [3e-4, 3e-3])
+@pytest.mark.parametrize("width_px", [0.0, 1.0, 3.0])
+def test_the_correlated_area_is_found_whatever_the_strength(sigma_inverse: float, width_px: float) -> None:
+    area_px = noise_area([(plane_frame(sigma_inverse, width_px, index=k), MASK) for k in range(4)])
+    # Of a Gaussian mean of width s the autocorrelation is one of width √2 s. Wide errors pass for the plane's in part.
+    assert area_px == pytest.approx(max(4.0 * np.pi * width_px**2, 1.0), rel=0.1 if width_px < 3.0 else 0.35)
+
+
+def test_edges_and_the_object_do_not_count() -> None:
+    frame = plane_frame(1e-3, 0.0)
+    depth_m = frame.depth_m.copy()
+    depth_m[:, 300:] += 0.4  # a step
+    assert noise_area([(Frame(0, 0.0, depth_m, CAMERA, MASK), MASK)]) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("nothing", [np.nan, 0.0])
+def test_without_surroundings_nothing_is_said(nothing: float) -> None:
+    frame = plane_frame(1e-3, 0.0)
+    alone = np.where(MASK, frame.depth_m, np.float32(nothing)).astype(np.float32)
+    assert noise_area([(Frame(0, 0.0, alone, CAMERA, MASK), MASK)]) is None
+    assert noise_area([]) is None
+
+
+def test_a_scene_tells_the_sensor() -> None:
+    scene = Segmenter().scene([plane_frame(2e-3, 2.0, index=k) for k in range(3)])
+    assert scene.noise_area_px is not None
+    assert Sensor(0.001, 0.0007).measured(scene.noise_area_px) == Sensor(
+        0.001, 0.0007, noise_area_px=scene.noise_area_px
+    )
+    assert Sensor().measured(Segmenter().scene([]).noise_area_px) == Sensor()
+
+
+def test_the_more_pixels_err_alike_the_fewer_patches_a_view_has() -> None:
+    frame = plane_frame(1e-3, 0.0)
+    views = [Sensor(0.001, 0.0007, noise_area_px=area_px).ray_image(frame) for area_px in (1.0, 10.0, 100.0)]
+    counts = [view.patches for view in views]
+    assert counts[0] > counts[1] > counts[2]
+    # Three correlated areas each beside the ball: method.md, eq. 23.
+    sharing = [view.sharing for view in views]
+    assert (sharing[2] - sharing[1]) / (sharing[1] - sharing[0]) == pytest.approx(10.0, rel=1e-6)
