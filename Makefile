@@ -2,7 +2,7 @@
 # make demo       model the bundled box sequence into runs/demo
 # make test       the whole gate: format, lint, types, layers, tests
 # make test-slow  the tests that take long, which make test leaves out
-# make calibrate  whether stated uncertainties are true, on rendered pairs (many minutes)
+# make calibrate  whether stated uncertainties are true, on rendered pairs and other cameras (many minutes)
 # make trust      whether status 0 can be trusted: 150 rendered runs, half with a fault (some 20 minutes a core)
 # make ablation   what each stage and each constant of the default registration is worth (many hours)
 # make bench      speed, against Open3D and the committed baseline
@@ -42,6 +42,7 @@ test-slow: setup
 
 calibrate: setup
 	PYTHONPATH=tests $(BIN)/python -m calibration
+	PYTHONPATH=tests $(BIN)/python -m calibration.by_camera
 
 trust: setup
 	PYTHONPATH=tests $(BIN)/python -m trust --jobs 2

@@ -1,0 +1,83 @@
+"""The depth cameras of the study by camera, against what they are said to be, and the study itself."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibration.by_camera import CameraStudy, Trial, equal_volume, main, summary, text
+from calibration.depth_cameras import CAMERAS, TimeOfFlight, World
+from calibration.specimens import Specimen
+
+from modeler.range_noise import noise_area
+from modeler.types import Frame
+
+CUBE = np.array([[x, y, z] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (0.6, 0.7)])
+FACES = np.array([[0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3], [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5],
+                  [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]])  # fmt: skip
+WALL = np.array([[-3.0, -3.0, 0.8], [3.0, -3.0, 0.8], [3.0, 3.0, 0.8], [-3.0, 3.0, 0.8]])
+WORLD = World((CUBE, FACES), (WALL, np.array([[0, 1, 2], [0, 2, 3]])))
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_noise_is_of_the_size_and_the_correlation_that_the_camera_has(name: str) -> None:
+    camera = CAMERAS[name]
+    seen = camera.look(WORLD)
+    depth_m = camera.measure(WORLD, np.random.default_rng(0), 0).astype(np.float32)
+    assert np.isfinite(depth_m).all()
+    face = seen.on_object & (depth_m > 0.0)
+    assert abs(np.median(depth_m[face] - seen.depth_m[face])) < 0.004  # time of flight: by light from the wall
+    around = ~seen.on_object & (np.abs(depth_m - 0.8) < 0.02)
+    expected_mm = {"laser stripe": 0.1, "time of flight": 1.07, "independent pixels": 1.79}.get(name)
+    if expected_mm is not None:
+        assert 1e3 * np.std(depth_m[around] - 0.8) == pytest.approx(expected_mm, rel=0.25)
+    area_px = noise_area([(Frame(0, 0.0, depth_m, camera.camera, seen.on_object), seen.on_object)])
+    assert area_px is not None
+    assert (area_px > 20.0) == (name in ("Kinect 1", "D415, holes filled", "D435"))
+
+
+def test_holes_are_filled_by_the_camera_that_fills_them_only() -> None:
+    for name in ("D415, holes filled", "D435"):
+        depth_m = CAMERAS[name].measure(WORLD, np.random.default_rng(0), 0)
+        assert (depth_m == 0.0).any() == (name == "D435")
+
+
+def test_light_by_way_of_other_surfaces_makes_time_of_flight_read_too_far() -> None:
+    floor = np.array([[-1.0, 0.05, 0.3], [1.0, 0.05, 0.3], [1.0, 0.05, 2.0], [-1.0, 0.05, 2.0]])
+    beside = World((CUBE, FACES), (floor, np.array([[0, 1, 2], [0, 2, 3]])))
+    empty = World((CUBE, FACES), (floor, np.zeros((0, 3), dtype=np.int64)))
+    camera = TimeOfFlight()
+    face = camera.look(beside).on_object
+    near, alone = (camera.measure(world, np.random.default_rng(1), 0)[face] for world in (beside, empty))
+    assert np.median(near) - np.median(alone) > 0.0005
+
+
+def _trial(squares: float, **changes: object) -> Trial:
+    said = {"method": "visibility", "usable": True, "nees": squares, "log_volume": -40.0, "outcome": "converged"}
+    return Trial("laser stripe", "true", "n-fold", "box", 0.8, 25.0, "table", **{**said, **changes})
+
+
+def test_volumes_are_compared_at_the_same_coverage() -> None:
+    rng = np.random.default_rng(0)
+    squares = rng.chisquare(6, 4000)
+    true, sure = ([_trial(float(factor * one)) for one in squares] for factor in (1.0, 100.0))
+    assert equal_volume(true) == pytest.approx(-40.0, abs=0.2)
+    assert equal_volume(sure) - equal_volume(true) == pytest.approx(3.0 * np.log(100.0), abs=1e-6)
+    assert "1.0" in summary(true)
+    assert "-" in summary([])
+
+
+def test_the_study_by_camera_runs_and_repeats_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    box = Specimen("box", "n-fold", "tuning")
+    study = CameraStudy((box,), ("independent pixels",), frames=2)
+    trials = list(study.trials(0))
+    assert {(one.stated, one.prior, one.method) for one in trials} == {
+        (stated, prior, method)
+        for stated in ("true", "nominal")
+        for prior in ("general", "table")
+        for method in ("visibility", "icp")
+    }
+    assert [one.nees for one in trials] == pytest.approx([one.nees for one in study.trials(0)], nan_ok=True)
+    assert "independent pixels" in text(trials)
+    with pytest.raises(SystemExit):
+        main(["--frames", "1", "--out", str(tmp_path)])
+    assert "no pair is left" in capsys.readouterr().err
