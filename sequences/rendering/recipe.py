@@ -192,6 +192,22 @@ class Mosaic:
 
 @final
 @dataclass(frozen=True)
+class TurnedOver:
+    """The object is put down otherwise within the sequence."""
+
+    at: int
+    """Number of the first frame in which it lies so."""
+    rest_rotation_deg: tuple[float, float, float]
+    """How it lies from then on: turns about the fixed x, y and z axes, before it is set on the table."""
+
+    def __post_init__(self) -> None:
+        """Check the frame."""
+        if self.at < 1:
+            raise ValueError("at must be at least 1, for frame 0 shows the object as rest_rotation_deg says")
+
+
+@final
+@dataclass(frozen=True)
 class Recipe:
     """Everything a synthetic sequence depends on."""
 
@@ -203,6 +219,8 @@ class Recipe:
     """Seed of motion and noise."""
     rest_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """How the object lies: turns about the fixed x, y and z axes, before it is set on the table."""
+    turned_over: TurnedOver | None = None
+    """Whether it is put down otherwise on the way; the trajectory goes on as it is."""
     view: Viewpoint = Viewpoint()
     """The camera and its place."""
     table: Table | None = Table()

@@ -140,13 +140,21 @@ class RenderedSequence(AbstractSequence):
 
     @cached_property
     def _camera_from_model(self) -> Array:
-        resting = self._mesh.moved(placement((0.0, 0.0, 0.0), self.recipe.rest_rotation_deg)).vertices_m
-        low, high = resting.min(axis=0), resting.max(axis=0)
+        recipe, turned_over = self.recipe, self.recipe.turned_over
+        object_from_model, centre_m = self._resting(recipe.rest_rotation_deg)
+        table_from_object = recipe.trajectory.table_from_object(centre_m, self._rng(_MOTION))
+        rests = np.tile(object_from_model, (len(table_from_object), 1, 1))
+        if turned_over is not None:
+            rests[turned_over.at :] = self._resting(turned_over.rest_rotation_deg)[0]
+        return recipe.view.camera_from_table() @ table_from_object @ rests
+
+    def _resting(self, rotation_deg: tuple[float, float, float]) -> tuple[Array, Array]:
+        """Return object_from_model (4, 4) of the object as it is set on the table, and its centre (3,) there."""
+        vertices_m = self._mesh.moved(placement((0.0, 0.0, 0.0), rotation_deg)).vertices_m
+        low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)
         middle = 0.5 * (low + high)
-        object_from_model = placement((-middle[0], -middle[1], -low[2]), self.recipe.rest_rotation_deg)
-        centre_m = np.array([0.0, 0.0, middle[2] - low[2]])
-        table_from_object = self.recipe.trajectory.table_from_object(centre_m, self._rng(_MOTION))
-        return self.recipe.view.camera_from_table() @ table_from_object @ object_from_model
+        resting = placement((-middle[0], -middle[1], -low[2]), rotation_deg)
+        return resting, np.array([0.0, 0.0, middle[2] - low[2]])
 
     def _jittered(self, rays: Array, camera: Camera, rng: np.random.Generator) -> Array:
         if self._sensor.jitter is None:

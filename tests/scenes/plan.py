@@ -27,7 +27,7 @@ FRAMES: Final = 10
 
 def thing(recipe: Recipe, shape: AnyShape, places: Sequence[Place]) -> Recipe:
     """Return something else in the same view, on no table of its own."""
-    own = replace(recipe, object=shape, table=None, wall=None, rest_rotation_deg=(0.0, 0.0, 0.0))
+    own = replace(recipe, object=shape, table=None, wall=None, rest_rotation_deg=(0.0, 0.0, 0.0), turned_over=None)
     return replace(own, seed=recipe.seed + 1, trajectory=Places(tuple(places)))
 
 
