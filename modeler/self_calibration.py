@@ -239,4 +239,4 @@ def _scaled(plane: Plane, factor: float) -> Plane:
 
 
 def _counts(edge: Edge) -> bool:
-    return edge.accepted or (edge.kind == "closure" and edge.posterior.usable)
+    return edge.kind != "join" and (edge.accepted or (edge.kind == "closure" and edge.posterior.usable))

@@ -399,3 +399,34 @@ def test_where_a_turn_may_be_complete_a_loop_must_have_been_tried(
 
 def test_evidence_is_gathered_once_all_edges_are_in() -> None:
     assert whole_run(STEPS_DEG, unsure=4, last=False) == (["unfinished"], {})
+
+
+def test_two_segments_need_two_pairs_that_join_them_and_what_is_between_them_counts_not() -> None:
+    angles_deg = [0.0, 25.0, 50.0, 30.0, 55.0, 80.0]  # of frames 0 to 2, and 4 to 6, after the object was put down anew
+    numbers = [0, 1, 2, 4, 5, 6]
+    views = {k: seen(k, turned(angle_deg)) for k, angle_deg in zip(numbers, angles_deg, strict=True)}
+    poses = dict(zip(numbers, poses_of(angles_deg).values(), strict=True))
+    chain = [joined(k, k - 1, poses) for k in (1, 2, 5, 6)]
+    joins = [joined(4, 1, poses, kind="join"), joined(5, 2, poses, kind="join")]
+    newest = views[6]
+    assert newest.frame.mask is not None
+    for count, lost, expected in ((2, 3, set()), (1, 3, {"unconfirmed"}), (2, 7, {"left_out"})):
+        edges = (*chain, *joins[:count])
+        step = Step(
+            frame=newest.frame,
+            segmentation=Segmentation(newest.frame.mask, None, Outcome.CONVERGED),
+            view=newest,
+            posteriors=(),
+            edges=(),
+            left_out=None,
+            solution=solve(PoseGraph(edges=edges, first=0), {}),
+            model=None,
+            edges_so_far=edges,
+            views=views,
+            last=True,
+        )
+        frames = [FrameRecord(k, float(k), 100, "accepted") for k in numbers]
+        frames.append(FrameRecord(lost, float(lost), 0, "a hand", cause="no overlap"))
+        # Steps of 25° where the motion was known, and none of the joins is one.
+        verdict = judged(step, frames, prior=TurntablePrior(-25.0, axis_direction=UP))
+        assert {found.code for found in verdict.shortcomings} == expected

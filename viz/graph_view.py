@@ -82,7 +82,7 @@ def _edges(step: Step) -> Drawing:
     lines: dict[str, list[list[Array]]] = {entities.ODOMETRY: [], entities.CLOSURE: [], entities.REJECTED: []}
     for edge in step.edges_so_far:
         if edge.source in trajectory and edge.target in trajectory:
-            accepted = entities.CLOSURE if edge.kind == "closure" else entities.ODOMETRY
+            accepted = entities.CLOSURE if edge.kind in ("closure", "join") else entities.ODOMETRY
             path = accepted if step.solution.takes_part(edge) else entities.REJECTED
             lines[path].append([trajectory[edge.target][:3, 3], trajectory[edge.source][:3, 3]])
     yield entities.ODOMETRY, _lines(lines[entities.ODOMETRY], entities.ODOMETRY_RGB, 1.5)
@@ -219,7 +219,7 @@ def _below_ring(step: Step, words: str) -> rr.AsComponents:
 
 
 def _edge_rgb(edge: Edge) -> entities.Rgb:
-    return entities.CLOSURE_RGB if edge.kind == "closure" else entities.UNCERTAINTY_RGB
+    return entities.CLOSURE_RGB if edge.kind in ("closure", "join") else entities.UNCERTAINTY_RGB
 
 
 def magnification(edges: Sequence[Edge], distance_m: float) -> float:

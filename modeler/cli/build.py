@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -246,10 +247,10 @@ def _run(
 
 
 def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt) -> Iterator[Event]:
-    """Yield what happens in a run; Ctrl-C ends the refinement."""
+    """Yield what happens in a run; Ctrl-C ends what comes after its frames."""
     yield from run.track(frames)
     yield from run.revisit()
-    for event in run.refine():
+    for event in itertools.chain(run.rejoin(), run.refine()):
         yield event
         if interrupt.asked:
             break

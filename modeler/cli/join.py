@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -17,22 +16,17 @@ from modeler.cli.options import SEED
 if TYPE_CHECKING:
     from modeler.cli.inputs import Part, Reopened
     from modeler.export import RunFolder, RunMeta
-    from modeler.fusion import Match
     from modeler.graph import PoseGraph
-    from modeler.types import Array, Edge, Posterior, RayImage, Solution, Step
-
-_SIGMA_RAD, _SIGMA_M = 0.12, 0.01  # error of the models' alignment
-_LEAST = 0.15  # score of models that fit each other at all
-_RIVAL = 0.97  # of the best match's score: one that is as good and lies elsewhere leaves the choice open
-_FARTHEST_RAD = 0.5  # a posterior farther from the match than this is another place
+    from modeler.types import RayImage, Solution, Step
 
 
 @dataclass(frozen=True)
 class Join:
     """Join two runs of the same object in different postures, so that the model has what each of them hides.
 
-    The models are aligned from every side, pairs of their views registered as in a build, and the frames of
-    both fused into one model in the object frame of RUN_A.
+    They are joined as a build joins what it shows before and after an object was put down otherwise: the models are
+    aligned from every side, pairs of their views registered, and the frames of both fused into one model in the object
+    frame of RUN_A.
     """
 
     run_a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_A")]
@@ -57,6 +51,7 @@ class Join:
         from modeler.cli.inputs import reopened
         from modeler.export import RunFolder, RunMeta, alone
         from modeler.graph import PoseGraph, solve
+        from modeler.pipeline.joining import Joiner, Segment
         from modeler.types import InputError
 
         _check(self)
@@ -64,23 +59,22 @@ class Join:
         first, second = reopened(self.run_a), reopened(self.run_b)
         offset = max(record["id"] for record in first.report["frames"]) + 1
         second = _shifted(second, offset)
-        matches = _matches(first, second)
-        if matches[0].score < _LEAST:
-            raise InputError(
-                f"{self.run_a} and {self.run_b}: no alignment of the models fits; are they of "
-                "the same object, and do they share enough surface?"
-            )
-        say(f"models aligned: {100.0 * matches[0].score:.0f} % of the surface agrees")
-        edges = _edges(first, second, matches[0], self)
-        count = sum(edge.accepted for edge in edges)
+        joiner = Joiner(pairs=self.pairs, seed=self.seed)
+        parts = [Segment(run.views, run.solution, run.edges) for run in (first, second)]
+        alignments = joiner.join(*parts)
+        if not alignments:
+            raise InputError("the models cannot be aligned; build both runs from more views")
+        edges, ways = alignments[0].edges, len(alignments)
+        say(f"models aligned: {100.0 * alignments[0].share:.3g} % likely" + (f", of {ways} ways" if ways > 1 else ""))
+        count = alignments[0].accepted
         if not count:
             raise InputError(
-                f"{self.run_a} and {self.run_b}: none of {len(edges)} pairs of views could be registered; are they "
-                "of the same object, and do they share enough surface? Try more --pairs"
+                f"{self.run_a} and {self.run_b}: no alignment of the models fits their views; are they "
+                "of the same object, and do they share enough surface?"
             )
         graph = PoseGraph(edges=(*first.edges, *second.edges, *edges), first=min(first.solution.trajectory))
         guess = dict(first.solution.trajectory) | {
-            frame: matches[0].target_from_source @ pose for frame, pose in second.solution.trajectory.items()
+            frame: alignments[0].target_from_source @ pose for frame, pose in second.solution.trajectory.items()
         }
         meta = RunMeta(
             sequence=f"{first.report['sequence']} + {second.report['sequence']}",
@@ -91,7 +85,6 @@ class Join:
                 "offset": offset,
                 "pairs": self.pairs,
             },
-            doubts=_doubts(matches),
             camera=_least_known([*first.parts, *second.parts]),
         )
         with alone(self.out):
@@ -124,37 +117,6 @@ def _check(options: Join) -> None:
             pass
 
 
-def _matches(first: Reopened, second: Reopened) -> list[Match]:
-    """Return alignments of the second model with the first, best first.
-
-    Raises:
-        InputError: where there is none.
-    """
-    from modeler.fusion import Fuser, Matcher
-    from modeler.types import InputError
-
-    volumes = first.volume(Fuser()), second.volume(Fuser())
-    models = volumes[0].model(), volumes[1].model()
-    found = Matcher().matches(*volumes, models) if all(len(model.points_m) for model in models) else []
-    if not found:
-        raise InputError("the models cannot be aligned; build both runs from more views")
-    return found
-
-
-def _doubts(matches: list[Match]) -> list[str]:
-    """Return in words why the way the models lie on each other is open; empty where it is not."""
-    from modeler import se3
-
-    rivals = [match for match in matches[1:] if match.score > _RIVAL * matches[0].score]
-    if not rivals:
-        return []
-    angle = float(se3.rotation_angle(se3.inverse(matches[0].target_from_source) @ rivals[0].target_from_source))
-    return [
-        f"another alignment of the models fits as well, turned by {math.degrees(angle):.0f}°: the object "
-        "looks the same from several sides"
-    ]
-
-
 def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
     """Return what was estimated of the camera whose depth scale is known least; None where all are as stated."""
     from modeler.cli.inputs import estimated_camera
@@ -162,69 +124,6 @@ def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
     files = (part.report["settings"].get("camera") for part in parts)
     cameras = [camera for file in files if file is not None and (camera := estimated_camera(Path(file))) is not None]
     return max(cameras, key=lambda camera: float(camera["depth_scale_sigma"]), default=None)
-
-
-def _edges(first: Reopened, second: Reopened, match: Match, options: Join) -> tuple[Edge, ...]:
-    """Register views of the second run against views of the first that look from nearly the same side."""
-    import numpy as np
-
-    from modeler import se3
-    from modeler.pipeline import register
-    from modeler.priors.mixtures import KernelMixture
-    from modeler.registration import VisibilityRegistrar
-
-    edges = []
-    for target, source in _facing(first, second, match.target_from_source, options.pairs):
-        views = second.views[source], first.views[target]
-        poses = second.solution.trajectory[source], first.solution.trajectory[target]
-        guess = se3.inverse(poses[1]) @ match.target_from_source @ poses[0]
-        density = KernelMixture(
-            guess[None],
-            np.ones(1),
-            centre_m=views[0].centroid_m,
-            sigma_rad=_SIGMA_RAD,
-            sigma_m=_SIGMA_M,
-            evidence=False,
-        )
-        edges.append(_judged(register(VisibilityRegistrar(), *views, density, seed=options.seed), guess))
-    return tuple(edges)
-
-
-def _judged(posterior: Posterior, guess: Array) -> Edge:
-    """Return the posterior as an edge that takes part where it is usable and in the place that was looked at."""
-    import numpy as np
-
-    from modeler import se3
-    from modeler.types import Edge, Failed, Stated
-
-    off = se3.inverse(guess) @ posterior.pose.mean
-    away = float(se3.rotation_angle(off)) > _FARTHEST_RAD
-    lasting = replace(posterior, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
-    if not posterior.usable:
-        return Edge(lasting, "closure", False, Failed(posterior.outcome))
-    if away:
-        return Edge(lasting, "closure", False, Stated("contradicts the alignment of the models"))
-    return Edge(lasting, "closure", True, Stated("joins the runs"))
-
-
-def _facing(first: Reopened, second: Reopened, target_from_source: Array, count: int) -> list[tuple[int, int]]:
-    """Return pairs of views, target and source, that look at the object from the nearest sides, no view twice."""
-    import numpy as np
-
-    centre = np.mean([first.solution.trajectory[k] @ np.append(v.centroid_m, 1.0) for k, v in first.views.items()], 0)
-    sides = []
-    for run, motion in ((first, np.eye(4)), (second, target_from_source)):
-        frames = [frame for frame in run.solution.trajectory if frame in run.views]
-        rays = np.stack([(motion @ run.solution.trajectory[frame])[:3, 3] - centre[:3] for frame in frames])
-        sides.append((frames, rays / np.linalg.norm(rays, axis=1, keepdims=True)))
-    cosines = sides[0][1] @ sides[1][1].T
-    pairs = []
-    for flat in np.argsort(-cosines, axis=None, kind="stable"):
-        row, column = np.unravel_index(flat, cosines.shape)
-        target, source = sides[0][0][int(row)], sides[1][0][int(column)]
-        if len(pairs) < count and all(target != pair[0] and source != pair[1] for pair in pairs):
-            pairs.append((target, source))
-    return pairs
 
 
 def _shifted(run: Reopened, offset: int) -> Reopened:

@@ -23,6 +23,7 @@ from modeler.types import (
     Reason,
     Solution,
     loops_closed,
+    segments,
 )
 
 _MIN_PROBABILITY = 0.02  # that a view is within reach: a return whose turn was uncertain adds much information
@@ -106,7 +107,11 @@ class Closer:
         return bool(probability[0] >= _MIN_PROBABILITY)
 
     def span_pairs(self, map_view: MapView) -> tuple[tuple[int, int], ...]:
-        """Return pairs (source, target) of views to register once all are in: those of most information for each."""
+        """Return pairs (source, target) of views to register once all are in: those of most information for each.
+
+        Both are of one segment: between segments nothing is known of the motion.
+        """
+        segment_of = segments([edge for edge in map_view.edges if map_view.solution.takes_part(edge)])
         frames, targets = sorted(map_view.frames), np.array(sorted(map_view.targets))
         poses = map_view.poses(targets.tolist())
         tried = {frozenset((edge.source, edge.target)) for edge in map_view.edges}
@@ -116,6 +121,7 @@ class Closer:
             pose, number = map_view.solution.trajectory[source], int(np.searchsorted(targets, source))
             angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses[:number]) @ pose))
             near = [k for k in np.flatnonzero(angle_deg <= limit_deg) if {source, int(targets[k])} not in tried]
+            near = [k for k in near if segment_of.get(source) == segment_of.get(int(targets[k]))]
             systematic = self.consistency.systematic(1, map_view.views[source].centroid_m)
             gain = InformationGain(map_view, source, pose, systematic, limit_deg, has_own_edge=False, power=_SPAN_POWER)
             found = gain.candidates(targets[near].tolist(), angle_deg[near], self.min_span_gain_nats)

@@ -80,8 +80,8 @@ def read_model(path: Path) -> ObjectModel:
 
 
 def _kind(edge: Mapping[str, Any]) -> EdgeKind:
-    """Return what an edge is for; reports count spans as odometry, and say so beside."""
-    return "span" if edge.get("span") else edge["kind"]
+    """Return what an edge is for; reports count spans as odometry and joins as closures, and say so beside."""
+    return "span" if edge.get("span") else "join" if edge.get("join") else edge["kind"]
 
 
 def _posterior(edge: Mapping[str, Any]) -> Posterior:

@@ -178,8 +178,9 @@ def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) ->
     record = {
         "source": posterior.source,
         "target": posterior.target,
-        "kind": "closure" if edge.kind == "closure" else "odometry",
+        "kind": "closure" if edge.kind in ("closure", "join") else "odometry",
         "span": edge.kind == "span",  # of the odometry, those that only join frames which others placed
+        "join": edge.kind == "join",  # of the closures, those between segments
         "accepted": solution.takes_part(edge),
         "outcome": posterior.outcome.label,
         "reason": explain(OptimisationOutlier() if outlier else edge.reason),

@@ -7,7 +7,7 @@ is the axis (method.md, eq. G7). A is a variable of all steps, so that what each
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.graph.covariance import Rows, chi_square_quantile
 from modeler.graph.pose_graph import Factor, inverse_right_jacobian
-from modeler.types import Array
+from modeler.types import Array, segments
 
 _MIN_TURN_RAD = np.radians(5.0)  # a table that has turned by less in all shows no axis
 _SLIP = [0, 1, 3, 4, 5]  # components of ξ other than the rotation about the axis
@@ -42,7 +42,15 @@ def best_known_point(factors: Sequence[Factor]) -> Array:
     return np.asarray(np.linalg.solve(inertia, moment), dtype=np.float64)
 
 
-def estimated_axis(trajectory: Mapping[int, Array], near_m: Array) -> Array | None:
+def steps_of(factors: Sequence[Factor], frames: Iterable[int]) -> list[tuple[int, int]]:
+    """Return pairs of consecutive frames, but for those of two segments, between which a hand moved the object."""
+    segment_of = segments([factor.edge for factor in factors])
+    return [pair for pair in itertools.pairwise(sorted(frames)) if len({segment_of.get(frame) for frame in pair}) == 1]
+
+
+def estimated_axis(
+    trajectory: Mapping[int, Array], near_m: Array, pairs: Sequence[tuple[int, int]] | None = None
+) -> Array | None:
     """Return camera_from_axis (4, 4) that the steps between consecutive frames share best; None without rotation.
 
     The object turns about its third direction in the positive sense, seen from camera coordinates, as time goes back.
@@ -50,8 +58,10 @@ def estimated_axis(trajectory: Mapping[int, Array], near_m: Array) -> Array | No
     Args:
         trajectory: object_from_camera (4, 4) by frame number.
         near_m: (3,) a point in camera coordinates, to which the origin is the nearest on the axis.
+        pairs: the frames of the steps; None: all consecutive ones.
     """
-    steps = np.stack([se3.inverse(trajectory[t]) @ trajectory[s] for t, s in itertools.pairwise(sorted(trajectory))])
+    pairs = list(itertools.pairwise(sorted(trajectory))) if pairs is None else pairs
+    steps = np.stack([se3.inverse(trajectory[t]) @ trajectory[s] for t, s in pairs])
     turns = se3.log(steps)[:, :3]
     if np.sum(np.linalg.norm(turns, axis=1)) < _MIN_TURN_RAD:
         return None
@@ -137,12 +147,13 @@ class CommonAxis:
             trajectory: object_from_camera (4, 4) by frame number, not far off.
             root: the frame whose pose is the identity.
         """
-        if len(trajectory) < 2:
+        steps = steps_of(factors, trajectory)
+        if not steps:
             return None
-        start = estimated_axis(trajectory, best_known_point(factors))
+        start = estimated_axis(trajectory, best_known_point(factors), steps)
         if start is None:
             return None
-        problem = _Problem(self, factors, list(trajectory), root, start)
+        problem = _Problem(self, factors, steps, root, start)
         alone = _half_square(problem.rows({**trajectory, _AXIS: start})[: len(factors)])
         poses, rows = problem.minimised({**trajectory, _AXIS: start})
         if not self._fits(rows[len(factors) + 1 :], 2.0 * (_half_square(rows) - alone)):
@@ -173,7 +184,7 @@ class _Problem:
 
     axis: CommonAxis
     factors: Sequence[Factor]
-    frames: Sequence[int]
+    steps: Sequence[tuple[int, int]]
     root: int
     start: Array
 
@@ -201,8 +212,7 @@ class _Problem:
         away[2] = 0.0
         sigmas = _AXIS_SIGMAS if np.isfinite(self.axis.sigma_tilt_rad) else _PLACE_SIGMAS
         rows.append(({_AXIS: np.diag(1.0 / sigmas)}, away / sigmas))
-        steps = list(itertools.pairwise(sorted(self.frames)))
-        for (target, source), error, *blocks in zip(steps, *self._slips(poses, np.array(steps)), strict=True):
+        for (target, source), error, *blocks in zip(self.steps, *self._slips(poses, np.array(self.steps)), strict=True):
             rows.append((self._free({target: blocks[0], source: blocks[1], _AXIS: blocks[2]}), error))
         return rows
 

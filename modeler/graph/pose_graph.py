@@ -18,7 +18,7 @@ from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian, Posterior, 
 
 ROOT_SIGMA = 1e-9
 """Of the root's pose, in rad and m: zero for all purposes, and still positive definite."""
-_KINDS: tuple[EdgeKind, ...] = ("odometry", "span", "closure")  # in the order in which a tree prefers them
+_KINDS: tuple[EdgeKind, ...] = ("odometry", "span", "closure", "join")  # in the order in which a tree prefers them
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -13,6 +13,7 @@ import numpy as np
 from modeler.closure import Closer
 from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances
 from modeler.graph import CommonAxis, shared_noise
+from modeler.pipeline.joining import LEAST_JOINS, Joiner, Segment
 from modeler.pipeline.pairs import Prepared, anywhere, prepare, register
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
@@ -29,6 +30,7 @@ from modeler.types import (
     Failed,
     Frame,
     Fusing,
+    NotJoined,
     Posterior,
     RayImage,
     Reason,
@@ -37,6 +39,8 @@ from modeler.types import (
     Solution,
     Step,
 )
+
+_LEAST_SEGMENT = 3  # frames that fit each other: two may do so by chance
 
 
 @final
@@ -86,6 +90,7 @@ class Modeler:
         run = self.start(scene)
         yield from run.track(frames)
         yield from run.revisit()
+        yield from run.rejoin()
         yield from run.refine()
         yield from run.finish()
 
@@ -149,6 +154,10 @@ class Modeler:
         glance = None if self.glance is None else partial(self._register, self.glance)
         return Tracker(state, self.prior, self.closer, self.sensor, self.register, glance, self.executor)
 
+    def joiner(self, tracker: Tracker) -> Joiner:
+        """Return what joins segments of a run."""
+        return Joiner(self.registrar, tracker.ready, seed=self.seed)
+
     def _register(
         self, registrar: AbstractRegistrar, source: RayImage, target: RayImage, prior: AbstractPrior
     ) -> Posterior:
@@ -158,9 +167,10 @@ class Modeler:
 @final
 @dataclass(eq=False)
 class Run:
-    """One run of the loop and the only owner of its state: four phases in order, each a stream of events.
+    """One run of the loop and the only owner of its state: five phases in order, each a stream of events.
 
-    A consumer in a hurry omits `revisit` or `refine`, or stops consuming one of them: `finish` takes what is there.
+    A consumer in a hurry omits `revisit`, `rejoin` or `refine`, or stops consuming one of them: `finish` takes what is
+    there.
     """
 
     modeler: Modeler
@@ -193,6 +203,20 @@ class Run:
             view = self.modeler.tracker(self.state).ready(lost.view)
             yield from self._place(replace(lost, view=view), neighbour, again=True)
 
+    def rejoin(self) -> Iterator[Step | Searching]:
+        """Build segments of lost frames that fit each other, and join them with the rest; yield steps of their frames.
+
+        Where the object was put down otherwise, nothing that is known of its motion holds from the frames before to
+        those after, and all of those are lost; among themselves they are as good as any.
+        """
+        tried: set[int] = set()
+        while stretches := [some for some in self.state.stretches() if len({*some} - tried) >= _LEAST_SEGMENT]:
+            frames = [frame for frame in max(stretches, key=len) if frame not in tried]
+            segment = yield from self._segment(frames)
+            tried |= {*segment.views} if len(segment.views) >= _LEAST_SEGMENT else {*frames}
+            if len(segment.views) >= _LEAST_SEGMENT:
+                yield from self._joined(segment)
+
     def refine(self) -> Iterator[Refining]:
         """Register further pairs of views, whose edges make the poses more precise.
 
@@ -223,6 +247,42 @@ class Run:
             self.state = replace(self.state, model=model)
         spans = self.state.spans
         yield self._step(newest, [edge.posterior for edge in spans], spans, last=True)
+
+    def _segment(self, frames: Sequence[int]) -> Generator[Searching, None, State]:
+        """Place lost frames among each other, and return what comes of it; it begins where two of them fit."""
+        apart, tracker = self.state.apart(frames), self.modeler.tracker(self.state)
+        part = Run(self.modeler, self.scene, apart)
+        for frame in frames:
+            yield Searching(frame)
+            lost = self.state.lost[frame]
+            assert lost.view is not None
+            lost = replace(lost, view=tracker.ready(lost.view), left_out=None)
+            for _ in part._place(lost, part.state.latest, last=frame == frames[-1]):
+                pass
+            if frame not in part.state.views and len(part.state.views) == 1:  # the first may show it in a hand
+                part.state = apart
+                for _ in part._place(lost, None):
+                    pass
+        return part.state
+
+    def _joined(self, segment: State) -> Iterator[Step]:
+        """Join a segment with the views so far where that can be; yield steps of its frames."""
+        joiner = self.modeler.joiner(self.modeler.tracker(self.state))
+        parts = [Segment(state.views, state.solution, state.graph.edges) for state in (self.state, segment)]
+        alignments = joiner.join(parts[0], parts[1])
+        joins = alignments[0].edges if alignments else ()
+        lost, left_out = self.state.lost, None
+        united = self.state.united(segment, joins) if sum(edge.accepted for edge in joins) >= LEAST_JOINS else None
+        if united is None or sum(united.solution.takes_part(edge) for edge in joins) < LEAST_JOINS:
+            left_out = NotJoined(len(segment.views))
+        else:
+            self.state = united
+            self._preview()
+        if (newest := self.state.newest) is not None and newest.frame.index in segment.views:
+            self.state = replace(self.state, newest=replace(newest, left_out=left_out))
+        for frame in sorted(segment.views, key=lambda frame: self.state.places[frame]):
+            edges = [edge for edge in (*segment.graph.edges, *joins) if edge.source == frame]
+            yield self._step(replace(lost[frame], left_out=left_out), [edge.posterior for edge in edges], edges)
 
     def _place(
         self, prepared: Prepared, previous: int | None, *, last: bool = False, again: bool = False

@@ -113,6 +113,31 @@ class State:
         graph = self.graph.plus(self.spans)
         return replace(self, graph=graph, smoother=self.smoother.to(graph))
 
+    def stretches(self) -> list[list[int]]:
+        """Return the lost frames in order of time, those between which no view was accepted together."""
+        found: list[list[int]] = []
+        among = sorted({*self.lost, *self.views}, key=lambda frame: self.places[frame])
+        for before, frame in zip([None, *among], among, strict=False):
+            if frame in self.lost:
+                found = [*found[:-1], [*found[-1], frame]] if before in self.lost else [*found, [frame]]
+        return found
+
+    def apart(self, frames: Sequence[int]) -> State:
+        """Return what is known of some lost frames alone: that they were read."""
+        return State(places=self.places, lost={frame: self.lost[frame] for frame in frames}, store=self.store)
+
+    def united(self, segment: State, joins: Sequence[Edge]) -> State:
+        """Return the state with another of frames that are lost here, and edges between both."""
+        graph = self.graph.plus([*segment.graph.edges, *joins])
+        return replace(
+            self,
+            graph=graph,
+            smoother=self.smoother.to(graph),
+            views={**self.views, **segment.views},
+            keyframes=(*self.keyframes, *segment.keyframes),
+            lost={frame: lost for frame, lost in self.lost.items() if frame not in segment.views},
+        )
+
     def solved(self, *, axis: CommonAxis | None, shared: float = 0.0, common: float = 0.0) -> State:
         """Return the state solved with an axis that all steps share, or the noise that edges do; see `Smoother`."""
         return replace(self, smoother=replace(self.smoother, axis=axis, shared=shared, common=common).to(self.graph))

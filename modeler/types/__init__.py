@@ -28,11 +28,14 @@ from modeler.types.reasons import ACCEPTED as ACCEPTED
 from modeler.types.reasons import ConfirmedBy as ConfirmedBy
 from modeler.types.reasons import Consistency as Consistency
 from modeler.types.reasons import Degenerate as Degenerate
+from modeler.types.reasons import ElsewhereThanSegments as ElsewhereThanSegments
 from modeler.types.reasons import Failed as Failed
 from modeler.types.reasons import JoinsPrevious as JoinsPrevious
+from modeler.types.reasons import JoinsSegments as JoinsSegments
 from modeler.types.reasons import LowEvidence as LowEvidence
 from modeler.types.reasons import LowOverlap as LowOverlap
 from modeler.types.reasons import NearExtrapolation as NearExtrapolation
+from modeler.types.reasons import NotJoined as NotJoined
 from modeler.types.reasons import NotPlaced as NotPlaced
 from modeler.types.reasons import OpenRotation as OpenRotation
 from modeler.types.reasons import OptimisationOutlier as OptimisationOutlier
@@ -54,6 +57,7 @@ from modeler.types.solution import joined_without as joined_without
 from modeler.types.solution import loop_opening as loop_opening
 from modeler.types.solution import loop_openings as loop_openings
 from modeler.types.solution import loops_closed as loops_closed
+from modeler.types.solution import segments as segments
 from modeler.types.views import Camera as Camera
 from modeler.types.views import Frame as Frame
 from modeler.types.views import Plane as Plane

@@ -45,6 +45,32 @@ class Relocalised:
 
 
 @dataclass(frozen=True)
+class JoinsSegments:
+    """The edge joins two segments, between which nothing is known of the motion."""
+
+    share: float
+    """Probability (0..1) that the segments lie on each other so, among all ways that were found."""
+    rival_deg: float
+    """Rotation in degrees to the likeliest other way."""
+
+
+@dataclass(frozen=True)
+class ElsewhereThanSegments:
+    """The registration contradicts the way in which the segments lie on each other."""
+
+    angle_deg: float
+    """Rotation between the two."""
+
+
+@dataclass(frozen=True)
+class NotJoined:
+    """The frame belongs to a segment that nothing joins with the rest."""
+
+    views: int
+    """Number of the segment's."""
+
+
+@dataclass(frozen=True)
 class Failed:
     """The attempt ended without a posterior or a view to go on with."""
 
@@ -130,6 +156,9 @@ class Stated:
 Reason: TypeAlias = (
     JoinsPrevious
     | Relocalised
+    | JoinsSegments
+    | ElsewhereThanSegments
+    | NotJoined
     | Failed
     | PriorRefused
     | Degenerate
@@ -180,6 +209,13 @@ def summary(reason: Reason) -> str:
             return f"joins the previous view: {outcome.label}, overlap {overlap:.2f}{_supported(support)}"
         case Relocalised(overlap, support):
             return f"joins in place of the failed previous view: overlap {overlap:.2f}{_supported(support)}"
+        case JoinsSegments(share, rival_deg):
+            rival = f", else turned by {rival_deg:.0f}°" if share < 1.0 else ""
+            return f"joins two segments, with a probability of {100.0 * share:.3g} %{rival}"
+        case NotJoined(views):
+            return f"fits {views - 1} other frames that were left out, but nothing tells how these lie on the others"
+        case ElsewhereThanSegments(angle_deg):
+            return f"contradicts how the models of the two segments lie on each other, by {angle_deg:.0f}°"
         case Failed(outcome):
             return outcome.label
         case PriorRefused(message):

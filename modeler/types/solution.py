@@ -18,9 +18,10 @@ from modeler.types.chains import Chains
 from modeler.types.posteriors import PoseGaussian, Posterior
 from modeler.types.reasons import Reason
 
-EdgeKind = Literal["odometry", "closure", "span"]
-"""What an edge is for: to place a frame, to close a loop with a view that the object had turned away from, or to span
-several steps between frames that others placed."""
+EdgeKind = Literal["odometry", "closure", "span", "join"]
+"""What an edge is for: to place a frame, to close a loop with a view that the object had turned away from, to span
+several steps between frames that others placed, or to join two segments, between which nothing is known of the motion:
+the object was put down otherwise, or a hand took it anew."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +115,21 @@ def loops_closed(edges: Sequence[Edge]) -> int:
         return 0
     ends = _ends(edges)
     return int(closures.sum()) - (_parts(ends[~closures], ends) - _parts(ends, ends))
+
+
+def segments(edges: Sequence[Edge]) -> dict[int, int]:
+    """Return the number of its segment for each frame of edges: frames that are connected without joins are in one.
+
+    Args:
+        edges: those that take part.
+    """
+    ends = _ends(edges)
+    frames, indices = np.unique(ends, return_inverse=True)
+    indices = indices.reshape(-1, 2)[np.array([edge.kind != "join" for edge in edges], dtype=bool)]
+    ones = np.ones(len(indices), dtype=np.int8)
+    count = len(frames)
+    labels = connected_components(coo_array((ones, (indices[:, 0], indices[:, 1])), (count, count)), directed=False)[1]
+    return dict(zip(frames.tolist(), labels.tolist(), strict=True))
 
 
 def joined_without(edge: Edge, edges: Sequence[Edge]) -> bool:

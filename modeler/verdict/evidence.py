@@ -11,7 +11,17 @@ from scipy import ndimage
 from scipy.special import chdtri, ndtri
 
 from modeler import se3
-from modeler.types import AbstractPrior, Array, BoolArray, Edge, InputError, LoopOpening, RayImage, Solution
+from modeler.types import (
+    AbstractPrior,
+    Array,
+    BoolArray,
+    Edge,
+    InputError,
+    JoinsSegments,
+    LoopOpening,
+    RayImage,
+    Solution,
+)
 
 MAX_UNSURE: Final = 0.5
 """Share of frames with an unsure mask: beyond, the rule and not the exception is unsure, and what moves together with
@@ -101,7 +111,7 @@ def prior_distances(
     """Return edges with the distances Δ, in nats, from the prior's mode to the means of their posteriors.
 
     Limits of a search, outside of which a density is zero, are those for several steps: motions beyond the limits of
-    one are looked for there. Edges to which the prior does not apply are left out.
+    one are looked for there. Edges to which the prior does not apply are left out, and those between segments.
 
     Args:
         edges: those that take part.
@@ -110,7 +120,7 @@ def prior_distances(
     """
     found = []
     for edge in edges:
-        if edge.source not in views or edge.target not in views:
+        if edge.kind == "join" or edge.source not in views or edge.target not in views:
             continue
         source, target = views[edge.source], views[edge.target]
         try:
@@ -190,7 +200,8 @@ def graph_figure(edges: Sequence[Edge], solution: Solution) -> Figure | None:
 def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage]) -> Figure:
     """Return the probability that some pair is at another mode than the heaviest, by the weights that the graph leaves.
 
-    Modes that differ by less than what is called an error are one.
+    So it is where two segments may lie on each other in another way. Modes that differ by less than what is called an
+    error are one.
 
     Args:
         edges: those that take part.
@@ -211,6 +222,8 @@ def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, R
             for mode in modes
         ]
         settled *= float(np.sum(np.asarray(weights)[alike]) / np.sum(weights))
+    for share in {edge.reason.share for edge in edges if isinstance(edge.reason, JoinsSegments)}:
+        settled *= share
     return Figure(1.0 - settled, MAX_OTHER_MODE)
 
 

@@ -26,6 +26,7 @@ from modeler.types import (
     joined_without,
     loop_openings,
     loops_closed,
+    segments,
 )
 from modeler.verdict.evidence import (
     MAX_UNSURE,
@@ -128,15 +129,16 @@ def judged(
         reasons.append(Shortcoming("interrupted", f"the run was interrupted after frame {step.frame.index}"))
     elif not step.last:
         reasons.append(Shortcoming("unfinished", "the run has not finished"))
-    reasons += [Shortcoming("left_out", words) for words in _left_out(frames)]
     if sum(frame.accepted for frame in frames) < 2:
         words = "fewer than two frames were accepted: there is nothing to align"
         reasons.append(Shortcoming("too_few_frames", words))
     edges = [edge for edge in step.edges_so_far if step.solution.takes_part(edge)]
+    reasons += [Shortcoming("left_out", words) for words in _left_out(frames, segments(edges))]
     found = _found(step, frames, edges, prior) if step.last else []
     reasons += _against(found)
     reasons += _open_loop(step, edges, closure_expected=closure_expected)
     reasons += _little_overlap(edges)
+    reasons += _unconfirmed_join(edges)
     spreads = [*_spreads(step, edges), *_size(step, depth_scale_sigma)] if step.last else []
     reasons += _against(spreads)
     return Verdict(tuple(reasons), {finding.name: finding.figure for finding in (*found, *spreads)})
@@ -250,15 +252,35 @@ def _size(step: Step, depth_scale_sigma: float) -> list[_Finding]:
     return [_Finding("size_m", figure, "unsure_size", words)]
 
 
-def _left_out(frames: Sequence[FrameRecord]) -> list[str]:
-    """Return in words which frames were left out and why, those that follow each other for one reason together."""
-    words = []
-    for outcome, together in itertools.groupby(sorted(frames, key=lambda frame: frame.id), key=lambda f: f.outcome):
+def _left_out(frames: Sequence[FrameRecord], segment_of: Mapping[int, int]) -> list[str]:
+    """Return in words which frames were left out and why, those that follow each other for one reason together.
+
+    Not those between two segments: what is seen there is the object in a hand that puts it down otherwise, if at all.
+
+    Args:
+        frames: what became of each.
+        segment_of: number of its segment by frame number.
+    """
+    words, ordered = [], sorted(frames, key=lambda frame: frame.id)
+    before = list(itertools.accumulate((segment_of.get(frame.id) for frame in ordered), _latest))
+    after = list(itertools.accumulate((segment_of.get(frame.id) for frame in reversed(ordered)), _latest))[::-1]
+    between = {
+        frame.id
+        for frame, one, other in zip(ordered, before, after, strict=True)
+        if not frame.accepted and None not in (one, other) and one != other
+    }
+    counted = [frame for frame in ordered if frame.id not in between]
+    for outcome, together in itertools.groupby(counted, key=lambda frame: frame.outcome):
         ids = [frame.id for frame in together]
         if outcome != ACCEPTED:
             which = f"frame {ids[0]} was" if len(ids) == 1 else f"frames {ids[0]} to {ids[-1]} were"
             words.append(f"{which} left out: {outcome}")
     return words
+
+
+def _latest(before: int | None, now: int | None) -> int | None:
+    """Return the newest number of a segment."""
+    return before if now is None else now
 
 
 def _open_loop(step: Step, edges: Sequence[Edge], *, closure_expected: bool) -> list[Shortcoming]:
@@ -286,12 +308,20 @@ def _open_loop(step: Step, edges: Sequence[Edge], *, closure_expected: bool) -> 
     if closure_expected:
         words = "the object never came back to an earlier view, so that no loop was closed"
         return [Shortcoming("never_came_back", words)]
-    back = None if closures else _came_back(step.solution)
+    joins = any(edge.kind == "join" for edge in edges)
+    back = None if closures or joins else _came_back(step.solution)
     if back is not None:
         frame, first = back
         words = f"frame {frame} shows the object from the side of frame {first} again, and no loop was tried"
         return [Shortcoming("not_tried", words)]
     return []
+
+
+def _unconfirmed_join(edges: Sequence[Edge]) -> list[Shortcoming]:
+    """Return that segments are joined by a single pair of views, where they are."""
+    alone = [edge for edge in edges if edge.kind == "join" and not joined_without(edge, edges)]
+    words = "what joins frames {} and {}, of two segments, is confirmed by no other pair of views"
+    return [Shortcoming("unconfirmed", words.format(edge.target, edge.source)) for edge in alone[:1]]
 
 
 def _tells(edge: Edge, solution: Solution) -> bool:

@@ -28,6 +28,7 @@ _TERMS: Final = {
     "odometry": "to the previous frame; this is how a frame gets its first pose",
     "span": "over several frames, to make their poses more precise",
     "closure": "to a view that the object had turned away from; it closes the loop",
+    "join": "between two segments, such as views before and after the object was put down otherwise",
     "converged": "one narrow pose explains both images; other outcomes say what is wrong, and what to do",
     "rejected": "did not join the pose graph, for the reason written below it",
     "rotation sd, translation sd": "standard deviation along the least certain axis, at the object's centre",

@@ -96,7 +96,12 @@ def uncertainty(result: Result, centre_m: Array) -> bytes:
             (of_translation, [sd.translation_mm for sd in spread]),
         ):
             axis.plot(frames, values, ".-", color=colour, linewidth=1.4, label=f"sd of the pose, {label}")
-    for kind, colour, marker in (("odometry", ODOMETRY, "o"), ("span", ODOMETRY, "^"), ("closure", CLOSURE, "D")):
+    for kind, colour, marker in (
+        ("odometry", ODOMETRY, "o"),
+        ("span", ODOMETRY, "^"),
+        ("closure", CLOSURE, "D"),
+        ("join", CLOSURE, "s"),
+    ):
         edges = [e for e in result.edges if e.kind == kind and e.accepted and e.source in result.poses]
         if edges:
             own = [sd_of(e.posterior.pose, _seen_m(result, e.source, centre_m)) for e in edges]

@@ -1,0 +1,147 @@
+"""An object that is put down otherwise on the way: its segments are found, joined and judged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import tabletop
+from trust.plan import coarser
+
+from modeler import se3
+from modeler.closure import Closer, MapView
+from modeler.evaluation import rotation_error_deg, true_motion
+from modeler.graph import PoseGraph, solve
+from modeler.graph.axis import steps_of
+from modeler.graph.pose_graph import Factor
+from modeler.pipeline import Modeler
+from modeler.pipeline.joining import Alignment, Joiner, Segment
+from modeler.priors import TablePrior
+from modeler.rays import Sensor
+from modeler.segmentation import Scene
+from modeler.types import (
+    Array,
+    Edge,
+    EdgeKind,
+    JoinsSegments,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    Solution,
+    Stated,
+    Step,
+    segments,
+)
+from modeler.verdict.evidence import other_modes
+from sequences.rendering.depth_sensor import DepthSensor
+from sequences.rendering.recipe import Recipe, Table, TurnedOver, Viewpoint
+from sequences.rendering.renderer import RenderedSequence
+from sequences.rendering.shapes import Box, Capsule, Compound, Part, Sphere
+from sequences.rendering.trajectory import Tabletop
+
+LOPSIDED = Compound(
+    (
+        Part(Box((0.09, 0.06, 0.04))),
+        Part(Sphere(0.022), offset_m=(0.03, 0.01, 0.03)),
+        Part(Capsule(0.01, 0.06), offset_m=(-0.03, -0.02, 0.03), rotation_deg=(30.0, 0.0, 20.0)),
+    )
+)
+POSTURE = 4
+"""Frames of each posture."""
+RECIPE = Recipe(
+    LOPSIDED,
+    "lopsided",
+    3,
+    turned_over=TurnedOver(POSTURE, (-90.0, 0.0, 0.0)),
+    view=Viewpoint(200, 150, 260.0, 0.55, look_height_m=0.03),
+    table=Table((0.5, 0.5)),
+    sensor=coarser(DepthSensor(), 0.5),
+    trajectory=Tabletop(2 * POSTURE, 25.0, 1.0, shift_m=0.005),
+)
+
+
+def edge(source: int, target: int, kind: EdgeKind = "odometry", pose: Array | None = None) -> Edge:
+    gaussian = PoseGaussian(np.eye(4) if pose is None else pose, 1e-6 * np.eye(6))
+    return Edge(Posterior(source, target, gaussian, Outcome.CONVERGED, overlap=0.8), kind, True, Stated("made up"))
+
+
+def test_a_recipe_puts_the_object_down_otherwise_and_it_stands_on_the_table() -> None:
+    sequence = RenderedSequence(RECIPE)
+    table_from_camera = se3.inverse(RECIPE.view.camera_from_table())
+    tops = []
+    for index, pose in sequence.truth().items():
+        standing = se3.transform(table_from_camera @ pose, RECIPE.object.mesh().vertices_m)
+        assert abs(standing[:, 2].min()) < 1e-9, index
+        tops.append(standing[:, 2].max())
+    np.testing.assert_allclose(tops[:POSTURE], tops[0])
+    np.testing.assert_allclose(tops[POSTURE:], tops[-1])
+    assert abs(tops[0] - tops[-1]) > 0.005
+
+
+def test_both_postures_make_one_model_and_the_table_ties_neither_to_the_other() -> None:
+    sequence = RenderedSequence(RECIPE)
+    modeler = Modeler(prior=TablePrior(), sensor=Sensor(*sequence.sensor()), closer=Closer(max_relocations=0))
+    steps = [event for event in modeler.run(sequence, Scene()) if isinstance(event, Step)]
+    last, truth = steps[-1], sequence.truth()
+    lost = {step.frame.index for step in steps if step.left_out is not None}
+    assert lost == set(range(POSTURE, 2 * POSTURE))  # at first
+    assert {step.frame.index for step in steps if step.accepted} == set(truth)
+    for frame, pose in last.solution.trajectory.items():
+        assert rotation_error_deg(pose, true_motion(truth, 0, frame)) < 3.0
+    segment_of = segments([one for one in last.edges_so_far if last.solution.takes_part(one)])
+    assert [segment_of[frame] for frame in range(2 * POSTURE)] == POSTURE * [0] + POSTURE * [1]
+    joins = [one for one in last.edges_so_far if one.kind == "join" and last.solution.takes_part(one)]
+    assert len(joins) >= 2
+    assert other_modes(joins, last.solution, last.views).value < 1e-3
+
+
+def test_a_brick_may_lie_either_way_round_and_that_is_said() -> None:
+    poses = tabletop.turntable(6)
+    sensor = Sensor(1e-3, 1e-3)
+    views = {k: sensor.ray_image(view.frame) for k, view in tabletop.views(tabletop.BRICK, poses).items()}
+    moved = {k + 6: shifted(view, k + 6) for k, view in views.items()}
+    one, other = tabletop.trajectory(poses), {k + 6: pose for k, pose in tabletop.trajectory(poses).items()}
+    halfway = se3.exp(np.array([0.0, 0.0, np.pi, 0.0, 0.0, 0.0]))
+    quarter = se3.exp(np.array([0.0, 0.0, 0.5 * np.pi, 0.0, 0.0, 0.0]))
+    ways = [Alignment(pose) for pose in (quarter, np.eye(4), halfway)]
+    parts = Segment(views, Solution(one), ()), Segment(moved, Solution(other), ())
+    found = Joiner().weighed(*parts, ways)
+    assert [Joiner().stands(*parts, way) for way in found] == [True, True, False]
+    assert 0.05 < found[0].share < 0.95
+    assert found[1].share > 0.05
+    assert found[2].share < 1e-6
+    np.testing.assert_array_equal(found[2].target_from_source, quarter)
+    why = JoinsSegments(found[0].share, 180.0)
+    joins = [replace(edge(6, 0, "join"), reason=why), replace(edge(7, 1, "join"), reason=why)]
+    assert not other_modes(joins, Solution(), {}).holds
+
+
+def shifted(view: RayImage, index: int) -> RayImage:
+    return replace(view, frame=replace(view.frame, index=index))
+
+
+def test_segments_are_what_hangs_together_without_joins() -> None:
+    edges = [edge(1, 0), edge(2, 1), edge(6, 5), edge(5, 2, "join"), edge(6, 0, "join")]
+    found = segments(edges)
+    assert found[0] == found[1] == found[2] != found[5] == found[6]
+    factors = [Factor(one, one.posterior.pose) for one in edges]
+    assert steps_of(factors, found) == [(0, 1), (1, 2), (5, 6)]
+
+
+def test_spans_stay_within_a_segment() -> None:
+    turns_deg = [0.0, 25.0, 50.0, 75.0, 5.0, 30.0, 55.0, 80.0]
+    poses = tabletop.turntable(72)
+    views = {k: tabletop.view(tabletop.BRICK, poses[int(turn / 5.0)], k) for k, turn in enumerate(turns_deg)}
+    truth = {k: se3.inverse(poses[int(turn / 5.0)]) for k, turn in enumerate(turns_deg)}
+    base = se3.inverse(truth[0])
+
+    def between(source: int, target: int, kind: EdgeKind = "odometry") -> Edge:
+        return edge(source, target, kind, se3.inverse(truth[target]) @ truth[source])
+
+    chain = [between(k, k - 1) for k in (1, 2, 3, 5, 6, 7)]
+    edges = (*chain, between(4, 0, "join"), between(5, 1, "join"))
+    solution = solve(PoseGraph(edges, first=0), {k: base @ pose for k, pose in truth.items()})
+    pairs = Closer().span_pairs(MapView(views, solution, edges))
+    assert pairs
+    assert all((source < 4) == (target < 4) for source, target in pairs)
