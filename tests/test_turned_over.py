@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import tabletop
+from scipy.spatial.transform import Rotation
 from trust.plan import coarser
 
 from modeler import se3
@@ -145,3 +146,15 @@ def test_spans_stay_within_a_segment() -> None:
     pairs = Closer().span_pairs(MapView(views, solution, edges))
     assert pairs
     assert all((source < 4) == (target < 4) for source, target in pairs)
+
+
+def test_postures_of_the_study_rest_on_the_table() -> None:
+    from turned_over.plan import Plan
+
+    stage = Plan("tuning", 0).stage()
+    assert stage.recipe.turned_over is not None
+    before, after = (
+        Rotation.from_euler("xyz", turns, degrees=True).as_matrix()
+        for turns in (stage.recipe.rest_rotation_deg, stage.recipe.turned_over.rest_rotation_deg)
+    )
+    assert np.degrees(np.arccos(np.clip(before[2] @ after[2], -1.0, 1.0))) > 59.0
