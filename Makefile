@@ -7,13 +7,14 @@
 # make ablation   what each stage and each constant of the default registration is worth (many hours)
 # make bench      speed, against Open3D and the committed baseline
 # make bench-gpu  speed on an NVIDIA GPU, against the CPU of the same machine
+# make scale      200 small sequences by a batch of two workers, beside single builds (some 15 minutes)
 # make same       COMMIT=…: whether the results are those of another commit, byte by byte
 # make audit      locked packages against published advisories, where these can be reached
 
 BIN := .venv/bin
 TWO := -n 2 --dist loadfile  # processes; kernels have threads of their own
 
-.PHONY: setup demo test test-slow calibrate trust ablation bench bench-gpu same audit
+.PHONY: setup demo test test-slow calibrate trust ablation bench bench-gpu scale same audit
 
 setup: .venv/.installed
 
@@ -55,6 +56,9 @@ bench: setup
 
 bench-gpu: setup
 	$(BIN)/python tests/bench/gpu.py
+
+scale: setup
+	PYTHONPATH=tests $(BIN)/python -m scale builds runs/scale
 
 same: setup
 	PYTHONPATH=tests $(BIN)/python -m same_bytes $(COMMIT)
