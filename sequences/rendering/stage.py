@@ -47,26 +47,28 @@ class Stage:
         """Return the stage after a motion (4, 4) of the object in the camera's coordinates."""
         camera_from_table = self.recipe.view.camera_from_table()
         motion = se3.inverse(camera_from_table) @ new_from_last @ camera_from_table
-        return replace(self, poses=(*self.poses, _place(motion @ _matrix(self.poses[-1]))))
+        return replace(self, poses=(*self.poses, place_of(motion @ matrix_of(self.poses[-1]))))
 
     def moved_on_table(self, turn_deg: float, shift_m: tuple[float, float]) -> Stage:
         """Return the stage after a turn about the object's own upright axis and a shift on the table, in m."""
-        pose = _matrix(self.poses[-1])
+        pose = matrix_of(self.poses[-1])
         turn = np.eye(4)
         turn[:3, :3] = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
         moved = pose.copy()
         moved[:3, :3] = turn[:3, :3] @ pose[:3, :3]
         moved[:2, 3] += shift_m
-        return replace(self, poses=(*self.poses, _place(moved)))
+        return replace(self, poses=(*self.poses, place_of(moved)))
 
 
-def _matrix(place: Place) -> Array:
+def matrix_of(place: Place) -> Array:
+    """Return the pose (4, 4) of a place."""
     pose = se3.translation(np.array(place.offset_m))
     pose[:3, :3] = Rotation.from_euler("xyz", place.rotation_deg, degrees=True).as_matrix()
     return pose
 
 
-def _place(pose: Array) -> Place:
+def place_of(pose: Array) -> Place:
+    """Return the place of a pose (4, 4)."""
     x, y, z = (float(value) for value in pose[:3, 3])
     a, b, c = (float(value) for value in Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", degrees=True))
     return Place((x, y, z), (a, b, c))

@@ -19,7 +19,8 @@ from modeler.types import BoolArray, Step
 from scenes.plan import arm, reach_m, thing
 from sequences.rendering.recipe import Recipe
 from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.shapes import Box, Compound, Part
+from sequences.rendering.shapes import Box, Compound, Part, placement
+from sequences.rendering.stage import matrix_of, place_of
 from sequences.rendering.trajectory import Place, Places, Tabletop
 
 Holder = Literal["arm", "gripper"]
@@ -69,7 +70,7 @@ def stage(shape: str, holder: Holder, told: Told) -> Stage:
     if holder == "arm":
         hidden = arm(object_alone, rng, shown=range(FRAMES))
     else:
-        hidden = replace(object_alone, others=(_gripper(recipe, places),))
+        hidden = replace(object_alone, others=(gripper(recipe, places),))
     with_hand = told == "masks with hand"
     shown = told in {"masks and hand", "hand"}
     return replace(
@@ -111,18 +112,18 @@ def _count(mask: BoolArray) -> int:
     return int(np.count_nonzero(mask))
 
 
-def _gripper(recipe: Recipe, places: Sequence[Place]) -> Recipe:
-    """Return two fingers and a palm that hold the object from above by its narrow sides, and turn with it."""
+def gripper(recipe: Recipe, places: Sequence[Place], width_m: float = 0.03) -> Recipe:
+    """Return two fingers so wide and a palm that hold the object from above by its narrow sides, and turn with it."""
     x_m, y_m, height_m = reach_m(recipe)
     narrow_m, thick_m = min(x_m, y_m), 0.012
     lowest_m = 0.35 * height_m
-    finger = Box((0.03, thick_m, 1.2 * height_m - lowest_m))
+    finger = Box((width_m, thick_m, 1.2 * height_m - lowest_m))
     palm = Box((0.05, 2.0 * (narrow_m + thick_m), 0.03))
     up_m = 0.5 * (1.2 * height_m - lowest_m)
     parts = tuple(Part(finger, (0.0, side * (narrow_m + 0.5 * thick_m), up_m)) for side in (-1.0, 1.0))
     parts += (Part(palm, (0.0, 0.0, 2.0 * up_m + 0.015)),)
-    turn_deg = 0.0 if y_m <= x_m else 90.0
-    held = [Place((*p.offset_m[:2], lowest_m), (0.0, 0.0, p.rotation_deg[2] + turn_deg)) for p in places]
+    grasp = placement((0.0, 0.0, lowest_m), (0.0, 0.0, 0.0 if y_m <= x_m else 90.0))
+    held = [place_of(matrix_of(place) @ grasp) for place in places]
     return thing(recipe, Compound(parts), held)
 
 

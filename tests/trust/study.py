@@ -187,8 +187,10 @@ def _centroid_m(frame: Frame, mask: BoolArray) -> Array:
     return np.stack([w[measured] * depth_m, h[measured] * depth_m, depth_m], axis=1).mean(axis=0)
 
 
-def f_score(recorded: Recorded, model: ObjectModel, trajectory: Mapping[int, Array]) -> float | None:
-    """Return the F-score at `MAX_M` of a mesh against what the frames saw of the object.
+def f_score(
+    recorded: Recorded, model: ObjectModel, trajectory: Mapping[int, Array], within_m: float = MAX_M
+) -> float | None:
+    """Return the F-score at a distance of a mesh against what the frames saw of the object.
 
     The mesh is laid on the true surface by its poses, or nearer by iterated closest points: whoever uses it has no
     frames that say where it belongs.
@@ -207,7 +209,7 @@ def f_score(recorded: Recorded, model: ObjectModel, trajectory: Mapping[int, Arr
     for model_from_object in (placed, _nearer(placed, model.vertices_m, surface.points_m)):
         vertices_m = se3.transform(model_from_object, model.vertices_m)
         errors = surface_errors(vertices_m, model.triangles, surface, np.random.default_rng(0))
-        scores.append(errors.over(seen).f_score(MAX_M))
+        scores.append(errors.over(seen).f_score(within_m))
     return max(scores)
 
 
