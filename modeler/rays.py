@@ -9,7 +9,7 @@ import numpy as np
 
 from modeler.kernels import planes
 from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
-from modeler.types import BoolArray, Frame, Plane, RayImage
+from modeler.types import COLOUR_SHIFT_PX, BoolArray, Frame, Plane, RayImage
 
 _ALIKE = 3.0  # areas of correlated noise that err alike: measured, see method.md
 
@@ -22,6 +22,9 @@ class Sensor:
     """Lateral noise in (w, h); the paper's value for the first Kinect."""
     sigma_r_m: float = 0.002
     """Noise along the ray in m, for a surface that faces the camera."""
+    sigma_colour_px: float = COLOUR_SHIFT_PX
+    """Shift of colours beside depth from one image to the next, in px: they are aligned so well at best, and may be
+    taken at another moment."""
     smoothing: float = 0.28
     """Radius of the ball in which planes are fitted, as a share of the geometric mean of noise and object's extent.
 
@@ -96,6 +99,7 @@ class Sensor:
             plane=plane,
             sigma_wh=self.sigma_wh,
             sigma_r_m=self.sigma_r_m,
+            sigma_colour_px=self.sigma_colour_px,
             points_m=points_m,
             normals=normals,
             pixels=pixels,

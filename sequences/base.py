@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import final
 
-from modeler.types import Array, Frame, InputError
+from modeler.types import Array, Frame, InputError, SensorNoise
 
 
 class AbstractSequence(ABC):
@@ -47,8 +47,8 @@ class AbstractSequence(ABC):
         """
 
     @abstractmethod
-    def sensor(self) -> tuple[float, float] | None:
-        """Return the sensor's noise `(sigma_wh, sigma_r_m)`; None where the sequence does not say."""
+    def sensor(self) -> SensorNoise | None:
+        """Return the noise of its camera; None where the sequence does not say."""
 
     @property
     @abstractmethod
@@ -152,8 +152,8 @@ class AbstractDerived(AbstractSequence):
         """Return the true camera_from_model (4, 4) by frame number; None where it is not known."""
         return self.whole.truth()
 
-    def sensor(self) -> tuple[float, float] | None:
-        """Return the sensor's noise `(sigma_wh, sigma_r_m)`; None where the sequence does not say."""
+    def sensor(self) -> SensorNoise | None:
+        """Return the noise of its camera; None where the sequence does not say."""
         return self.whole.sensor()
 
     @property

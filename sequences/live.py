@@ -13,7 +13,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types import Array, Camera, Frame, InputError
+from modeler.types import Array, Camera, Frame, InputError, SensorNoise
 from sequences.base import AbstractSequence, check_every, span
 from sequences.image_files import metres
 from sequences.intrinsics import Overrides
@@ -119,7 +119,7 @@ class LiveSequence(AbstractSequence):
         """Return None: a camera does not know."""
         return None
 
-    def sensor(self) -> tuple[float, float] | None:
+    def sensor(self) -> SensorNoise | None:
         """Return None: a camera does not say."""
         return None
 

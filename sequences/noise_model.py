@@ -11,7 +11,7 @@ from typing import final
 
 import numpy as np
 
-from modeler.types import Array, Frame
+from modeler.types import COLOUR_SHIFT_PX, Array, Frame, SensorNoise
 from sequences.base import AbstractDerived
 from sequences.input_files import Node, read_tree
 
@@ -117,9 +117,11 @@ class CalibratedSequence(AbstractDerived):
     noise: NoiseModel
     """The camera's noise."""
 
-    def sensor(self) -> tuple[float, float]:
-        """Return the noise `(sigma_wh, sigma_r_m)` at the distance of the object in the first frame."""
-        return self._at_object
+    def sensor(self) -> SensorNoise:
+        """Return the noise at the distance of the object in the first frame."""
+        said = self.whole.sensor()
+        shift_px = COLOUR_SHIFT_PX if said is None else said.sigma_colour_px
+        return SensorNoise(*self._at_object, shift_px)
 
     def select(self, every: int = 1, frames: slice | None = None) -> CalibratedSequence:
         """Return a part of the sequence."""

@@ -12,7 +12,7 @@ from typing import Generic, TypeVar, final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types import Array, Frame, InputError
+from modeler.types import COLOUR_SHIFT_PX, Array, Frame, InputError, SensorNoise
 from sequences.base import AbstractSequence, span
 from sequences.input_files import Node, is_there, read_tree
 from sequences.lens import Lens
@@ -40,12 +40,17 @@ class AbstractRecording(AbstractSequence):
         """The folder or the file."""
         return (self.path,)
 
-    def sensor(self) -> tuple[float, float] | None:
-        """Return `(sigma_wh, sigma_r_m)` from `sequence.json`; None where it does not say."""
+    def sensor(self) -> SensorNoise | None:
+        """Return the noise of the camera from `sequence.json`; None where it does not say."""
         node = None if self._meta is None else self._meta.get("sensor")
         if node is None:
             return None
-        return node.need("sigma_wh").number(1e-9, 1.0), node.need("sigma_r_m").number(1e-9, 10.0)
+        shift = node.get("sigma_colour_px")
+        return SensorNoise(
+            node.need("sigma_wh").number(1e-9, 1.0),
+            node.need("sigma_r_m").number(1e-9, 10.0),
+            COLOUR_SHIFT_PX if shift is None else shift.number(0.0, 100.0),
+        )
 
     @property
     def motion(self) -> Mapping[str, object] | None:

@@ -20,6 +20,7 @@ from modeler.types import (
     PoseGaussian,
     Posterior,
     RayImage,
+    SensorNoise,
 )
 
 BODY = tabletop.Box((0.05, 0.08, 0.035))
@@ -43,8 +44,8 @@ class Recording:
     def truth(self) -> Mapping[int, Array] | None:
         return POSES if self.known else None
 
-    def sensor(self) -> tuple[float, float] | None:
-        return 0.002, 0.001
+    def sensor(self) -> SensorNoise | None:
+        return SensorNoise(0.002, 0.001)
 
 
 @dataclass(frozen=True)

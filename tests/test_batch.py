@@ -144,8 +144,8 @@ def test_rows_of_a_manifest_have_options_of_their_own(cli: Run, tmp_path: Path) 
     path = manifest(
         tmp_path,
         "sequence,name,prior,step_deg,roi,colour\n"
-        f"{tmp_path / 'a'},cup,turntable,-24,1 2 3 4,yes\n"
-        f"{tmp_path / 'b'},,,,,no\n",
+        f"{tmp_path / 'a'},cup,turntable,-24,1 2 3 4,no\n"
+        f"{tmp_path / 'b'},,,,,yes\n",
     )
     assert cli("batch", "--manifest", path, "--out", tmp_path / "out", "--prior", "table").status == 0
     notes = {note.stem: json.loads(note.read_text()) for note in (tmp_path / "out" / NOTES).glob("*.json")}
@@ -154,7 +154,7 @@ def test_rows_of_a_manifest_have_options_of_their_own(cli: Run, tmp_path: Path) 
     build = parsed(["build", "S", "--out", "R", *notes["cup"]["arguments"]])
     settings = build.settings()  # type: ignore[union-attr]
     assert build.prior.prior == "turntable"  # type: ignore[union-attr]
-    assert (settings["step_deg"], settings["roi"], settings["colour"]) == (-24.0, (1, 2, 3, 4), True)
+    assert (settings["step_deg"], settings["roi"], settings["colour"]) == (-24.0, (1, 2, 3, 4), False)
 
 
 FAULTS = {

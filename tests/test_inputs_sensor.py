@@ -116,13 +116,14 @@ def test_what_is_stored_is_what_is_used(
     )
     noise = open_sequence(tmp_path / "b").sensor()
     box = open_sequence(bundled("box"))
-    assert noise == pytest.approx(stored.at(object_distance_m(box.frame(0))))
+    assert noise is not None
+    assert noise[:2] == pytest.approx(stored.at(object_distance_m(box.frame(0))))
 
 
 def test_a_sequence_takes_the_noise_that_was_measured() -> None:
     whole = open_sequence(bundled("box"))
     sensed = CalibratedSequence(whole, MODEL)
-    assert sensed.sensor() == MODEL.at(object_distance_m(whole.frame(0)))
+    assert sensed.sensor()[:2] == MODEL.at(object_distance_m(whole.frame(0)))
     part = sensed.select(every=5)
     assert part.indices == (0, 5, 10)
     assert part.sensor() == sensed.sensor()

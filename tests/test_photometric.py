@@ -163,6 +163,29 @@ def test_a_label_tells_the_spin_that_depth_leaves_open(printed):
     assert rotation_error_deg(both, truth) < 3.0 * sigma_deg
 
 
+def test_a_shift_of_colours_is_eliminated(rng):
+    root, shifts = rng.normal(size=(6, 6)), rng.normal(size=(6, 2))
+    information = root @ root.T
+    marginal = colours.unshifted(information, shifts) @ information
+    np.testing.assert_allclose(np.linalg.inv(marginal), np.linalg.inv(information) + shifts @ shifts.T, rtol=1e-8)
+
+
+def test_a_shift_of_colours_widens_the_spin_and_does_not_mislead(printed):
+    views, truth = printed
+    shift_px = 0.7
+    loose = [replace(view, sigma_colour_px=shift_px) for view in views]
+    colour = loose[1].frame.colour
+    assert colour is not None
+    moved = np.stack(
+        [ndimage.shift(colour[..., k], (0.0, shift_px), order=1, mode="nearest") for k in range(3)], axis=-1
+    )
+    loose[1] = replace(loose[1], frame=replace(loose[1].frame, colour=moved))
+    aligned, shifted = registered(views, colour=True), registered((loose[0], loose[1]), colour=True)
+    error = se3.difference(truth, shifted.pose.mean, np.zeros(3))
+    assert error @ np.linalg.solve(shifted.pose.covariance, error) / 6.0 < 3.0
+    assert np.trace(shifted.pose.covariance[:3, :3]) > np.trace(aligned.pose.covariance[:3, :3])
+
+
 def test_light_says_nothing_of_the_spin_of_a_plain_tin():
     views, truth = turned("tin-plain")
     posterior = registered(views, colour=True)
@@ -179,10 +202,10 @@ def test_without_colour_pairs_are_what_depth_says(printed):
     np.testing.assert_array_equal(without.pose.covariance, switched_off.pose.covariance)
 
 
-def test_commands_repeat_that_colour_is_compared():
-    build = Build(Path("a"), Path("run"), method=MethodOptions(colour=True))
-    assert build.command({}).endswith("--colour")
-    assert build.settings()["colour"] is True
+def test_commands_repeat_that_colour_is_left_out():
+    build = Build(Path("a"), Path("run"), method=MethodOptions(colour=False))
+    assert build.command({}).endswith("--no-colour")
+    assert build.settings()["colour"] is False
     assert "colour" not in Build(Path("a"), Path("run")).command({})
 
 

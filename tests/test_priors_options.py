@@ -30,7 +30,7 @@ from modeler.priors import (
     TurntablePrior,
     VelocityPrior,
 )
-from modeler.types import Array, Frame
+from modeler.types import Array, Frame, SensorNoise
 from sequences import AbstractSequence, bundled
 
 OWN = """
@@ -76,7 +76,7 @@ class Telling(AbstractSequence):
     def truth(self) -> dict[int, Array] | None:
         return None
 
-    def sensor(self) -> tuple[float, float] | None:
+    def sensor(self) -> SensorNoise | None:
         return None
 
 

@@ -131,7 +131,7 @@ class Build:
         """Return the command line that replaces the run by one with other options, by name without dashes."""
         given = {"prior": self.prior.prior, **self.settings(), "seed": self.method.seed}
         given |= {name: getattr(self.model, name) for name in ("sensor", "camera")}  # named as they were
-        usual = {"every": 1, "frames": ":", "method": "visibility", "colour": False, "seed": 0}
+        usual = {"every": 1, "frames": ":", "method": "visibility", "colour": True, "seed": 0}
         words = {
             name.replace("_", "-"): shlex.join(map(str, value if isinstance(value, tuple) else (value,)))
             for name, value in given.items()
@@ -139,8 +139,8 @@ class Build:
         }
         if changes.get("prior", words.get("prior")) != words.get("prior"):  # whose parameters are its own
             words = {name: value for name, value in words.items() if name.replace("-", "_") not in vars(self.prior)}
-        if "colour" in words:
-            words["colour"] = ""  # a flag
+        if words.pop("colour", None) is not None:
+            words["no-colour"] = ""  # a flag
         options = " ".join(f"--{name} {value}".rstrip() for name, value in {**words, **changes}.items())
         return (
             f"modeler build {shlex.quote(str(self.sequence))} --out {shlex.quote(str(self.out))} --overwrite {options}"

@@ -111,7 +111,7 @@ def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
 
 
 def registrar(
-    method: Method, *, colour: bool = False, device: Literal["cpu", "cuda"] | None = None
+    method: Method, *, colour: bool = True, device: Literal["cpu", "cuda"] | None = None
 ) -> AbstractRegistrar:
     """Return the registration method of a name.
 

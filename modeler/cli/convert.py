@@ -100,7 +100,7 @@ def _meta(sequence: AbstractSequence) -> dict[str, object]:
     meta: dict[str, object] = {"name": sequence.name}
     noise, motion = sequence.sensor(), sequence.motion
     if noise is not None:
-        meta["sensor"] = {"sigma_wh": noise[0], "sigma_r_m": noise[1]}
+        meta["sensor"] = noise._asdict()
     if motion is not None:
         meta["motion"] = dict(motion)
     return meta

@@ -138,12 +138,11 @@ class _Demo:
             done = best.words
             robot = robot.after(best.prediction.candidate, belief, rng)
         sequence = robot.stage.sequence
-        sigma_wh, sigma_r_m = sequence.sensor()
         write_bop(
             self.folder.path.parent / "scene",
             sequence,
             sequence.truth(),
-            {"name": recipe.name, "sensor": {"sigma_wh": sigma_wh, "sigma_r_m": sigma_r_m}, "source": "rendered"},
+            {"name": recipe.name, "sensor": sequence.sensor()._asdict(), "source": "rendered"},
             depth_scale_mm=recipe.depth_unit_mm,
         )
         for _ in run.refine():

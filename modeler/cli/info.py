@@ -66,7 +66,7 @@ def record(sequence: AbstractSequence, found: Survey) -> dict[str, object]:
         "masks": found.masks,
         "colour": found.colours,
         "ground_truth": found.truths,
-        "sensor": None if sensor is None else {"sigma_wh": sensor[0], "sigma_r_m": sensor[1]},
+        "sensor": None if sensor is None else sensor._asdict(),
         "motion": None if motion is None else dict(motion),
         "missing": list(found.missing),
         "notes": [*found.doubts, *sequence.notes],

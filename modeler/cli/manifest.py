@@ -25,6 +25,7 @@ from modeler.types import InputError
 
 _GROUPS = (ModelOptions, PriorOptions, MethodOptions, FrameOptions, ObjectOptions)
 _YES, _NO = ("yes", "true", "1"), ("no", "false", "0")
+_FLAGS = {"colour": ("--no-colour", _NO), "strict-paths": ("--strict-paths", _YES)}  # and the answers that give them
 _LONGEST = 100  # characters of a name; with an ending, a file system takes 255 bytes
 
 
@@ -94,10 +95,11 @@ def _arguments(options: tuple[tuple[str, str], ...], common: tuple[str, ...]) ->
     """
     words: list[str] = []
     for column, cell in options:
-        if column in ("colour", "strict-paths"):
+        if column in _FLAGS:
             if cell.lower() not in (*_YES, *_NO):
                 raise InputError(f"{column} is {cell}; write yes or no")
-            words += [f"--{column}"] * (cell.lower() in _YES)
+            flag, given = _FLAGS[column]
+            words += [flag] * (cell.lower() in given)
         else:
             words += [f"--{column}", *([cell] if column in ("sensor", "camera") else cell.split())]
     return _checked(tuple(words), common)

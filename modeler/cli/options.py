@@ -104,8 +104,8 @@ def as_arguments(options: object) -> tuple[str, ...]:
         value = getattr(options, one.name)
         if value == one.default:
             continue
-        words.append(_flag(one.name))
-        if value is not True:
+        words.append(_flag(one.name if value is not False else f"no_{one.name}"))
+        if not isinstance(value, bool):
             words += [str(part.absolute() if isinstance(part, Path) else part) for part in _parts(value)]
     return tuple(words)
 
@@ -220,8 +220,8 @@ class MethodOptions:
 
     method: Method = "visibility"
     """visibility: ours. paper: Wüthrich et al. 2012. The others are baselines."""
-    colour: bool = False
-    """Compare the colours of matching surface too, where frames have them: for labels on what shape leaves open."""
+    colour: bool = True
+    """Leave colours out: by default those of matching surface are compared too, where frames have them."""
     device: Annotated[Literal["cpu", "cuda"] | None, default("cuda where one is present and pays, else cpu")] = None
     """Where poses are sampled and scored: cuda needs an NVIDIA GPU and the extra gpu (visibility, paper)."""
     seed: Annotated[int, SEED] = 0

@@ -24,6 +24,7 @@ from modeler.types import (
     Outcome,
     Posterior,
     RayImage,
+    SensorNoise,
     Solution,
     Stated,
 )
@@ -53,8 +54,8 @@ class Recorded(Protocol):
         """Return the true camera_from_model (4, 4) by frame number, where it is known."""
         ...
 
-    def sensor(self) -> tuple[float, float] | None:
-        """Return the sensor's noise `(sigma_wh, sigma_r_m)`, where it is known."""
+    def sensor(self) -> SensorNoise | None:
+        """Return the noise of its camera, where it is known."""
         ...
 
 

@@ -159,7 +159,9 @@ class Remembered(AbstractRegistrar):
 def _digest(view: RayImage) -> bytes:
     """Return a digest of a view."""
     frame, digest = view.frame, hashlib.blake2b()
-    digest.update(f"{frame.camera!r} {view.plane!r} {view.sigma_wh!r} {view.sigma_r_m!r}".encode())
+    digest.update(
+        f"{frame.camera!r} {view.plane!r} {view.sigma_wh!r} {view.sigma_r_m!r} {view.sigma_colour_px!r}".encode()
+    )
     for pixels in (frame.depth_m, frame.mask, frame.colour, frame.occluder, view.points_m):
         digest.update(b"none" if pixels is None else np.ascontiguousarray(pixels).tobytes())
     return digest.digest()

@@ -72,11 +72,12 @@ def _iterate(poses, surfaces, colours, weight, centre, surface_m, regulariser, s
 @numba.njit(cache=True)
 def new_workspace(surfaces, colours):
     """Return the buffers of `equations`."""
-    wide = surfaces[0] if surfaces[0].points.shape[1] > surfaces[1].points.shape[1] else surfaces[1]
-    count = wide.points.shape[1]  # colours are compared at some of these points
+    count = 0
+    for direction in range(2):
+        count = max(count, surfaces[direction].points.shape[1], colours[direction].points.shape[1])
     cells, rows = np.empty((CELL_SIZE, count), dtype=np.float32), np.empty((_ROWS, count), dtype=np.float32)
     small = np.empty(12), np.empty(3), np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
-    return buffers(wide), cells, rows, small
+    return buffers(count), cells, rows, small
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")

@@ -118,7 +118,10 @@ def _moments(poses, projections, surface_m2):
     result = np.zeros((poses.shape[0], 4))
     carried = np.empty(12)
     wide = projections[0] if projections[0].values.shape[0] > projections[1].values.shape[0] else projections[1]
-    (transformed, pixels, found), colour = buffers(wide), np.empty((CELL_SIZE, wide.values.shape[0]), dtype=np.float32)
+    (transformed, pixels, found), colour = (
+        buffers(wide.values.shape[0]),
+        np.empty((CELL_SIZE, wide.values.shape[0]), dtype=np.float32),
+    )
     for i in range(poses.shape[0]):
         for direction in range(2):
             projection = projections[direction]
@@ -137,8 +140,9 @@ def _moments(poses, projections, surface_m2):
 
 def no_colour(projection: Projection) -> ColourProjection:
     """Return one direction of views without colour: no points."""
-    none = projection._replace(points=np.ascontiguousarray(projection.points[:, :0]))
-    return ColourProjection(*none, np.zeros(0, dtype=np.float32), np.zeros((1, CELL_SIZE), dtype=np.float32))
+    return ColourProjection(
+        *projection.empty(), np.zeros(0, dtype=np.float32), np.zeros((1, CELL_SIZE), dtype=np.float32)
+    )
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)

@@ -72,6 +72,10 @@ class Projection(NamedTuple):
     cosines: FloatArray
     """(4,) cosines between which f rises from 0 to 1, and g (method.md, eq. 4)."""
 
+    def empty(self) -> "Projection":
+        """Return one without points."""
+        return self._replace(points=np.ascontiguousarray(self.points[:, :0]))
+
 
 @numba.njit(cache=True, forceinline=True)
 def invert(pose, inverse):
@@ -147,9 +151,8 @@ def project(pose, projection, transformed, pixels, looked_up):
 
 
 @numba.njit(cache=True, forceinline=True)
-def buffers(projection):
-    """Return buffers for `project`: transformed points (8, n), pixels (n,), cells (8, n)."""
-    count = projection.points.shape[1]
+def buffers(count):
+    """Return buffers for `project` of n = `count` points: transformed points (8, n), pixels (n,), cells (8, n)."""
     transformed, pixels = np.empty((TRANSFORMED_ROWS, count), dtype=np.float32), np.empty(count, dtype=np.int32)
     return transformed, pixels, np.empty((CELL_SIZE, count), dtype=np.float32)
 
@@ -287,7 +290,7 @@ def _log_likelihoods(poses, projections, parameters):
     result = np.zeros((poses.shape[0], 2))
     carried = np.empty(12)
     wide = projections[0] if projections[0].points.shape[1] > projections[1].points.shape[1] else projections[1]
-    transformed, pixels, looked_up = buffers(wide)
+    transformed, pixels, looked_up = buffers(wide.points.shape[1])
     for i in range(poses.shape[0]):
         for direction in range(2):  # one copy of the code: compiling is slow
             if direction == 0:
@@ -307,7 +310,7 @@ def _log_likelihoods(poses, projections, parameters):
 @numba.njit(cache=True)
 def classify(pose, projection, parameters):
     """Return the class (n,) of each point of a `Projection` under one pose (12,)."""
-    transformed, pixels, looked_up = buffers(projection)
+    transformed, pixels, looked_up = buffers(projection.points.shape[1])
     project(pose, projection, transformed, pixels, looked_up)
     classes = np.zeros(pixels.shape[0], dtype=np.int8)
     for j in range(pixels.shape[0]):
@@ -338,7 +341,7 @@ def residual_excess(pose, projection, blur_m):
         Sum in m² of the squared distances less the variances of point and plane, over the points that face the camera
         and are within `LOOSE_SIGMAS` standard deviations, `blur_m` included; and their number.
     """
-    transformed, pixels, looked_up = buffers(projection)
+    transformed, pixels, looked_up = buffers(projection.points.shape[1])
     project(pose, projection, transformed, pixels, looked_up)
     total, count = 0.0, 0
     for j in range(pixels.shape[0]):

@@ -53,7 +53,7 @@ def matches(pose, projection, surface_m):
         (n, 12): position in m, own normal and normal of the surface there, all in the other camera's frame; distance
         in m in front of that surface; weight in 1/m², 0 where nothing matches; f (0..1).
     """
-    transformed, pixels, cells = buffers(projection)
+    transformed, pixels, cells = buffers(projection.points.shape[1])
     project(pose, projection, transformed, pixels, cells)
     found = np.zeros((pixels.shape[0], 12))
     for j in range(pixels.shape[0]):

@@ -58,8 +58,10 @@ from modeler.types.solution import loop_opening as loop_opening
 from modeler.types.solution import loop_openings as loop_openings
 from modeler.types.solution import loops_closed as loops_closed
 from modeler.types.solution import segments as segments
+from modeler.types.views import COLOUR_SHIFT_PX as COLOUR_SHIFT_PX
 from modeler.types.views import Camera as Camera
 from modeler.types.views import Frame as Frame
 from modeler.types.views import Plane as Plane
 from modeler.types.views import RayImage as RayImage
 from modeler.types.views import Segmentation as Segmentation
+from modeler.types.views import SensorNoise as SensorNoise

@@ -58,12 +58,21 @@ class Photography:
     """Standard deviation of each colour's gain in a frame, in natural logarithm."""
     noise_levels: float = 1.5
     """Standard deviation of the noise of each colour of a pixel, in 8-bit levels."""
+    shift_px: float = 0.0
+    """Standard deviation of the shift of a frame's colours beside its depth, along either axis, in px."""
     samples: int = 3
     """Rays a pixel along each side; their mean is what it sees."""
 
     def __post_init__(self) -> None:
         """Check the values."""
-        sizes = (self.ambient, self.highlight, self.exposure_sigma, self.white_balance_sigma, self.noise_levels)
+        sizes = (
+            self.ambient,
+            self.highlight,
+            self.exposure_sigma,
+            self.white_balance_sigma,
+            self.noise_levels,
+            self.shift_px,
+        )
         if min(sizes) < 0.0 or self.highlight_exponent <= 0.0 or not 1 <= self.samples <= 16:
             raise ValueError(
                 "ambient, highlight and standard deviations must not be negative, highlight_exponent positive, samples "

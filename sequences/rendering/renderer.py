@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
-from modeler.types import Array, Camera, Frame, InputError
+from modeler.types import Array, Camera, Frame, InputError, SensorNoise
 from sequences.base import AbstractSequence, span
 from sequences.bop import write_bop
 from sequences.rendering.depth_sensor import EXACT, DepthSensor, Exposure
@@ -50,7 +50,8 @@ def mosaic_shade(points_m: Array, mosaic: Mosaic) -> Array:
     return 1.0 - mosaic.contrast * (code >> np.uint64(40)).astype(np.float64) / 2.0**24
 
 
-_MOTION, _READINGS, _FRAMES, _PHOTOGRAPHS = range(4)  # keys of the seed's branches
+_MOTION, _READINGS, _FRAMES, _PHOTOGRAPHS, _SHIFTS = range(5)  # keys of the seed's branches
+_ALIGNED_PX = 0.1  # what interpolation leaves of colours that are taken along the rays of depth, by hand
 
 
 @final
@@ -89,10 +90,12 @@ class RenderedSequence(AbstractSequence):
         """Return the true camera_from_model (4, 4), in m, by frame number."""
         return dict(enumerate(self._camera_from_model))
 
-    def sensor(self) -> tuple[float, float]:
-        """Return the sensor's noise `(sigma_wh, sigma_r_m)` at the distance of the object."""
-        view = self.recipe.view
-        return self._sensor.sigmas(view.distance_m, view.focal_px, self.recipe.depth_unit_mm / 1000.0)
+    def sensor(self) -> SensorNoise:
+        """Return the camera's noise at the distance of the object."""
+        view, photography = self.recipe.view, self.recipe.photography
+        shift_px = 0.0 if photography is None else np.sqrt(2.0) * photography.shift_px
+        sigmas = self._sensor.sigmas(view.distance_m, view.focal_px, self.recipe.depth_unit_mm / 1000.0)
+        return SensorNoise(*sigmas, float(np.hypot(shift_px, _ALIGNED_PX)))
 
     @property
     def motion(self) -> Mapping[str, object] | None:
@@ -188,7 +191,8 @@ class RenderedSequence(AbstractSequence):
         if photography is None:
             return self._painted(index, rays)
         steps = ((np.arange(photography.samples) + 0.5) / photography.samples - 0.5) / self.recipe.view.focal_px
-        offsets = [np.array([along_w, along_h, 0.0]) for along_w in steps for along_h in steps]
+        shift = photography.shift_px / self.recipe.view.focal_px * self._rng(_SHIFTS, index).normal(size=2)
+        offsets = [np.array([along_w + shift[0], along_h + shift[1], 0.0]) for along_w in steps for along_h in steps]
         light = sum((self._light(index, rays + offset, photography) for offset in offsets), np.zeros_like(rays))
         return photography.image(light / len(offsets), self._rng(_PHOTOGRAPHS, index))
 
@@ -230,7 +234,6 @@ def render(
         InputError: where the folder is not empty or cannot be written.
     """
     sequence = RenderedSequence(recipe)
-    sigma_wh, sigma_r_m = sequence.sensor()
     files = {"model.ply": ply_bytes(sequence.model())}
     readings = sequence.robot_readings()
     if readings is not None:
@@ -241,7 +244,7 @@ def render(
         sequence.truth(),
         {
             "name": recipe.name,
-            "sensor": {"sigma_wh": sigma_wh, "sigma_r_m": sigma_r_m},
+            "sensor": sequence.sensor()._asdict(),
             **({} if sequence.motion is None else {"motion": sequence.motion}),
             "ground_truth": "exact",
             "source": "rendered",

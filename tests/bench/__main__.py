@@ -26,6 +26,7 @@ OUT = Path(__file__).parents[2] / "runs" / "bench" / "bench.json"
 RATIOS = {  # name: (ours, the reference)
     "general / Open3D FPFH+RANSAC+ICP": ("visibility general", "Open3D FPFH+RANSAC+ICP"),
     "table / Open3D ICP": ("visibility table", "Open3D ICP"),
+    "table, colour / Open3D ICP": ("visibility table, colour", "Open3D ICP"),
 }
 LIMITS = {
     **dict.fromkeys(RATIOS, 1.0),

@@ -16,7 +16,7 @@ from modeler.kernels import point_likelihood
 from modeler.kernels.point_likelihood import Projection
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
-from modeler.registration import PaperRegistrar, VisibilityRegistrar
+from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Segmenter, telling
 from modeler.types import AbstractPrior, Array, Frame, Plane, RayImage
 from sequences import AbstractSequence, bundled, open_sequence
@@ -58,18 +58,21 @@ class Method:
 def methods(sensor: Sensor) -> dict[str, Method]:
     """Return our method with either prior, and Open3D's."""
 
-    def ours(prior: AbstractPrior) -> Method:
+    def ours(prior: AbstractPrior, *, colour: bool = False) -> Method:
+        registrar = VisibilityRegistrar(VisibilityLikelihood(colour=colour))
+
         def register(source: object, target: object) -> tuple[Array, float]:
             assert isinstance(source, RayImage)
             assert isinstance(target, RayImage)
             rng = np.random.default_rng([0, source.index, target.index])
-            found = VisibilityRegistrar().register(source, target, prior.between(source, target), rng=rng)
+            found = registrar.register(source, target, prior.between(source, target), rng=rng)
             return found.pose.mean, found.effective_samples
 
         return Method(sensor.ray_image, register)
 
     return {
         **{f"visibility {name}": ours(prior) for name, prior in PRIORS.items()},
+        "visibility table, colour": ours(PRIORS["table"], colour=True),
         "Open3D ICP": Method(
             lambda frame, _: reference.icp_view(frame),
             lambda source, target: (reference.icp(source, target), float("nan")),  # pyright: ignore[reportArgumentType]

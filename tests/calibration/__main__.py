@@ -2,7 +2,7 @@
 
 Shapes have no colour, unless printed ones are asked for (`--colour`): bodies of revolution and n-fold shapes with a
 strong print, with a faint one and with none, under lamps that stay with the camera. With `--blind` as well, the same
-pairs are registered without their colour.
+pairs are registered without their colour; with `--shifted`, colours are not aligned to depth, by as much as a camera's.
 
 The shapes are split: methods may be tuned on one half; the other is there to be looked at once, at the end, and only
 where it is asked for (`--half held-out`). The tables go to stdout, progress to stderr, and calibration.json,
@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibration.specimens import PRINTED, SPECIMENS
-from calibration.study import CONTROL, MEASURES, OURS, Study, Trial
+from calibration.study import CONDITIONS, CONTROL, MEASURES, OURS, SHIFTED, Study, Trial
 from calibration.tables import degrees, results_csv, results_json, rows, text
 from modeler.export import write_atomically
 from modeler.registration import ColouredIcpRegistrar
@@ -38,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--half", choices=("tuning", "held-out", "both"), default="tuning", help="which shapes")
     parser.add_argument("--colour", action="store_true", help="printed shapes under lamps, instead of bare ones")
     parser.add_argument("--blind", action="store_true", help="leave their colour out")
+    parser.add_argument("--shifted", action="store_true", help="with colours that are not aligned to depth")
     parser.add_argument("--shapes", nargs="+", metavar="NAME", help="only these of them")
     parser.add_argument(
         "--frames",
@@ -58,7 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("no pair is left; check --shapes, --half, --frames (2 or more) and --seed (not negative)")
     try:
         options.out.mkdir(parents=True, exist_ok=True)
-        study = Study(specimens=chosen, frames=options.frames, seed=options.seed, blind=options.blind)
+        conditions = SHIFTED if options.shifted else CONDITIONS
+        study = Study(chosen, conditions, frames=options.frames, seed=options.seed, blind=options.blind)
         if options.colour and not options.blind:
             study = replace(study, methods={**study.methods, "coloured-icp": ColouredIcpRegistrar()})
         trials = run(study, options.out)

@@ -43,10 +43,13 @@ class Condition:
     """Disparity noise and steps and lateral jitter, as multiples of the first Kinect's."""
     step_deg: float = 25.0
     """Mean turn from frame to frame."""
+    shift_px: float = 0.0
+    """Standard deviation of the shift of a frame's colours beside its depth."""
 
     def __str__(self) -> str:
         """Return it in words."""
-        return f"{self.distance_m:g} m, noise x{self.noise:g}, {self.step_deg:g} deg"
+        shifted = f", colours {self.shift_px:g} px" if self.shift_px else ""
+        return f"{self.distance_m:g} m, noise x{self.noise:g}, {self.step_deg:g} deg{shifted}"
 
 
 CONDITIONS = (
@@ -58,6 +61,8 @@ CONDITIONS = (
     Condition(step_deg=12.0),
     Condition(step_deg=40.0),
 )
+SHIFTED = tuple(replace(condition, shift_px=0.35) for condition in CONDITIONS)
+"""The same with colours that are not aligned: as far, from frame to frame, as those of cameras."""
 
 
 @final
@@ -117,6 +122,7 @@ def staged(recipe: Recipe, condition: Condition, *, frames: int, seed: int) -> R
         trajectory=replace(wobble, frames=frames, step_deg=condition.step_deg),
         sensor=replace(sensor, disparity=disparity, jitter=jitter),
         colour="none" if recipe.photography is None else "png",
+        photography=None if recipe.photography is None else replace(recipe.photography, shift_px=condition.shift_px),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from modeler.cli.options import PriorOptions
-from modeler.types import Array, BoolArray, Frame
+from modeler.types import Array, BoolArray, Frame, SensorNoise
 from sequences import AbstractSequence
 from sequences.rendering.meshes import Mesh
 from sequences.rendering.recipe import Recipe
@@ -100,8 +100,8 @@ class Recorded(AbstractSequence):
             if not (self.stage.foreign and index >= self.stage.since)
         }
 
-    def sensor(self) -> tuple[float, float]:
-        """Return the camera's noise `(sigma_wh, sigma_r_m)`."""
+    def sensor(self) -> SensorNoise:
+        """Return the camera's noise."""
         return self._first.sensor()
 
     @property

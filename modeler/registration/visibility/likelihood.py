@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from modeler.kernels import gauss_newton, gpu, point_likelihood, point_to_plane
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.kernels.photometric import ColourProjection, no_colour
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
-from modeler.registration.visibility.photometric import UNDECIDED, PairColour, weight_of
+from modeler.registration.visibility.photometric import UNDECIDED, PairColour, unshifted, weight_of
 from modeler.se3 import matrices, rows
 from modeler.types import Array, RayImage
 
@@ -69,11 +69,8 @@ class VisibilityLikelihood:
     """Cost (nats) of a pose under which no surface matches."""
     overlap_scale: float = 0.1
     """Share of matching points at which that cost has fallen to its e-th part."""
-    colour: bool = False
-    """Whether the colours of matching surface are compared, where both frames have them.
-
-    Not by default: the error by which a camera aligns colour to depth, or takes it at another moment, is not modelled.
-    """
+    colour: bool = True
+    """Whether the colours of matching surface are compared, where both frames have them."""
     device: gpu.Device = "auto"
     """Where poses are scored; descent and refinement stay on the CPU."""
 
@@ -297,9 +294,17 @@ class PairLikelihood:
     ) -> tuple[tuple[ColourProjection, ColourProjection], np.float32]:
         """Return the colours of both directions and their weight, as kernels take them; without colour, no points."""
         if self.colour is None:
-            return (no_colour(self.forward.projection(1)), no_colour(self.backward.projection(1))), np.float32(0.0)
+            return self._no_colours, np.float32(0.0)
         projections = self.colour.projections(band, _COLOUR_STRIDE * stride)
         return projections, np.float32(_COLOUR_STRIDE * weight_of(correlation))
+
+    @cached_property
+    def _no_surfaces(self) -> tuple[Projection, Projection]:
+        return self.forward.projection(1).empty(), self.backward.projection(1).empty()
+
+    @cached_property
+    def _no_colours(self) -> tuple[ColourProjection, ColourProjection]:
+        return no_colour(self.forward.projection(1)), no_colour(self.backward.projection(1))
 
     def match_noise(self, pose: Array, blur_m: float) -> MatchNoise:
         """Return how well surfaces and colours match under a pose (4, 4), see `surface_noise_m`."""
@@ -386,11 +391,14 @@ class PairLikelihood:
             noise: of matching surface and colours.
             stride: every `stride`-th point is used, and counts for as many.
         """
-        projections = self.forward.projection(stride), self.backward.projection(stride)
-        colours = self._colours(noise.band, noise.correlation, stride)
-        gradients, equations = gauss_newton.normal_equations(
-            rows(poses), projections, *colours, self.centre_m, noise.surface_m
-        )
+        surfaces = self.forward.projection(stride), self.backward.projection(stride)
+        solved = partial(gauss_newton.normal_equations, rows(poses), centre=self.centre_m, surface_m=noise.surface_m)
+        gradients, equations = solved(surfaces, self._no_colours, np.float32(0.0))
+        if self.colour is not None:
+            of_colour, by_colour = solved(self._no_surfaces, *self._colours(noise.band, noise.correlation, stride))
+            kept = unshifted(stride * by_colour, self.colour.shifts(poses))
+            gradients = gradients + (kept @ of_colour[:, :, None])[:, :, 0]
+            equations = equations + kept @ by_colour
         return stride * gradients, stride * equations
 
     def descend(self, poses: Array, blur_m: float, regulariser: Regulariser, *, steps: int) -> Array:

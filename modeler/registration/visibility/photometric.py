@@ -34,9 +34,12 @@ _KNOWN: WeakKeyDictionary[RayImage, np.ndarray] = WeakKeyDictionary()  # feature
 
 _FINEST_SCORED = 1
 """Finest band by which samples are weighted; weights by the finest of all are too uneven (it refines the samples)."""
+_STEADY = 4.0
+"""So many standard deviations of the colours' shift is the finest band by which samples are weighted, at least."""
 UNDECIDED = 0.7
 """Correlation that is assumed where a descent starts."""
 _MOST = 0.99  # correlation
+_HALVINGS = 5  # patches of surface, as many as the refinement has
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +55,7 @@ class PairColour:
     surfaces: tuple[Projection, Projection]
     """The source's points in the target, and the target's in the source."""
     _unmoved: dict[int, float] = field(default_factory=dict)
+    _evenness: dict[int, float] = field(default_factory=dict)
     _made: dict[tuple[int, int], tuple[ColourProjection, ColourProjection]] = field(default_factory=dict)
 
     def band(self, blur_m: float) -> int:
@@ -78,11 +82,30 @@ class PairColour:
         self, poses: Array, blur_m: float, max_independent: float, *, surface_m: float, stride: int
     ) -> Array:
         """Return how much likelier (n,) in nats the target's colours are, given the source's (method.md, eq. 19)."""
-        band = max(self.band(blur_m), _FINEST_SCORED)
+        band = max(self.band(blur_m), self._finest_scored)
         correlation, share = self.correlations(poses, band, surface_m, stride=stride)
-        count = share * (1.0 - self.unmoved(band) ** 2) / (1.0 / max_independent + 1.0 / self.patches(band))
+        patches = max(self.evenness(band) * self.patches(band), 1e-6)  # without features there is nothing to count
+        independent = 1.0 / (1.0 / max_independent + 1.0 / patches)
+        count = share * (1.0 - self.unmoved(band) ** 2) * independent
         gain = -0.5 * count * np.log1p(-(np.clip(correlation, 0.0, _MOST) ** 2))
         return np.asarray(np.logaddexp(0.0, gain - 0.5 * np.log(np.maximum(count, 1.0))), dtype=np.float64)
+
+    @property
+    def _finest_scored(self) -> int:
+        """Number of the finest band by which samples are weighted: a shift of the colours changes little in it."""
+        steady = int(np.ceil(np.log2(max(_STEADY * self.target.sigma_colour_px / FINEST_PX, 1.0))))
+        return int(np.clip(steady, _FINEST_SCORED, BANDS - 1))
+
+    def shifts(self, poses: Array) -> Array:
+        """Return the motions ξ (..., 6, 2) that shift the target's colours by a standard deviation along both axes.
+
+        Args:
+            poses: (..., 4, 4) target_from_source.
+        """
+        sigma_m = self.target.sigma_colour_px * float(self.target.centroid_m[2]) / self.target.frame.camera.fx
+        found = np.zeros((*poses.shape[:-2], 6, 2))
+        found[..., 3:, :] = sigma_m * np.swapaxes(poses[..., :2, :3], -1, -2)
+        return found
 
     def matches(self, carried: Array, matches: Array, band: int, weight: float, *, forward: bool) -> Array:
         """Return the features of matches (n, 12) of one direction in the place of their surface, see `point_to_plane`.
@@ -144,6 +167,26 @@ class PairColour:
         points = 0.5 * (len(self.source.points_m) + len(self.target.points_m))
         return points / (4.0 * np.pi * (FINEST_PX * 2**band) ** 2)
 
+    def evenness(self, band: int) -> float:
+        """Return the share of the surface that makes up the features: 1 where they are as strong everywhere.
+
+        It is the participation ratio of the energies of 32 patches of either view. On a plain box most lies at its
+        edges, which meet few of them.
+        """
+        if band not in self._evenness:
+            shares = []
+            for patches, projection in zip(self._patches, self.projections(band, 1), strict=True):
+                energies = np.bincount(patches, projection.values.astype(np.float64) ** 2, 2**_HALVINGS)
+                shares.append(np.sum(energies) ** 2 / max(len(energies) * np.sum(energies**2), 1e-12))
+            self._evenness[band] = float(np.mean(shares))
+        return self._evenness[band]
+
+    @cached_property
+    def _patches(self) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers of the patches of the points of either view."""
+        source, target = self.source.points_m[self.source_points], self.target.points_m[self.target_points]
+        return point_to_plane.bisected(source, _HALVINGS), point_to_plane.bisected(target, _HALVINGS)
+
     def unmoved(self, band: int) -> float:
         """Return the correlation of features that both views show in the same place (method.md, eq. 18).
 
@@ -161,6 +204,17 @@ class PairColour:
         """See `_in_place`: of the source's points in the target, and vice versa."""
         shift_m = self.target.centroid_m - self.source.centroid_m
         return _in_place(self.source, self.target, shift_m), _in_place(self.target, self.source, -shift_m)
+
+
+def unshifted(equations: Array, shifts: Array) -> Array:
+    """Return the matrices (..., 6, 6) that take unknown shifts out of equations (method.md, eq. 24).
+
+    Args:
+        equations: (..., 6, 6) normal equations of colours.
+        shifts: (..., 6, 2) their shifts by a standard deviation, as motions ξ.
+    """
+    felt, across = equations @ shifts, np.swapaxes(shifts, -1, -2)
+    return np.eye(6) - felt @ np.linalg.solve(np.eye(2) + across @ felt, across)
 
 
 def weight_of(correlation: float) -> float:

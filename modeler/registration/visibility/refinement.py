@@ -9,6 +9,7 @@ J, variability V, information J V⁻¹ J).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from modeler import se3
 from modeler.kernels import point_to_plane
 from modeler.registration.posterior import FLOOR
 from modeler.registration.visibility.likelihood import DirectedLikelihood, MatchNoise, PairLikelihood
+from modeler.registration.visibility.photometric import unshifted
 from modeler.se3 import rows
 from modeler.types import Array
 
@@ -63,21 +65,20 @@ class Refiner:
 
     def _information(self, pair: PairLikelihood, mode: Array, noise: MatchNoise, spread: Array) -> tuple[Array, Array]:
         """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) in it (method.md, eq. 14)."""
-        arms, by_own, by_other, residuals, weights = _equations(pair, mode, noise)
-        halvings = min(self.halvings, int(np.log2(max(len(arms) / self.min_matches, 1.0))))
+        surface, colours = _equations(pair, mode, noise)
+        halvings = min(self.halvings, int(np.log2(max(len(surface.residuals) / self.min_matches, 1.0))))
         if 2**halvings <= len(spread):  # the scatter of six equations would be singular
             return spread, np.zeros((6, 6))
-        by_own, by_other = by_own @ spread, by_other @ spread
-        # The noise of either surface's normals would add up in its own square; in their product it averages out.
-        product = (by_own.T * weights) @ by_other
-        sensitivity, axes = np.linalg.eigh(0.5 * (product + product.T))
-        count = 2**halvings
-        members = (point_to_plane.bisected(arms, halvings) == np.arange(count)[:, None]).astype(np.float64)
-        by_both = 0.5 * (by_own + by_other) @ axes
-        scores = members @ (by_both * (weights * residuals)[:, None])
-        variability = shrunk(scores, (by_both.T * weights) @ by_both)
-        positive = np.diag(np.maximum(sensitivity, 0.0))
-        information = visible_share(pair.patches / count) * positive @ np.linalg.solve(variability, positive)
+        sensitivity, variability = surface.scatter(spread, halvings, pair.patches)
+        if pair.colour is not None and len(colours.residuals):
+            by_colour, scatter = colours.scatter(spread, halvings, pair.colour.patches(noise.band))
+            shifts = np.asarray(np.linalg.solve(spread, pair.colour.shifts(mode)), dtype=np.float64)
+            kept, felt = unshifted(by_colour, shifts), by_colour @ shifts
+            sensitivity = sensitivity + kept @ by_colour
+            variability = variability + kept @ (scatter + felt @ felt.T) @ kept.T
+        scales, axes = np.linalg.eigh(0.5 * (sensitivity + sensitivity.T))
+        positive = np.diag(np.maximum(scales, 0.0))
+        information = positive @ np.linalg.solve(axes.T @ variability @ axes, positive)
         return spread @ axes, np.asarray(0.5 * (information + information.T), dtype=np.float64)
 
 
@@ -140,14 +141,43 @@ def _steps(pair: PairLikelihood, poses: Array, noise: MatchNoise, spread: Array)
     return np.asarray(np.linalg.solve(regularised, gradient[:, :, None])[:, :, 0], dtype=np.float64)
 
 
-def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the equations of matching points and of their colours in the source's frame, about the centre.
+class Equations(NamedTuple):
+    """Linear equations of ξ about the centre, of surface or of its colours."""
 
-    Returns:
-        Positions (n, 3), derivatives of the residuals by ξ with the point's own normal and with the other surface's
-        (n, 6), residuals (n,) in m and weights (n,) in 1/m²; of colours likewise, without units.
-    """
-    parts = []
+    arms: Array
+    """(n, 3) positions in m."""
+    by_own: Array
+    """(n, 6) derivatives of the residuals by ξ, from the point's own normal or gradient."""
+    by_other: Array
+    """(n, 6) likewise, from the other surface's."""
+    residuals: Array
+    """(n,) in m; of colours without a unit."""
+    weights: Array
+    """(n,) in 1/m²; of colours without a unit."""
+
+    def scatter(self, basis: Array, halvings: int, independent: float) -> tuple[Array, Array]:
+        """Return sensitivity (6, 6) and variability (6, 6) of the sum of the equations (method.md, eq. 14 and 15).
+
+        Args:
+            basis: (6, 6) of ξ.
+            halvings: the surface is bisected this many times.
+            independent: number of its patches whose errors are independent.
+        """
+        by_own, by_other = self.by_own @ basis, self.by_other @ basis
+        # The noise of either surface's normals would add up in its own square; in their product it averages out.
+        product = (by_own.T * self.weights) @ by_other
+        scales, axes = np.linalg.eigh(0.5 * (product + product.T))
+        patches, count = point_to_plane.bisected(self.arms, halvings), 2**halvings
+        members = (patches == np.arange(count)[:, None]).astype(np.float64)
+        by_both = 0.5 * (by_own + by_other)
+        scores = members @ (by_both * (self.weights * self.residuals)[:, None])
+        variability = shrunk(scores, (by_both.T * self.weights) @ by_both) / visible_share(independent / count)
+        return (axes * np.maximum(scales, 0.0)) @ axes.T, variability
+
+
+def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Equations, Equations]:
+    """Return the equations of matching points, and of their colours, in the source's frame, about the centre."""
+    parts: list[list[tuple[Array, ...]]] = [[], []]
     directions: list[tuple[DirectedLikelihood, Array, float]] = [
         (pair.forward, pose, 1.0),
         (pair.backward, se3.inverse(pose), -1.0),
@@ -155,11 +185,11 @@ def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Ar
     for directed, carried, sign in directions:
         found = directed.matches(rows(carried), noise.surface_m)
         to_source = np.eye(4) if sign < 0.0 else se3.inverse(pose)
-        for matches in (found, pair.colour_matches(carried, found, noise, forward=sign > 0.0)):
+        for kind, matches in enumerate((found, pair.colour_matches(carried, found, noise, forward=sign > 0.0))):
             used = matches[matches[:, point_to_plane.WEIGHT] > 0.0]
             arms = se3.transform(to_source, used[:, point_to_plane.POSITION]) - pair.centre_m
             own, other = (used[:, k] @ to_source[:3, :3].T for k in (point_to_plane.OWN, point_to_plane.OTHER))
             derivatives = [sign * np.hstack([np.cross(arms, normals), normals]) for normals in (own, other)]
-            parts.append((arms, *derivatives, used[:, point_to_plane.RESIDUAL], used[:, point_to_plane.WEIGHT]))
-    arms, by_own, by_other, residuals, weights = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return arms, by_own, by_other, residuals, weights
+            parts[kind].append((arms, *derivatives, used[:, point_to_plane.RESIDUAL], used[:, point_to_plane.WEIGHT]))
+    surface, colours = (Equations(*(np.concatenate(columns) for columns in zip(*part, strict=True))) for part in parts)
+    return surface, colours
