@@ -137,6 +137,17 @@ def _carried(covariance: Array, matrix: Array) -> Array:
     return matrix @ covariance @ np.swapaxes(matrix, -1, -2)
 
 
+def _orthonormal(pose: Array) -> Array:
+    """Return a motion (4, 4) whose rotation is orthonormal to rounding, by a Newton step of its polar decomposition.
+
+    Inverses that transpose turn an error e of a rotation into products off by 2 e: from prediction to mean to
+    prediction, rounding errors would double at every frame.
+    """
+    made = pose.copy()
+    made[:3, :3] = 0.5 * pose[:3, :3] @ (3.0 * np.eye(3) - pose[:3, :3].T @ pose[:3, :3])
+    return made
+
+
 def mean(
     poses: Array, weights: Array, *, about_m: Array | None = None, start: Array | None = None, iterations: int = 20
 ) -> tuple[Array, Array]:
@@ -151,7 +162,7 @@ def mean(
     """
     weights = np.asarray(weights, dtype=np.float64) / np.sum(weights)
     point_m = np.zeros(3) if about_m is None else np.asarray(about_m, dtype=np.float64)
-    begin = poses[int(np.argmax(weights))] if start is None else start
+    begin = _orthonormal(poses[int(np.argmax(weights))] if start is None else start)
     centre, covariance = lie_group.mean(rows(poses), weights, rows(begin), point_m, iterations, 1e-11)
     return matrices(centre[None])[0], covariance
 

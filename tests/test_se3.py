@@ -237,6 +237,15 @@ def test_mean_solves_its_equation_and_recovers_the_gaussian(seed: int) -> None:
     np.testing.assert_array_equal(spread, spread.T)
 
 
+def test_means_that_are_predicted_from_means_stay_rigid(rng: np.random.Generator) -> None:
+    before, last = np.eye(4), se3.exp(np.array([0.1, 0.2, -0.05, 0.01, 0.0, 0.02]))
+    for _ in range(100):
+        predicted = last @ se3.inverse(before) @ last
+        samples = predicted @ se3.exp(rng.normal(0.0, 1e-3, (50, 6)))
+        before, last = last, se3.mean(samples, np.ones(50))[0]
+    np.testing.assert_allclose(last[:3, :3] @ last[:3, :3].T, np.eye(3), atol=1e-12)
+
+
 def test_mean_does_not_depend_on_the_frame_nor_on_the_start() -> None:
     rng = np.random.default_rng(3)
     samples = se3.exp(rng.normal(size=(20, 6)) * 0.3)
