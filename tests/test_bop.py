@@ -13,7 +13,7 @@ from recordings import png_claiming
 from refusal import refused
 from small_scene import CAMERA, INDICES, META, frame, random_frames, random_truth, written
 
-from modeler.types import Frame, InputError
+from modeler.types import Frame, InputError, SensorNoise
 from sequences import BopSequence, open_sequence, survey, write_bop
 
 
@@ -49,7 +49,7 @@ def test_reading_undoes_writing(scene: Path, frames: list[Frame], truth: dict[in
     for index in INDICES:
         np.testing.assert_allclose(read_truth[index], truth[index], atol=1e-12)
     assert sequence.name == "thing"
-    assert sequence.sensor() == (1e-3, 2e-3)
+    assert sequence.sensor() == SensorNoise(1e-3, 2e-3)
     assert sequence.motion == {"kind": "table", "step_deg": 25}
 
 

@@ -192,7 +192,8 @@ def outcomes(steps: list[Step]) -> list[tuple[int, bool, Reason | None]]:
 def test_after_one_frame_searched_for_in_vain_others_that_are_hidden_are_only_glanced_at() -> None:
     registrar, glance = Oracle(blind=HIDDEN), Oracle(blind=HIDDEN)
     steps = run(registrar=registrar, glance=glance)
-    assert {source for source, _ in registrar.asked} & HIDDEN == {2}
+    # At the end they are tried among each other: they might be a segment of their own.
+    assert {source for source, target in registrar.asked if target not in HIDDEN} & HIDDEN == {2}
     assert {source for source, _ in glance.asked} >= {3, 4, 5}
     whole = run(registrar=Oracle(blind=HIDDEN))
     assert outcomes(steps) == outcomes(whole)
