@@ -220,8 +220,8 @@ class MethodOptions:
 
     method: Method = "visibility"
     """visibility: ours. paper: Wüthrich et al. 2012. The others are baselines."""
-    colour: bool = True
-    """Leave colours out: by default those of matching surface are compared too, where frames have them."""
+    colour: Annotated[bool, default("they are, where frames have them")] = True
+    """Do not compare the colours of matching surface."""
     device: Annotated[Literal["cpu", "cuda"] | None, default("cuda where one is present and pays, else cpu")] = None
     """Where poses are sampled and scored: cuda needs an NVIDIA GPU and the extra gpu (visibility, paper)."""
     seed: Annotated[int, SEED] = 0
