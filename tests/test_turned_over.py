@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import tabletop
@@ -12,6 +13,7 @@ from trust.plan import coarser
 from modeler import se3
 from modeler.closure import Closer, MapView
 from modeler.evaluation import rotation_error_deg, true_motion
+from modeler.export import Pairs, Remembered
 from modeler.graph import PoseGraph, solve
 from modeler.graph.axis import steps_of
 from modeler.graph.pose_graph import Factor
@@ -19,6 +21,7 @@ from modeler.pipeline import Modeler
 from modeler.pipeline.joining import Alignment, Joiner, Segment
 from modeler.priors import TablePrior
 from modeler.rays import Sensor
+from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Scene
 from modeler.types import (
     Array,
@@ -158,3 +161,9 @@ def test_postures_of_the_study_rest_on_the_table() -> None:
         for turns in (stage.recipe.rest_rotation_deg, stage.recipe.turned_over.rest_rotation_deg)
     )
     assert np.degrees(np.arccos(np.clip(before[2] @ after[2], -1.0, 1.0))) > 59.0
+
+
+def test_alignments_are_judged_by_the_likelihood_of_the_run_also_where_its_pairs_are_remembered(tmp_path: Path) -> None:
+    depth_alone = VisibilityRegistrar(VisibilityLikelihood(colour=False))
+    joiner = Joiner(Remembered(depth_alone, Pairs(tmp_path), {}))
+    assert joiner._visibility is depth_alone

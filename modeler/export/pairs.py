@@ -124,6 +124,11 @@ class Remembered(AbstractRegistrar):
     versions: Mapping[str, str]
     """Of the packages: with others, answers may be others."""
 
+    @property
+    def method(self) -> AbstractRegistrar:
+        """The registrar that is asked."""
+        return self.registrar.method
+
     def register(
         self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:

@@ -271,7 +271,8 @@ class Joiner:
 
     @property
     def _visibility(self) -> VisibilityRegistrar:
-        return self.registrar if isinstance(self.registrar, VisibilityRegistrar) else VisibilityRegistrar()
+        method = self.registrar.method
+        return method if isinstance(method, VisibilityRegistrar) else VisibilityRegistrar()
 
     @property
     def _search(self) -> Search:

@@ -128,6 +128,11 @@ class AbstractPrior(ABC):
 class AbstractRegistrar(ABC):
     """A registration method: parameters as fields, one pure method."""
 
+    @property
+    def method(self) -> AbstractRegistrar:
+        """The registrar itself, without a memory around it."""
+        return self
+
     @abstractmethod
     def register(
         self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
