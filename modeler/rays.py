@@ -25,6 +25,8 @@ class Sensor:
     sigma_colour_px: float = COLOUR_SHIFT_PX
     """Shift of colours beside depth from one image to the next, in px: they are aligned so well at best, and may be
     taken at another moment."""
+    sigma_focal: float = 0.0
+    """Standard deviation of the logarithm of the focal length; 0 = it is taken for known."""
     smoothing: float = 0.28
     """Radius of the ball in which planes are fitted, as a share of the geometric mean of noise and object's extent.
 
@@ -47,6 +49,17 @@ class Sensor:
     def measured(self, noise_area_px: float | None) -> Sensor:
         """Return the sensor with the correlated area of its noise that a scene shows; None where it shows none."""
         return self if noise_area_px is None else replace(self, noise_area_px=noise_area_px)
+
+    def refocused(self, view: RayImage, log_factor: float) -> RayImage:
+        """Return a view as it is under another focal length: x and y of every point shrink as it grows.
+
+        Args:
+            view: as this sensor made it.
+            log_factor: logarithm of the other focal length over that of the view.
+        """
+        camera, factor = view.frame.camera, math.exp(log_factor)
+        scaled = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+        return self.ray_image(replace(view.frame, camera=scaled), view.plane and _drawn(view.plane, factor))
 
     def ray_image(self, frame: Frame, plane: Plane | None = None) -> RayImage:
         """Make a segmented frame ready for registration; without object pixels it has no points.
@@ -153,3 +166,10 @@ def _places(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     top, bottom, left, right = planes.bounds(mask)
     rows, columns = np.nonzero(mask[top:bottom, left:right])
     return rows + top, columns + left
+
+
+def _drawn(plane: Plane, factor: float) -> Plane:
+    """Return the support plane whose points have x and y divided by a factor."""
+    normal = plane.normal * (factor, factor, 1.0)
+    length = float(np.linalg.norm(normal))
+    return replace(plane, normal=normal / length, offset_m=plane.offset_m / length)

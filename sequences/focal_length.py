@@ -11,7 +11,7 @@ from typing import Literal, final
 
 import numpy as np
 
-from modeler.types import Frame, InputError
+from modeler.types import Frame, InputError, SensorNoise
 from sequences.base import AbstractDerived
 from sequences.input_files import read_tree
 
@@ -77,6 +77,13 @@ class RefocusedSequence(AbstractDerived):
 
     focal: FocalFactor
     """The focal length."""
+
+    def sensor(self) -> SensorNoise | None:
+        """Return the noise of its camera, with how well loops told its focal length; None where nothing says."""
+        noise = self.whole.sensor()
+        if self.focal.told_by != "loop" or self.focal.factor_sigma == 0.0:
+            return noise
+        return (SensorNoise() if noise is None else noise)._replace(sigma_focal=self.focal.factor_sigma)
 
     def frame(self, index: int) -> Frame:
         """Return the frame with number `index`.

@@ -11,7 +11,7 @@ from typing import final
 
 import numpy as np
 
-from modeler.types import COLOUR_SHIFT_PX, Array, Frame, SensorNoise
+from modeler.types import COLOUR_SHIFT_PX, NOMINAL_FOCAL, Array, Frame, SensorNoise
 from sequences.base import AbstractDerived
 from sequences.input_files import Node, read_tree
 
@@ -121,7 +121,8 @@ class CalibratedSequence(AbstractDerived):
         """Return the noise at the distance of the object in the first frame."""
         said = self.whole.sensor()
         shift_px = COLOUR_SHIFT_PX if said is None else said.sigma_colour_px
-        return SensorNoise(*self._at_object, shift_px)
+        sigma_focal = NOMINAL_FOCAL if said is None else said.sigma_focal
+        return SensorNoise(*self._at_object, shift_px, sigma_focal)
 
     def select(self, every: int = 1, frames: slice | None = None) -> CalibratedSequence:
         """Return a part of the sequence."""

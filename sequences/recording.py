@@ -12,7 +12,7 @@ from typing import Generic, TypeVar, final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types import COLOUR_SHIFT_PX, Array, Frame, InputError, SensorNoise
+from modeler.types import COLOUR_SHIFT_PX, NOMINAL_FOCAL, Array, Frame, InputError, SensorNoise
 from sequences.base import AbstractSequence, span
 from sequences.input_files import Node, is_there, read_tree
 from sequences.lens import Lens
@@ -50,6 +50,7 @@ class AbstractRecording(AbstractSequence):
             node.need("sigma_wh").number(1e-9, 1.0),
             node.need("sigma_r_m").number(1e-9, 10.0),
             COLOUR_SHIFT_PX if shift is None else shift.number(0.0, 100.0),
+            NOMINAL_FOCAL if (focal := node.get("sigma_focal")) is None else focal.number(0.0, 0.2),
         )
 
     @property

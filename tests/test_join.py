@@ -57,7 +57,7 @@ def rendered(name: str, shape: Compound, seed: int) -> RenderedSequence:
 
 def true_run(sequence: RenderedSequence, scene: Path, path: Path) -> None:
     """Write the scene folder of a sequence, and the run folder of a build of it that found every motion."""
-    truth, (sigma_wh, sigma_r_m, _) = sequence.truth(), sequence.sensor()
+    truth, (sigma_wh, sigma_r_m, *_) = sequence.truth(), sequence.sensor()
     write_bop(scene, sequence, truth, {"sensor": {"sigma_wh": sigma_wh, "sigma_r_m": sigma_r_m}})
     views = {frame.index: Sensor(sigma_wh, sigma_r_m).ray_image(frame) for frame in BopSequence(scene)}
     edges = []

@@ -15,8 +15,8 @@ from modeler.cli import main
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
-from modeler.self_calibration import FocalCalibrator, FocalLength
-from modeler.types import Edge, RayImage, Stated
+from modeler.self_calibration import FocalCalibrator
+from modeler.types import Edge, FocalLength, RayImage, Stated
 from sequences import FocalFactor, RefocusedSequence, bundled, open_sequence, read_focal_factor
 
 STEPS = 12
@@ -93,7 +93,7 @@ def test_what_is_known_of_the_camera_decides_the_scale_of_its_depth(
     known: str | None, depth_scale: float, sigma: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: Path
 ) -> None:
     """A loop tells the product of two factors, of the focal length and of the depth's relief."""
-    told = FocalLength(0.9025, 0.01, "loop", 5.0, 1.0, 1)
+    told = FocalLength(float(np.log(0.9025)), 0.01, 0.05, 1, 5.0, 1.0, {})
     monkeypatch.setattr(FocalCalibrator, "estimate", lambda *_: told)
     run, file = tmp_path / "run", tmp_path / "camera.json"
     assert main(["build", str(scene), "--out", str(run), "--prior", "table", "--method", "icp", "--frames", "0:2"]) == 0

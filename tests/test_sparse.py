@@ -136,7 +136,7 @@ def test_sparse_views_are_registered_as_well_as_they_state(drill, share, worst_d
 
 
 def test_a_small_object_is_registered_by_a_hundred_pixels(drill):
-    indices, (sigma_wh, sigma_r_m, _) = drill.indices[:2], drill.sensor()
+    indices, (sigma_wh, sigma_r_m, *_) = drill.indices[:2], drill.sensor()
     found = segmented([drill.frame(index) for index in indices])
     target, source = (
         Sensor(sigma_wh, sigma_r_m).ray_image(coarse(drill.frame(index), 6), segmentation.plane)

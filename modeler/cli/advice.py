@@ -123,6 +123,22 @@ def step_angles_deg(edges: Sequence[Mapping[str, Any]]) -> list[float]:
     ]
 
 
+def told_focal_length(camera: Mapping[str, Any]) -> str:
+    """Return in words what loops told of the focal length, else "".
+
+    Args:
+        camera: what report.json says of it.
+    """
+    fx_px, factor, sigma = camera.get("fx_px"), camera.get("factor_in_run", 1.0), camera["focal_factor_sigma"]
+    if fx_px is None or not camera.get("loops"):
+        return ""
+    loops, given_px = "1 loop" if camera["loops"] == 1 else f"{camera['loops']} loops", fx_px / factor
+    return (
+        f"the focal length is {fx_px:.1f} ± {sigma * fx_px:.1f} px, {given_px:.1f} px was given; {loops} close to "
+        f"{camera['sigmas_after']:.1f} sd with it, to {camera['sigmas_before']:.1f} sd as given"
+    )
+
+
 def unchecked_focal_length(report: Mapping[str, Any]) -> str:
     """Return in words what an error of the focal length would do to a trusted model without a loop, else "".
 

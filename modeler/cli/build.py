@@ -259,7 +259,14 @@ def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt) -> Iterator
 
 def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
     """Write a summary of the run to stderr, and return the exit status."""
-    from modeler.cli.advice import ends_without, other_step, remedy, sense_in_doubt, unchecked_focal_length
+    from modeler.cli.advice import (
+        ends_without,
+        other_step,
+        remedy,
+        sense_in_doubt,
+        told_focal_length,
+        unchecked_focal_length,
+    )
     from modeler.types import ACCEPTED
 
     accepted = sum(frame["outcome"] == ACCEPTED for frame in report["frames"])
@@ -272,6 +279,8 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
             f"the loop was open by {opening['opening_deg']:.1f}° and {1000.0 * opening['opening_m']:.1f} mm, "
             f"{opening['sigmas']:.1f} times what its {opening['edges']} edges and the closure state"
         )
+    if (camera := report.get("camera")) and (words := told_focal_length(camera)):
+        say(words)
     if report["reasons"]:
         coded = list(zip(report.get("reason_codes") or report["reasons"], report["reasons"], strict=False))
         first, *others = [words for _, words in sorted(coded, key=lambda reason: reason[0] == "left_out")]  # said above

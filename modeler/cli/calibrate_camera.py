@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,7 +13,7 @@ from modeler.cli.console import say
 from modeler.cli.options import MovedOptions
 
 if TYPE_CHECKING:
-    from modeler.self_calibration import FocalLength
+    from modeler.types import FocalLength
 
 
 _OPEN = 0.005  # of sizes: less is not worth a line
@@ -53,7 +53,7 @@ class CalibrateCamera:
         from modeler.export import write_atomically
         from modeler.self_calibration import FocalCalibrator
         from modeler.types import InputError
-        from sequences import FocalFactor, read_focal_factor
+        from sequences import FocalFactor
 
         check_files([self.out], run_inputs([self.run_folder], self.moved.sequence), overwrite=self.overwrite)
         run = reopened(self.run_folder, self.moved.sequence)
@@ -63,15 +63,13 @@ class CalibrateCamera:
         modeler = part.modeler()
         found = FocalCalibrator().estimate(run.views, run.edges, run.sensor, modeler.register, modeler.prior)
         used_px = run.views[min(run.views)].frame.camera.fx
-        file = run.report["settings"].get("camera")
-        factor = found.factor * (1.0 if file is None else read_focal_factor(Path(file)).factor)
+        factor = found.factor * (run.report.get("camera") or {}).get("focal_factor", 1.0)
         share = {"neither": 0.5, "focal-length": 1.0, "depth": 0.0}[self.known]
         open_by = abs(math.log(factor)) if self.known == "neither" else 0.0
         stated_px = used_px * found.factor / factor
         stated = FocalFactor(factor, stated_px, factor**share, 0.5 * open_by, found.sigma, found.told_by)
-        facts = {
-            name: value for name, value in asdict(found).items() if name in ("sigmas_before", "sigmas_after", "loops")
-        }
+        open_sds = {"sigmas_before": found.sigmas_before, "sigmas_after": found.sigmas_after} if found.loops else {}
+        facts = {"sigmas_before": None, "sigmas_after": None, **open_sds, "loops": found.loops}
         write_atomically(self.out, stated.text({**facts, "fx_px": found.factor * used_px, "run": str(self.run_folder)}))
         say(f"{_said(found, used_px)}: {self.out}")
         if found.told_by == "loop" and stated.depth_scale_sigma >= _OPEN:
@@ -84,7 +82,7 @@ class CalibrateCamera:
 
 def _said(found: FocalLength, used_px: float) -> str:
     loops = "1 loop" if found.loops == 1 else f"{found.loops} loops"
-    if found.told_by == "prior" and math.isfinite(found.sigmas_after):
+    if found.told_by == "prior" and found.loops:
         return (
             f"the focal length stays uncertain after {loops}: {found.sigmas_before:.1f} sd open as given, "
             f"{found.sigmas_after:.1f} sd with the best one; if that is much, an edge is wrong, see the worst pairs in "

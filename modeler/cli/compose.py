@@ -35,7 +35,7 @@ from modeler.priors import (
 from modeler.priors.checks import ParameterError
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
-from modeler.types import AbstractPrior, AbstractRegistrar, InputError
+from modeler.types import NOMINAL_FOCAL, AbstractPrior, AbstractRegistrar, InputError
 from sequences import AbstractSequence
 from sequences.image_folders import trajectory
 from sequences.input_files import frame_number
@@ -74,7 +74,7 @@ def modeler(
     noise, chosen = sequence.sensor(), registrar(method.method, colour=method.colour, device=method.device)
     return Modeler(
         segmenter=segmenter(where),
-        sensor=Sensor() if noise is None else Sensor(*noise),
+        sensor=Sensor(sigma_focal=NOMINAL_FOCAL) if noise is None else Sensor(*noise),
         prior=chosen_prior(prior_options, sequence),
         registrar=chosen,
         glance=glancing(chosen),

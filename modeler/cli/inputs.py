@@ -154,6 +154,7 @@ class Part:
         """
         (modeler, scene), views = self._looking, {}
         points = {record["id"]: record["points"] for record in self.report["frames"]}
+        log_factor = math.log((self.report.get("camera") or {}).get("factor_in_run", 1.0))
         for frame in frames:
             view = modeler.prepare(self.sequence.frame(frame), scene).view
             if view is None or abs(len(view.points_m) - points[frame]) > _ALIKE * points[frame]:
@@ -162,6 +163,8 @@ class Part:
                     "from, or another version finds the object otherwise there; say where that sequence is with "
                     "--sequence, or build the run again"
                 )
+            if log_factor:
+                view = self.sensor.refocused(view, log_factor)
             views[frame + self.offset] = renumbered(view, self.offset)
         return views
 

@@ -119,10 +119,7 @@ def _check(options: Join) -> None:
 
 def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
     """Return what was estimated of the camera whose depth scale is known least; None where all are as stated."""
-    from modeler.cli.inputs import estimated_camera
-
-    files = (part.report["settings"].get("camera") for part in parts)
-    cameras = [camera for file in files if file is not None and (camera := estimated_camera(Path(file))) is not None]
+    cameras = [camera for part in parts if (camera := part.report.get("camera")) is not None]
     return max(cameras, key=lambda camera: float(camera["depth_scale_sigma"]), default=None)
 
 

@@ -53,7 +53,7 @@ class Register:
                 flaw = prepared.flaw
                 raise InputError(f"{self.sequence}: frame {index} has {flaw.label}. {outcome_advice(flaw)}")
             views.append(prepared.view)
-        posterior = modeler.register(*views)
+        posterior = modeler.register(*views).widened(modeler.sensor.sigma_focal)
         what_to_do = outcome_advice(posterior.outcome, modeler.prior, posterior)
         edge = Edge(posterior, "odometry", posterior.usable, Stated(what_to_do))
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}

@@ -87,7 +87,9 @@ class MapView:
 
 def composed(first: PoseGaussian, then: PoseGaussian) -> PoseGaussian:
     """Return the motion `first`, then `then`, of independent errors: mean `then.mean @ first.mean`."""
-    return PoseGaussian(then.mean @ first.mean, se3.composed_covariance(then.covariance, first.mean, first.covariance))
+    covariance = se3.composed_covariance(then.covariance, first.mean, first.covariance)
+    by_focal = first.by_focal + se3.adjoint(se3.inverse(first.mean)) @ then.by_focal
+    return PoseGaussian(then.mean @ first.mean, covariance, by_focal)
 
 
 @dataclass(frozen=True)

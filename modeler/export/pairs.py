@@ -29,6 +29,7 @@ from modeler.types import (
 )
 
 _DRAWN = 64  # poses at which priors are compared
+_GAUSSIAN = ("mean", "covariance", "by_focal")  # its arrays
 _digests: WeakKeyDictionary[RayImage, bytes] = WeakKeyDictionary()  # of views, each part of several questions
 
 
@@ -181,13 +182,13 @@ def _arrays(posterior: Posterior) -> dict[str, np.ndarray]:
             case None:
                 arrays[f"{name}.none"] = np.zeros(0)
             case PoseGaussian():
-                arrays |= {f"{name}.mean": value.mean, f"{name}.covariance": value.covariance}
+                arrays |= {f"{name}.{part}": getattr(value, part) for part in _GAUSSIAN}
             case Outcome():
                 arrays[f"{name}.label"] = np.array(value.label)
             case tuple():  # modes
                 arrays[f"{name}.weights"] = np.array([mode.weight for mode in value])
-                arrays[f"{name}.means"] = np.array([mode.pose.mean for mode in value])
-                arrays[f"{name}.covariances"] = np.array([mode.pose.covariance for mode in value])
+                for part in _GAUSSIAN:
+                    arrays[f"{name}.{part}s"] = np.array([getattr(mode.pose, part) for mode in value])
             case _:
                 arrays[name] = np.asarray(value)
     return arrays
@@ -205,11 +206,11 @@ def _posterior(arrays: dict[str, np.ndarray]) -> Posterior:
         if f"{name}.none" in arrays:
             values[name] = None
         elif f"{name}.mean" in arrays:
-            values[name] = PoseGaussian(arrays[f"{name}.mean"], arrays[f"{name}.covariance"])
+            values[name] = PoseGaussian(*(arrays[f"{name}.{part}"] for part in _GAUSSIAN))
         elif f"{name}.label" in arrays:
             values[name] = Outcome(str(arrays[f"{name}.label"]))
         elif f"{name}.weights" in arrays:
-            parts = (arrays[f"{name}.{part}"] for part in ("weights", "means", "covariances"))
+            parts = (arrays[f"{name}.{part}s"] for part in ("weight", *_GAUSSIAN))
             values[name] = tuple(Mode(float(weight), PoseGaussian(*pose)) for weight, *pose in zip(*parts, strict=True))
         else:
             values[name] = arrays[name] if arrays[name].ndim else arrays[name].item()

@@ -100,7 +100,9 @@ def _posterior(edge: Mapping[str, Any]) -> Posterior:
 
 
 def _gaussian(record: Mapping[str, Any]) -> PoseGaussian:
-    return PoseGaussian(_matrix(record["target_from_source"], 4), _matrix(record["covariance"], 6))
+    mean, covariance = _matrix(record["target_from_source"], 4), _matrix(record["covariance"], 6)
+    by_focal = record.get("by_focal")  # reports of earlier versions have none
+    return PoseGaussian(mean, covariance, np.zeros(6) if by_focal is None else np.array([*map(_number, by_focal)]))
 
 
 def _matrix(numbers: Sequence[float | None], size: int) -> Array:
@@ -112,7 +114,7 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
-_LATER = frozenset({"modes", "cause", "mask", "reason"})  # reports of earlier versions have none
+_LATER = frozenset({"by_focal", "modes", "cause", "mask", "reason"})  # reports of earlier versions have none
 
 
 def fault(report: Mapping[str, Any]) -> str | None:
@@ -236,6 +238,14 @@ def _is_loop(value: Any) -> bool:
     )
 
 
+def _is_camera(value: Any) -> bool:
+    if not isinstance(value, dict):
+        return False
+    factors = [value.get(name, 1.0) for name in ("focal_factor", "factor_in_run")]
+    sigmas = [value.get(name, 0.0) for name in ("focal_factor_sigma", "depth_scale_sigma")]
+    return all(_is_number(factor) and 0.25 <= factor <= 4.0 for factor in factors) and all(map(_is_number, sigmas))
+
+
 def _is_figure(value: Any) -> bool:
     return (
         isinstance(value, dict)
@@ -252,6 +262,7 @@ _WHOLE: dict[str, Test] = {
     "poses": _is(list),
     "closed": _is(bool),
     "loop": _null_or(_is_loop),
+    "camera": _null_or(_is_camera),
     "trustworthy": _is(bool),
     "reasons": lambda value: isinstance(value, list) and all(map(_is_text, value)),
     "reason_codes": _null_or(lambda value: isinstance(value, list) and all(map(_is(str), value))),
@@ -269,7 +280,12 @@ _FRAME: dict[str, Test] = {
     "mask": _null_or(_is_text),
 }
 _POSE: dict[str, Test] = {"id": _is_whole, "object_from_camera": _numbers(16), "covariance": _numbers(36)}
-_MODE: dict[str, Test] = {"weight": _is_number_or_null, "target_from_source": _numbers(16), "covariance": _numbers(36)}
+_MODE: dict[str, Test] = {
+    "weight": _is_number_or_null,
+    "target_from_source": _numbers(16),
+    "covariance": _numbers(36),
+    "by_focal": _null_or(_numbers(6)),
+}
 _EDGE: dict[str, Test] = {
     "source": _is_whole,
     "target": _is_whole,
@@ -279,6 +295,7 @@ _EDGE: dict[str, Test] = {
     "outcome": lambda value: value in [outcome.label for outcome in Outcome],
     "target_from_source": _numbers(16),
     "covariance": _numbers(36),
+    "by_focal": _null_or(_numbers(6)),
     "modes": _null_or(_are_modes),
     "overlap": _is_number_or_null,
     "effective_samples": _is_number_or_null,

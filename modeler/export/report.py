@@ -92,6 +92,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
     solution, views, covariances = step.solution, dict(step.views), dict(step.solution.covariances.items())
     if step.view is not None:  # also where the frame was left out
         views[step.frame.index] = step.view
+    camera = _camera(meta.camera, solution, views)
     verdict = judged(
         step,
         frames,
@@ -99,7 +100,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         interrupted=meta.interrupted,
         closure_expected=meta.closure_expected,
         prior=meta.known,
-        depth_scale_sigma=0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"]),
+        depth_scale_sigma=0.0 if camera is None else float(camera["depth_scale_sigma"]),
     )
     support = _support(solution, views)
     report = {
@@ -113,7 +114,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "complete": step.last and not meta.interrupted,
         "closed": loops_closed(_taking_part(step)) > 0,
         "loop": _loop(step.edges_so_far, solution, views),
-        "camera": None if meta.camera is None else dict(meta.camera),
+        "camera": camera,
         "trustworthy": verdict.trustworthy,
         "reasons": [shortcoming.words for shortcoming in verdict.shortcomings],
         "reason_codes": [shortcoming.code for shortcoming in verdict.shortcomings],
@@ -136,6 +137,39 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
     ]
     edges = [edge_record(edge, solution, views.get(edge.source)) for edge in step.edges_so_far]
     return {**_json(report), "edges": edges, "poses": _json(poses)}
+
+
+def _camera(
+    stated: Mapping[str, float | str] | None, solution: Solution, views: Mapping[int, RayImage]
+) -> dict[str, Any] | None:
+    """Return what is known of the camera; None where it is as the sequence says, exactly.
+
+    Loops tell the focal length and the relief of the depth together, so that the scale of one of them is as uncertain
+    as they moved the other.
+
+    Args:
+        stated: by the file that the run was made with, as report.json has it.
+        solution: with what its loops tell.
+        views: by frame number.
+    """
+    focal = solution.focal
+    if focal is None:
+        return None if stated is None else dict(stated)
+    before = {"focal_factor": 1.0, "depth_scale": 1.0, "depth_scale_sigma": 0.0} if stated is None else stated
+    in_run = math.exp(focal.log_factor)
+    root = views.get(min(solution.trajectory, default=-1))
+    return {
+        "focal_factor": in_run * float(before["focal_factor"]),
+        "focal_factor_sigma": focal.sigma,
+        "depth_scale": before["depth_scale"],
+        "depth_scale_sigma": math.hypot(float(before["depth_scale_sigma"]), 0.5 * focal.log_factor),
+        "told_by": focal.told_by,
+        "factor_in_run": in_run,  # beyond the file of a camera
+        "fx_px": None if root is None else root.frame.camera.fx,
+        "loops": focal.loops,
+        "sigmas_before": focal.sigmas_before,
+        "sigmas_after": focal.sigmas_after,
+    }
 
 
 def _loop(
@@ -186,6 +220,7 @@ def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) ->
         "reason": explain(OptimisationOutlier() if outlier else edge.reason),
         "target_from_source": posterior.pose.mean,
         "covariance": posterior.pose.covariance,
+        "by_focal": posterior.pose.by_focal,  # ξ by the logarithm of the focal length
         "beyond": list(posterior.beyond),
         "undetermined": undetermined(posterior, view),
         "modes": [_mode_record(mode, None if left is None else left[k]) for k, mode in enumerate(posterior.modes)],
@@ -205,6 +240,7 @@ def _mode_record(mode: Mode, left: float | None) -> dict[str, Any]:
         "weight_in_graph": left,
         "target_from_source": mode.pose.mean,
         "covariance": mode.pose.covariance,
+        "by_focal": mode.pose.by_focal,
     }
 
 

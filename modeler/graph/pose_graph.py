@@ -71,6 +71,14 @@ class Factor:
         """Those of the posterior that loops may choose between; none where they are not separate."""
         return self.edge.posterior.modes if are_separate(self.edge.posterior.modes) else ()
 
+    def under(self, log_factor: float) -> Factor:
+        """Return the factor under a longer focal length (method.md, eq. G12).
+
+        Args:
+            log_factor: logarithm of the focal length over that of the views.
+        """
+        return self if log_factor == 0.0 else Factor(self.edge, self.pose.under(log_factor))
+
     @cached_property
     def between(self) -> gtsam.BetweenFactorPose3:
         """The factor in GTSAM.

@@ -1,4 +1,4 @@
-"""Noise that edges share, of their frames and of all views: its effect on the uncertainty of a solution.
+"""What edges share, noise of their frames and of all views and the focal length: how it widens a solution.
 
 Of an edge's covariance Σ a share ρ is its two images' own: pixel noise moves an image as a whole, alike in all its
 edges. Frame k then appears not at T_k but at T_k exp(η_k), with one η_k ~ N(0, Q_k) for all its edges, and edges are
@@ -9,6 +9,8 @@ several edges of a frame make it no smaller than the images allow, and along a c
 All views may also err alike: one camera sees one object from one height, and puts it too near, say. Every frame then
 appears at T_k exp(β), with one β ~ N(0, B) in camera coordinates (eq. G10). Every loop still closes, so that no graph
 observes β; it cancels between frames that see the same side of the object.
+
+A focal length that is not known exactly moves all edges together, and widens every motion by how it follows (eq. G14).
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy as np
 from modeler import se3
 from modeler.graph.covariance import RelativeCovariance, chi_square_quantile
 from modeler.graph.pose_graph import Factor, PoseGraph
-from modeler.types import Array, Solution
+from modeler.types import Array, FocalLength, Solution
 
 _QUANTILE = 0.16  # one standard error towards larger covariances
 _MAX_SHARE = 0.9  # of a covariance: registration has noise of its own, from its samples
@@ -40,6 +42,8 @@ class SharedCovariance:
     """Share (0..1) of covariances that is the frames' own noise."""
     common: float = 0.0
     """B, as a share of the harmonic mean of all edges' covariances."""
+    focal: FocalLength | None = None
+    """What is known of the focal length; None: it is taken for known."""
 
     def __call__(self, target: int, source: int) -> Array:
         """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
@@ -64,6 +68,11 @@ class SharedCovariance:
         source_from_target = se3.inverse(self.independent.trajectory[source]) @ self.independent.trajectory[target]
         of_target = se3.inverse_covariance(source_from_target, self._own.get(target, np.zeros((6, 6))))
         covariance = (1.0 - self.share) * alone + self._own.get(source, np.zeros((6, 6))) + of_target  # eq. G9
+        if self.focal is not None:
+            still = np.zeros(6)  # of frames that came later
+            apart = self.focal.by_focal.get(source, still) - self.focal.by_focal.get(target, still)
+            moved = self.focal.sigma * se3.adjoint(se3.inverse(self.independent.trajectory[source])) @ apart
+            covariance = covariance + np.outer(moved, moved)  # eq. G14
         if self.common:
             left = np.eye(6) - se3.adjoint(source_from_target)
             covariance = covariance + left @ self._alike @ left.T  # eq. G10

@@ -15,7 +15,7 @@ from modeler.graph.modes import select_modes
 from modeler.graph.optimise import IncrementalSolver, inliers, selected, solve_loops, values_of
 from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, chain, collapse_modes, extended
 from modeler.graph.shared import SharedCovariance
-from modeler.types import Array, Edge, Solution
+from modeler.types import Array, Edge, FocalLength, Solution
 
 _MAX_ROUNDS = 5  # in which an axis may change which loops take part
 
@@ -57,6 +57,8 @@ class Smoother:
     """Covariance of the error common to all views, as a share of an edge's; see `SharedCovariance`."""
     axis: CommonAxis | None = None
     """The turntable, where there is one; not together with shared noise. Each solution is then a batch solution."""
+    focal: FocalLength | None = None
+    """What is known of the focal length, by which covariances are widened; None: it is taken for known."""
     graph: PoseGraph = field(default_factory=PoseGraph)
     """What is solved."""
     solution: Solution = field(default_factory=Solution)
@@ -150,6 +152,7 @@ class Smoother:
             relative_covariance=relative_covariance,
             edge_poses={(factor.source, factor.target): factor.pose for factor in several},
             mode_weights={(factor.source, factor.target): _weights(factor, state.weights) for factor in several},
+            focal=self.focal,
             camera_from_axis=None if with_axis is None else with_axis.camera_from_axis,
         )
 
@@ -188,9 +191,9 @@ class Smoother:
             found = before.at(trajectory, factors)
         else:
             found = RelativeCovariance(trajectory, root, factors, () if with_axis is None else with_axis.rows)
-        if not (factors and (self.shared or self.common)):
+        if not (factors and (self.shared or self.common or self.focal)):
             return found
-        return SharedCovariance(found, factors, self.shared, self.common)
+        return SharedCovariance(found, factors, self.shared, self.common, self.focal)
 
     def _with_axis(
         self,
@@ -246,6 +249,7 @@ def solve(
     shared: float = 0.0,
     common: float = 0.0,
     axis: CommonAxis | None = None,
+    focal: FocalLength | None = None,
 ) -> Solution:
     """Optimise the poses of all frames that accepted edges connect with the first.
 
@@ -260,8 +264,9 @@ def solve(
         shared: see `Smoother`.
         common: see `Smoother`.
         axis: the turntable, where there is one.
+        focal: see `Smoother`; of a solution of the same graph.
 
     Raises:
         ValueError: where an accepted edge's covariance is not positive definite.
     """
-    return Smoother(outlier_distance, shared, common, axis, solution=Solution(guess)).to(graph).solution
+    return Smoother(outlier_distance, shared, common, axis, focal, solution=Solution(guess)).to(graph).solution

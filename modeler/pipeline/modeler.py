@@ -11,8 +11,8 @@ from typing import final
 import numpy as np
 
 from modeler.closure import Closer
-from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances
-from modeler.graph import CommonAxis, shared_noise
+from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances, widened
+from modeler.graph import CommonAxis, MovingGraph, located, shared_noise
 from modeler.pipeline.joining import LEAST_JOINS, Joiner, Segment
 from modeler.pipeline.pairs import Prepared, anywhere, prepare, register
 from modeler.pipeline.state import State
@@ -28,6 +28,7 @@ from modeler.types import (
     Edge,
     Event,
     Failed,
+    FocalLength,
     Frame,
     Fusing,
     NotJoined,
@@ -40,6 +41,7 @@ from modeler.types import (
     Step,
 )
 
+_FOCAL_REACH = 5.0  # prior standard deviations: nominal focal lengths of captures were off by up to 4.5
 _LEAST_SEGMENT = 3  # frames that fit each other: two may do so by chance
 
 
@@ -244,7 +246,7 @@ class Run:
             self.state = replace(self.state, growing=None)  # so that its memory serves the fusion
             sure = conditional_covariances(self.state.solution, self.state.graph.edges)
             model = self.modeler.fuser.fuse(self.state.views, self.state.solution.trajectory, sure)
-            self.state = replace(self.state, model=model)
+            self.state = replace(self.state, model=widened(model, self.state.solution))
         spans = self.state.spans
         yield self._step(newest, [edge.posterior for edge in spans], spans, last=True)
 
@@ -319,20 +321,43 @@ class Run:
         self.state = replace(self.state, growing=growing, model=growing.model())
 
     def _solve(self) -> None:
-        """Solve the graph with what its edges share: an axis about which all steps turn, or noise.
+        """Solve the graph with what its edges share: an axis about which all steps turn, or noise, and a focal length.
 
         The images of every pair say where the axis lies, so that it makes the first pairs as precise as the last, and
         what each pair says of it counts once. The noise is that of a frame's image in all its edges, and that of all
-        images.
+        images. Where loops tell the focal length, views and edges become those of the one they tell.
         """
-        state = self.state.with_spans()
+        state, focal = self.state.with_spans(), None
+        if (sigma := self.modeler.sensor.sigma_focal) > 0.0 and len(state.solution.trajectory) > 1:
+            state, focal = self._focused(state, sigma)
         axis = self.modeler.prior.shared_axis(list(state.views.values()))
         if axis is None:
             shared = shared_noise(state.graph, state.solution)
-            self.state = state.solved(axis=None, shared=shared, common=self.modeler.common_noise)
+            self.state = state.solved(axis=None, shared=shared, common=self.modeler.common_noise, focal=focal)
         else:
             tilt_rad, shift_m = axis.sigma_tilt_rad, axis.sigma_shift_m
-            self.state = state.solved(axis=CommonAxis(tilt_rad, shift_m, sigma_lift_m=np.inf))
+            self.state = state.solved(axis=CommonAxis(tilt_rad, shift_m, sigma_lift_m=np.inf), focal=focal)
+
+    def _focused(self, state: State, sigma: float) -> tuple[State, FocalLength]:
+        """Return a state under the focal length that its loops tell, and what that is.
+
+        Where it is far from the given one, edges are registered again, for how they follow it is known roughly.
+
+        Args:
+            state: with all edges.
+            sigma: standard deviation of the focal length's logarithm.
+        """
+        at, sensor = 0.0, self.modeler.sensor
+
+        def told_at(log_factor: float) -> FocalLength:
+            nonlocal state, at
+            if log_factor != at:
+                moved = state.under(log_factor - at, sensor)
+                state, at = moved.again(self.modeler.tracker(moved).spans), log_factor
+            return MovingGraph.of(state.graph, state.solution).estimate(sigma, -at)
+
+        focal = located(told_at, rounds=2, enough=1.0, reach=_FOCAL_REACH * sigma)
+        return (state if focal.log_factor == at else state.under(focal.log_factor - at, sensor)), focal
 
     def _step(
         self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge], *, last: bool = False

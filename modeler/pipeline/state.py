@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
+
+from modeler import se3
 from modeler.closure import MapView, PathNetwork
 from modeler.disk_arrays import ViewStore
 from modeler.fusion import IncrementalTsdf
 from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.pipeline.pairs import Prepared
-from modeler.types import Edge, InputError, ObjectModel, RayImage, Solution
+from modeler.rays import Sensor
+from modeler.types import Edge, FocalLength, InputError, ObjectModel, PoseGaussian, Posterior, RayImage, Solution
 
 READY = 8  # views kept ready for registration; of others the images that a likelihood looks up are made again
 _REVISITED = 3  # frames at most between a lost one and a view that followed it, to which it is registered again
@@ -138,9 +142,51 @@ class State:
             lost={frame: lost for frame, lost in self.lost.items() if frame not in segment.views},
         )
 
-    def solved(self, *, axis: CommonAxis | None, shared: float = 0.0, common: float = 0.0) -> State:
-        """Return the state solved with an axis that all steps share, or the noise that edges do; see `Smoother`."""
-        return replace(self, smoother=replace(self.smoother, axis=axis, shared=shared, common=common).to(self.graph))
+    def under(self, log_factor: float, sensor: Sensor) -> State:
+        """Return the state as it is under another focal length: its views, edges and poses.
+
+        Args:
+            log_factor: logarithm of the other focal length over that of the views.
+            sensor: that made the views.
+        """
+        moved = {edge: replace(edge, posterior=edge.posterior.under(log_factor)) for edge in self.graph.edges}
+        views = {frame: self.store.keep(sensor.refocused(view, log_factor)) for frame, view in self.views.items()}
+        graph = replace(self.graph, edges=tuple(moved.values()))
+        newest = self.newest
+        if newest is not None and newest.frame.index in views:
+            newest = replace(newest, view=views[newest.frame.index])
+        spans = tuple(moved[edge] for edge in self.spans)
+        smoother = replace(self.smoother, focal=None).to(graph)
+        return replace(self, graph=graph, smoother=smoother, views=views, ready={}, newest=newest, spans=spans)
+
+    def again(self, register: Callable[[Sequence[tuple[int, int]]], Iterable[Posterior]]) -> State:
+        """Return the state with the edges that take part registered again where that finds them at the same place.
+
+        Args:
+            register: returns the posteriors of pairs (source, target) of its views.
+        """
+        lasting = [edge for edge in self.graph.accepted if edge.kind != "join" and not edge.posterior.modes]
+        found = register([(edge.source, edge.target) for edge in lasting])
+        new = {
+            edge: replace(edge, posterior=posterior.without_samples())
+            for edge, posterior in zip(lasting, found, strict=True)
+            if posterior.usable and not posterior.modes and _same_place(edge.posterior.pose, posterior.pose)
+        }
+        graph = replace(self.graph, edges=tuple(new.get(edge, edge) for edge in self.graph.edges))
+        spans = tuple(new.get(edge, edge) for edge in self.spans)
+        return replace(self, graph=graph, spans=spans, smoother=self.smoother.to(graph))
+
+    def solved(
+        self,
+        *,
+        axis: CommonAxis | None,
+        shared: float = 0.0,
+        common: float = 0.0,
+        focal: FocalLength | None = None,
+    ) -> State:
+        """Return the state solved with what its edges share: an axis or noise, and a focal length; see `Smoother`."""
+        smoother = replace(self.smoother, axis=axis, shared=shared, common=common, focal=focal)
+        return replace(self, smoother=smoother.to(self.graph))
 
     def overdue(self) -> Iterator[tuple[int, int]]:
         """Yield lost frames, newest first, each with the view that followed it soonest, if that was soon."""
@@ -161,3 +207,9 @@ class State:
         assert images.mask is not None
         found = replace(prepared.segmentation, mask=images.mask)
         return replace(prepared, frame=frame, segmentation=found, view=view)
+
+
+def _same_place(before: PoseGaussian, after: PoseGaussian) -> bool:
+    """Return whether a registration found what it did under another focal length, or another mode."""
+    xi = se3.log(se3.inverse(before.mean) @ after.mean)
+    return bool(xi @ np.linalg.solve(before.covariance + after.covariance, xi) <= Smoother.outlier_distance**2)

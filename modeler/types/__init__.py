@@ -51,6 +51,7 @@ from modeler.types.solution import AWAY_DEG as AWAY_DEG
 from modeler.types.solution import NEAR_DEG as NEAR_DEG
 from modeler.types.solution import Edge as Edge
 from modeler.types.solution import EdgeKind as EdgeKind
+from modeler.types.solution import FocalLength as FocalLength
 from modeler.types.solution import LoopOpening as LoopOpening
 from modeler.types.solution import Solution as Solution
 from modeler.types.solution import joined_without as joined_without
@@ -59,6 +60,7 @@ from modeler.types.solution import loop_openings as loop_openings
 from modeler.types.solution import loops_closed as loops_closed
 from modeler.types.solution import segments as segments
 from modeler.types.views import COLOUR_SHIFT_PX as COLOUR_SHIFT_PX
+from modeler.types.views import NOMINAL_FOCAL as NOMINAL_FOCAL
 from modeler.types.views import Camera as Camera
 from modeler.types.views import Frame as Frame
 from modeler.types.views import Plane as Plane

@@ -22,10 +22,22 @@ class PoseGaussian:
     """(4, 4)."""
     covariance: Array
     """(6, 6) of ξ: rotation in rad first, then translation in m."""
+    by_focal: Array = field(default_factory=lambda: np.zeros(6))
+    """(6,) derivative of ξ by the logarithm of the camera's focal length, which no image tells by itself and all share
+    (method.md, eq. 25); 0 where it is not stated. The covariance is that under a known focal length."""
 
     def inverse(self) -> PoseGaussian:
         """Return the Gaussian of the inverse motion."""
-        return PoseGaussian(se3.inverse(self.mean), se3.inverse_covariance(self.mean, self.covariance))
+        covariance = se3.inverse_covariance(self.mean, self.covariance)
+        return PoseGaussian(se3.inverse(self.mean), covariance, -se3.adjoint(self.mean) @ self.by_focal)
+
+    def under(self, log_factor: float) -> PoseGaussian:
+        """Return the Gaussian under a focal length, given as the logarithm of its factor."""
+        return replace(self, mean=self.mean @ se3.exp(log_factor * self.by_focal))
+
+    def widened(self, sigma_focal: float) -> PoseGaussian:
+        """Return the Gaussian under a focal length of which the logarithm has a standard deviation."""
+        return replace(self, covariance=self.covariance + sigma_focal**2 * np.outer(self.by_focal, self.by_focal))
 
     @cached_property
     def rotation_variance_rad2(self) -> float:
@@ -86,6 +98,16 @@ class Posterior:
         """Whether the surfaces overlap enough at the mean; at a limit of the prior they may not."""
         return self.outcome is not Outcome.NO_OVERLAP and self.overlap > 0.0 and self.overlap >= self.least_overlap
 
+    def under(self, log_factor: float) -> Posterior:
+        """Return the posterior, without its samples, under a focal length, given as the logarithm of its factor."""
+        modes = tuple(replace(mode, pose=mode.pose.under(log_factor)) for mode in self.modes)
+        return replace(self.without_samples(), pose=self.pose.under(log_factor), modes=modes)
+
+    def widened(self, sigma_focal: float) -> Posterior:
+        """Return the posterior of a single pair where the logarithm of the focal length has this sd."""
+        modes = tuple(replace(mode, pose=mode.pose.widened(sigma_focal)) for mode in self.modes)
+        return replace(self, pose=self.pose.widened(sigma_focal), modes=modes)
+
     def without_samples(self) -> Posterior:
         """Return the posterior without its samples, most of its memory, which are not needed once it is judged."""
         return replace(self, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
@@ -112,7 +134,8 @@ def pooled(modes: Sequence[Mode], weights: Array | None = None) -> PoseGaussian:
         weights: (m,) weights of the modes; None: their own.
     """
     weights = np.array([mode.weight for mode in modes]) if weights is None else weights
-    mean = modes[int(np.argmax(weights))].pose.mean
+    heaviest = modes[int(np.argmax(weights))].pose
+    mean = heaviest.mean
     offsets = se3.log(se3.inverse(mean) @ np.stack([mode.pose.mean for mode in modes]))
     spread = np.stack([mode.pose.covariance for mode in modes]) + offsets[:, :, None] * offsets[:, None, :]
-    return PoseGaussian(mean, np.tensordot(weights / np.sum(weights), spread, 1))
+    return PoseGaussian(mean, np.tensordot(weights / np.sum(weights), spread, 1), heaviest.by_focal)

@@ -54,6 +54,36 @@ NEAR_DEG: Final = 45.0
 """Rotation up to which two views share surface whatever the shape: 85 % of what each sees of a sphere."""
 
 
+@dataclass(frozen=True, eq=False)
+class FocalLength:
+    """What the edges of a graph tell of the logarithm of the true focal length over that of their views."""
+
+    log_factor: float
+    """Its mean."""
+    sigma: float
+    """Its standard deviation."""
+    prior_sigma: float
+    """The same before the edges are asked."""
+    loops: int
+    """Number of loops that tell it."""
+    sigmas_before: float
+    """Root mean square of the loops' normalised residuals with the one given: 1 where all is true; 0 without a loop."""
+    sigmas_after: float
+    """The same at the mean."""
+    by_focal: Mapping[int, Array] = field(repr=False)
+    """By frame number (6,) derivative of a pose: it moves to exp(by_focal · log_factor) object_from_camera."""
+
+    @property
+    def factor(self) -> float:
+        """The true focal length over that of the views."""
+        return float(np.exp(self.log_factor))
+
+    @property
+    def told_by(self) -> Literal["loop", "prior"]:
+        """Whether loops tell it, more than what was known before."""
+        return "loop" if self.sigma < 0.5 * self.prior_sigma else "prior"
+
+
 def _unsolved(target: int, source: int) -> Array:
     """Raise: nothing was solved."""
     raise KeyError(f"no motion from frame {source} to frame {target} was solved")
@@ -77,6 +107,8 @@ class Solution:
     """target_from_source by (source, target) of edges that entered with a pose other than their posterior's."""
     mode_weights: Mapping[tuple[int, int], Array] = field(default_factory=dict)
     """Weights (m,) of the modes of a multimodal edge, given all edges together, by (source, target)."""
+    focal: FocalLength | None = None
+    """What is known of the focal length, and covariances hold; None: it is taken for known."""
     camera_from_axis: Array | None = None
     """(4, 4), whose third direction is the axis of all steps; None where none was estimated, or it does not fit."""
 

@@ -106,15 +106,24 @@ Fitted with the pose to the pairs of three captures: 0.44 by column and 0.26 px 
 """
 
 
+NOMINAL_FOCAL = 0.02
+"""Standard deviation of the logarithm of a focal length of which nobody says how well it is known.
+
+What manufacturers allow for. Focal lengths fitted to boards are good to some 0.002.
+"""
+
+
 class SensorNoise(NamedTuple):
     """Noise of a depth camera, as a sequence states it."""
 
-    sigma_wh: float
-    """Lateral noise in ray coordinates (w, h)."""
-    sigma_r_m: float
+    sigma_wh: float = 0.002
+    """Lateral noise in ray coordinates (w, h); the paper's value for the first Kinect."""
+    sigma_r_m: float = 0.002
     """Noise along the ray in m, for a surface that faces the camera."""
     sigma_colour_px: float = COLOUR_SHIFT_PX
     """Standard deviation in px of the shift of colours beside depth from one image to the next."""
+    sigma_focal: float = NOMINAL_FOCAL
+    """Standard deviation of the logarithm of the focal length; 0 = it is exact."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,7 +95,7 @@ class RenderedSequence(AbstractSequence):
         view, photography = self.recipe.view, self.recipe.photography
         shift_px = 0.0 if photography is None else np.sqrt(2.0) * photography.shift_px
         sigmas = self._sensor.sigmas(view.distance_m, view.focal_px, self.recipe.depth_unit_mm / 1000.0)
-        return SensorNoise(*sigmas, float(np.hypot(shift_px, _ALIGNED_PX)))
+        return SensorNoise(*sigmas, float(np.hypot(shift_px, _ALIGNED_PX)), sigma_focal=0.0)
 
     @property
     def motion(self) -> Mapping[str, object] | None:

@@ -36,7 +36,7 @@ def memory_mib() -> dict[str, float]:
 def write_sequence(folder: Path, frames: int, *, shape: str, width: int) -> None:
     """Render frames at 3° each into a folder, one after the other."""
     sequence = turned([3.0 * frame for frame in range(frames)], shape=shape, width=width)
-    sigma_wh, sigma_r_m, _ = sequence.sensor() or (0.0, 0.0, 0.0)
+    sigma_wh, sigma_r_m, *_ = sequence.sensor() or (0.0, 0.0)
     sensor = {"sigma_wh": sigma_wh, "sigma_r_m": sigma_r_m}
     write_bop(folder, sequence, sequence.truth(), {"name": folder.name, "sensor": sensor})
 

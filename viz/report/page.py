@@ -8,7 +8,7 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -63,6 +63,20 @@ def _opening(loop: Mapping[str, float] | None) -> list[tuple[str, str, str]]:
     return [(value, "open loop, before optimisation", why)]
 
 
+def _focal_length(camera: Mapping[str, Any] | None) -> list[tuple[str, str, str]]:
+    """Return what is known of the focal length, as a key figure; nothing where it is taken for known."""
+    if camera is None or not (fx_px := camera.get("fx_px")):
+        return []
+    value = f"{fx_px:.1f} ± {fx_px * camera['focal_factor_sigma']:.1f} px"
+    if not camera["loops"]:
+        return [(value, "focal length", "as given: no loop tells it, and poses are as uncertain as it makes them")]
+    why = (
+        f"{fx_px / camera['factor_in_run']:.1f} px was given; loops close to {camera['sigmas_after']:.1f} sd with this "
+        f"one, to {camera['sigmas_before']:.1f} as given; poses and surface are those under this one"
+    )
+    return [(value, "focal length, as loops tell it", why)]
+
+
 def _head(result: Result, mesh: Mesh | None) -> str:
     """Return name, verdict and key figures."""
     report = result.report
@@ -82,6 +96,7 @@ def _head(result: Result, mesh: Mesh | None) -> str:
             "a view was registered to one that the object had turned away from",
         ),
         *_opening(report.get("loop")),
+        *_focal_length(report.get("camera")),
         ("none" if mesh is None else f"{mesh.total:,}", "triangles", "of the fused mesh"),
         ("unknown" if total_s is None else f"{total_s:.0f} s", "build time", "reading and writing included"),
     ]

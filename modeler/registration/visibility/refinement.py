@@ -35,8 +35,8 @@ class Refiner:
 
     def refine(
         self, pair: PairLikelihood, poses: Array, weights: Array, rng: np.random.Generator, *, fine_m: float
-    ) -> Array:
-        """Return refined samples (n, 4, 4): those of posterior × matching surface, if both were Gaussian.
+    ) -> Refined:
+        """Return refined samples: those of posterior × matching surface, if both were Gaussian.
 
         Each sample takes its own Gauss-Newton step, scaled by how much more certain the surface is than the samples'
         spread, and a share of the surface's uncertainty (randomised maximum likelihood: Oliver, He and Reynolds 1996).
@@ -53,7 +53,7 @@ class Refiner:
         mean, covariance = se3.mean(poses, weights, about_m=centre_m)
         spread = np.asarray(np.linalg.cholesky(covariance + FLOOR), dtype=np.float64)
         mode, noise = _mode(pair, mean, spread, centre_m, fine_m=fine_m)
-        basis, information = self._information(pair, mode, noise, spread)
+        basis, information, by_focal = self._information(pair, mode, noise, spread)
         scales, axes = np.linalg.eigh(information)
         root = axes * np.sqrt(np.maximum(scales, 0.0))
         narrowed = np.linalg.inv(np.eye(6) + information)
@@ -61,25 +61,45 @@ class Refiner:
         step = _steps(pair, poses, noise, spread) @ to_basis.T @ information
         scatter = rng.normal(size=(len(poses), 6)) @ root.T
         moved = (step + scatter) @ narrowed.T @ basis.T  # method.md, eq. 16
-        return se3.moved(poses, moved, centre_m)
+        from_centre = se3.adjoint(se3.translation(centre_m))
+        return Refined(se3.moved(poses, moved, centre_m), np.asarray(from_centre @ by_focal, dtype=np.float64))
 
-    def _information(self, pair: PairLikelihood, mode: Array, noise: MatchNoise, spread: Array) -> tuple[Array, Array]:
-        """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) in it (method.md, eq. 14)."""
+    def _information(
+        self, pair: PairLikelihood, mode: Array, noise: MatchNoise, spread: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return a basis (6, 6) of ξ about the centre, the information (6, 6) in it, and ξ (6,) by the focal length.
+
+        Equations 14 and 25 of method.md.
+        """
         surface, colours = _equations(pair, mode, noise)
         halvings = min(self.halvings, int(np.log2(max(len(surface.residuals) / self.min_matches, 1.0))))
         if 2**halvings <= len(spread):  # the scatter of six equations would be singular
-            return spread, np.zeros((6, 6))
+            return spread, np.zeros((6, 6)), np.zeros(6)
         sensitivity, variability = surface.scatter(spread, halvings, pair.patches)
+        pulled = surface.pulled(spread)
         if pair.colour is not None and len(colours.residuals):
             by_colour, scatter = colours.scatter(spread, halvings, pair.colour.patches(noise.band))
             shifts = np.asarray(np.linalg.solve(spread, pair.colour.shifts(mode)), dtype=np.float64)
             kept, felt = unshifted(by_colour, shifts), by_colour @ shifts
             sensitivity = sensitivity + kept @ by_colour
             variability = variability + kept @ (scatter + felt @ felt.T) @ kept.T
+            pulled = pulled + kept @ colours.pulled(spread)
         scales, axes = np.linalg.eigh(0.5 * (sensitivity + sensitivity.T))
         positive = np.diag(np.maximum(scales, 0.0))
         information = positive @ np.linalg.solve(axes.T @ variability @ axes, positive)
-        return spread @ axes, np.asarray(0.5 * (information + information.T), dtype=np.float64)
+        information = np.asarray(0.5 * (information + information.T), dtype=np.float64)
+        # In the basis the samples have unit covariance: they hold where the surface determines nothing.
+        by_focal = spread @ np.linalg.solve(np.eye(6) + (axes @ positive @ axes.T), pulled)
+        return spread @ axes, information, np.asarray(by_focal, dtype=np.float64)
+
+
+class Refined(NamedTuple):
+    """Refined samples."""
+
+    poses: Array
+    """(n, 4, 4) of target_from_source."""
+    by_focal: Array
+    """(6,) derivative of their mean's ξ by the logarithm of the focal length; 0 where too little matches."""
 
 
 def shrunk(scores: Array, shape: Array) -> Array:
@@ -154,6 +174,20 @@ class Equations(NamedTuple):
     """(n,) in m; of colours without a unit."""
     weights: Array
     """(n,) in 1/m²; of colours without a unit."""
+    focal_own: Array
+    """(n,) derivatives of the residuals by the logarithm of the focal length, from the point's own normal."""
+    focal_other: Array
+    """(n,) likewise, from the other surface's."""
+
+    def pulled(self, basis: Array) -> Array:
+        """Return the derivative (6,) of the right side of the normal equations by the logarithm of the focal length.
+
+        Args:
+            basis: (6, 6) of ξ.
+        """
+        # As in the normal equations: in products of both surfaces the noise of normals averages out.
+        found = self.by_own.T @ (self.weights * self.focal_other) + self.by_other.T @ (self.weights * self.focal_own)
+        return np.asarray(0.5 * basis.T @ found, dtype=np.float64)
 
     def scatter(self, basis: Array, halvings: int, independent: float) -> tuple[Array, Array]:
         """Return sensitivity (6, 6) and variability (6, 6) of the sum of the equations (method.md, eq. 14 and 15).
@@ -187,9 +221,27 @@ def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Eq
         to_source = np.eye(4) if sign < 0.0 else se3.inverse(pose)
         for kind, matches in enumerate((found, pair.colour_matches(carried, found, noise, forward=sign > 0.0))):
             used = matches[matches[:, point_to_plane.WEIGHT] > 0.0]
+            moves = following(carried, used[:, point_to_plane.POSITION])
+            focal = [np.sum(used[:, k] * moves, axis=1) for k in (point_to_plane.OWN, point_to_plane.OTHER)]
             arms = se3.transform(to_source, used[:, point_to_plane.POSITION]) - pair.centre_m
             own, other = (used[:, k] @ to_source[:3, :3].T for k in (point_to_plane.OWN, point_to_plane.OTHER))
             derivatives = [sign * np.hstack([np.cross(arms, normals), normals]) for normals in (own, other)]
-            parts[kind].append((arms, *derivatives, used[:, point_to_plane.RESIDUAL], used[:, point_to_plane.WEIGHT]))
+            residuals, weights = used[:, point_to_plane.RESIDUAL], used[:, point_to_plane.WEIGHT]
+            parts[kind].append((arms, *derivatives, residuals, weights, *focal))
     surface, colours = (Equations(*(np.concatenate(columns) for columns in zip(*part, strict=True))) for part in parts)
     return surface, colours
+
+
+def following(carried: Array, positions: Array) -> Array:
+    """Return how other surface moves away (n, 3) from points there, in m by the logarithm of the focal length.
+
+    A longer focal length draws what a camera measured towards its axis, x and y alike and depths not at all: the
+    surface as its own camera does, the points as theirs did, in another direction once they are carried.
+
+    Args:
+        carried: (4, 4) the transform that carries the points into the other camera.
+        positions: (n, 3) of the carried points in m.
+    """
+    drawn = np.diag([-1.0, -1.0, 0.0])
+    own = se3.transform(se3.inverse(carried), positions) @ drawn @ carried[:3, :3].T
+    return np.asarray(positions @ drawn - own, dtype=np.float64)

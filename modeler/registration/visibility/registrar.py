@@ -120,8 +120,9 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return refined samples of a mode; those that would leave the prior's support stay."""
         fine_m = self.search.fine_m(pair)
         refined = self.refiner.refine(pair, samples.poses, samples.weights, rng, fine_m=fine_m)
-        inside = np.isfinite(density.log_evidence(refined))
-        return replace(samples, poses=np.where(inside[:, None, None], refined, samples.poses))
+        inside = np.isfinite(density.log_evidence(refined.poses))
+        poses = np.where(inside[:, None, None], refined.poses, samples.poses)
+        return replace(samples, poses=poses, by_focal=refined.by_focal)
 
     def _share_at_limit(
         self,
@@ -149,10 +150,13 @@ class VisibilityRegistrar(AbstractRegistrar):
         samples = np.concatenate([mode.poses for _, mode in weighed])
         weights = np.concatenate([share * mode.weights for share, mode in weighed])
         modes = tuple(
-            Mode(share, weighted_gaussian(mode.poses, mode.weights, pair.centre_m)) for share, mode in weighed
+            Mode(share, replace(weighted_gaussian(mode.poses, mode.weights, pair.centre_m), by_focal=mode.by_focal))
+            for share, mode in weighed
         )
         separate = len(modes) == 1 or are_separate(modes)
-        pose = pooled(modes) if separate else weighted_gaussian(samples, weights, pair.centre_m)
+        pose = pooled(modes)
+        if not separate:
+            pose = replace(weighted_gaussian(samples, weights, pair.centre_m), by_focal=pose.by_focal)
         overlap = pair.overlap(modes[0].pose.mean)
         # Of very many poses, some match by chance; of few, the likeliest is right though a mask be cut off.
         matches = not found.anywhere or pair.fits(modes[0].pose.mean, self.search.fine_m(pair))

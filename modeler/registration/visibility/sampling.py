@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -111,6 +111,8 @@ class WeightedSamples:
     """Log of the mean likelihood under the prior."""
     pareto_k: float
     """Tail index of the weights of everything that was drawn."""
+    by_focal: Array = field(default_factory=lambda: np.zeros(6))
+    """(6,) derivative of their mean's ξ by the logarithm of the focal length, once it is known."""
 
     @property
     def effective_samples(self) -> float:

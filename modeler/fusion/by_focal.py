@@ -1,0 +1,40 @@
+"""How uncertain a focal length leaves the surface: it draws what every view measured, and moves the views."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from modeler import se3
+from modeler.types import ObjectModel, Solution
+
+_MAX_VIEWS = 60  # spread over a run: more show the same sides again
+_MIN_COSINE = 0.3  # between normal and the ray to a camera: flatter surface has no say in the mesh
+
+
+def widened(model: ObjectModel, solution: Solution) -> ObjectModel:
+    """Return a model whose vertices are as uncertain as the focal length makes them, too (method.md, eq. F12).
+
+    Args:
+        model: fused under the solution's poses.
+        solution: with what is known of the focal length; without, the model stays as it is.
+    """
+    focal, sigmas_m = solution.focal, model.vertex_sigmas_m
+    frames = [] if focal is None else [frame for frame in solution.trajectory if frame in focal.by_focal]
+    if focal is None or sigmas_m is None or not frames:
+        return model
+    vertices_m, normals = model.vertices_m, model.vertex_normals
+    total, weight = np.zeros(len(vertices_m)), np.zeros(len(vertices_m))
+    for place in np.unique(np.linspace(0, len(frames) - 1, _MAX_VIEWS).astype(np.int64)).tolist():
+        object_from_camera, by_focal = solution.trajectory[frames[place]], focal.by_focal[frames[place]]
+        points_m = se3.transform(se3.inverse(object_from_camera), vertices_m)
+        drawn = (points_m * (-1.0, -1.0, 0.0)) @ object_from_camera[:3, :3].T
+        moved = drawn + np.cross(by_focal[:3], vertices_m) + by_focal[3:]
+        rays = object_from_camera[:3, 3] - vertices_m
+        cosines = np.sum(normals * rays, axis=1) / np.linalg.norm(rays, axis=1)
+        share = np.where(cosines > _MIN_COSINE, cosines, 0.0)
+        total += share * np.sum(normals * moved, axis=1)
+        weight += share
+    by_normal = np.divide(total, weight, out=np.zeros(len(total)), where=weight > 0.0)
+    return replace(model, vertex_sigmas_m=np.hypot(sigmas_m, focal.sigma * by_normal))
