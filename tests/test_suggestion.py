@@ -15,7 +15,7 @@ from modeler.priors import PokePrior, TablePrior
 from modeler.rays import Sensor
 from modeler.suggestion import Belief, Candidate, Goal, Prediction, suggest
 from modeler.suggestion.candidates import poked, pokes
-from modeler.suggestion.edge_forecast import basins
+from modeler.suggestion.edge_forecast import TURNS_RAD, basins
 from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information
 from modeler.suggestion.surface_cells import enclosing_circle
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Stated
@@ -81,7 +81,9 @@ def test_the_circle_holds_all_points_and_is_hardly_larger_than_needed(rng: np.ra
     assert radius == pytest.approx(1.0, abs=0.02)
 
 
-def shown(name: str, turns_deg: list[float], *, spin_sd_deg: float = 0.3, reach_deg: float = 100.0) -> Belief:
+def shown(
+    name: str, turns_deg: list[float], *, spin_sd_deg: float = 0.3, reach_deg: float = 100.0, colour: bool = False
+) -> Belief:
     """Return what is known of a shape after true turns, whose edges state a spin uncertain by so much."""
     recipe = load_specimen(name)
     places = tuple(Place(rotation_deg=(0.0, 0.0, turn)) for turn in turns_deg)
@@ -93,6 +95,8 @@ def shown(name: str, turns_deg: list[float], *, spin_sd_deg: float = 0.3, reach_
         view=type(view)(200, 150, 180.0, 0.5, view.elevation_deg, view.look_height_m),
         trajectory=Places(places),
     )
+    if colour:
+        small = replace(small, colour=recipe.colour, photography=recipe.photography, label=recipe.label)
     sequence = RenderedSequence(small)
     modeler = Modeler(sensor=Sensor(*sequence.sensor()), prior=TablePrior(max_rotation_deg=reach_deg))
     frames = [sequence.frame(k) for k in sequence.indices]
@@ -141,6 +145,83 @@ def test_new_surface_grows_with_the_turn_and_the_pose_gets_less_certain(box: Bel
     assert found[2].right <= found[0].right
 
 
+def test_no_action_takes_knowledge_away_and_odds_fall_with_the_turn(box: Belief) -> None:
+    found = [box.predict(Candidate("turn", turn_deg=turn)) for turn in (5.0, 20.0, 45.0, 70.0, 95.0)]
+    told = [each for each in found if each is not None]
+    assert len(told) == len(found)
+    assert all(min(each.pose_nats, each.surface_nats, each.gain_nats, each.mode_nats) >= 0.0 for each in told)
+    assert all(0.0 <= each.right <= each.usable <= 1.0 for each in told)
+    odds = [each.usable for each in told]
+    assert odds == sorted(odds, reverse=True)
+    assert odds[0] > 0.98
+    for each in told:
+        assert all(edge.masses.sum() == pytest.approx(1.0) for edge in each.edges)
+
+
+@pytest.fixture(scope="module")
+def can() -> Belief:
+    """Return a can, whose spin nothing tells, after two views."""
+    return shown("can", [0.0, 25.0], spin_sd_deg=25.0)
+
+
+def mass_within(found: Prediction | None, turn_deg: float) -> float:
+    """Return the probability that a view is placed within so much of where it belongs."""
+    assert found is not None
+    edge = found.edges[0]
+    return float(edge.masses[np.abs(TURNS_RAD) <= np.radians(turn_deg)].sum())
+
+
+def test_a_view_of_a_body_of_revolution_may_be_placed_at_many_turns(box: Belief, can: Belief) -> None:
+    turn = Candidate("turn", turn_deg=45.0)
+    assert mass_within(box.predict(turn), 10.0) > 0.95
+    assert mass_within(can.predict(turn), 20.0) < 0.6
+
+
+def test_colours_that_told_the_spin_are_expected_to_tell_it_again() -> None:
+    turn = Candidate("turn", turn_deg=25.0)
+    plain, printed = shown("can+plain", [0.0, 25.0], colour=True), shown("can+labelled", [0.0, 25.0], colour=True)
+    assert shown("can+labelled", [0.0]).forecast.colour is None
+    assert printed.forecast.colour is not None
+    assert (printed.forecast.colour.losses <= 0.0).all()
+    assert spin_deg(printed.predict(turn)) < 0.5 * spin_deg(plain.predict(turn))
+    assert mass_within(printed.predict(turn), 10.0) > mass_within(plain.predict(turn), 10.0)
+
+
+def test_a_view_that_may_be_placed_anywhere_is_expected_to_show_less_new_surface(can: Belief) -> None:
+    found = can.predict(Candidate("turn", turn_deg=60.0))
+    assert found is not None
+    object_from_new = can.object_from_last @ se3.inverse(
+        found.candidate.motion(can.last, can.stand, can.object_from_last)
+    )
+    cells, surface = can.cells.looked_at(se3.inverse(object_from_new))
+    there = ~can.cells.under[cells]
+    new = surface[there & ~can.cells.seen[cells]].sum() / surface[there].sum()
+    assert found.new_surface < 0.9 * new
+
+
+def test_surface_seen_counts_once_and_hidden_space_less_the_farther_out_it_is(box: Belief) -> None:
+    pose = se3.inverse(box.stand.turned(np.radians(-60.0)) @ box.object_from_last)
+    cells, surface = box.cells.looked_at(pose)
+    np.testing.assert_array_equal(cells, box.cells.visible(pose))
+    seen = box.cells.seen[cells]
+    hidden = ~seen & ~box.cells.under[cells]
+    np.testing.assert_array_equal(surface[seen], 1.0)
+    assert hidden.any()
+    assert (surface[hidden] > 0.0).all()
+    far = hidden & box.cells.beyond[cells]
+    assert surface[far].mean() < surface[hidden & ~far].mean()
+    assert not box.cells.beyond[box.cells.seen].any()
+
+
+def test_laying_it_down_shows_what_it_stood_on_with_the_odds_of_joining(box: Belief) -> None:
+    found = box.predict(Candidate("lay"))
+    assert found is not None
+    assert found.new_surface > 0.0
+    assert found.pose_nats == 0.0
+    assert 0.5 < found.right < 1.0
+    assert "placed right with" in suggest(box, [Candidate("lay")]).ranked[0].words
+
+
 def test_a_turn_beyond_the_prior_is_no_candidate(box: Belief) -> None:
     assert box.predict(Candidate("turn", turn_deg=120.0)) is None
 
@@ -161,8 +242,8 @@ def spin_deg(found: Prediction | None) -> float:
     return float(np.degrees(np.sqrt(found.edges[0].covariance[:3, :3].trace())))
 
 
-def test_hardly_anything_tells_the_spin_of_a_can_but_a_poke_tells_more_than_a_turn(box: Belief) -> None:
-    belief = shown("can", [0.0, 25.0], spin_sd_deg=25.0)
+def test_hardly_anything_tells_the_spin_of_a_can_but_a_poke_tells_more_than_a_turn(box: Belief, can: Belief) -> None:
+    belief = can
     turn = Candidate("turn", turn_deg=25.0)
     assert spin_deg(belief.predict(turn)) > 5.0 * spin_deg(box.predict(turn))
     found = pokes(belief.last, belief.stand, belief.object_from_last)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -16,14 +17,15 @@ _ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object to the ey
 FROM_THE_SIDE: Final = np.array([-0.8, -0.35, -0.5])  # errors along the camera's own axis show from here
 
 
-def layout(first: RayImage | None) -> rrb.Blueprint:
+def layout(first: RayImage | None, further: Sequence[rrb.Container] = ()) -> rrb.Blueprint:
     """Return the layout: tabs, the first of which has the poses and their uncertainty large.
 
     Args:
         first: the first accepted view, which tells where to look from; None before there is one.
+        further: tabs after the first.
     """
     return rrb.Blueprint(
-        rrb.Tabs(_poses(first), _object(first), _pair(first), _edges(first), _words(), active_tab=0),
+        rrb.Tabs(_poses(first), *further, _object(first), _pair(first), _edges(first), _words(), active_tab=0),
         rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=3.0),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),

@@ -23,15 +23,16 @@ _GREY, _ORANGE = (150, 155, 165), (240, 140, 40)
 _SHOWN: Final = 8
 
 
-def draw_next(belief: Belief, found: Suggestions, done: str) -> Drawing:
+def draw_next(belief: Belief, found: Suggestions, done: str | None = None) -> Drawing:
     """Yield what is known and what to do next.
 
     Args:
         belief: what is known.
         found: what to do next.
-        done: the action that led here, in words.
+        done: the action that led here, in words; None where nobody says.
     """
-    lines = [f"**{found.summary}**", "", f"Done: {done}", "", *(f"1. {each.words}" for each in found.ranked[:_SHOWN])]
+    told = [] if done is None else [f"Done: {done}", ""]
+    lines = [f"**{found.summary}**", "", *told, *(f"1. {each.words}" for each in found.ranked[:_SHOWN])]
     yield WORDS, rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
     cells, size_m = belief.cells, 0.5 * belief.cells.cell_m
     open_ = belief.can_be_seen & ~cells.seen & ~cells.under
@@ -42,36 +43,50 @@ def draw_next(belief: Belief, found: Suggestions, done: str) -> Drawing:
 
 
 def layout(first: RayImage) -> rrb.Blueprint:
-    """Return the layout: seen and unseen surface among the cameras, the frame, the list, and both over time.
+    """Return the layout of a recording of nothing else.
 
     Args:
         first: the first view, which tells where to look from.
     """
-    centre_m, size_m = first.centroid_m, max(first.size_m, 0.02)
-    eye = rrb.EyeControls3D(
-        position=centre_m + 7.0 * size_m * FROM_THE_SIDE / np.linalg.norm(FROM_THE_SIDE),
-        look_target=centre_m,
-        eye_up=np.array([0.0, -1.0, 0.0]),
-    )
-    cells = rrb.Spatial3DView(
-        origin=entities.WORLD,
-        contents=[SEEN_CELLS, UNSEEN_CELLS, entities.CAMERAS, entities.POSITION_3_SIGMA],
-        name="Seen (grey), and where unseen surface may be (orange)",
-        eye_controls=eye,
-    )
-    frame = rrb.Spatial2DView(
-        origin=entities.CAMERA, contents=[entities.COLOUR, entities.OUTLINE], name="Frame, object outlined"
-    )
-    words = rrb.TextDocumentView(origin=WORDS, name="What to do next")
-    times = rrb.Horizontal(
-        rrb.TimeSeriesView(origin=SEEN, name="Seen, % of what can be seen"),
-        rrb.TimeSeriesView(origin=POSE_SD, name="Largest standard deviation of a rotation, °"),
-    )
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(cells, times, row_shares=[2.0, 1.0]), rrb.Vertical(frame, words)),
+        tab(first),
         rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=1.0),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
         auto_layout=False,
+    )
+
+
+def tab(first: RayImage | None) -> rrb.Container:
+    """Return seen and unseen surface among the cameras, the frame, the list, and both over time.
+
+    Args:
+        first: the first view, which tells where to look from; None before there is one.
+    """
+    cells = rrb.Spatial3DView(
+        origin=entities.WORLD,
+        contents=[SEEN_CELLS, UNSEEN_CELLS, entities.CAMERAS, entities.POSITION_3_SIGMA],
+        name="Seen (grey), and where unseen surface may be (orange)",
+        eye_controls=None if first is None else _eye(first),
+    )
+    frame = rrb.Spatial2DView(
+        origin=entities.CAMERA, contents=[entities.COLOUR, entities.OUTLINE], name="Frame, object outlined"
+    )
+    words = rrb.TextDocumentView(origin=WORDS, name="What to do next, best first")
+    times = rrb.Horizontal(
+        rrb.TimeSeriesView(origin=SEEN, name="Seen, % of what can be seen"),
+        rrb.TimeSeriesView(origin=POSE_SD, name="Largest standard deviation of a rotation, °"),
+    )
+    return rrb.Horizontal(
+        rrb.Vertical(cells, times, row_shares=[2.0, 1.0]), rrb.Vertical(frame, words), name="What to do next"
+    )
+
+
+def _eye(first: RayImage) -> rrb.EyeControls3D:
+    centre_m, size_m = first.centroid_m, max(first.size_m, 0.02)
+    return rrb.EyeControls3D(
+        position=centre_m + 7.0 * size_m * FROM_THE_SIDE / np.linalg.norm(FROM_THE_SIDE),
+        look_target=centre_m,
+        eye_up=np.array([0.0, -1.0, 0.0]),
     )

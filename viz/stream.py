@@ -20,6 +20,10 @@ from viz import entities, viewer
 
 if TYPE_CHECKING:
     import rerun as rr
+    import rerun.blueprint as rrb
+
+    from modeler.suggestion import Belief, Suggestions
+    from modeler.types import RayImage
 
 _log = logging.getLogger(__name__)
 
@@ -44,6 +48,8 @@ class RerunStream:
     """What it is recorded to."""
     watched: bool = False
     """Whether it is also sent to a viewer, which may be slow or freeze."""
+    advised: bool = False
+    """Whether it will be told what to do next, for which the layout has a tab."""
 
     @property
     def address(self) -> str | None:
@@ -55,14 +61,14 @@ class RerunStream:
         if not self.recording.is_enabled():
             return
         # Rerun takes half a second to import: only runs that record pay for it.
-        from viz import blueprint, graph_view, images, model_view, pair_view, readings
+        from viz import graph_view, images, model_view, pair_view, readings
         from viz.drawings import shown_posterior
 
         # A frame that was lost is tried again when later ones are known: what that brings stands at the latest frame.
         self.recording.set_time(entities.FRAME, sequence=max([step.frame.index, *step.views]))
         self.recording.set_time(entities.ELAPSED, duration=time.monotonic() - self.started_s)
         if step.view is not None and set(step.views) == {step.frame.index}:
-            self.recording.send_blueprint(blueprint.layout(step.view))
+            self.recording.send_blueprint(_layout(step.view, advised=self.advised))
         of_pair = (
             images.draw_frame,
             pair_view.draw_pair,
@@ -80,6 +86,17 @@ class RerunStream:
             readings.draw_readings(step),
             readings.draw_text(step),
         ):
+            self.recording.log(path, archetype)
+
+    def advise(self, step: Step, belief: Belief, found: Suggestions) -> None:
+        """Draw what is known after a step and what to do next; it may come from a thread of its own."""
+        if not self.recording.is_enabled():
+            return
+        from viz import next_view
+
+        self.recording.set_time(entities.FRAME, sequence=max([step.frame.index, *step.views]))
+        self.recording.set_time(entities.ELAPSED, duration=time.monotonic() - self.started_s)
+        for path, archetype in next_view.draw_next(belief, found):
             self.recording.log(path, archetype)
 
     def close(self) -> None:
@@ -126,6 +143,7 @@ def open_stream(
     web: bool = False,
     connect: str | None = None,
     facts: Mapping[str, object] | None = None,
+    advised: bool = False,
 ) -> RerunStream:
     """Open a recording and the viewer that is to watch it.
 
@@ -138,6 +156,7 @@ def open_stream(
         web: serve the viewer in the browser on 127.0.0.1; `address` names the page.
         connect: `rerun+http://HOST:PORT/proxy` of a viewer that is already open.
         facts: settings of the run, by name, which the viewer shows.
+        advised: whether it will be told what to do next.
 
     Raises:
         InputError: where `save` cannot be written, or `connect` is not an address.
@@ -147,7 +166,7 @@ def open_stream(
         check_room(_ROOM)
     import rerun as rr
 
-    from viz import blueprint, drawings, images, readings
+    from viz import drawings, images, readings
 
     listens = connect is not None and viewer.reachable(connect)
     sinks: list[rr.FileSink | rr.GrpcSink] = [] if save is None else [_file_sink(save)]
@@ -167,14 +186,21 @@ def open_stream(
         except RuntimeError as error:  # the disk has become full since
             raise InputError(f"{save}: cannot write the recording ({error}); choose another folder") from error
         recording.send_recording_name(name)
-        recording.send_blueprint(blueprint.layout(None))
+        recording.send_blueprint(_layout(None, advised=advised))
         for path, archetype in itertools.chain(
             drawings.draw_axes(),
             images.draw_area_colours(),
             readings.draw_legend(name, facts or {}),
         ):
             recording.log(path, archetype, static=True)
-    return RerunStream(recording, viewers, time.monotonic(), save, watched=watched)
+    return RerunStream(recording, viewers, time.monotonic(), save, watched=watched, advised=advised)
+
+
+def _layout(first: RayImage | None, *, advised: bool) -> rrb.Blueprint:
+    """Return the layout, with a tab for what to do next where that will be told."""
+    from viz import blueprint, next_view
+
+    return blueprint.layout(first, (next_view.tab(first),) if advised else ())
 
 
 def _own_viewers(*, spawn: bool, web: bool) -> tuple[viewer.Viewer, ...]:

@@ -206,6 +206,7 @@ def _run(
     """
     from modeler.beside import behind
     from modeler.cli.inputs import while_it_lasts
+    from modeler.cli.live_advice import advising
     from modeler.types import Step
     from viz.stream import open_stream
 
@@ -217,6 +218,7 @@ def _run(
         web=options.web,
         connect=options.connect,
         facts={"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings},
+        advised=frames.live,
     )
     seconds = {"scene": time.perf_counter() - began_s, "registration": 0.0, "total": 0.0}
     report: Mapping[str, Any] = {}
@@ -225,7 +227,9 @@ def _run(
             behind(stream) as draw,
             Interrupt() as interrupt,
             Console(len(frames), stream.address, modeler.prior) as console,
+            advising(modeler, console.advise, stream.advise) as advise,
         ):
+            followed = frames.live and (console.watched or stream.watched)
             wanted = frames.until(lambda: interrupt.asked)
             coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
             for event in _events(modeler.start(scene), coming, interrupt):
@@ -239,6 +243,8 @@ def _run(
                     # are linearised about, and so their last digits.
                     event.solution.covariances.values()
                     draw(event)
+                    if followed and not event.last:
+                        advise(event)
     finally:
         stream.close()
     if not report:

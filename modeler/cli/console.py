@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from modeler.suggestion import Belief, Suggestions
     from modeler.types import AbstractPrior, Event, Posterior, Reason, Step
 
 T = TypeVar("T")
@@ -155,6 +156,7 @@ class Console:
         self._advised: set[str] = set()
         self._reported, self._aloud = "", 0
         self._held: list[int] = []  # frames left out for the same reason as those reported last
+        self._state, self._enough = "", False
 
     def __enter__(self) -> Console:
         """Show the bar."""
@@ -175,6 +177,21 @@ class Console:
         if self._unsure:
             doubt = Outcome.UNSURE_MASK
             self._say(f"{len(self._unsure)} of {len(self._placed)} frames: {doubt.label}: {outcome_advice(doubt)}")
+
+    @property
+    def watched(self) -> bool:
+        """Whether stderr is a terminal."""
+        return not self._bar.disable
+
+    def advise(self, step: Step, belief: Belief, found: Suggestions) -> None:
+        """Show what to do next after a step; the first time that nothing more is to be gained, it is said for good."""
+        from modeler.cli.live_advice import in_short
+
+        if found.reached and not self._enough:
+            self._enough = True
+            self._say(found.summary)
+        if self._state and not self._stage:
+            self._bar.update(self._task, description=f"{self._state}; {in_short(found)}")
 
     def __call__(self, event: Event) -> None:
         """Show what happens in a run."""
@@ -203,8 +220,8 @@ class Console:
         before, self._placed[frame] = self._placed.get(frame), accepted
         if accepted and step.segmentation.outcome is Outcome.UNSURE_MASK:
             self._unsure.add(frame)
-        description = f"{len(step.views)} joined, {loops} {'loop' if loops == 1 else 'loops'} closed"
-        self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=description)
+        self._state = f"{len(step.views)} joined, {loops} {'loop' if loops == 1 else 'loops'} closed"
+        self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=self._state)
         if step.left_out is not None and before is None:
             self._tell(frame, f"left out: {self._why(step.left_out, step.posteriors)}")
         elif accepted and before is False:

@@ -15,6 +15,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.kernels import point_likelihood, point_to_plane
+from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration.posterior import PRIOR_SAMPLES, weighted_gaussian
 from modeler.registration.visibility.likelihood import (
     DirectedLikelihood,
@@ -30,11 +31,24 @@ USUAL_NOISE: Final = 0.66
 """Noise b of matching surfaces before there is an edge, of the sensor's along the ray: 0.59 to 0.70 for 7 shapes."""
 USUAL_SCALE: Final = 1.7
 """Information of an edge over what is predicted, before there is one: 1.6 to 1.9 for 6 shapes that determine a pose."""
-EVEN_ODDS_DEG, ODDS_DEG = 95.0, 19.0
-"""Rotation between views at which a registration fails or finds a wrong pose as often as not, and over which the odds
-change e-fold: fitted to 248 steps over rendered shapes of the tuning half, 51 of which failed (`python -m active`)."""
+EVEN_ODDS_DEG, ODDS_DEG = 106.0, 21.0
+"""Rotation between views at which a registration fails or is surely wrong as often as not, and over which the odds
+change e-fold: a logistic fit to 475 steps over 48 rendered shapes of the tuning half, 42 of which failed."""
 _PATCHES: Final = 32  # into which the registration divides a surface (`Refiner.halvings`)
-_STEP_DEG: Final = 3.0  # between turns at which the likelihood is asked for other modes: a posterior's usual width
+TURNS_RAD: Final = np.radians(3.0) * np.arange(-60, 60)
+"""Turns from the true pose about the table's normal at which the likelihood is asked: a posterior's width apart."""
+_TRUE: Final = 60
+_FORESEEN: Final = 0.3
+"""Share of what is predicted that a view tells between modes: so tempered, the true mode's mass is right on average.
+
+Of 175 steps over 35 shapes of the tuning half the true mode is given 0.76 untempered and 0.61 tempered; views that were
+taken give it 0.63."""
+_CORE_RAD: Final = np.radians(6.0)  # two steps: turns so near the true pose are what the local Gaussian is about
+_DESCENT_STEPS: Final = (
+    4  # along the table: with 2 or 8, 13 of 14 shapes get the same masses to 0.03; with none, others
+)
+_DESCENT_NOISE: Final = 0.05  # noise of matching surfaces in them, of the object's size; as good are 0.02 and 0.1
+_LARGEST_STEP_RAD: Final = 0.1  # no step turns, which the damping forbids
 _VALLEY: Final = np.exp(-2.0)  # of a mode's peak: what separates two Gaussians two standard deviations apart each
 _MAX_EDGES: Final = 6  # newest edges by which predictions are scaled: their scatter is about a factor of two
 
@@ -58,6 +72,8 @@ class ForeseenView:
     """Share (0..1) of its points that are new."""
     normal_variance: float
     """Variance in each tangent direction of the noise that its normals share with those of earlier views."""
+    axis_m: Array
+    """(3,) point in its camera on the axis of turns: other modes of a body on a table are turns about its middle."""
 
 
 @final
@@ -69,14 +85,31 @@ class ForeseenEdge:
     """Frame number of the other."""
     covariance: Array
     """(6, 6) of target_from_source about the source's camera; of several modes, that of all about the true one."""
+    masses: Array
+    """(t,) probabilities, which sum to 1, that the registration places the view at each of `TURNS_RAD`."""
     right: float
     """Probability (0..1) that it finds the true pose: by the modes' masses, and by how far the views are apart."""
+    usable: float
+    """Probability (0..1) that it finds one of the modes: by how far the views are apart."""
     mode_nats: float
     """Entropy of the modes' weights."""
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class ColourForecast:
+    """What colours have told in the pairs so far, which they are expected to tell again."""
+
+    matrix: Array
+    """(6, 6) sensitivity of their matches, a point of the pair, for ξ about the object's middle in the camera."""
+    losses: Array
+    """(t,) nats by which they contradict turns about the table's normal, see `TURNS_RAD`; at most 0."""
+    explained: float
+    """Share of the points that matched in those pairs."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class EdgeForecast:
     """Predicts edges, with what the edges so far tell of the camera and the object."""
 
@@ -86,6 +119,8 @@ class EdgeForecast:
     """Noise b of matching surfaces (method.md, eq. 8), the median of the edges so far."""
     scale: float = USUAL_SCALE
     """Information of edges so far over what is predicted for them."""
+    colour: ColourForecast | None = None
+    """What colours tell; None where none have been compared yet."""
 
     def learned(
         self,
@@ -94,6 +129,8 @@ class EdgeForecast:
         solution: Solution,
         prior: AbstractPrior,
         ready: Callable[[RayImage], RayImage],
+        *,
+        axis: tuple[Array, Array],
     ) -> EdgeForecast:
         """Return the forecast with noise and scale from the newest edges (method.md, eq. N4).
 
@@ -105,6 +142,7 @@ class EdgeForecast:
             solution: tells which edges take part.
             prior: of the run.
             ready: returns a view with the images that a likelihood looks up.
+            axis: (3,) point and (3,) direction of the axis of turns in the object frame.
         """
         used = [
             edge
@@ -117,20 +155,29 @@ class EdgeForecast:
                 ready(views[edge.source]), ready(views[edge.target]), np.random.default_rng(0)
             )
             pose = edge.posterior.pose
-            noise_m = pair.surface_noise_m(pose.mean, 0.015 * pair.size_m)  # as fine as the search
-            pairs.append((edge, pair, noise_m))
-            noises_m.append(noise_m)
+            noise = pair.match_noise(pose.mean, 0.015 * pair.size_m)  # as fine as the search
+            pairs.append((edge, pair, noise))
+            noises_m.append(noise.surface_m)
         if not pairs:
             return self
-        scales = [np.log(USUAL_SCALE)]
-        for edge, pair, noise_m in pairs:
+        scales, colours = [np.log(USUAL_SCALE)], []
+        for edge, pair, noise in pairs:
             pose = edge.posterior.pose
-            _, matrix = pair.normal_equations(pose.mean[None], MatchNoise(noise_m), stride=1)
+            _, matrix = pair.normal_equations(pose.mean[None], noise, stride=1)
             information = self.independent(pair.patches) / pair.points * matrix[0]
+            if pair.colour is not None:
+                camera_from_object = se3.inverse(solution.trajectory[edge.source])
+                axis_m = se3.transform(camera_from_object, axis[0][None])[0]
+                colours.append(
+                    _colour_told(
+                        pair, pose.mean, noise, matrix[0], axis_m=axis_m, up=camera_from_object[:3, :3] @ axis[1]
+                    )
+                )
             known = prior_information(prior, views[edge.source], views[edge.target], pair.centre_m)
             actual = inverted(se3.covariance_about(pose.covariance, pair.centre_m))
             scales.append(_log_scale(information, known, actual))
-        return replace(self, noise_m=float(np.median(noises_m)), scale=float(np.exp(np.mean(scales))))
+        colour = ColourForecast(*(np.mean(part, axis=0) for part in zip(*colours, strict=True))) if colours else None
+        return replace(self, noise_m=float(np.median(noises_m)), scale=float(np.exp(np.mean(scales))), colour=colour)
 
     def independent(self, patches: float) -> float:
         """Return the number of independent measurements in a pair's points (method.md, eq. N3).
@@ -161,42 +208,51 @@ class EdgeForecast:
             2.0 * source.weight * matched(directed, target_from_source, self.noise_m, centre_m, source.normal_variance)
         )
         patches = max(target.patches, 1.0)
+        poses, told, before, explained = self._turned(directed, source, target_from_source, density, up)
+        if self.colour is not None:
+            alike = min(explained / max(self.colour.explained, 1e-9), 1.0)
+            matrix = matrix + alike * points * self.colour.matrix
+            told = told + alike * self.colour.losses
         information = self.scale * self.independent(patches) / points * matrix
         known = density_information(density, centre_m)
         local = inverted(information + known)
-        offsets_rad, masses = self._modes(directed, source, target_from_source, density, up)
-        turn = np.append(up, np.zeros(3))
-        spread = local + float(masses @ offsets_rad**2) * np.outer(turn, turn)
+        away = se3.difference(target_from_source, poses, centre_m)
+        stated = normalised(told + before) * (np.abs(TURNS_RAD) > _CORE_RAD)  # nearer ones are the local Gaussian
+        spread = local + (away.T * stated) @ away
+        share = normalised(_FORESEEN * told + before)
+        offsets_rad, masses = basins(TURNS_RAD, _FORESEEN * told + before)
         angle_deg = float(np.degrees(se3.rotation_angle(target_from_source)))
-        own = float(masses[np.argmin(np.abs(offsets_rad))]) / (1.0 + np.exp((angle_deg - EVEN_ODDS_DEG) / ODDS_DEG))
+        usable = 1.0 / (1.0 + float(np.exp((angle_deg - EVEN_ODDS_DEG) / ODDS_DEG)))
+        own = usable * float(masses[np.argmin(np.abs(offsets_rad))])
         entropy = float(-np.sum(masses * np.log(np.maximum(masses, 1e-12))))
-        return ForeseenEdge(target.index, se3.covariance_about(spread, -centre_m), own, entropy)
+        return ForeseenEdge(target.index, se3.covariance_about(spread, -centre_m), share, own, usable, entropy)
 
-    def _modes(
+    def _turned(
         self,
         directed: DirectedLikelihood,
         source: ForeseenView,
         target_from_source: Array,
         density: AbstractPoseDensity,
         up: Array,
-    ) -> tuple[Array, Array]:
-        """Return turns (m,) in rad from the true mode to each, itself included, and the modes' masses (m,)."""
-        steps_rad = np.radians(_STEP_DEG) * np.arange(-60, 60)
-        xi = np.hstack([steps_rad[:, None] * up, np.zeros((120, 3))])
-        poses = se3.moved(target_from_source, xi, source.image.centroid_m)
+    ) -> tuple[Array, Array, Array, float]:
+        """Return the poses (t, 4, 4) that match best at `TURNS_RAD`, and log masses (t,) by the images and before them.
+
+        The last is the share of points that match at the true pose.
+        """
         pair = PairLikelihood(directed, replace(directed, points=directed.points[:0]), directed.size_m)
+        poses = turned(pair, target_from_source, source.axis_m, up)
         parameters = directed.parameters(self.noise_m, pair.typical_misfit(target_from_source, self.noise_m))
         projection = directed.projection(1)
         nothing = projection._replace(points=np.ascontiguousarray(projection.points[:, :0]))
         found = point_likelihood.log_likelihoods(rows(poses), projection, nothing, parameters, parameters)
         sums = source.weight * found / self.likelihood.points  # a point, in the mean of both directions
         independent = 1.0 / (1.0 / self.likelihood.max_independent + 1.0 / max(directed.image.patches, 1.0))
-        alike = sums[:, 1] + np.where(steps_rad == 0.0, 0.0, self._mistaken(source, poses))
+        alike = sums[:, 1] + np.where(TURNS_RAD == 0.0, 0.0, self._mistaken(source, poses))
         costs = [np.exp(-share / self.likelihood.overlap_scale) for share in (sums[:, 1], alike)]
         costs = [self.likelihood.no_overlap_cost * cost for cost in costs]
         looks = np.logaddexp(-costs[0], -costs[1]) - np.log(2.0)
-        log_mass = independent * sums[:, 0] + looks + density.log_density(poses)  # method.md, eq. 7 and N6
-        return basins(steps_rad, log_mass)
+        told = independent * sums[:, 0] + looks  # method.md, eq. 7 and N7
+        return poses, told, density.log_density(poses), float(sums[_TRUE, 1])
 
     def _mistaken(self, source: ForeseenView, poses: Array) -> Array:
         """Return the share (n,) of a view's points, new surface, that could be taken for what the other view saw.
@@ -211,6 +267,40 @@ class EdgeForecast:
         normals = np.einsum("nij,uj->nui", poses[:, :3, :3], source.unseen_normals[some])
         facing = -np.sum(points_m * normals, axis=2) >= 0.35 * np.linalg.norm(points_m, axis=2)
         return source.unseen_share * facing.mean(axis=1)
+
+
+def turned(pair: PairLikelihood, target_from_source: Array, axis_m: Array, up: Array) -> Array:
+    """Return the poses (t, 4, 4) at `TURNS_RAD` from a pose (4, 4) that match best.
+
+    A body of revolution looks alike at turns about its own axis, which need not be the middle of what was seen of it:
+    matching surface moves each turned pose along the table.
+
+    Args:
+        pair: the likelihood.
+        target_from_source: the pose.
+        axis_m: (3,) point of the source on the axis of turns.
+        up: (3,) its direction.
+    """
+    none = np.zeros((len(TURNS_RAD), 3))
+    poses = se3.moved(target_from_source, np.hstack([TURNS_RAD[:, None] * up, none]), axis_m)
+    held = Regulariser(rows(target_from_source), np.zeros((6, 6)), np.repeat([1e9, 1e3], 3), _LARGEST_STEP_RAD)
+    moved = pair.descend(poses, _DESCENT_NOISE * pair.size_m, held, steps=_DESCENT_STEPS)
+    shifts_m = se3.difference(poses, moved, axis_m)[:, 3:]
+    shifts_m = shifts_m - (shifts_m @ up)[:, None] * up
+    poses = se3.moved(poses, np.hstack([none, shifts_m]), axis_m)
+    poses[_TRUE] = target_from_source
+    return poses
+
+
+def _colour_told(
+    pair: PairLikelihood, pose: Array, noise: MatchNoise, matrix: Array, *, axis_m: Array, up: Array
+) -> tuple[Array, Array, float]:
+    """Return what a `ColourForecast` has, of one pair at its pose (4, 4), whose matches have a matrix (6, 6) in all."""
+    _, of_depth = pair.normal_equations(pose[None], MatchNoise(noise.surface_m), stride=1)
+    poses = turned(pair, pose, axis_m, up)
+    gains = pair.colour_gain(poses, noise.surface_m, stride=1)
+    _, explained = pair.log_likelihoods(pose[None], noise.surface_m, stride=1)
+    return (matrix - of_depth[0]) / pair.points, np.minimum(gains - gains[_TRUE], 0.0), float(explained[0])
 
 
 def matched(
@@ -273,8 +363,7 @@ def basins(places: Array, log_mass: Array) -> tuple[Array, Array]:
         places: (n,) ascending.
         log_mass: (n,), -inf outside the support.
     """
-    mass = np.exp(log_mass - np.max(log_mass))
-    mass = mass / mass.sum()
+    mass = normalised(log_mass)
     lows = [k for k in range(1, len(mass) - 1) if mass[k] < mass[k - 1] and mass[k] <= mass[k + 1]]
     cuts = [0, *lows, len(mass)]
     parts = [[start, stop] for start, stop in itertools.pairwise(cuts)]
@@ -290,6 +379,12 @@ def basins(places: Array, log_mass: Array) -> tuple[Array, Array]:
         0.0 if start <= zero < stop else float(places[start + np.argmax(mass[start:stop])]) for start, stop in joined
     ]
     return np.array(peaks), np.array([mass[start:stop].sum() for start, stop in joined])
+
+
+def normalised(log_mass: Array) -> Array:
+    """Return the probabilities (n,) of log masses, which sum to 1."""
+    mass = np.exp(log_mass - np.max(log_mass))
+    return mass / mass.sum()
 
 
 def _log_scale(information: Array, known: Array, actual: Array) -> float:

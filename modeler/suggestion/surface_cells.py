@@ -29,6 +29,9 @@ _NEIGHBOURS, _REACH = 50, 7.0  # cells by which normals are smoothed, and how fa
 _THINNED = 2  # of so many cells one takes part in that, which halves the time
 _RIDGE = 1e-3  # where neighbours lie on a line
 _ALIKE = np.cos(np.radians(50.0))  # between normals of one face: edges stay
+_SURFACE_WITHIN, _SURFACE_BEYOND = 1.15, 0.24
+"""Cells of new surface that a view shows in a cell of hidden space that it looks at squarely, fitted to 48 shapes of
+the tuning half (docs/method.md). Surface of which a view shows a cell's area is itself larger, for it is slanted."""
 _STEPS = 24  # of 15°: turns from which is told what can be seen
 
 
@@ -107,10 +110,8 @@ class SurfaceCells:
     """(x, y, z) whether a cell of the grid, on its table, holds seen surface or touches a cell that does."""
     under: BoolArray
     """(c,) whether the cell is unseen surface that the object stands on."""
-    solidity: float
-    """Surface to be expected in a cell that may hold unseen surface: hidden space has more surface than what is in it.
-
-    As much unseen surface is expected as there would be if the object were the same from behind."""
+    beyond: BoolArray
+    """(c,) whether a cell may hold unseen surface, but farther from the stand's axis than any seen at that height."""
     normal_variance: float
     """Variance, in each tangent direction, of the noise that smoothed normals share with those of a view."""
 
@@ -140,29 +141,36 @@ class SurfaceCells:
         mean_m, mean_normals, shared = smoothed(
             found[:3, holding].T / found[6, holding, None], found[3:6, holding].T, cell_m, float(np.mean(patch_cells))
         )
-        behind = np.zeros(len(found[6]), dtype=bool)
-        behind[_numbers(mean_m * np.array([-1.0, -1.0, 1.0]), origin_m, cell_m, shape)[0]] = True
-        expected = np.count_nonzero(behind & ~near.ravel())
         kinds = unseen & ~bottom, bottom
         places = [np.argwhere(kind) for kind in kinds]
         outwards = _unit(outward[kinds[0]])
         middles_m = origin_m + (np.concatenate(places) + 0.5) * cell_m
         counts = np.array([len(holding), *(len(some) for some in places)])
+        local_m = np.concatenate([mean_m, middles_m])
         directions = np.concatenate([mean_normals, outwards, np.tile([0.0, 0.0, -1.0], (counts[2], 1))])
         return cls(
             stand,
             cell_m,
-            se3.transform(stand.object_from_stand, np.concatenate([mean_m, middles_m])),
+            se3.transform(stand.object_from_stand, local_m),
             directions @ stand.object_from_stand[:3, :3].T,
             np.repeat([True, False, False], counts),
             near,
             np.repeat([False, False, True], counts),
-            min(expected / max(counts[1], 1), 1.0),
+            _beyond(local_m, counts[0], cell_m),
             shared,
         )
 
     def visible(self, camera_from_object: Array) -> IntArray:
         """Return which cells (k,) a camera at a pose (4, 4) sees, and well enough for points."""
+        return self.looked_at(camera_from_object)[0]
+
+    def looked_at(self, camera_from_object: Array) -> tuple[IntArray, Array]:
+        """Return which cells (k,) a camera at a pose (4, 4) sees well enough for points, and the surface there (k,).
+
+        The second is how much surface, in cells, it is expected to see there: 1 of surface that was seen. Of hidden
+        space it counts how much of the view a cell covers, and whether surface is to be expected behind it: where the
+        back of seen surface is, or not farther from the axis than any was seen at that height (method.md, eq. N5).
+        """
         points_m = se3.transform(camera_from_object, self.points_m)
         normals = self.normals @ camera_from_object[:3, :3].T
         depth_m = points_m[:, 2]
@@ -170,14 +178,20 @@ class SurfaceCells:
         rays = points_m[:, 1::-1] / depth_m[:, None]
         corner = rays.min(axis=0) - pitch
         size = np.ceil((rays.max(axis=0) - corner) / pitch).astype(np.intp) + 2
-        near_m = np.full(tuple(size), np.inf)
+        near_m, back_m = np.full(tuple(size), np.inf), np.full(tuple(size), -np.inf)
         place = np.floor((rays - corner) / pitch).astype(np.intp)
         np.minimum.at(near_m, tuple(place.T), depth_m)
         covered = ndimage.minimum_filter(near_m, size=2)  # a cell covers up to two of the raster each way
         near_m = np.minimum(near_m, np.where(np.isfinite(covered), covered + self.cell_m, np.inf))
         cosine = -np.sum(points_m * normals, axis=1) / np.linalg.norm(points_m, axis=1)
-        visible = (depth_m <= near_m[tuple(place.T)] + 1.5 * self.cell_m) & (cosine >= _MIN_COSINE)
-        return np.flatnonzero(visible)
+        visible = np.flatnonzero((depth_m <= near_m[tuple(place.T)] + 1.5 * self.cell_m) & (cosine >= _MIN_COSINE))
+        away = self.seen & (cosine < 0.0)
+        np.maximum.at(back_m, tuple(place[away].T), depth_m[away])
+        back_m = ndimage.maximum_filter(back_m, size=3)
+        solid = back_m[tuple(place[visible].T)] > depth_m[visible] + 1.5 * self.cell_m
+        likely = solid | ~self.beyond[visible]
+        surface = np.where(likely, _SURFACE_WITHIN, _SURFACE_BEYOND) * cosine[visible]
+        return visible, np.where(self.seen[visible] | self.under[visible], 1.0, surface)
 
     def at(self, points_m: Array) -> tuple[IntArray, IntArray]:
         """Return which cells of seen surface (k,) hold or touch points of a view, and one point (m,) of each new cell.
@@ -248,6 +262,15 @@ def smoothed(points_m: Array, normals: Array, cell_m: float, patch: float) -> tu
     residual = float(np.median(np.sum((normals - mean) ** 2, axis=1))) / (2.0 * np.log(2.0))
     patches = _THINNED * float(np.median(weights.sum(axis=1))) / patch
     return points_m + off_m[:, None] * mean, mean, residual / max(patches - 1.0, 0.5)
+
+
+def _beyond(local_m: Array, seen: int, cell_m: float) -> BoolArray:
+    """Return which cells (c,), the first of which were seen, are farther from the axis than those at that height."""
+    layer = np.maximum(np.floor(local_m[:, 2] / cell_m).astype(np.intp), 0)
+    radius_m = np.hypot(local_m[:, 0], local_m[:, 1])
+    farthest_m = np.full(layer.max() + 1, -np.inf)
+    np.maximum.at(farthest_m, layer[:seen], radius_m[:seen])
+    return (radius_m > farthest_m[layer] + cell_m) & (np.arange(len(layer)) >= seen)
 
 
 def _unit(vectors: Array) -> Array:

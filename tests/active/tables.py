@@ -23,7 +23,7 @@ def steps(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
     for record in records:
         for one in record["outcomes"]:
-            predicted = one["right"] * (one["predicted_pose_nats"] + one["predicted_surface_nats"])
+            predicted = one["usable"] * (one["predicted_pose_nats"] + one["predicted_surface_nats"])
             right = one["accepted"] and one["error_deg"] <= 3.0 * one["edge_sigma_deg"] + 3.0
             gain = one["pose_nats"] + one["surface_nats"] if right else 0.0
             found.append({**one, "shape": record["shape"], "predicted_gain": predicted, "gain": gain, "placed": right})

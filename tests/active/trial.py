@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from typing import Any, Literal, final
 
 import numpy as np
@@ -43,6 +45,7 @@ class Outcome:
     predicted_new: float
     predicted_sigma_deg: float
     right: float
+    usable: float
     accepted: bool
     pose_nats: float = 0.0
     surface_nats: float = 0.0
@@ -99,9 +102,10 @@ def small(recipe: Recipe, seed: int, width_px: int) -> Recipe:
     )
 
 
-def visible_points(stage: Stage) -> Array:
+@lru_cache(maxsize=1)
+def visible_points(shape: str, seed: int, width_px: int) -> Array:
     """Return points (n, 3) of the true surface that some turn shows, in the model frame, one a voxel."""
-    points = []
+    points, stage = [], Stage(small(load_specimen(shape), seed, width_px))
     for step in range(24):
         turned = Stage(stage.recipe, (stage.poses[0],)).moved_on_table(15.0 * step, (0.0, 0.0))
         exact = replace(turned.recipe, sensor=None)
@@ -134,7 +138,7 @@ class Trial:
         rng = np.random.default_rng([self.seed, zlib.crc32(self.shape.encode()), len(self.policy)])
         stage = Stage(recipe)
         modeler = Modeler(sensor=Sensor(*stage.sequence.sensor()), prior=TablePrior(max_rotation_deg=REACH_DEG))
-        wanted = KDTree(visible_points(stage))
+        wanted = KDTree(visible_points(self.shape, self.seed, self.width_px))
         covered = np.zeros(wanted.n, dtype=bool)
         scene = modeler.segmenter.scene([stage.frame()])
         run, trace = modeler.start(scene), Trace(self.shape, self.policy, self.seed)
@@ -210,7 +214,7 @@ def outcome(belief: Belief, candidate: Candidate, prediction: Prediction | None,
         candidate.action,
         candidate.turn_deg,
         *(
-            (nan, nan, nan, nan, 0.0)
+            (nan, nan, nan, nan, 0.0, 0.0)
             if prediction is None
             else (
                 prediction.pose_nats,
@@ -218,6 +222,7 @@ def outcome(belief: Belief, candidate: Candidate, prediction: Prediction | None,
                 prediction.new_surface,
                 sigma_deg(prediction.new_covariance),
                 prediction.right,
+                prediction.usable,
             )
         ),
         accepted=step.accepted,
@@ -242,3 +247,8 @@ def outcome(belief: Belief, candidate: Candidate, prediction: Prediction | None,
 
 def sigma_deg(covariance: Array) -> float:
     return float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])))
+
+
+def ran(trials: Sequence[Trial]) -> list[dict[str, Any]]:
+    """Return the records of trials."""
+    return [trial.run().record() for trial in trials]
