@@ -17,7 +17,15 @@ from modeler import se3
 from modeler.experiment import sparse_view
 from modeler.features import kabsch, mutual_matches
 from modeler.priors import GeneralPrior
-from modeler.registration import ColouredIcpRegistrar, FpfhIcpRegistrar, FpfhRegistrar, GicpRegistrar, IcpRegistrar
+from modeler.registration import (
+    ColouredIcpRegistrar,
+    FpfhIcpRegistrar,
+    FpfhRegistrar,
+    GicpRegistrar,
+    IcpRegistrar,
+    KissIcpRegistrar,
+)
+from modeler.registration.baselines import kiss
 from modeler.registration.baselines.clouds import (
     Cloud,
     Fit,
@@ -405,3 +413,19 @@ def test_sparse_clouds_are_registered_by_the_levels_that_they_allow(pair: Pair, 
     fewest = [sparse_view(view, 11, rng) for view in pair]
     found = IcpRegistrar().register(fewest[0], fewest[1], Normal(truth, few[0].centroid_m, 0.05, 0.005), rng=rng)
     assert found.outcome is Outcome.TOO_FEW_POINTS
+
+
+@pytest.mark.skipif(not kiss.installed(), reason="KISS-Matcher is not installed")
+def test_kiss_finds_any_motion_of_a_body_with_features(rng: np.random.Generator) -> None:
+    """A bumpy ball of 4 cm, smaller than the cubes that KISS-Matcher is made for, turned by 140°; twice the same."""
+    directions = rng.normal(size=(20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    waves, phases = rng.normal(size=(8, 3)) * 2.5, rng.uniform(0.0, 6.0, size=8)
+    points = 0.02 * directions * (1.0 + 0.06 * np.sin(directions @ waves.T + phases).sum(axis=1, keepdims=True))
+    source = Cloud(points[:12_000], directions[:12_000])
+    motion = se3.translation(np.array([0.1, -0.2, 0.9])) @ se3.exp(np.array([1.0, -2.0, 1.0, 0.0, 0.0, 0.0]))
+    target = Cloud(se3.transform(motion, points[6_000:]), directions[6_000:] @ motion[:3, :3].T)
+    found = KissIcpRegistrar().search(source, target, np.eye(4))
+    assert np.degrees(se3.rotation_angle(se3.inverse(found) @ motion)) < 3.0
+    assert np.linalg.norm(found[:3, 3] - motion[:3, 3]) < 0.002
+    np.testing.assert_array_equal(KissIcpRegistrar().search(source, target, np.eye(4)), found)

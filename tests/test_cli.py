@@ -22,6 +22,7 @@ from modeler.cli.advice import comes_back, ends_without, other_step, sense_in_do
 from modeler.cli.console import Interrupt
 from modeler.cli.options import PriorOptions
 from modeler.export import RunFolder, model_upright
+from modeler.registration.baselines import kiss
 from modeler.types import ACCEPTED, Outcome
 from sequences import bundled, open_sequence
 
@@ -245,6 +246,18 @@ def test_coloured_icp_refuses_what_has_no_colour(cli: Run, tmp_path: Path, argum
     assert ended.err.count("\n") == 1
     assert "has no colour" in ended.err
     assert not (tmp_path / "out" / "report.json").exists()
+
+
+@pytest.mark.parametrize("arguments", [("register", TUBE, 1, 0), ("evaluate", TUBE, "--prior", "table")])
+def test_kiss_is_refused_where_it_is_not_installed(
+    cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...]
+) -> None:
+    monkeypatch.setattr(kiss, "installed", lambda: False)
+    named = ("--methods", "kiss", "--out", tmp_path / "out") if arguments[0] == "evaluate" else ("--method", "kiss")
+    ended = cli(*arguments, *named)
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err.count("\n") == 1
+    assert "pip install 'modeler[peers]'" in ended.err
 
 
 def test_evaluate_writes_errors_and_prints_a_table(cli: Run, tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from modeler.priors import (
 )
 from modeler.priors.checks import ParameterError
 from modeler.rays import Sensor
+from modeler.registration.baselines import kiss
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import NOMINAL_FOCAL, AbstractPrior, AbstractRegistrar, InputError
 from sequences import AbstractSequence
@@ -121,7 +122,7 @@ def registrar(
         device: where it samples and scores poses; None = chosen for each job.
 
     Raises:
-        InputError: where it cannot be there.
+        InputError: where it cannot be there, or is not installed.
     """
     if device == "cuda":
         if method not in ("visibility", "paper"):
@@ -145,6 +146,10 @@ def registrar(
             return registration.FpfhRegistrar()
         case "fpfh-icp":
             return registration.FpfhIcpRegistrar()
+        case "kiss":
+            if not kiss.installed():
+                raise InputError(f"--method kiss: {kiss.MISSING}")
+            return registration.KissIcpRegistrar()
 
 
 def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> AbstractPrior:

@@ -12,7 +12,7 @@ import tyro
 
 from modeler.cli.compiling import compile_kernels
 from modeler.cli.console import bar, say
-from modeler.cli.options import SEED, FrameOptions, Method, ObjectOptions, PriorOptions, StrictPaths, default
+from modeler.cli.options import OF_EXTRAS, SEED, FrameOptions, Method, ObjectOptions, PriorOptions, StrictPaths, default
 
 if TYPE_CHECKING:
     from modeler.cli.inputs import Part
@@ -43,8 +43,10 @@ class Evaluate:
     """Folder for the results."""
     overwrite: bool = False
     """Replace the results of an earlier evaluation in the folder."""
-    methods: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ",".join(get_args(Method))
-    """Methods to compare."""
+    methods: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ",".join(
+        name for name in get_args(Method) if name not in OF_EXTRAS
+    )
+    """Methods to compare; kiss, which needs the extra peers, only where it is named."""
     offsets: Annotated[str, tyro.conf.arg(metavar="N,...")] = "1"
     """Differences of frame numbers to compare; each gives a table of its own."""
     both_ways: bool = False

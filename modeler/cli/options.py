@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
@@ -211,7 +211,9 @@ class PriorOptions:
         return {name: value for name, value in values.items() if value is not None}
 
 
-Method = Literal["visibility", "paper", "icp", "gicp", "coloured-icp", "fpfh", "fpfh-icp"]
+Method = Literal["visibility", "paper", "icp", "gicp", "coloured-icp", "fpfh", "fpfh-icp", "kiss"]
+OF_EXTRAS: Final[tuple[Method, ...]] = ("kiss",)
+"""Methods that need an extra, which are run only where they are asked for."""
 
 
 @dataclass(frozen=True)
@@ -219,7 +221,7 @@ class MethodOptions:
     """How two frames are registered."""
 
     method: Method = "visibility"
-    """visibility: ours. paper: Wüthrich et al. 2012. The others are baselines."""
+    """visibility: ours. paper: Wüthrich et al. 2012. The others are baselines (kiss needs the extra peers)."""
     colour: Annotated[bool, default("they are, where frames have them")] = True
     """Do not compare the colours of matching surface."""
     device: Annotated[Literal["cpu", "cuda"] | None, default("cuda where one is present and pays, else cpu")] = None

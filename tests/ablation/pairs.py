@@ -144,8 +144,8 @@ def recorded_views(name: str) -> dict[int, RayImage]:
     """Return the views of a recording, by frame number; without those in which no object was found."""
     sequence, segmenter, views = open_sequence(SHARED / name), Segmenter(), {}
     noise = sequence.sensor()
-    sensor = Sensor() if noise is None else Sensor(*noise)
     scene = segmenter.scene([sequence.frame(index) for index in telling(sequence.indices)])
+    sensor = (Sensor() if noise is None else Sensor(*noise)).measured(scene.noise_area_px)
     for index in sequence.indices:
         found = segmenter.segment(sequence.frame(index), scene)
         if found.outcome in (Outcome.CONVERGED, Outcome.UNSURE_MASK):
