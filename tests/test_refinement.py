@@ -78,7 +78,7 @@ def test_directions_that_the_surface_determines_are_refined(rng):
     pair, truth, centre_m = bundled_pair("box")
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
     mean, turn_rad, shift_m = sigmas_about(
-        Refiner().refine(pair, poses, np.ones(len(poses)), rng, fine_m=0.001).poses, centre_m
+        Refiner().refine(pair, pair, (poses, np.ones(len(poses))), rng, fine_m=0.001).poses, centre_m
     )
     _, turn_before_rad, shift_before_m = sigmas_about(poses, centre_m)
     assert turn_rad < 0.5 * turn_before_rad
@@ -97,7 +97,7 @@ def test_the_roll_of_a_tube_is_not(rng):
     roll = np.concatenate([axis, shift])
     poses = scattered(truth, centre_m, np.repeat([0.003, 0.0003], 3), rng)
     poses = se3.moved(poses, rng.normal(size=(len(poses), 1)) * 0.2 * roll, centre_m)
-    refined = Refiner().refine(pair, poses, np.ones(len(poses)), rng, fine_m=0.001).poses
+    refined = Refiner().refine(pair, pair, (poses, np.ones(len(poses))), rng, fine_m=0.001).poses
     xi = se3.difference(truth, refined, centre_m)
     assert np.std(xi[:, :3] @ axis) > 0.12
 
@@ -105,7 +105,7 @@ def test_the_roll_of_a_tube_is_not(rng):
 def test_too_few_matches_leave_the_samples_alone(rng):
     pair, truth, centre_m = bundled_pair("box")
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
-    refined = Refiner(min_matches=10_000.0).refine(pair, poses, np.ones(len(poses)), rng, fine_m=0.001)
+    refined = Refiner(min_matches=10_000.0).refine(pair, pair, (poses, np.ones(len(poses))), rng, fine_m=0.001)
     np.testing.assert_allclose(refined.poses, poses, atol=1e-9)
     assert not refined.by_focal.any()
 

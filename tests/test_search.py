@@ -134,7 +134,7 @@ def test_the_posterior_of_a_tube_spans_its_roll(seed):
     rolls_deg = np.degrees(se3.difference(truth, found.samples, source.centroid_m)[:, :3] @ axis)
     mean = found.weights @ rolls_deg
     sigma_deg = np.sqrt(found.weights @ (rolls_deg - mean) ** 2)
-    assert sigma_deg > 15.0
+    assert sigma_deg > 10.0  # more than of any rotation that is called known
     assert abs(mean) < 3.0 * sigma_deg
 
 

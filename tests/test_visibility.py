@@ -7,7 +7,7 @@ import pytest
 
 from modeler import se3
 from modeler.cli.advice import outcome_advice
-from modeler.evaluation import nees, rotation_error_deg, true_motion
+from modeler.evaluation import about_point, nees, rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
@@ -104,3 +104,23 @@ def test_a_flat_object_from_above_without_noise_is_registered(sensor, rng):
     assert posterior.usable
     assert np.linalg.eigvalsh(posterior.pose.covariance)[0] > 0.0
     assert rotation_error_deg(posterior.pose.mean, truth) < 3.0
+
+
+@pytest.mark.parametrize("name", ["box", "flashlight"])
+def test_the_choice_of_points_moves_an_answer_by_less_than_half_its_standard_deviation(name: str) -> None:
+    sequence = open_sequence(bundled(name))
+    noise = sequence.sensor()
+    assert noise is not None
+    target, source = (Sensor(*noise).ray_image(sequence.frame(index)) for index in (0, 1))
+    density = GeneralPrior().between(source, target)
+    found = [
+        about_point(
+            VisibilityRegistrar().register(source, target, density, rng=np.random.default_rng(seed)).pose,
+            source.centroid_m,
+        )
+        for seed in range(6)
+    ]
+    moved = np.array([se3.log(se3.inverse(found[0].mean) @ pose.mean) for pose in found])
+    moved -= moved.mean(axis=0)
+    stated = np.mean([pose.covariance for pose in found], axis=0)
+    assert np.sum(moved * np.linalg.solve(stated, moved.T).T) / 5 / 6 < 0.5**2

@@ -100,8 +100,9 @@ def bisected(points, halvings):
         halves = []
         for group in groups:
             side = int(np.argmax(np.ptp(points[group], axis=0))) if len(group) else 0
-            order = group[np.argsort(points[group, side], kind="stable")]
-            halves += [order[: len(group) // 2], order[len(group) // 2 :]]
+            middle = len(group) // 2
+            order = group[np.argpartition(points[group, side], middle)] if len(group) > 1 else group
+            halves += [order[:middle], order[middle:]]
         groups = halves
     patches = np.empty(len(points), dtype=np.int64)
     for number, group in enumerate(groups):

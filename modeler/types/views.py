@@ -165,6 +165,15 @@ class RayImage:
         return len(self.points_m) / self.sharing
 
     @cached_property
+    def along_curve(self) -> npt.NDArray[np.int64]:
+        """Numbers (n,) of the surface points in the order of a curve that fills the image square by square (Morton)."""
+        code = np.zeros(len(self.pixels), dtype=np.int64)
+        for bit in range(int(self.pixels.max(initial=0)).bit_length()):
+            for axis in (0, 1):
+                code |= (self.pixels[:, axis] >> bit & 1) << (2 * bit + axis)
+        return np.argsort(code, kind="stable")
+
+    @cached_property
     def centroid_m(self) -> Array:
         """Mean (3,) of the surface points; the origin where there are none."""
         return np.array([axis_m.mean() for axis_m in self.points_m.T]) if len(self.points_m) else np.zeros(3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a share of its pixels' later
 _RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; how far f and g rise beside it
 _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).astype(np.float32)  # see `Projection`
 IntArray = npt.NDArray[np.int64]
-_DESCENT_STRIDE, _STRIDE = 4, 2  # every fourth point is used for descent, every second for scores
+_DESCENT_STRIDE = 4  # every fourth point is used for descent
 _COLOUR_STRIDE = 2  # every second of the points that are used for depth is used for colour
 _CHANCE = 0.01  # with which a right pose is taken for one that the images contradict
 _STATED_MISFIT = 0.5  # mean of r² / 2τ² if variances are as stated
@@ -46,7 +46,9 @@ class VisibilityLikelihood:
     """Parameters of the likelihood: surface that faces a camera is seen by it, other surface is hidden."""
 
     points: int = 600
-    """Surface points taken from each view."""
+    """Surface points taken from each view to search and to sample,"""
+    refining_points: int = 2400
+    """and to refine."""
     surface_noise: float = 0.1
     """Least error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
     surface_detail: float = 0.003
@@ -85,6 +87,14 @@ class VisibilityLikelihood:
             return PairLikelihood(forward, backward, size_m)
         colour = PairColour(source, target, *chosen, (forward.projection(1), backward.projection(1)))
         return PairLikelihood(forward, backward, size_m, colour)
+
+    def denser(self, pair: PairLikelihood, rng: np.random.Generator) -> PairLikelihood:
+        """Return the likelihood of a pair at more points, to refine; the same where it has all of them."""
+        source, target = pair.backward.image, pair.forward.image
+        if max(len(source.points_m), len(target.points_m)) <= self.points:
+            return pair
+        chosen = (spread_points(view, self.refining_points, rng) for view in (source, target))
+        return pair.at(*chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +223,17 @@ class PairLikelihood:
     colour: PairColour | None = None
     """The colours of both views, where they are compared."""
 
+    def at(self, source_points: IntArray, target_points: IntArray) -> PairLikelihood:
+        """Return the likelihood at other surface points of source and target, given by number."""
+        target, source = self.forward.image, self.backward.image
+        forward = replace(self.forward, points=_points(source, source_points))
+        backward = replace(self.backward, points=_points(target, target_points))
+        if self.colour is None:
+            return replace(self, forward=forward, backward=backward)
+        surfaces = forward.projection(1), backward.projection(1)
+        colour = self.colour.at(source_points, target_points, surfaces)
+        return replace(self, forward=forward, backward=backward, colour=colour)
+
     @property
     def centre_m(self) -> Array:
         """The source's centroid (3,), about which tangents are taken."""
@@ -264,18 +285,21 @@ class PairLikelihood:
             found = stride * visibility.log_likelihoods(rows(poses), one, [sides], device)
         return found[:, point_likelihood.LOG_LIKELIHOOD], found[:, point_likelihood.EXPLAINED] / self.points
 
-    def tempered(self, poses: Array, blur_m: float, *, typical_misfit: float = _STATED_MISFIT) -> Array:
+    def tempered(
+        self, poses: Array, blur_m: float, *, typical_misfit: float = _STATED_MISFIT, stride: int = 1
+    ) -> Array:
         """Return tempered log-likelihoods (n,) of poses (n, 4, 4) (method.md, eq. 7).
 
         Args:
             poses: target_from_source.
             blur_m: blur of the surfaces in m.
             typical_misfit: misfit μ of a typical match (nats).
+            stride: every `stride`-th point is used, and counts for as many.
         """
-        plain, share = self.log_likelihoods(poses, blur_m, stride=_STRIDE, typical_misfit=typical_misfit)
+        plain, share = self.log_likelihoods(poses, blur_m, stride=stride, typical_misfit=typical_misfit)
         model = self.forward.model
         depth = self.temper * plain - model.no_overlap_cost * np.exp(-share / model.overlap_scale)  # method.md, eq. 7
-        return depth + self.colour_gain(poses, blur_m, stride=_STRIDE)
+        return depth + self.colour_gain(poses, blur_m, stride=stride)
 
     def colour_gain(self, poses: Array, blur_m: float, *, stride: int) -> Array:
         """Return the log-likelihood (n,) of the colours of matching surface (method.md, eq. 19); 0 without colours."""
@@ -417,13 +441,15 @@ def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:
 
 
 def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> IntArray:
-    """Return the numbers of `count` surface points, or of all if fewer, evenly spread over the image."""
+    """Return the numbers of `count` surface points, or of all if fewer, evenly spread over the image.
+
+    They follow a curve through the image that fills it, so that every stride through them is again evenly spread: what
+    differs from place to place is then the same, nearly, whichever points are chosen.
+    """
     total = len(view.points_m)
     stride = max(total / count, 1.0)
     picks = np.arange(min(count, total)) * stride + rng.random() * stride
-    chosen = np.minimum(picks.astype(np.int64), total - 1)
-    # In random order, so that every stride through them is again spread over the object.
-    return chosen[rng.permutation(len(chosen))]
+    return view.along_curve[np.minimum(picks.astype(np.int64), total - 1)]
 
 
 def _points(view: RayImage, chosen: IntArray) -> Array:

@@ -7,7 +7,7 @@ neighbourhood, shows the print and little else, band by band.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from weakref import WeakKeyDictionary
 
@@ -56,7 +56,14 @@ class PairColour:
     """The source's points in the target, and the target's in the source."""
     _unmoved: dict[int, float] = field(default_factory=dict)
     _evenness: dict[int, float] = field(default_factory=dict)
+    _left: dict[int, tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
     _made: dict[tuple[int, int], tuple[ColourProjection, ColourProjection]] = field(default_factory=dict)
+
+    def at(
+        self, source_points: np.ndarray, target_points: np.ndarray, surfaces: tuple[Projection, Projection]
+    ) -> PairColour:
+        """Return the colour of the same views at other points, which shares what was made of the images."""
+        return replace(self, source_points=source_points, target_points=target_points, surfaces=surfaces, _made={})
 
     def band(self, blur_m: float) -> int:
         """Return the number of the band for surfaces of that blur."""
@@ -152,15 +159,21 @@ class PairColour:
         return self._made[band, stride]
 
     def _projections(self, band: int) -> tuple[ColourProjection, ColourProjection]:
-        source, target = (view_features(view)[band] for view in (self.source, self.target))
-        share = max(self.unmoved(band), 0.0)
-        left = (
-            _unexplained(source, target, self._partners[0], share),
-            _unexplained(target, source, self._partners[1], share),
-        )
-        forward = ColourProjection(*self.surfaces[0], left[0][VALUE, self.source_points], _cells(self.target, left[1]))
-        backward = ColourProjection(*self.surfaces[1], left[1][VALUE, self.target_points], _cells(self.source, left[0]))
+        values, cells = self._looked_up(band)
+        forward = ColourProjection(*self.surfaces[0], values[0][self.source_points], cells[1])
+        backward = ColourProjection(*self.surfaces[1], values[1][self.target_points], cells[0])
         return forward, backward
+
+    def _looked_up(self, band: int) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        """Return the features of all points of source and target in a band, and the cells of both images."""
+        if band not in self._left:
+            source, target = (view_features(view)[band] for view in (self.source, self.target))
+            share = max(self.unmoved(band), 0.0)
+            here = _unexplained(source, target, self._partners[0], share)
+            there = _unexplained(target, source, self._partners[1], share)
+            cells = _cells(self.source, here), _cells(self.target, there)
+            self._left[band] = (here[VALUE], there[VALUE]), cells
+        return self._left[band]
 
     def patches(self, band: int) -> float:
         """Return the number of patches of the surface whose features are independent; mean of both views."""

@@ -34,7 +34,13 @@ class Refiner:
     """Least number of matches in a patch; with fewer in all, there are fewer patches."""
 
     def refine(
-        self, pair: PairLikelihood, poses: Array, weights: Array, rng: np.random.Generator, *, fine_m: float
+        self,
+        pair: PairLikelihood,
+        dense: PairLikelihood,
+        samples: tuple[Array, Array],
+        rng: np.random.Generator,
+        *,
+        fine_m: float,
     ) -> Refined:
         """Return refined samples: those of posterior × matching surface, if both were Gaussian.
 
@@ -43,22 +49,25 @@ class Refiner:
         Where the surface determines nothing, as about the axis of a can, samples stay as they are.
 
         Args:
-            pair: the two views.
-            poses: (n, 4, 4) samples of target_from_source.
-            weights: (n,) of the samples, of any sum.
+            pair: the two views, at the points at which each sample takes its step.
+            dense: the same, at the points that say where surface matches best, and how well that is known.
+            samples: poses (n, 4, 4) of target_from_source, and their weights (n,) of any sum.
             rng: source of all randomness.
             fine_m: smallest blur in m at which matches are selected.
         """
-        centre_m = pair.centre_m
+        (poses, weights), centre_m = samples, pair.centre_m
         mean, covariance = se3.mean(poses, weights, about_m=centre_m)
         spread = np.asarray(np.linalg.cholesky(covariance + FLOOR), dtype=np.float64)
-        mode, noise = _mode(pair, mean, spread, centre_m, fine_m=fine_m)
-        basis, information, by_focal = self._information(pair, mode, noise, spread)
+        mode, noise = _mode(dense, mean, spread, centre_m, fine_m=fine_m)
+        basis, information, by_focal = self._information(dense, mode, noise, spread)
         scales, axes = np.linalg.eigh(information)
         root = axes * np.sqrt(np.maximum(scales, 0.0))
         narrowed = np.linalg.inv(np.eye(6) + information)
         to_basis = np.linalg.inv(basis)
-        step = _steps(pair, poses, noise, spread) @ to_basis.T @ information
+        steps = _steps(pair, poses, noise, spread, stride=2)
+        # What the choice of few points moves all samples by, to first order.
+        steps += _steps(dense, mode[None], noise, spread, stride=1) - _steps(pair, mode[None], noise, spread, stride=2)
+        step = steps @ to_basis.T @ information
         scatter = rng.normal(size=(len(poses), 6)) @ root.T
         moved = (step + scatter) @ narrowed.T @ basis.T  # method.md, eq. 16
         from_centre = se3.adjoint(se3.translation(centre_m))
@@ -154,9 +163,9 @@ def _mode(
     return pose, pair.match_noise(pose, fine_m)
 
 
-def _steps(pair: PairLikelihood, poses: Array, noise: MatchNoise, spread: Array) -> Array:
+def _steps(pair: PairLikelihood, poses: Array, noise: MatchNoise, spread: Array, *, stride: int) -> Array:
     """Return Gauss-Newton steps (n, 6), regularised by the samples' spread."""
-    gradient, matrix = pair.normal_equations(poses, noise, stride=2)
+    gradient, matrix = pair.normal_equations(poses, noise, stride=stride)
     regularised = matrix + np.linalg.inv(spread @ spread.T)
     return np.asarray(np.linalg.solve(regularised, gradient[:, :, None])[:, :, 0], dtype=np.float64)
 

@@ -92,8 +92,8 @@ class VisibilityRegistrar(AbstractRegistrar):
         sampled = [self._sampled(pair, density, mode, rng) for mode in modes_found]
         reference = min(sampled, key=lambda mode: mode.noise_m)
         compared = [mode.compared(pair, reference) for mode in sampled]
-        refined = [self._refined(pair, density, samples, rng) for samples in compared]
-        modes = weigh_modes(refined)
+        dense = self.likelihood.denser(pair, rng)
+        modes = [(share, self._refined(pair, dense, density, mode, rng)) for share, mode in weigh_modes(compared)]
         at_limit = self._share_at_limit(pair, density, found, modes[0][1], rng)
         posterior = self._judged(pair, modes, found, at_limit=at_limit, seconds=time.perf_counter() - started)
         return replace(posterior, beyond=found.beyond) if _leads_beyond(found) else posterior
@@ -113,13 +113,14 @@ class VisibilityRegistrar(AbstractRegistrar):
     def _refined(
         self,
         pair: PairLikelihood,
+        dense: PairLikelihood,
         density: AbstractPoseDensity,
         samples: WeightedSamples,
         rng: np.random.Generator,
     ) -> WeightedSamples:
         """Return refined samples of a mode; those that would leave the prior's support stay."""
         fine_m = self.search.fine_m(pair)
-        refined = self.refiner.refine(pair, samples.poses, samples.weights, rng, fine_m=fine_m)
+        refined = self.refiner.refine(pair, dense, (samples.poses, samples.weights), rng, fine_m=fine_m)
         inside = np.isfinite(density.log_evidence(refined.poses))
         poses = np.where(inside[:, None, None], refined.poses, samples.poses)
         return replace(samples, poses=poses, by_focal=refined.by_focal)

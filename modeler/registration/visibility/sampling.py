@@ -172,7 +172,7 @@ class AdaptiveSampler:
 
     draws: int = 400
     """Samples of a round; regions that the first misses altogether, later ones may miss too."""
-    samples: int = 600
+    samples: int = 300
     """Effective sample size at which the rounds end, and largest number of samples in the result."""
     max_draws: int = 8000
     """No further round begins after this many samples."""

@@ -15,6 +15,7 @@ from modeler.registration.posterior import MIN_MODE_SHARE, PRIOR_SAMPLES
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 
+_STRIDE = 2  # every second point is used for scores
 ANY_ROTATION_RAD = 1.0
 """Standard deviation of a rotation that may be any: 1.33 where all are alike, 1.0 within limits of 130°."""
 
@@ -141,7 +142,7 @@ class Search:
         inside = np.isfinite(density.log_evidence(poses))
         outside = poses[~inside]
         poses = poses[inside] if inside.any() else started
-        scores = pair.tempered(poses, fine_m)
+        scores = pair.tempered(poses, fine_m, stride=_STRIDE)
         order = np.argsort(-scores, kind="stable")
         # The volumes of two modes may outweigh their likelihoods as much as a negligible mode is outweighed.
         order = order[scores[order] > scores.max() + 2.0 * np.log(MIN_MODE_SHARE)]
@@ -151,7 +152,7 @@ class Search:
         found = found.distinct(pair.centre_m)
         if not len(outside):
             return found
-        gains = pair.tempered(outside, fine_m) - found.scores[0]
+        gains = pair.tempered(outside, fine_m, stride=_STRIDE) - found.scores[0]
         best = int(np.argmax(gains))
         return replace(found, beyond_gain=float(gains[best]), beyond=outside[best : best + 1])
 
