@@ -7,6 +7,7 @@ import os
 import pty
 import re
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commanded import BOX
+from commanded import BOX, QUICK
 
 from modeler.cli import main
 from modeler.cli.advice import outcome_advice
@@ -141,6 +142,13 @@ def test_a_terminal_sees_how_far_it_is_and_how_long_it_takes(scene: Path) -> Non
     assert "3/3" in said
     assert "0:00:0" in said  # gone by, and to go
     assert "box" not in said  # data goes to stdout
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
+def test_a_terminal_sees_what_to_do_next_while_frames_come(scene: Path, tmp_path: Path) -> None:
+    growing = shutil.copytree(scene, tmp_path / "box")
+    options = ["--watch", "--idle-s", "3", "--out", str(tmp_path / "run"), *QUICK]
+    assert "next: turn by " in on_a_terminal([*COMMAND, "build", str(growing), *options])
 
 
 def test_nobody_is_told_where_there_is_no_bar(capfd: pytest.CaptureFixture[str]) -> None:
