@@ -23,8 +23,6 @@ _ROUNDS = 4  # of Newton's method
 _REACH = 3.0  # prior standard deviations within which loops are asked
 _GRID = 0.02  # of the logarithm at most, between the values that Newton's method starts from
 _SLOPES = 0.3  # relative error of an estimate: noise of the derivatives makes it too small, by 29 % on the bundled box
-_MAX_GAIN = 3.0  # of steps, by how much of the last one was missing
-_TELLING = 2.0  # standard deviations: smaller steps do not tell a gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +120,7 @@ class MovingGraph:
 def located(told_at: Callable[[float], FocalLength], *, rounds: int, enough: float, reach: float) -> FocalLength:
     """Return the focal length that edges tell when they are registered again under each estimate (method.md, eq. S2).
 
-    Noise of the derivatives makes every step too small by the same share, as that of regressors does. What a second
-    estimate still finds missing tells that share, by which further steps are lengthened.
+    Noise of the derivatives makes every step too small, as that of regressors does; further ones find what is missing.
 
     Args:
         told_at: returns what edges tell that were registered under a focal length, its logarithm over the given one
@@ -133,17 +130,13 @@ def located(told_at: Callable[[float], FocalLength], *, rounds: int, enough: flo
         reach: largest logarithm.
     """
     first = told = told_at(0.0)
-    centre, gain = 0.0, 1.0
+    centre = 0.0
     for number in range(rounds):
         if not told.loops:  # those that there were cannot be registered with the estimate
             return replace(told, log_factor=0.0, sigma=told.prior_sigma)
-        before, missing = centre, told.log_factor
-        centre = float(np.clip(before + gain * missing, -reach, reach))
+        before = centre
+        centre = float(np.clip(before + told.log_factor, -reach, reach))
         if abs(centre - before) <= enough * told.sigma or number == rounds - 1:
             break
         told = told_at(centre)
-        if abs(centre - before) > _TELLING * told.sigma:
-            share = (missing - told.log_factor) / missing
-            gain = float(np.clip(gain / max(share, 1.0 / _MAX_GAIN), 1.0, _MAX_GAIN))
-    sigma = min(gain * told.sigma, told.prior_sigma)
-    return replace(told, log_factor=centre, sigma=sigma, sigmas_before=first.sigmas_before)
+    return replace(told, log_factor=centre, sigmas_before=first.sigmas_before)

@@ -356,7 +356,7 @@ class Run:
                 state, at = moved.again(self.modeler.tracker(moved).spans), log_factor
             return MovingGraph.of(state.graph, state.solution).estimate(sigma, -at)
 
-        focal = located(told_at, rounds=2, enough=1.0, reach=_FOCAL_REACH * sigma)
+        focal = located(told_at, rounds=3, enough=1.0, reach=_FOCAL_REACH * sigma)
         return (state if focal.log_factor == at else state.under(focal.log_factor - at, sensor)), focal
 
     def _step(
