@@ -105,7 +105,8 @@ class MovingGraph:
         if not loops:
             return Optimum(chain(tree, root, {}), (), 0.0)
         start = chain(tree, root, anchored(near.poses, root))
-        return optimise(tree, loops, start, root=root, threshold=self.threshold, inlier=near.inlier)
+        # Not the loops that took part nearby: the bare chain contradicts one that all edges together can close.
+        return optimise(tree, loops, start, root=root, threshold=self.threshold)
 
     @cached_property
     def loops(self) -> int:
