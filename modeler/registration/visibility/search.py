@@ -87,7 +87,7 @@ class Search:
     """each the best of so many samples of the prior on average."""
     finest: float = 0.015
     """Blur of the surfaces in the last stage of the descent, as a share of the object's size."""
-    max_recognised: int = 100
+    max_recognised: int = 400
     """Largest number of starts on which features agree, where the prior holds more basins than `max_starts` reach."""
     matcher: FeatureMatcher = field(default_factory=FeatureMatcher)
     """How features are matched."""
