@@ -146,10 +146,12 @@ def test_visibility_is_within_its_bound_of_its_twin(seed):
 def test_descent_is_the_step_of_the_regularised_normal_equations(rng):
     projections, centre_m = (random_projection(rng), random_projection(rng)), np.array([0.0, 0.0, 0.8])
     poses = np.stack([random_pose(rng, 0.1) for _ in range(6)])
-    nothing = tuple(photometric.no_colour(projection) for projection in projections), np.float32(0.0)
+    nothing = (photometric.NO_COLOURS, photometric.NO_COLOURS), np.float32(0.0)
     root = rng.normal(size=(6, 6))
     regulariser = gauss_newton.Regulariser(rows(random_pose(rng, 0.1)), 100.0 * root @ root.T, np.arange(1.0, 7.0), 0.2)
-    gradients, matrices_ = gauss_newton.normal_equations(rows(poses), projections, *nothing, centre_m, 0.05)
+    gradients, matrices_ = (
+        part[:, 0] for part in gauss_newton.normal_equations(rows(poses), projections, *nothing, centre_m, 0.05)
+    )
     got = gauss_newton.descend(rows(poses), projections, *nothing, centre_m, 0.05, regulariser, 1)
     assert np.count_nonzero(np.abs(gradients).max(axis=1)) == len(poses)  # something matches
     for pose, gradient, matrix, there in zip(poses, gradients, matrices_, matrices(got), strict=True):

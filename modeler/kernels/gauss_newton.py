@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from modeler.kernels.lie_group import difference, retract
 from modeler.kernels.photometric import CELL_SIZE, fetch_colours, linearise_features
-from modeler.kernels.point_likelihood import VECTOR_MATHS, ZERO, Projection, buffers, invert, project
+from modeler.kernels.point_likelihood import VECTOR_MATHS, ZERO, buffers, invert, project
 from modeler.kernels.point_to_plane import linearise
 from modeler.kernels.threads import over_rows
 
@@ -33,12 +33,12 @@ _NO_PRIOR = Regulariser(np.eye(4)[:3].ravel(), np.zeros((6, 6)), np.zeros(6), 0.
 
 
 def normal_equations(poses, surfaces, colours, weight, centre, surface_m):
-    """Return gradients (m, 6) and matrices (m, 6, 6) of poses (m, 12), see `equations`.
+    """Return gradients (m, 2, 6) and matrices (m, 2, 6, 6) of surface and of colours at poses (m, 12), see `equations`.
 
     Args:
         poses: rows of the 3×4 matrices of target_from_source.
         surfaces: the `Projection` of the source's points in the target, and that of the target's in the source.
-        colours: likewise the two `ColourProjection`, without points where colours are not compared.
+        colours: their `Colours`, `photometric.NO_COLOURS` where these are not compared.
         weight: inverse variance of the difference of features (method.md, eq. 20).
         centre: (3,) point of the source in m.
         surface_m: noise of the surfaces in m beyond that of points and planes.
@@ -54,9 +54,9 @@ def descend(poses, surfaces, colours, weight, centre, surface_m, regulariser, st
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _iterate(poses, surfaces, colours, weight, centre, surface_m, regulariser, steps):
-    """Return poses (m, 12) after some steps, or none, and the equations (m, 6) and (m, 6, 6) they were last at."""
-    moved, gradients, matrices = poses.copy(), np.empty((poses.shape[0], 6)), np.empty((poses.shape[0], 6, 6))
-    workspace = new_workspace(surfaces, colours)
+    """Return poses (m, 12) after some steps, or none, and the `equations` that they were last at."""
+    moved, gradients, matrices = poses.copy(), np.empty((poses.shape[0], 2, 6)), np.empty((poses.shape[0], 2, 6, 6))
+    workspace = new_workspace(surfaces)
     held, step, further, rotation = np.empty((6, 6)), np.empty(6), np.empty(12), np.empty((3, 3))
     for i in range(poses.shape[0]):
         for _ in range(max(steps, 1)):
@@ -70,11 +70,9 @@ def _iterate(poses, surfaces, colours, weight, centre, surface_m, regulariser, s
 
 
 @numba.njit(cache=True)
-def new_workspace(surfaces, colours):
+def new_workspace(surfaces):
     """Return the buffers of `equations`."""
-    count = 0
-    for direction in range(2):
-        count = max(count, surfaces[direction].points.shape[1], colours[direction].points.shape[1])
+    count = max(surfaces[0].points.shape[1], surfaces[1].points.shape[1])
     cells, rows = np.empty((CELL_SIZE, count), dtype=np.float32), np.empty((_ROWS, count), dtype=np.float32)
     small = np.empty(12), np.empty(3), np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
     return buffers(count), cells, rows, small
@@ -97,41 +95,39 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
         centre: likewise.
         surface_m: likewise.
         workspace: of `new_workspace`.
-        gradient: (6,) out.
-        matrix: (6, 6) out.
+        gradient: (2, 6) out: of surface, and of its colours.
+        matrix: (2, 6, 6) out, likewise.
     """
     (transformed, pixels, found), colour, rows, small = workspace
     carried, about, part, block, rotated, turned, turned_block = small
     surface_m2 = np.float32(surface_m * surface_m)
-    for k in range(6):
-        gradient[k] = 0.0
-        for m in range(6):
-            matrix[k, m] = 0.0
+    gradient[:] = 0.0
+    matrix[:] = 0.0
     for term in range(4):
-        direction, of_colour = term % 2, term >= 2
+        direction, kind = term // 2, term % 2
         surface, features = surfaces[direction], colours[direction]
-        if of_colour:
-            surface = Projection(features.points, features.cells, features.camera, features.cosines)
         count = surface.points.shape[1]
-        if count == 0:
-            continue
-        if direction == 0:
-            for k in range(12):
-                carried[k] = pose[k]
-            for k in range(3):
-                about[k] = pose[4 * k + 3]
-                for m in range(3):
-                    about[k] += pose[4 * k + m] * centre[m]
-        else:
-            invert(pose, carried)
-            for k in range(3):
-                about[k] = centre[k]
-        project(carried, surface, transformed, pixels, found)
-        if of_colour:
-            fetch_colours(count, pixels, features.colours, colour)
-            linearise_features(features, transformed, found, colour, about, surface_m2, weight, rows)
-        else:
+        if kind == 0:
+            if direction == 0:
+                for k in range(12):
+                    carried[k] = pose[k]
+                for k in range(3):
+                    about[k] = pose[4 * k + 3]
+                    for m in range(3):
+                        about[k] += pose[4 * k + m] * centre[m]
+            else:
+                invert(pose, carried)
+                for k in range(3):
+                    about[k] = centre[k]
+            project(carried, surface, transformed, pixels, found)
             linearise(surface.points, transformed, found, about, surface_m2, rows)
+        elif features.values.shape[0] == 0:
+            continue
+        else:
+            fetch_colours(count, pixels, features.cells, colour)
+            linearise_features(
+                surface.points, features.values, transformed, found, colour, about, surface_m2, weight, rows
+            )
         accumulate(rows, count, part, block)
         if direction == 0:
             rotate_to_source(pose, part, block, rotated, turned, turned_block)
@@ -141,9 +137,9 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
                 for m in range(6):
                     turned_block[k, m] = block[k, m]
         for k in range(6):
-            gradient[k] += turned[k]
+            gradient[kind, k] += turned[k]
             for m in range(6):
-                matrix[k, m] += turned_block[k, m]
+                matrix[kind, k, m] += turned_block[k, m]
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
@@ -180,13 +176,13 @@ def rotate_to_source(pose, part, block, rotated, gradient, matrix):
 
 @numba.njit(cache=True)
 def regularised_step(pose, regulariser, centre, gradient, matrix, held, step):
-    """Write the Gauss-Newton step (6,) of a pose (12,) from its normal equations; `held` is a buffer (6, 6)."""
+    """Write the Gauss-Newton step (6,) of a pose (12,) from its `equations`; `held` is a buffer (6, 6)."""
     away = difference(regulariser.mean, pose, centre)
     for k in range(6):
-        step[k] = gradient[k]
+        step[k] = gradient[0, k] + gradient[1, k]
         for m in range(6):
             step[k] -= regulariser.precision[k, m] * away[m]
-            held[k, m] = matrix[k, m] + regulariser.precision[k, m]
+            held[k, m] = matrix[0, k, m] + matrix[1, k, m] + regulariser.precision[k, m]
         held[k, k] += regulariser.damping[k]
     solve_positive_definite(held, step)
     angle = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])

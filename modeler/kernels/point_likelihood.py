@@ -72,10 +72,6 @@ class Projection(NamedTuple):
     cosines: FloatArray
     """(4,) cosines between which f rises from 0 to 1, and g (method.md, eq. 4)."""
 
-    def empty(self) -> "Projection":
-        """Return one without points."""
-        return self._replace(points=np.ascontiguousarray(self.points[:, :0]))
-
 
 @numba.njit(cache=True, forceinline=True)
 def invert(pose, inverse):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.special import chdtri
 from modeler import se3
 from modeler.kernels import gauss_newton, gpu, point_likelihood, point_to_plane
 from modeler.kernels.gauss_newton import Regulariser
-from modeler.kernels.photometric import ColourProjection, no_colour
+from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
 from modeler.registration.visibility.photometric import UNDECIDED, PairColour, unshifted, weight_of
 from modeler.se3 import matrices, rows
@@ -25,7 +25,6 @@ _RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable
 _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).astype(np.float32)  # see `Projection`
 IntArray = npt.NDArray[np.int64]
 _DESCENT_STRIDE = 4  # every fourth point is used for descent
-_COLOUR_STRIDE = 2  # every second of the points that are used for depth is used for colour
 _CHANCE = 0.01  # with which a right pose is taken for one that the images contradict
 _STATED_MISFIT = 0.5  # mean of r² / 2τ² if variances are as stated
 
@@ -85,8 +84,8 @@ class VisibilityLikelihood:
         seen = self.colour and source.frame.colour is not None and target.frame.colour is not None
         if not seen:
             return PairLikelihood(forward, backward, size_m)
-        colour = PairColour(source, target, *chosen, (forward.projection(1), backward.projection(1)))
-        return PairLikelihood(forward, backward, size_m, colour)
+        plain = PairLikelihood(forward, backward, size_m)
+        return replace(plain, colour=PairColour(source, target, *chosen, plain.surfaces))
 
     def denser(self, pair: PairLikelihood, rng: np.random.Generator) -> PairLikelihood:
         """Return the likelihood of a pair at more points, to refine; the same where it has all of them."""
@@ -228,11 +227,10 @@ class PairLikelihood:
         target, source = self.forward.image, self.backward.image
         forward = replace(self.forward, points=_points(source, source_points))
         backward = replace(self.backward, points=_points(target, target_points))
+        plain = replace(self, forward=forward, backward=backward, colour=None)
         if self.colour is None:
-            return replace(self, forward=forward, backward=backward)
-        surfaces = forward.projection(1), backward.projection(1)
-        colour = self.colour.at(source_points, target_points, surfaces)
-        return replace(self, forward=forward, backward=backward, colour=colour)
+            return plain
+        return replace(plain, colour=self.colour.at(source_points, target_points, plain.surfaces))
 
     @property
     def centre_m(self) -> Array:
@@ -270,8 +268,7 @@ class PairLikelihood:
             typical_misfit: misfit μ of a typical match (nats).
         """
         sides = (
-            self.forward.projection(stride),
-            self.backward.projection(stride),
+            *self.surfaces(stride),
             self.forward.parameters(blur_m, typical_misfit),
             self.backward.parameters(blur_m, typical_misfit),
         )
@@ -305,30 +302,18 @@ class PairLikelihood:
         """Return the log-likelihood (n,) of the colours of matching surface (method.md, eq. 19); 0 without colours."""
         if self.colour is None:
             return np.zeros(len(poses))
-        return self.colour.log_likelihoods(
-            poses,
-            blur_m,
-            self.forward.model.max_independent_colours,
-            surface_m=blur_m,
-            stride=_COLOUR_STRIDE * stride,
-        )
+        most = self.forward.model.max_independent_colours
+        return self.colour.log_likelihoods(poses, blur_m, most, surface_m=blur_m, stride=stride)
 
-    def _colours(
-        self, band: int, correlation: float, stride: int
-    ) -> tuple[tuple[ColourProjection, ColourProjection], np.float32]:
-        """Return the colours of both directions and their weight, as kernels take them; without colour, no points."""
+    def surfaces(self, stride: int) -> tuple[Projection, Projection]:
+        """Return every `stride`-th point of both directions, as kernels take them."""
+        return self.forward.projection(stride), self.backward.projection(stride)
+
+    def _colours(self, band: int, correlation: float, stride: int) -> tuple[tuple[Colours, Colours], np.float32]:
+        """Return the colours of both directions and their weight, as kernels take them."""
         if self.colour is None:
-            return self._no_colours, np.float32(0.0)
-        projections = self.colour.projections(band, _COLOUR_STRIDE * stride)
-        return projections, np.float32(_COLOUR_STRIDE * weight_of(correlation))
-
-    @cached_property
-    def _no_surfaces(self) -> tuple[Projection, Projection]:
-        return self.forward.projection(1).empty(), self.backward.projection(1).empty()
-
-    @cached_property
-    def _no_colours(self) -> tuple[ColourProjection, ColourProjection]:
-        return no_colour(self.forward.projection(1)), no_colour(self.backward.projection(1))
+            return (NO_COLOURS, NO_COLOURS), np.float32(0.0)
+        return self.colour.colours(band, stride), np.float32(weight_of(correlation))
 
     def match_noise(self, pose: Array, blur_m: float) -> MatchNoise:
         """Return how well surfaces and colours match under a pose (4, 4), see `surface_noise_m`."""
@@ -415,23 +400,25 @@ class PairLikelihood:
             noise: of matching surface and colours.
             stride: every `stride`-th point is used, and counts for as many.
         """
-        surfaces = self.forward.projection(stride), self.backward.projection(stride)
-        solved = partial(gauss_newton.normal_equations, rows(poses), centre=self.centre_m, surface_m=noise.surface_m)
-        gradients, equations = solved(surfaces, self._no_colours, np.float32(0.0))
+        colours = self._colours(noise.band, noise.correlation, stride)
+        found = gauss_newton.normal_equations(
+            rows(poses), self.surfaces(stride), *colours, self.centre_m, noise.surface_m
+        )
+        (gradients, of_colour), (equations, by_colour) = (stride * np.moveaxis(part, 1, 0) for part in found)
         if self.colour is not None:
-            of_colour, by_colour = solved(self._no_surfaces, *self._colours(noise.band, noise.correlation, stride))
-            kept = unshifted(stride * by_colour, self.colour.shifts(poses))
+            kept = unshifted(by_colour, self.colour.shifts(poses))
             gradients = gradients + (kept @ of_colour[:, :, None])[:, :, 0]
             equations = equations + kept @ by_colour
-        return stride * gradients, stride * equations
+        return gradients, equations
 
     def descend(self, poses: Array, blur_m: float, regulariser: Regulariser, *, steps: int) -> Array:
         """Return poses (n, 4, 4) after Gauss-Newton steps on matching surface (method.md, eq. 10)."""
-        projections = self.forward.projection(_DESCENT_STRIDE), self.backward.projection(_DESCENT_STRIDE)
         regulariser = _per_point(regulariser, _DESCENT_STRIDE)
         band = 0 if self.colour is None else self.colour.band(blur_m)
         colours = self._colours(band, UNDECIDED, _DESCENT_STRIDE)
-        moved = gauss_newton.descend(rows(poses), projections, *colours, self.centre_m, blur_m, regulariser, steps)
+        moved = gauss_newton.descend(
+            rows(poses), self.surfaces(_DESCENT_STRIDE), *colours, self.centre_m, blur_m, regulariser, steps
+        )
         return matrices(moved)
 
 

@@ -7,6 +7,8 @@ neighbourhood, shows the print and little else, band by band.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from weakref import WeakKeyDictionary
@@ -15,8 +17,9 @@ import numpy as np
 from scipy import ndimage
 
 from modeler.kernels import photometric, point_to_plane
-from modeler.kernels.photometric import ColourProjection
+from modeler.kernels.photometric import Colours
 from modeler.kernels.point_likelihood import Projection
+from modeler.kernels.shading import harmonics_of
 from modeler.se3 import rows
 from modeler.types import Array, Frame, RayImage
 
@@ -29,17 +32,20 @@ VALUE, BY_COLUMN, BY_ROW = 0, 1, 2
 """Of a band at a surface point: the feature, and its derivatives by column and row in 1/px."""
 
 _BLACK = 4.0  # added to 8-bit values: below it noise and rounding would rule their logarithm
+_LOGS = (np.log(np.arange(256) + _BLACK) / 3.0).astype(np.float32)  # of each of three 8-bit values, a third
+_ALIGNED = 2  # band by which images are aligned: print of a tin turns by more than its width
+_SHADED = 2000  # points from which the shading of a view is fitted
+_CREASE = 3.0  # standard deviations by which shading changes where surface has an edge, beyond noise of its normals
+_NORMAL_QUARTILE = 0.6745  # median magnitude of a standard normal variable
+_LEVEL = 1.0 / 255.0  # smallest change of a bright colour's logarithm that 8 bits show
 _REACH = 3.0  # of a Gaussian, in standard deviations
 _KNOWN: WeakKeyDictionary[RayImage, np.ndarray] = WeakKeyDictionary()  # features of views made so far
 
-_FINEST_SCORED = 1
-"""Finest band by which samples are weighted; weights by the finest of all are too uneven (it refines the samples)."""
 _STEADY = 4.0
 """So many standard deviations of the colours' shift is the finest band by which samples are weighted, at least."""
 UNDECIDED = 0.7
 """Correlation that is assumed where a descent starts."""
 _MOST = 0.99  # correlation
-_HALVINGS = 5  # patches of surface, as many as the refinement has
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +58,18 @@ class PairColour:
     """(n,) numbers of the source's surface points that are compared."""
     target_points: np.ndarray
     """(m,) of the target's."""
-    surfaces: tuple[Projection, Projection]
-    """The source's points in the target, and the target's in the source."""
+    surfaces: Callable[[int], tuple[Projection, Projection]]
+    """Every so many of the source's points in the target, and of the target's in the source."""
     _unmoved: dict[int, float] = field(default_factory=dict)
-    _evenness: dict[int, float] = field(default_factory=dict)
+    _places: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     _left: dict[int, tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
-    _made: dict[tuple[int, int], tuple[ColourProjection, ColourProjection]] = field(default_factory=dict)
+    _made: dict[tuple[int, int], tuple[Colours, Colours]] = field(default_factory=dict)
 
     def at(
-        self, source_points: np.ndarray, target_points: np.ndarray, surfaces: tuple[Projection, Projection]
+        self,
+        source_points: np.ndarray,
+        target_points: np.ndarray,
+        surfaces: Callable[[int], tuple[Projection, Projection]],
     ) -> PairColour:
         """Return the colour of the same views at other points, which shares what was made of the images."""
         return replace(self, source_points=source_points, target_points=target_points, surfaces=surfaces, _made={})
@@ -79,8 +88,8 @@ class PairColour:
             surface_m: noise of the surfaces, within which points match.
             stride: every `stride`-th point is used.
         """
-        forward, backward = self.projections(band, stride)
-        found = photometric.moments(rows(poses), (forward, backward), surface_m)
+        forward, backward = self.colours(band, stride)
+        found = photometric.moments(rows(poses), self.surfaces(stride), (forward, backward), surface_m)
         scale = np.sqrt(found[:, photometric.OWN_SQUARE] * found[:, photometric.OTHER_SQUARE])
         share = found[:, photometric.MATCHES] / (len(forward.values) + len(backward.values))
         return found[:, photometric.PRODUCT] / np.maximum(scale, 1e-12), share
@@ -89,19 +98,25 @@ class PairColour:
         self, poses: Array, blur_m: float, max_independent: float, *, surface_m: float, stride: int
     ) -> Array:
         """Return how much likelier (n,) in nats the target's colours are, given the source's (method.md, eq. 19)."""
-        band = max(self.band(blur_m), self._finest_scored)
+        band = self.scored_band(blur_m)
         correlation, share = self.correlations(poses, band, surface_m, stride=stride)
-        patches = max(self.evenness(band) * self.patches(band), 1e-6)  # without features there is nothing to count
-        independent = 1.0 / (1.0 / max_independent + 1.0 / patches)
-        count = share * (1.0 - self.unmoved(band) ** 2) * independent
+        count = share * self.independent(band, max_independent)
         gain = -0.5 * count * np.log1p(-(np.clip(correlation, 0.0, _MOST) ** 2))
         return np.asarray(np.logaddexp(0.0, gain - 0.5 * np.log(np.maximum(count, 1.0))), dtype=np.float64)
+
+    def independent(self, band: int, most: float) -> float:
+        """Return the number of independent features if all surface matched (method.md, eq. 19)."""
+        return (1.0 - self.unmoved(band) ** 2) / (1.0 / most + 1.0 / self.patches(band))
+
+    def scored_band(self, blur_m: float) -> int:
+        """Return the number of the band by which samples are weighted."""
+        return max(self.band(blur_m), self._finest_scored)
 
     @property
     def _finest_scored(self) -> int:
         """Number of the finest band by which samples are weighted: a shift of the colours changes little in it."""
         steady = int(np.ceil(np.log2(max(_STEADY * self.target.sigma_colour_px / FINEST_PX, 1.0))))
-        return int(np.clip(steady, _FINEST_SCORED, BANDS - 1))
+        return int(min(steady, BANDS - 1))
 
     def shifts(self, poses: Array) -> Array:
         """Return the motions ξ (..., 6, 2) that shift the target's colours by a standard deviation along both axes.
@@ -126,7 +141,8 @@ class PairColour:
             weight: of squared differences of features.
             forward: whether the points are the source's.
         """
-        projection = self.projections(band, 1)[0 if forward else 1]
+        colours = self.colours(band, 1)
+        theirs, mirror = colours if forward else colours[::-1]
         view, chosen = (self.source, self.source_points) if forward else (self.target, self.target_points)
         other = self.target if forward else self.source
         position = matches[:, point_to_plane.POSITION]
@@ -134,10 +150,9 @@ class PairColour:
         z = np.maximum(position[:, 2], 1e-6)
         column = np.clip(np.round(camera.fx * position[:, 0] / z + camera.cx), 0, camera.width - 1)
         row = np.clip(np.round(camera.fy * position[:, 1] / z + camera.cy), 0, camera.height - 1)
-        cells = projection.colours[(row * camera.width + column).astype(np.int64)].astype(np.float64)
+        cells = theirs.cells[(row * camera.width + column).astype(np.int64)].astype(np.float64)
         pixels = view.pixels[chosen]
-        mirror = self.projections(band, 1)[1 if forward else 0]
-        own = mirror.colours[pixels[:, 0] * view.frame.camera.width + pixels[:, 1], :3].astype(np.float64)
+        own = mirror.cells[pixels[:, 0] * view.frame.camera.width + pixels[:, 1], :3].astype(np.float64)
         normals = matches[:, point_to_plane.OWN]
         # Along the surface a gradient turns with it; then it is taken along the other camera's rays.
         own = own @ carried[:3, :3].T
@@ -146,33 +161,34 @@ class PairColour:
         own -= normals * slope[:, None]
         found = matches.copy()
         found[:, point_to_plane.OWN], found[:, point_to_plane.OTHER] = own, cells[:, :3]
-        found[:, point_to_plane.RESIDUAL] = np.sum(cells[:, :3] * position, axis=1) + cells[:, 3] - projection.values
+        found[:, point_to_plane.RESIDUAL] = np.sum(cells[:, :3] * position, axis=1) + cells[:, 3] - theirs.values
         matched = matches[:, point_to_plane.WEIGHT] > 0.0
         found[:, point_to_plane.WEIGHT] = weight * matched * matches[:, point_to_plane.FACING_WEIGHT]
         return found
 
-    def projections(self, band: int, stride: int) -> tuple[ColourProjection, ColourProjection]:
+    def colours(self, band: int, stride: int) -> tuple[Colours, Colours]:
         """Return the two directions of a band, at every `stride`-th point."""
         if (band, stride) not in self._made:
-            forward, backward = self._projections(band) if stride == 1 else self.projections(band, 1)
+            forward, backward = self._colours(band) if stride == 1 else self.colours(band, 1)
             self._made[band, stride] = forward.thinned(stride), backward.thinned(stride)
         return self._made[band, stride]
 
-    def _projections(self, band: int) -> tuple[ColourProjection, ColourProjection]:
-        values, cells = self._looked_up(band)
-        forward = ColourProjection(*self.surfaces[0], values[0][self.source_points], cells[1])
-        backward = ColourProjection(*self.surfaces[1], values[1][self.target_points], cells[0])
-        return forward, backward
+    def _colours(self, band: int) -> tuple[Colours, Colours]:
+        (of_source, of_target), (in_source, in_target) = self._looked_up(band)
+        return Colours(of_source[self.source_points], in_target), Colours(of_target[self.target_points], in_source)
 
     def _looked_up(self, band: int) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """Return the features of all points of source and target in a band, and the cells of both images."""
         if band not in self._left:
-            source, target = (view_features(view)[band] for view in (self.source, self.target))
-            share = max(self.unmoved(band), 0.0)
-            here = _unexplained(source, target, self._partners[0], share)
-            there = _unexplained(target, source, self._partners[1], share)
-            cells = _cells(self.source, here), _cells(self.target, there)
-            self._left[band] = (here[VALUE], there[VALUE]), cells
+            views, share = (self.source, self.target), max(self.unmoved(band), 0.0)
+            source, target = (
+                _unexplained(view_features(view)[band], there, view_features(other)[band], share)
+                for view, other, there in zip(views, views[::-1], self._in_place(band), strict=True)
+            )
+            self._left[band] = (
+                (source[VALUE], target[VALUE]),
+                (_cells(self.source, source), _cells(self.target, target)),
+            )
         return self._left[band]
 
     def patches(self, band: int) -> float:
@@ -180,43 +196,29 @@ class PairColour:
         points = 0.5 * (len(self.source.points_m) + len(self.target.points_m))
         return points / (4.0 * np.pi * (FINEST_PX * 2**band) ** 2)
 
-    def evenness(self, band: int) -> float:
-        """Return the share of the surface that makes up the features: 1 where they are as strong everywhere.
-
-        It is the participation ratio of the energies of 32 patches of either view. On a plain box most lies at its
-        edges, which meet few of them.
-        """
-        if band not in self._evenness:
-            shares = []
-            for patches, projection in zip(self._patches, self.projections(band, 1), strict=True):
-                energies = np.bincount(patches, projection.values.astype(np.float64) ** 2, 2**_HALVINGS)
-                shares.append(np.sum(energies) ** 2 / max(len(energies) * np.sum(energies**2), 1e-12))
-            self._evenness[band] = float(np.mean(shares))
-        return self._evenness[band]
-
-    @cached_property
-    def _patches(self) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers of the patches of the points of either view."""
-        source, target = self.source.points_m[self.source_points], self.target.points_m[self.target_points]
-        return point_to_plane.bisected(source, _HALVINGS), point_to_plane.bisected(target, _HALVINGS)
-
     def unmoved(self, band: int) -> float:
         """Return the correlation of features that both views show in the same place (method.md, eq. 18).
 
         What stays in its place while the object turns is light: highlights, shading, fixed pattern noise.
         """
         if band not in self._unmoved:
-            source, target = (view_features(view)[band] for view in (self.source, self.target))
-            partners = self._partners[0]
-            theirs = _in_other(target, partners)
-            self._unmoved[band] = _correlation(source[VALUE] * (partners[0] >= 0), theirs[VALUE])
+            there, found = self._in_place(band)[0], self._partners[0][0] >= 0
+            self._unmoved[band] = _correlation(view_features(self.source)[band][VALUE] * found, there[VALUE])
         return self._unmoved[band]
+
+    def _in_place(self, band: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return features (3, n) of the target in the places of the source's points, and vice versa; 0 for none."""
+        if band not in self._places:
+            self._places[band] = (
+                _in_other(view_features(self.target)[band], self._partners[0]),
+                _in_other(view_features(self.source)[band], self._partners[1]),
+            )
+        return self._places[band]
 
     @cached_property
     def _partners(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """See `_in_place`: of the source's points in the target, and vice versa."""
-        shift_m = self.target.centroid_m - self.source.centroid_m
-        return _in_place(self.source, self.target, shift_m), _in_place(self.target, self.source, -shift_m)
+        return _aligned(self.source, self.target), _aligned(self.target, self.source)
 
 
 def unshifted(equations: Array, shifts: Array) -> Array:
@@ -236,8 +238,28 @@ def weight_of(correlation: float) -> float:
     return square / (1.0 - square)
 
 
-def _in_place(view: RayImage, other: RayImage, shift_m: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the points of a view fall in the other if the object only moves by a shift (3,), without a turn.
+def _aligned(view: RayImage, other: RayImage) -> tuple[np.ndarray, np.ndarray]:
+    """Return the partners of a view's points in the other, shifted so that the two look most alike: see `_partners`.
+
+    Centroids err by more than the finest bands are wide. One step of least squares (Lucas and Kanade 1981).
+    """
+    own, others = view_features(view)[_ALIGNED], view_features(other)[_ALIGNED]
+    partners = _partners(view, other, np.zeros(2))
+    there = _in_other(others, partners) * (1.0 / _deviation(others))
+    slopes = there[[BY_COLUMN, BY_ROW]].astype(np.float64)
+    apart = (own[VALUE] * (1.0 / _deviation(own)) - there[VALUE]) * (partners[0] >= 0)
+    step = np.linalg.lstsq(slopes @ slopes.T, slopes @ apart, rcond=None)[0]
+    width_px = FINEST_PX * 2**_ALIGNED  # farther features are not linear
+    return _partners(view, other, step * min(1.0, width_px / max(float(np.linalg.norm(step)), 1e-12)))
+
+
+def _partners(view: RayImage, other: RayImage, shift_px: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the points of a view fall in the other if the object only moves, without a turn.
+
+    Args:
+        view: the points'.
+        other: where they fall.
+        shift_px: (2,) columns and rows from where the difference of the centroids brings them.
 
     Returns:
         Number (n,) of the other view's point there, -1 for none; and columns and rows (n, 2) from its pixel.
@@ -245,28 +267,32 @@ def _in_place(view: RayImage, other: RayImage, shift_m: Array) -> tuple[np.ndarr
     camera = other.frame.camera
     numbers = np.full((camera.height, camera.width), -1, dtype=np.int32)
     numbers[other.pixels[:, 0], other.pixels[:, 1]] = np.arange(len(other.pixels))
-    x, y, z = (view.points_m + shift_m).T
-    place = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
-    pixel = np.round(place).astype(np.int64)
-    inside = np.all((pixel >= 0) & (pixel < (camera.width, camera.height)), axis=1) & (z > 0.0)
-    column, row = np.where(inside[:, None], pixel, 0).T
-    return np.where(inside, numbers[row, column], -1), (place - pixel).astype(np.float32)
+    found = np.empty(len(view.points_m), dtype=np.int32)
+    offsets = np.zeros((len(view.points_m), 2), dtype=np.float32)
+    lens = np.array([camera.fx, camera.fy, camera.cx + shift_px[0], camera.cy + shift_px[1]])
+    photometric.find_in_place(view.points_m, other.centroid_m - view.centroid_m, lens, numbers, found, offsets)
+    return found, offsets
 
 
 def _in_other(others: np.ndarray, partners: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return what features (3, m) of the other view are in the same places, (3, n); see `_in_place`; 0 for none."""
-    numbers, offsets = partners
-    there = others[:, numbers] * (numbers >= 0)
-    there[VALUE] += there[BY_COLUMN] * offsets[:, 0] + there[BY_ROW] * offsets[:, 1]
+    """Return what features (3, m) of the other view are in the same places, (3, n); see `_partners`; 0 for none."""
+    there = np.empty((3, len(partners[0])), dtype=np.float32)
+    photometric.fetch_in_place(others, *partners, there)
     return there
 
 
-def _unexplained(
-    features: np.ndarray, others: np.ndarray, partners: tuple[np.ndarray, np.ndarray], share: float
-) -> np.ndarray:
-    """Return features (3, n) of unit variance, less a share of the other view's in the same places (eq. 18)."""
-    left = features / _deviation(features) - share / _deviation(others) * _in_other(others, partners)
-    return np.asarray(left / _deviation(left), dtype=np.float32)
+def _unexplained(features: np.ndarray, there: np.ndarray, others: np.ndarray, share: float) -> np.ndarray:
+    """Return features (3, n) of unit variance, less a share of the other view's in the same places (eq. 18).
+
+    Args:
+        features: (3, n) of a view.
+        there: (3, n) of the other view in the same places.
+        others: (3, m) of the other view.
+        share: that light makes up.
+    """
+    left = features * (1.0 / _deviation(features)) - there * (share / _deviation(others))
+    left *= 1.0 / _deviation(left)
+    return left
 
 
 def _deviation(features: np.ndarray) -> float:
@@ -276,7 +302,7 @@ def _deviation(features: np.ndarray) -> float:
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Return the correlation of features (n,) about 0."""
-    scale = np.sqrt(float(np.sum(a * a)) * float(np.sum(b * b)))
+    scale = math.sqrt(float(np.sum(a * a)) * float(np.sum(b * b)))
     return float(np.sum(a * b)) / scale if scale > 0.0 else 0.0
 
 
@@ -293,16 +319,17 @@ def _cells(view: RayImage, features: np.ndarray) -> np.ndarray:
 def view_features(view: RayImage) -> np.ndarray:
     """Return the features of a view's surface points, see `features`; made once, as a view is part of several pairs."""
     if view not in _KNOWN:
-        _KNOWN[view] = features(view.frame, view.pixels)
+        _KNOWN[view] = features(view.frame, view.pixels, view.normals)
     return _KNOWN[view]
 
 
-def features(frame: Frame, pixels: np.ndarray) -> np.ndarray:
+def features(frame: Frame, pixels: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Return the features of surface points in bands of increasing width (method.md, eq. 17).
 
     Args:
         frame: with its colour.
         pixels: (n, 2) row and column of each surface point.
+        normals: (n, 3) in the camera's frame.
 
     Returns:
         (BANDS, 3, n) float32: `VALUE`, `BY_COLUMN` and `BY_ROW`.
@@ -312,36 +339,64 @@ def features(frame: Frame, pixels: np.ndarray) -> np.ndarray:
         return found
     low, high = pixels.min(axis=0), pixels.max(axis=0) + 1
     places = pixels - low
-    logs = np.log(frame.colour[low[0] : high[0], low[1] : high[1]].astype(np.float32) + np.float32(_BLACK)).mean(axis=2)
-    share = np.zeros(logs.shape, dtype=np.float32)
-    share[tuple(places.T)] = 1.0
-    image = (logs - logs[tuple(places.T)].mean()) * share
-    scale = 1
+    red, green, blue = frame.colour[pixels[:, 0], pixels[:, 1]].T
+    logs = _LOGS[red] + _LOGS[green] + _LOGS[blue]
+    images = np.zeros((3, *(high - low)), dtype=np.float32)  # colours, shading, and which pixels are surface
+    images[:, places[:, 0], places[:, 1]] = logs - logs.mean(), _shading(logs, normals), np.ones(len(logs))
+    scale, inner = 1, _blurred(images, FINEST_PX)
     for band in range(BANDS):
-        if band > 1:  # from an image of half the size of the one before
-            image, share, scale = _halved(image), _halved(share), 2 * scale
-        width_px = FINEST_PX * 2**band / scale
+        outer = _blurred(images, 2.0 * FINEST_PX * 2**band / scale)
         cell = places // scale
-        away = (places + 0.5) / scale - (cell + 0.5)
-        layer = np.where(share > 0.0, _mean(image, share, width_px) - _mean(image, share, 2.0 * width_px), 0.0)
-        by_row, by_column = (_slope(layer, share > 0.0, axis)[tuple(cell.T)] for axis in (0, 1))
-        found[band, VALUE] = layer[tuple(cell.T)] + by_row * away[:, 0] + by_column * away[:, 1]
+        flat, away = cell[:, 0] * images.shape[2] + cell[:, 1], (places + 0.5) / scale - (cell + 0.5)
+        layer, inside = _unshaded(*(_means(inner) - _means(outer)), images[2] > 0.0)
+        by_row, by_column = (_slope(layer, inside, axis).ravel()[flat] for axis in (0, 1))
+        found[band, VALUE] = layer.ravel()[flat] + by_row * away[:, 0] + by_column * away[:, 1]
         found[band, BY_COLUMN], found[band, BY_ROW] = by_column / scale, by_row / scale
+        if band == 0:
+            inner = outer
+        else:  # the next band is taken from images of half the size
+            images, inner, scale = _halved(images), _halved(outer), 2 * scale
     return found
 
 
-def _halved(image: np.ndarray) -> np.ndarray:
-    """Return the means of blocks of 2 × 2 px of an image (h, w)."""
-    padded = np.pad(image, [(0, side % 2) for side in image.shape])
-    return np.asarray(padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2).mean(axis=(1, 3)))
+def _shading(logs: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return what harmonics of normals (n, 3) tell of logarithms of colours (n,) (Basri and Jacobs 2003)."""
+    basis = np.column_stack([np.ones(len(logs)), harmonics_of(normals, np.eye(4))])
+    some = slice(None, None, max(len(logs) // _SHADED, 1))
+    inverse = np.linalg.pinv(basis[some].T @ basis[some], rcond=1e-4, hermitian=True)  # few faces tell few harmonics
+    return basis @ (inverse @ (basis[some].T @ logs[some]))
 
 
-def _mean(image: np.ndarray, share: np.ndarray, width_px: float) -> np.ndarray:
-    """Return Gaussian means of an image (h, w), which is weighted by the share of each pixel that is surface."""
-    weighted, weight = (
-        ndimage.gaussian_filter(part, width_px, mode="constant", truncate=_REACH) for part in (image, share)
+def _unshaded(colours: np.ndarray, shading: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a band (h, w) of colours without what that of the shading explains, and which pixels it holds for.
+
+    Lamps that stay with the camera light the faces of a plain box unlike, and their edges would be its print: where
+    shading changes by more than the noise of the normals would have it, there is no telling. Where that noise prevails,
+    the band of the shading explains little.
+    """
+    colours, shading = colours * inside, shading * inside
+    power = float(np.vdot(shading, shading)) + np.count_nonzero(inside) * _LEVEL**2
+    noise = max(float(np.median(np.abs(shading[inside]))) / _NORMAL_QUARTILE, _LEVEL)
+    steady = inside & (np.abs(shading) <= _CREASE * noise)
+    return (colours - np.float32(float(np.vdot(colours, shading)) / power) * shading) * steady, steady
+
+
+def _halved(images: np.ndarray) -> np.ndarray:
+    """Return the means of blocks of 2 × 2 px of images (k, h, w)."""
+    padded = np.pad(images, [(0, 0), *((0, side % 2) for side in images.shape[1:])])
+    return np.float32(0.25) * (
+        padded[:, ::2, ::2] + padded[:, 1::2, ::2] + padded[:, ::2, 1::2] + padded[:, 1::2, 1::2]
     )
-    return np.asarray(weighted / np.maximum(weight, np.float32(1e-3)))
+
+
+def _blurred(images: np.ndarray, width_px: float) -> np.ndarray:
+    """Return images (k, h, w) blurred by a Gaussian."""
+    return ndimage.gaussian_filter(images, width_px, mode="constant", truncate=_REACH, axes=(1, 2))
+
+
+def _means(blurred: np.ndarray) -> np.ndarray:
+    """Return Gaussian means (k - 1, h, w) over surface, from blurred images of which the last is its share."""
+    return np.asarray(blurred[:-1] / np.maximum(blurred[-1], np.float32(1e-3)))
 
 
 def _slope(image: np.ndarray, inside: np.ndarray, axis: int) -> np.ndarray:
