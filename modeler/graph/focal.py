@@ -18,6 +18,9 @@ from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, 
 from modeler.graph.smoother import Smoother
 from modeler.types import Array, FocalLength, Solution
 
+TURNS = 0.004
+"""Relative error of all turns alike, which loops take for one of the focal length: measured on renders."""
+
 _STEP = 0.005  # for derivatives, at most, and a quarter of the prior's: some standard deviations that loops leave
 _ROUNDS = 4  # of Newton's method
 _REACH = 3.0  # prior standard deviations within which loops are asked
@@ -75,7 +78,7 @@ class MovingGraph:
         agreeing = 6 * sum(fitting.inlier)
         left = 2.0 * (fitting.error - self.threshold * fitting.inlier.count(False))
         worse = max(left / (agreeing - 1), 1.0) if agreeing else 1.0  # than the edges state
-        sigma = float(np.hypot(np.sqrt(worse / curvature), _SLOPES * best))
+        sigma = float(np.linalg.norm([np.sqrt(worse / curvature), _SLOPES * best, TURNS]))
         return FocalLength(
             log_factor=best,
             sigma=min(sigma, prior_sigma),
