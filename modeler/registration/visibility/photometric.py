@@ -347,7 +347,7 @@ def features(frame: Frame, pixels: np.ndarray, normals: np.ndarray) -> np.ndarra
     for band in range(BANDS):
         outer = _blurred(images, 2.0 * FINEST_PX * 2**band / scale)
         cell = places // scale
-        flat, away = cell[:, 0] * images.shape[2] + cell[:, 1], (places + 0.5) / scale - (cell + 0.5)
+        flat, away = cell[:, 0] * images.shape[-1] + cell[:, 1], (places + 0.5) / scale - (cell + 0.5)
         layer, inside = _unshaded(*(_means(inner) - _means(outer)), images[2] > 0.0)
         by_row, by_column = (_slope(layer, inside, axis).ravel()[flat] for axis in (0, 1))
         found[band, VALUE] = layer.ravel()[flat] + by_row * away[:, 0] + by_column * away[:, 1]
