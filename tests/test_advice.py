@@ -15,11 +15,18 @@ from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.types import AbstractPrior, Outcome
 
 
-def untrusted(*codes: str, turn_deg: float = 40.0, outcome: Outcome = Outcome.CONVERGED, **more: Any) -> dict[str, Any]:
+def untrusted(
+    *codes: str,
+    turn_deg: float = 40.0,
+    sigma_deg: float = 1.0,
+    outcome: Outcome = Outcome.CONVERGED,
+    **more: Any,
+) -> dict[str, Any]:
     """What a report says of a run of two frames, of which one may be left out."""
     turn = se3.exp(np.array([0.0, np.radians(turn_deg), 0.0, 0.0, 0.0, 0.0]))
     edge = {"accepted": outcome is Outcome.CONVERGED, "kind": "odometry", "source": 1, "target": 0}
     edge |= {"outcome": outcome.label, "target_from_source": turn.ravel().tolist()}
+    edge["covariance"] = (np.radians(sigma_deg) ** 2 * np.eye(6)).ravel().tolist()
     frames = [{"id": 0, "cause": ""}, {"id": 1, "cause": "" if edge["accepted"] else outcome.label}]
     return {"reason_codes": list(codes), "frames": frames, "edges": [edge], "closed": False, **more}
 
@@ -37,6 +44,11 @@ def untrusted(*codes: str, turn_deg: float = 40.0, outcome: Outcome = Outcome.CO
         ),
         (untrusted("seen_through"), priors.GeneralPrior(), {"prior": "turntable", "step-deg": "40"}),
         (untrusted("unsure_rotation", up=[0.0, -1.0, 0.0]), priors.TablePrior(), {"prior": "turntable"}),
+        (
+            untrusted("unsure_rotation", sigma_deg=15.0),
+            priors.GeneralPrior(),
+            {"prior": "turntable", "step-deg": "DEG"},
+        ),
         (untrusted("unsure_rotation"), priors.TurntablePrior(25.0), None),
         (untrusted("prior_contradicted"), priors.TurntablePrior(25.0, 2.0), {"step-sigma-deg": "6"}),
         (untrusted("prior_contradicted"), priors.TablePrior(), {"prior": "general"}),

@@ -238,10 +238,20 @@ def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | Non
         wide = max(turns, default=0.0) >= prior.max_rotation_deg - _NEAR_LIMIT_DEG
         options = {"max-rotation-deg": _twice_deg(prior.max_rotation_deg)} if wide else {}
         return Remedy("say that the object stays on its table", {"prior": "table", **options})
-    step = f"{np.median(turns):.0f}" if turns and np.median(turns) >= 1.0 else "DEG"
-    sigma = f"{max(_ROUGH * float(np.median(turns)), 1.0):.0f}" if turns else "DEG"
-    known = {"prior": "turntable", "step-deg": step, "step-sigma-deg": sigma}
-    return Remedy("say how far it was turned from frame to frame, and how evenly", known)
+    words, step, sigma = "say how far it was turned from frame to frame, and how evenly", "DEG", "DEG"
+    turned_deg = float(np.median(turns)) if turns else 0.0
+    if turns and _sigma_deg(report["edges"]) > max(_ROUGH * turned_deg, 1.0):
+        words += ": the images leave that open"
+    elif turned_deg >= 1.0:
+        step, sigma = f"{turned_deg:.0f}", f"{max(_ROUGH * turned_deg, 1.0):.0f}"
+    return Remedy(words, {"prior": "turntable", "step-deg": step, "step-sigma-deg": sigma})
+
+
+def _sigma_deg(edges: Sequence[Mapping[str, Any]]) -> float:
+    """Return the largest standard deviation of a rotation in degrees, median over accepted edges of neighbours."""
+    covariances = [edge["covariance"] for edge in edges if edge["accepted"] and edge["kind"] == "odometry"]
+    rotations = np.reshape(covariances, (-1, 6, 6))[:, :3, :3]
+    return float(np.degrees(np.sqrt(np.median(np.linalg.eigvalsh(rotations)[:, -1]))))
 
 
 def _twice_deg(limit_deg: float) -> str:
