@@ -24,9 +24,15 @@ def layout(first: RayImage | None, further: Sequence[rrb.Container] = ()) -> rrb
         first: the first accepted view, which tells where to look from; None before there is one.
         further: tabs after the first.
     """
+    tabs = rrb.Tabs(_poses(first), *further, _object(first), _pair(first), _edges(first), _words(), active_tab=0)
+    return followed(tabs, fps=3.0)
+
+
+def followed(views: rrb.Container, *, fps: float) -> rrb.Blueprint:
+    """Return a layout of nothing but views, which follow the newest frame and play so many frames a second."""
     return rrb.Blueprint(
-        rrb.Tabs(_poses(first), *further, _object(first), _pair(first), _edges(first), _words(), active_tab=0),
-        rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=3.0),
+        views,
+        rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=fps),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,

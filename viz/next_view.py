@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from modeler.suggestion import Belief, Suggestions
 from modeler.types import RayImage
 from viz import entities
-from viz.blueprint import FROM_THE_SIDE
+from viz.blueprint import FROM_THE_SIDE, followed
 from viz.drawings import Drawing
 
 WORDS: Final = "next/words"
@@ -48,14 +48,7 @@ def layout(first: RayImage) -> rrb.Blueprint:
     Args:
         first: the first view, which tells where to look from.
     """
-    return rrb.Blueprint(
-        tab(first),
-        rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=1.0),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-        auto_layout=False,
-    )
+    return followed(tab(first), fps=1.0)
 
 
 def tab(first: RayImage | None) -> rrb.Container:
