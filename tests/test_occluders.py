@@ -59,9 +59,7 @@ def test_nothing_that_an_occluder_measures_counts(flashlight, rng) -> None:  # n
     whole = slice(0, frames[0].camera.height), slice(0, frames[0].camera.width)
     parts = [crop(view, whole, Cropping(2, 0.15, 0.1)) for view in views]
     likes = [
-        VisibilityLikelihood()
-        .between(source, view, np.random.default_rng(0))
-        .log_likelihoods(truth[None], 0.001, stride=1)
+        VisibilityLikelihood().between(source, view, np.random.default_rng(0)).scores(truth[None], 0.001, stride=1)
         for view in views
     ]
     place = rod(frames[0], middle(frames[0]))
@@ -90,7 +88,7 @@ def test_points_behind_an_occluder_count_nothing(flashlight) -> None:  # noqa: F
         assert (points.classify(se3.rows(pose)) == UNKNOWN).all()
         averted = replace(points, points=np.array([[0.0, 0.0, -5.0, 0.0, 0.0, -1.0, 1e-6]]))  # counts 0, too
         one_way = replace(pair, forward=points, backward=averted)
-        plain, explained = one_way.log_likelihoods(pose[None], 0.001, stride=1)
+        plain, explained, _ = one_way.scores(pose[None], 0.001, stride=1)
         assert plain[0] == 0.0
         assert explained[0] == 0.0
 

@@ -11,7 +11,7 @@ import modeler
 from modeler import se3
 from modeler.cli.build import Build
 from modeler.cli.options import MethodOptions
-from modeler.kernels import gauss_newton, photometric, point_to_plane
+from modeler.kernels import gauss_newton, photometric, point_to_plane, scores
 from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
 from modeler.rays import Sensor
@@ -103,12 +103,49 @@ def test_bands_are_differences_of_gaussian_means(rng):
             assert np.corrcoef(image[band, layer][inside].ravel(), want[inside].ravel())[0][1] > 0.95
 
 
+def test_few_spots_are_limited_and_prints_are_not(rng):
+    surface = rng.uniform(-1.0, 1.0, size=(3, 4000)).astype(np.float32)
+    spots, print_ = surface.copy(), surface.copy()
+    spots[:, :80] *= 50.0
+    print_[:, :1600] *= 3.0
+    want = print_ / print_[0].std()
+    for band in (spots, print_):
+        photometric.winsorise(band)
+        np.testing.assert_allclose(band[0].std(), 1.0, atol=0.02)
+    limited = np.abs(spots[0]) > 2.9999
+    assert 70 < np.count_nonzero(limited[:80])
+    assert not np.any(limited[80:])
+    assert not np.any(spots[1:, limited])
+    np.testing.assert_allclose(print_, want, atol=0.02)
+
+
+def test_curvatures_are_those_of_the_likelihood(printed):
+    """Along each of their axes: poses by one standard deviation from the best are half a nat worse."""
+    views, _ = printed
+    pair = VisibilityLikelihood().between(views[0], views[1], np.random.default_rng(0))
+    fine_m = 0.015 * pair.size_m
+    best = registered(views, colour=True).pose.mean
+    noise_m = pair.surface_noise_m(best, fine_m)
+    found = pair.curvatures(best[None], noise_m, stride=1)[0]
+    scales, axes = np.linalg.eigh(found)
+    away = np.linspace(-2.0, 2.0, 41)
+    for scale, axis in zip(scales, axes.T, strict=True):
+        poses = se3.moved(
+            best[None].repeat(len(away), axis=0),
+            np.outer(away, np.asarray(axis / np.sqrt(scale), dtype=np.float64)),
+            pair.centre_m,
+        )
+        values = pair.tempered(poses, noise_m, typical_misfit=pair.typical_misfit(best, noise_m))
+        assert 0.4 < -2.0 * np.polyfit(away, values, 2)[0] < 2.5
+
+
 def test_moments_are_sums_over_matching_points(printed):
     views, truth = printed
     pair = VisibilityLikelihood(colour=True).between(views[0], views[1], np.random.default_rng(0))
     assert pair.colour is not None
     both = pair.colour.colours(1, 1)
-    found = photometric.moments(rows(truth[None]), pair.surfaces(1), both, 0.002)[0]
+    sides = (*pair.surfaces(1), pair.forward.parameters(0.002), pair.backward.parameters(0.002))
+    found = scores.scores(rows(truth[None]), *sides, both)[0, scores.PRODUCT :]
     want = np.zeros(4)
     carried = ((truth, both[0], pair.forward), (se3.inverse(truth), both[1], pair.backward))
     for pose, seen, directed in carried:
@@ -117,7 +154,7 @@ def test_moments_are_sums_over_matching_points(printed):
         camera = directed.image.frame.camera
         x, y, z = matches[:, point_to_plane.POSITION].T
         pixel = np.round(camera.fy * y / z + camera.cy) * camera.width + np.round(camera.fx * x / z + camera.cx)
-        cells = seen.cells[pixel.astype(int)]
+        cells = seen.cells[seen.numbers[pixel.astype(int)]]
         other = np.sum(cells[:, :3] * matches[:, point_to_plane.POSITION], axis=1) + cells[:, 3]
         weight, own = matches[:, point_to_plane.FACING_WEIGHT] * good, seen.values
         want += [np.sum(weight * part) for part in (own * other, own * own, other * other, 1.0)]

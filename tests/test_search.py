@@ -93,7 +93,7 @@ def test_nothing_lies_below_the_support(bracket, rng):
     poses = np.stack([truth, flipped])
     standing = likelihood.between(source, target, np.random.default_rng(0))
     floating = likelihood.between(replace(source, plane=None), replace(target, plane=None), np.random.default_rng(0))
-    seen, unseen = (pair.log_likelihoods(poses, 0.002, stride=1)[0] for pair in (standing, floating))
+    seen, unseen = (pair.scores(poses, 0.002, stride=1).surface for pair in (standing, floating))
     assert seen[0] == pytest.approx(unseen[0], abs=1.0)
     assert seen[1] < unseen[1] - 1000.0
 

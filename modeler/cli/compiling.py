@@ -14,7 +14,16 @@ if TYPE_CHECKING:
     from modeler.pipeline import Modeler
     from modeler.types import Array, RayImage
 
-_USED = ("planes", "lie_group", "point_likelihood", "photometric", "point_to_plane", "gauss_newton", "mixture")
+_USED = (
+    "planes",
+    "lie_group",
+    "point_likelihood",
+    "photometric",
+    "point_to_plane",
+    "scores",
+    "gauss_newton",
+    "mixture",
+)
 _USED_TO_FUSE = ("tsdf", "shading", "marching_cubes", "point_clouds")
 
 

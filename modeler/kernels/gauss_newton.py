@@ -124,7 +124,7 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
         elif features.values.shape[0] == 0:
             continue
         else:
-            fetch_colours(count, pixels, features.cells, colour)
+            fetch_colours(count, pixels, features, colour)
             linearise_features(
                 surface.points, features.values, transformed, found, colour, about, surface_m2, weight, rows
             )

@@ -1,33 +1,23 @@
 """Colours of surface that both views saw: their correlation, and the equations by which they move a pose."""
 
+import math
 from typing import NamedTuple
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
-from modeler.kernels.point_likelihood import (
-    FACING,
-    VECTOR_MATHS,
-    ZERO,
-    X,
-    Y,
-    Z,
-    buffers,
-    invert,
-    plane_distance,
-    project,
-)
+from modeler.kernels.point_likelihood import FACING, HALF, VECTOR_MATHS, ZERO, X, Y, Z, plane_distance
 from modeler.kernels.point_to_plane import match_weight
-from modeler.kernels.threads import over_rows
 
-# Columns of a cell, the 16 bytes that are read for one pixel: at a point p that projects into it, the feature is
-# gradient · p + offset to first order. They are those of a plane, so that `plane_distance` of a cell is the feature.
+# Columns of a cell, the 16 bytes that are read for one point: at a point p that projects where the cell's own does, the
+# feature is gradient · p + offset to first order. They are those of a plane: `plane_distance` of a cell is the feature.
 GRADIENT_X, GRADIENT_Y, GRADIENT_Z, OFFSET = 0, 1, 2, 3
 CELL_SIZE = 4
 
-# Columns of `moments`.
-PRODUCT, OWN_SQUARE, OTHER_SQUARE, MATCHES = 0, 1, 2, 3
+_LEAST_DEVIATION = 1e-6  # of features; an image without any has none of unit variance
+_LIMIT = 3.0  # standard deviations, beyond which 0.3 % of normal features are
+_ROUNDS = 10  # of variance and limit, each by the other
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -38,54 +28,127 @@ class Colours(NamedTuple):
     values: FloatArray
     """(n,) features of the points in their own view, of unit variance; (0,) where colours are not compared."""
     cells: FloatArray
-    """(h · w, 4) cells of colour of the other view."""
+    """(m + 1, 4) cells of colour of the other view's surface points; the last is that of no point, zeros."""
+    numbers: npt.NDArray[np.int32]
+    """(h · w,) number of the other view's point at each pixel, m for none."""
 
     def thinned(self, stride: int) -> "Colours":
         """Return those of every `stride`-th point."""
         return self._replace(values=np.ascontiguousarray(self.values[::stride]))
 
 
-NO_COLOURS = Colours(np.zeros(0, dtype=np.float32), np.zeros((1, CELL_SIZE), dtype=np.float32))
+NO_COLOURS = Colours(
+    np.zeros(0, dtype=np.float32), np.zeros((1, CELL_SIZE), dtype=np.float32), np.zeros(1, dtype=np.int32)
+)
 """One direction of views whose colours are not compared."""
 
 
 @numba.njit(cache=True, error_model="numpy")
-def fill_cells(features, points_m, pixels, focal, cells):
-    """Write the cells of features: their gradients by position in 1/m, and the features themselves.
+def explain_light(features, there, share, points_m, focal, values, cells):
+    """Write what features are, and their cells, without what another view has in the same places (method.md, eq. 18).
 
-    Along a pixel's ray a feature stays the same, so that its gradient there adds nothing at the pixel's own point.
+    What is left has unit variance. Along a pixel's ray a feature stays the same, so that its gradient there adds
+    nothing at the pixel's own point.
 
     Args:
         features: (3, n) of the surface points: value, and derivatives by column and row in 1/px.
+        there: (3, n) the other view's, see `fetch_in_place`.
+        share: of `there` that light makes up.
         points_m: (n, 3) the points.
-        pixels: (n,) their pixels, row by row.
         focal: (2,) fx and fy in px.
-        cells: (h · w, 4) out; zeros, and left so where there is no point.
+        values: (n,) out.
+        cells: (n + 1, 4) out; the last is left as it is.
     """
-    for j in range(pixels.shape[0]):
+    count, total, square = points_m.shape[0], 0.0, 0.0
+    for j in range(count):
+        left = features[0, j] - share * there[0, j]
+        values[j] = left
+        total += left
+        square += left * left
+    variance = square / max(count, 1) - (total / max(count, 1)) ** 2
+    scale = 1.0 / max(math.sqrt(max(variance, 0.0)), _LEAST_DEVIATION)
+    for j in range(count):
+        values[j] *= scale
         x, y, z = points_m[j]
-        by_x, by_y = features[1, j] * focal[0] / z, features[2, j] * focal[1] / z
-        cell = cells[pixels[j]]
+        by_x = scale * (features[1, j] - share * there[1, j]) * focal[0] / z
+        by_y = scale * (features[2, j] - share * there[2, j]) * focal[1] / z
+        cell = cells[j]
         cell[GRADIENT_X], cell[GRADIENT_Y], cell[GRADIENT_Z] = by_x, by_y, -(by_x * x + by_y * y) / z
-        cell[OFFSET] = features[0, j]
+        cell[OFFSET] = values[j]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def find_in_place(points_m, shift_m, camera, numbers, found, offsets):
+def sample_layer(layer, inside, places, scale, found):
+    """Write the features of surface points in one band, interpolated linearly from the nearest cell of its image.
+
+    Args:
+        layer: (h, w) the band.
+        inside: (h, w) which cells it holds for; a slope across others is 0.
+        places: (n, 2) row and column of each point, in px.
+        scale: width of a cell in px.
+        found: (3, n) out: value, and derivatives by column and row in 1/px.
+    """
+    height, width = layer.shape
+    for j in range(places.shape[0]):
+        row, column = places[j, 0] // scale, places[j, 1] // scale
+        by_row, by_column = ZERO, ZERO
+        if 0 < row < height - 1 and inside[row - 1, column] and inside[row + 1, column]:
+            by_row = HALF * (layer[row + 1, column] - layer[row - 1, column]) / scale
+        if 0 < column < width - 1 and inside[row, column - 1] and inside[row, column + 1]:
+            by_column = HALF * (layer[row, column + 1] - layer[row, column - 1]) / scale
+        middle = 0.5 * (scale - 1)
+        found[0, j] = (
+            layer[row, column]
+            + by_row * (places[j, 0] - row * scale - middle)
+            + by_column * (places[j, 1] - column * scale - middle)
+        )
+        found[1, j], found[2, j] = by_column, by_row
+
+
+@numba.njit(cache=True, error_model="numpy")
+def winsorise(features):
+    """Scale features to unit variance, and limit them to three standard deviations, both ways.
+
+    A few dark spots would be all that a correlation heard of, and it takes its features for normal ones. The variance
+    is that of what is left, so that spots on less than a ninth of the surface are limited, prints on more are not.
+
+    Args:
+        features: (3, n) of the surface points, in place: value, and derivatives by column and row in 1/px.
+    """
+    count, scale, limit = features.shape[1], 1.0, np.inf
+    for _ in range(_ROUNDS):
+        total, square = 0.0, 0.0
+        for j in range(count):
+            value = min(max(features[0, j], -limit), limit)
+            total += value
+            square += value * value
+        variance = square / max(count, 1) - (total / max(count, 1)) ** 2
+        scale = max(math.sqrt(max(variance, 0.0)), _LEAST_DEVIATION)
+        limit = _LIMIT * scale
+    for j in range(count):
+        inside = abs(features[0, j]) <= limit
+        features[0, j] = min(max(features[0, j], -limit), limit) / scale
+        for k in range(1, 3):
+            features[k, j] = features[k, j] / scale if inside else ZERO
+
+
+@numba.njit(cache=True, error_model="numpy")
+def find_in_place(points_m, shift_m, camera, numbers, none, found, offsets):
     """Find where points fall in another view if they only move by a shift.
 
     Args:
         points_m: (n, 3) the points.
         shift_m: (3,) the shift.
         camera: (4,) fx, fy, cx, cy of the other view.
-        numbers: (h, w) numbers of the other view's points, -1 for none.
-        found: (n,) out; number of the other view's point there, -1 for none.
+        numbers: (h, w) numbers of the other view's points,
+        none: where there is no point.
+        found: (n,) out; number of the other view's point there, the same for none.
         offsets: (n, 2) out; columns and rows from that point's pixel.
     """
     height, width = numbers.shape
     for j in range(points_m.shape[0]):
         x, y, z = points_m[j, 0] + shift_m[0], points_m[j, 1] + shift_m[1], points_m[j, 2] + shift_m[2]
-        found[j] = -1
+        found[j] = none
         if z <= 0.0:
             continue
         column, row = camera[0] * x / z + camera[2], camera[1] * y / z + camera[3]
@@ -107,7 +170,7 @@ def fetch_in_place(features, numbers, offsets, found):
     """
     for j in range(numbers.shape[0]):
         k = numbers[j]
-        if k < 0:
+        if k >= features.shape[1]:
             found[0, j], found[1, j], found[2, j] = ZERO, ZERO, ZERO
         else:
             value, by_column, by_row = features[0, k], features[1, k], features[2, k]
@@ -116,12 +179,12 @@ def fetch_in_place(features, numbers, offsets, found):
 
 
 @numba.njit(cache=True, error_model="numpy", forceinline=True)
-def fetch_colours(count, pixels, cells, looked_up):
-    """Copy the cells of colour at the first `pixels` (n,) into columns of `looked_up` (4, n)."""
+def fetch_colours(count, pixels, colours, looked_up):
+    """Copy cells at the first `pixels` (n,) into columns of `looked_up` (4, n)."""
     for j in range(count):
-        cell = np.uint32(max(pixels[j], np.int32(0)))
+        cell = np.uint32(colours.numbers[np.uint32(max(pixels[j], np.int32(0)))])
         for k in range(CELL_SIZE):
-            looked_up[k, j] = cells[cell, k]
+            looked_up[k, j] = colours.cells[cell, k]
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
@@ -138,40 +201,6 @@ def sum_moments(points, values, transformed, looked_up, colour, surface_m2):
         other_square += weight * other * other
         count += weight
     return product, own_square, other_square, count
-
-
-def moments(poses, surfaces, colours, surface_m):
-    """Return moments (m, 4) of the features of matching surface under poses (m, 12), summed over both directions.
-
-    Args:
-        poses: rows of the 3×4 matrices of target_from_source.
-        surfaces: the `Projection` of the source's points in the target, and of the target's in the source.
-        colours: their `Colours`.
-        surface_m: noise of the surfaces in m beyond that of points and planes.
-    """
-    return over_rows(_moments, poses, surfaces, colours, np.float32(surface_m * surface_m), least=16)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _moments(poses, surfaces, colours, surface_m2):
-    result = np.zeros((poses.shape[0], 4))
-    carried = np.empty(12)
-    most = max(colours[0].values.shape[0], colours[1].values.shape[0])
-    (transformed, pixels, found), colour = buffers(most), np.empty((CELL_SIZE, most), dtype=np.float32)
-    for i in range(poses.shape[0]):
-        for direction in range(2):
-            surface, features = surfaces[direction], colours[direction]
-            if direction == 0:
-                for k in range(12):
-                    carried[k] = poses[i, k]
-            else:
-                invert(poses[i], carried)
-            project(carried, surface, transformed, pixels, found)
-            fetch_colours(features.values.shape[0], pixels, features.cells, colour)
-            found_moments = sum_moments(surface.points, features.values, transformed, found, colour, surface_m2)
-            for k in range(4):
-                result[i, k] += found_moments[k]
-    return result
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)

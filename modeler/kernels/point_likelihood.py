@@ -24,13 +24,9 @@ from modeler.kernels.planes import (
     SURFACE,
     VARIANCE,
 )
-from modeler.kernels.threads import over_rows
 
 # Classes of a point, see `classify`.
 UNKNOWN, MATCHED, BEHIND, IN_FRONT, HIDDEN, IN_EMPTY_SPACE, IN_SUPPORT = CLASSES = 0, 1, 2, 3, 4, 5, 6
-
-# Columns of what `log_likelihoods` returns.
-LOG_LIKELIHOOD, EXPLAINED = 0, 1
 
 MIN_AGREEMENT = np.float32(0.8)
 """Least cosine between the normals of a point and of the surface that it matches."""
@@ -261,46 +257,6 @@ def sum_over_points(points, transformed, looked_up, parameters):
         total += max(gain - HALF * below * below, -max_point_cost)
         explained += faces if (kind == _OF_SURFACE) & matches else ZERO
     return total, explained
-
-
-def log_likelihoods(poses, forward, backward, forward_parameters, backward_parameters):
-    """Return the log-likelihood of each pose, summed over the points of two views (method.md, eq. 3).
-
-    In single precision the error is below 1e-4 nats a point, unless a point falls within 1e-3 px of a pixel's border.
-
-    Args:
-        poses: (m, 12) float64 rows of the 3×4 matrices of target_from_source.
-        forward: the `Projection` of one view's points in the other, and
-        backward: that of the other's in the one.
-        forward_parameters: the `LikelihoodParameters` of the one direction, and
-        backward_parameters: of the other.
-
-    Returns:
-        (m, 2): log-likelihood; number of points that the other view explains, each weighted by f.
-    """
-    return over_rows(_log_likelihoods, poses, (forward, backward), (forward_parameters, backward_parameters), least=16)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _log_likelihoods(poses, projections, parameters):
-    result = np.zeros((poses.shape[0], 2))
-    carried = np.empty(12)
-    wide = projections[0] if projections[0].points.shape[1] > projections[1].points.shape[1] else projections[1]
-    transformed, pixels, looked_up = buffers(wide.points.shape[1])
-    for i in range(poses.shape[0]):
-        for direction in range(2):  # one copy of the code: compiling is slow
-            if direction == 0:
-                for k in range(12):
-                    carried[k] = poses[i, k]
-            else:
-                invert(poses[i], carried)
-            project(carried, projections[direction], transformed, pixels, looked_up)
-            total, explained = sum_over_points(
-                projections[direction].points, transformed, looked_up, parameters[direction]
-            )
-            result[i, LOG_LIKELIHOOD] += total
-            result[i, EXPLAINED] += explained
-    return result
 
 
 @numba.njit(cache=True)

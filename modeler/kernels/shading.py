@@ -28,3 +28,16 @@ def harmonics_of(normals, pose):
         for h in range(HARMONICS):
             result[n, h] = turned[h]
     return result
+
+
+@njit(cache=True)
+def shading_of(normals, coefficients):
+    """Return how surface is shaded (n,) by its normals (n, 3): coefficients (9,) of a constant and the harmonics."""
+    result = np.empty(len(normals))
+    camera = np.eye(4)
+    for n in range(len(normals)):
+        turned = harmonics(camera, normals[n, 0], normals[n, 1], normals[n, 2])
+        result[n] = coefficients[0]
+        for h in range(HARMONICS):
+            result[n] += coefficients[1 + h] * turned[h]
+    return result

@@ -236,9 +236,8 @@ class Joiner:
         Without the cost of having no surface in common: views from opposite sides have none.
         """
         pair = self._pair(source, target)
-        blur_m = self._search.fine_m(pair)
-        plain, _ = pair.log_likelihoods(poses, blur_m, stride=1)
-        return pair.temper * plain + pair.colour_gain(poses, blur_m, stride=1)
+        found = pair.scores(poses, self._search.fine_m(pair), stride=1)
+        return pair.temper * found.surface + found.colours
 
     def _own_nats(self, segment: Segment) -> float:
         """Return the log-likelihood of a pair of views of one segment: the mean of all pairs."""

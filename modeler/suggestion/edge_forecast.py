@@ -14,7 +14,7 @@ from typing import Final, final
 import numpy as np
 
 from modeler import se3
-from modeler.kernels import point_likelihood, point_to_plane
+from modeler.kernels import point_to_plane, scores
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration.posterior import PRIOR_SAMPLES, weighted_gaussian
 from modeler.registration.visibility.likelihood import (
@@ -244,7 +244,7 @@ class EdgeForecast:
         parameters = directed.parameters(self.noise_m, pair.typical_misfit(target_from_source, self.noise_m))
         projection = directed.projection(1)
         nothing = projection._replace(points=np.ascontiguousarray(projection.points[:, :0]))
-        found = point_likelihood.log_likelihoods(rows(poses), projection, nothing, parameters, parameters)
+        found = scores.scores(rows(poses), projection, nothing, parameters, parameters)
         sums = source.weight * found / self.likelihood.points  # a point, in the mean of both directions
         independent = 1.0 / (1.0 / self.likelihood.max_independent + 1.0 / max(directed.image.patches, 1.0))
         alike = sums[:, 1] + np.where(TURNS_RAD == 0.0, 0.0, self._mistaken(source, poses))
@@ -297,10 +297,9 @@ def _colour_told(
 ) -> tuple[Array, Array, float]:
     """Return what a `ColourForecast` has, of one pair at its pose (4, 4), whose matches have a matrix (6, 6) in all."""
     _, of_depth = pair.normal_equations(pose[None], MatchNoise(noise.surface_m), stride=1)
-    poses = turned(pair, pose, axis_m, up)
-    gains = pair.colour_gain(poses, noise.surface_m, stride=1)
-    _, explained = pair.log_likelihoods(pose[None], noise.surface_m, stride=1)
-    return (matrix - of_depth[0]) / pair.points, np.minimum(gains - gains[_TRUE], 0.0), float(explained[0])
+    found = pair.scores(turned(pair, pose, axis_m, up), noise.surface_m, stride=1)
+    gains = np.minimum(found.colours - found.colours[_TRUE], 0.0)
+    return (matrix - of_depth[0]) / pair.points, gains, float(found.explained[_TRUE])
 
 
 def matched(

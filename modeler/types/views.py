@@ -174,6 +174,13 @@ class RayImage:
         return np.argsort(code, kind="stable")
 
     @cached_property
+    def numbers(self) -> npt.NDArray[np.int32]:
+        """Number (h, w) of the surface point at each pixel; n, one beyond the last, for none."""
+        found = np.full(self.frame.depth_m.shape, len(self.pixels), dtype=np.int32)
+        found[self.pixels[:, 0], self.pixels[:, 1]] = np.arange(len(self.pixels))
+        return found
+
+    @cached_property
     def centroid_m(self) -> Array:
         """Mean (3,) of the surface points; the origin where there are none."""
         return np.array([axis_m.mean() for axis_m in self.points_m.T]) if len(self.points_m) else np.zeros(3)

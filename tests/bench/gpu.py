@@ -19,7 +19,7 @@ import numba
 import numpy as np
 import speed
 
-from modeler.kernels import gpu, point_likelihood
+from modeler.kernels import gpu, scores
 from modeler.kernels.gpu.memory import forget
 from modeler.rays import Sensor
 from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
@@ -93,12 +93,12 @@ def _pairs(device: gpu.Device, count: int, views: list[RayImage], timed: Timed) 
 
     def here() -> None:
         each = zip(poses, pairs, strict=True)
-        found["here"] = np.concatenate([point_likelihood.log_likelihoods(some, *pair) for some, pair in each])
+        found["here"] = np.concatenate([scores.scores(some, *pair) for some, pair in each])
 
     there_s, cpu_s = timed(there), timed(here)
     lookups = sum(STARTS * (pair[0].points.shape[1] + pair[1].points.shape[1]) for pair in pairs)
     tolerance = 1e-4 * lookups / STARTS / count
-    same = np.mean(np.abs(found["there"] - found["here"])[:, point_likelihood.LOG_LIKELIHOOD] < tolerance)
+    same = np.mean(np.abs(found["there"] - found["here"][:, :2])[:, scores.LOG_LIKELIHOOD] < tolerance)
     print(
         f"{count:,} pairs of {STARTS:,} poses, {lookups / 1e6:.0f} M look-ups: {there_s:.3f} s, CPU {cpu_s:.3f} s, "
         f"{cpu_s / there_s:.1f} times; goal {GOAL_PAIRS:.0f} times; {100 * same:.2f} % alike"

@@ -12,7 +12,7 @@ import numpy as np
 import reference
 
 from modeler.evaluation import rotation_error_deg, true_motion
-from modeler.kernels import point_likelihood
+from modeler.kernels import scores
 from modeler.kernels.point_likelihood import Projection
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
@@ -161,20 +161,18 @@ def segmented(sequence: AbstractSequence, most: int | None = None) -> list[tuple
 
 def _counted(work: Callable[[], object]) -> tuple[int, float, float]:
     """Return how many points some work looks up in the visibility kernel, the time spent there, and in all."""
-    kernel = point_likelihood.log_likelihoods
+    kernel = scores.scores
     count, spent_s = 0, 0.0
 
-    def counting(
-        poses: Array, forward: Projection, backward: Projection, *parameters: point_likelihood.LikelihoodParameters
-    ) -> Array:
+    def counting(poses: Array, forward: Projection, backward: Projection, *others: object) -> Array:
         nonlocal count, spent_s
         began = time.perf_counter()
-        result = kernel(poses, forward, backward, *parameters)
+        result = kernel(poses, forward, backward, *others)
         spent_s += time.perf_counter() - began
         count += len(poses) * (forward.points.shape[1] + backward.points.shape[1])
         return result
 
-    with patch.object(point_likelihood, "log_likelihoods", counting):
+    with patch.object(scores, "scores", counting):
         began = time.perf_counter()
         work()
         return count, spent_s, time.perf_counter() - began

@@ -130,7 +130,7 @@ def sum_over_points(
 def log_likelihoods(
     poses: npt.NDArray[np.float64], pair_of: npt.NDArray[np.int32], pairs: Sequence[Pair], device: str
 ) -> npt.NDArray[np.float64]:
-    """Return what `point_likelihood.log_likelihoods` returns, (m, 2), for poses of several pairs.
+    """Return the first two columns of what `scores.scores` returns, (m, 2), for poses of several pairs.
 
     The sums differ from the twin's by rounding only, unless a point falls within 1e-3 px of a pixel's border.
 

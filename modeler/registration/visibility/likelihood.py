@@ -11,11 +11,11 @@ import numpy.typing as npt
 from scipy.special import chdtri
 
 from modeler import se3
-from modeler.kernels import gauss_newton, gpu, point_likelihood, point_to_plane
+from modeler.kernels import gauss_newton, gpu, point_likelihood, point_to_plane, scores
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
-from modeler.registration.visibility.photometric import UNDECIDED, PairColour, unshifted, weight_of
+from modeler.registration.visibility.photometric import UNDECIDED, PairColour, correlations, unshifted, weight_of
 from modeler.se3 import matrices, rows
 from modeler.types import Array, RayImage
 
@@ -27,6 +27,17 @@ IntArray = npt.NDArray[np.int64]
 _DESCENT_STRIDE = 4  # every fourth point is used for descent
 _CHANCE = 0.01  # with which a right pose is taken for one that the images contradict
 _STATED_MISFIT = 0.5  # mean of r² / 2τ² if variances are as stated
+
+
+class Scores(NamedTuple):
+    """What poses (n, 4, 4) score."""
+
+    surface: Array
+    """(n,) log-likelihoods of surface, not tempered (nats)."""
+    explained: Array
+    """(n,) shares of points that matching surface explains."""
+    colours: Array
+    """(n,) log-likelihoods of the colours of matching surface (method.md, eq. 19); 0 where they are not compared."""
 
 
 class MatchNoise(NamedTuple):
@@ -85,7 +96,7 @@ class VisibilityLikelihood:
         if not seen:
             return PairLikelihood(forward, backward, size_m)
         plain = PairLikelihood(forward, backward, size_m)
-        return replace(plain, colour=PairColour(source, target, *chosen, plain.surfaces))
+        return replace(plain, colour=PairColour(source, target, *chosen))
 
     def denser(self, pair: PairLikelihood, rng: np.random.Generator) -> PairLikelihood:
         """Return the likelihood of a pair at more points, to refine; the same where it has all of them."""
@@ -230,7 +241,7 @@ class PairLikelihood:
         plain = replace(self, forward=forward, backward=backward, colour=None)
         if self.colour is None:
             return plain
-        return replace(plain, colour=self.colour.at(source_points, target_points, plain.surfaces))
+        return replace(plain, colour=self.colour.at(source_points, target_points))
 
     @property
     def centre_m(self) -> Array:
@@ -256,10 +267,8 @@ class PairLikelihood:
         """
         return 1.0 / (1.0 / self.forward.model.max_independent + 1.0 / self.patches) / self.points
 
-    def log_likelihoods(
-        self, poses: Array, blur_m: float, *, stride: int, typical_misfit: float = _STATED_MISFIT
-    ) -> tuple[Array, Array]:
-        """Return log-likelihoods (n,), not tempered, and the shares (n,) of points that matching surface explains.
+    def scores(self, poses: Array, blur_m: float, *, stride: int, typical_misfit: float = _STATED_MISFIT) -> Scores:
+        """Return what poses score.
 
         Args:
             poses: (n, 4, 4) target_from_source.
@@ -267,20 +276,29 @@ class PairLikelihood:
             stride: every `stride`-th point is used, and counts for as many.
             typical_misfit: misfit μ of a typical match (nats).
         """
+        band = 0 if self.colour is None else self.colour.scored_band(blur_m)
+        found = self._summed(poses, blur_m, band, stride=stride, typical_misfit=typical_misfit)
+        plain, share = stride * found[:, scores.LOG_LIKELIHOOD], stride * found[:, scores.EXPLAINED] / self.points
+        if self.colour is None:
+            return Scores(plain, share, np.zeros(len(poses)))
+        most = self.forward.model.max_independent_colours
+        return Scores(plain, share, self.colour.log_likelihoods(found, band, most, stride=stride))
+
+    def _summed(self, poses: Array, blur_m: float, band: int, *, stride: int, typical_misfit: float) -> Array:
+        """Return the sums (n, 6) of `scores.scores`, see `scores`; `band` is that of the colours."""
         sides = (
             *self.surfaces(stride),
             self.forward.parameters(blur_m, typical_misfit),
             self.backward.parameters(blur_m, typical_misfit),
         )
         lookups = len(poses) * sum(side.points.shape[1] for side in sides[:2])
-        if (device := gpu.chosen(self.forward.model.device, lookups)) is None:
-            found = stride * point_likelihood.log_likelihoods(rows(poses), *sides)
-        else:
-            from modeler.kernels.gpu import visibility
+        device = gpu.chosen(self.forward.model.device, lookups)
+        if device is None or self.colour is not None:  # colours are looked up on the CPU, in the same projection
+            return scores.scores(rows(poses), *sides, self._colours(band, stride))
+        from modeler.kernels.gpu import visibility
 
-            one = np.zeros(len(poses), dtype=np.int32)
-            found = stride * visibility.log_likelihoods(rows(poses), one, [sides], device)
-        return found[:, point_likelihood.LOG_LIKELIHOOD], found[:, point_likelihood.EXPLAINED] / self.points
+        one = np.zeros(len(poses), dtype=np.int32)
+        return visibility.log_likelihoods(rows(poses), one, [sides], device)
 
     def tempered(
         self, poses: Array, blur_m: float, *, typical_misfit: float = _STATED_MISFIT, stride: int = 1
@@ -293,27 +311,17 @@ class PairLikelihood:
             typical_misfit: misfit μ of a typical match (nats).
             stride: every `stride`-th point is used, and counts for as many.
         """
-        plain, share = self.log_likelihoods(poses, blur_m, stride=stride, typical_misfit=typical_misfit)
-        model = self.forward.model
-        depth = self.temper * plain - model.no_overlap_cost * np.exp(-share / model.overlap_scale)  # method.md, eq. 7
-        return depth + self.colour_gain(poses, blur_m, stride=stride)
-
-    def colour_gain(self, poses: Array, blur_m: float, *, stride: int) -> Array:
-        """Return the log-likelihood (n,) of the colours of matching surface (method.md, eq. 19); 0 without colours."""
-        if self.colour is None:
-            return np.zeros(len(poses))
-        most = self.forward.model.max_independent_colours
-        return self.colour.log_likelihoods(poses, blur_m, most, surface_m=blur_m, stride=stride)
+        found, model = self.scores(poses, blur_m, stride=stride, typical_misfit=typical_misfit), self.forward.model
+        alone = model.no_overlap_cost * np.exp(-found.explained / model.overlap_scale)
+        return self.temper * found.surface - alone + found.colours
 
     def surfaces(self, stride: int) -> tuple[Projection, Projection]:
         """Return every `stride`-th point of both directions, as kernels take them."""
         return self.forward.projection(stride), self.backward.projection(stride)
 
-    def _colours(self, band: int, correlation: float, stride: int) -> tuple[tuple[Colours, Colours], np.float32]:
-        """Return the colours of both directions and their weight, as kernels take them."""
-        if self.colour is None:
-            return (NO_COLOURS, NO_COLOURS), np.float32(0.0)
-        return self.colour.colours(band, stride), np.float32(weight_of(correlation))
+    def _colours(self, band: int, stride: int) -> tuple[Colours, Colours]:
+        """Return the colours of both directions, as kernels take them."""
+        return (NO_COLOURS, NO_COLOURS) if self.colour is None else self.colour.colours(band, stride)
 
     def match_noise(self, pose: Array, blur_m: float) -> MatchNoise:
         """Return how well surfaces and colours match under a pose (4, 4), see `surface_noise_m`."""
@@ -321,8 +329,8 @@ class PairLikelihood:
         if self.colour is None:
             return MatchNoise(surface_m)
         band = self.colour.band(surface_m)
-        correlation, _ = self.colour.correlations(pose[None], band, surface_m, stride=1)
-        return MatchNoise(surface_m, float(correlation[0]), band)
+        found = self._summed(pose[None], surface_m, band, stride=1, typical_misfit=_STATED_MISFIT)
+        return MatchNoise(surface_m, float(correlations(found)[0]), band)
 
     def typical_misfit(self, pose: Array, blur_m: float) -> float:
         """Return the misfit μ at which matches under a good pose (4, 4) count 0 on average (method.md, eq. 8).
@@ -382,9 +390,9 @@ class PairLikelihood:
         `blur_m` is the blur at which matches are selected, and the least at which they are judged.
         """
         noise_m = max(self.surface_noise_m(target_from_source, blur_m), blur_m)
-        plain, _ = self.log_likelihoods(target_from_source[None], noise_m, stride=1)
+        found = self.scores(target_from_source[None], noise_m, stride=1)
         independent = self.temper * self.points
-        return bool(self.temper * plain[0] >= 0.5 * (independent - chdtri(independent, _CHANCE)))
+        return bool(self.temper * found.surface[0] >= 0.5 * (independent - chdtri(independent, _CHANCE)))
 
     def colour_matches(self, carried: Array, matches: Array, noise: MatchNoise, *, forward: bool) -> Array:
         """Return equations of the colours of matches, as `DirectedLikelihood.matches` has those of surface."""
@@ -400,9 +408,9 @@ class PairLikelihood:
             noise: of matching surface and colours.
             stride: every `stride`-th point is used, and counts for as many.
         """
-        colours = self._colours(noise.band, noise.correlation, stride)
+        colours, weight = self._colours(noise.band, stride), np.float32(weight_of(noise.correlation))
         found = gauss_newton.normal_equations(
-            rows(poses), self.surfaces(stride), *colours, self.centre_m, noise.surface_m
+            rows(poses), self.surfaces(stride), colours, weight, self.centre_m, noise.surface_m
         )
         (gradients, of_colour), (equations, by_colour) = (stride * np.moveaxis(part, 1, 0) for part in found)
         if self.colour is not None:
@@ -411,14 +419,31 @@ class PairLikelihood:
             equations = equations + kept @ by_colour
         return gradients, equations
 
+    def curvatures(self, poses: Array, blur_m: float, *, stride: int) -> Array:
+        """Return curvatures (n, 6, 6) of `tempered` by ξ about the centre, at poses (n, 4, 4) that match, best first.
+
+        They are those of squared distances, and of squared differences of features by which correlations fall.
+        """
+        colours, weight = self._colours(0, stride), 0.0
+        if self.colour is not None:
+            band = self.colour.scored_band(blur_m)
+            found = self._summed(poses[:1], blur_m, band, stride=1, typical_misfit=_STATED_MISFIT)
+            colours = self.colour.colours(band, stride)
+            most = self.forward.model.max_independent_colours
+            weight = self.colour.curvature(correlations(found)[0], band, most) / self.points
+        g, found = gauss_newton.normal_equations(
+            rows(poses), self.surfaces(stride), colours, np.float32(weight), self.centre_m, blur_m
+        )
+        self.__dict__["grad"] = stride * (self.temper * g[:, 0] + g[:, 1])
+        return stride * (self.temper * found[:, 0] + found[:, 1])
+
     def descend(self, poses: Array, blur_m: float, regulariser: Regulariser, *, steps: int) -> Array:
         """Return poses (n, 4, 4) after Gauss-Newton steps on matching surface (method.md, eq. 10)."""
         regulariser = _per_point(regulariser, _DESCENT_STRIDE)
         band = 0 if self.colour is None else self.colour.band(blur_m)
-        colours = self._colours(band, UNDECIDED, _DESCENT_STRIDE)
-        moved = gauss_newton.descend(
-            rows(poses), self.surfaces(_DESCENT_STRIDE), *colours, self.centre_m, blur_m, regulariser, steps
-        )
+        colours, weight = self._colours(band, _DESCENT_STRIDE), np.float32(weight_of(UNDECIDED))
+        surfaces = self.surfaces(_DESCENT_STRIDE)
+        moved = gauss_newton.descend(rows(poses), surfaces, colours, weight, self.centre_m, blur_m, regulariser, steps)
         return matrices(moved)
 
 

@@ -8,19 +8,17 @@ neighbourhood, shows the print and little else, band by band.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy import ndimage
 
-from modeler.kernels import photometric, point_to_plane
+from modeler.kernels import photometric, point_to_plane, scores
 from modeler.kernels.photometric import Colours
-from modeler.kernels.point_likelihood import Projection
-from modeler.kernels.shading import harmonics_of
-from modeler.se3 import rows
+from modeler.kernels.shading import harmonics_of, shading_of
 from modeler.types import Array, Frame, RayImage
 
 FINEST_PX = 0.6
@@ -39,7 +37,7 @@ _CREASE = 3.0  # standard deviations by which shading changes where surface has 
 _NORMAL_QUARTILE = 0.6745  # median magnitude of a standard normal variable
 _LEVEL = 1.0 / 255.0  # smallest change of a bright colour's logarithm that 8 bits show
 _REACH = 3.0  # of a Gaussian, in standard deviations
-_KNOWN: WeakKeyDictionary[RayImage, np.ndarray] = WeakKeyDictionary()  # features of views made so far
+_KNOWN: WeakKeyDictionary[RayImage, np.ndarray] = WeakKeyDictionary()  # `view_features` made so far
 
 _STEADY = 4.0
 """So many standard deviations of the colours' shift is the finest band by which samples are weighted, at least."""
@@ -58,51 +56,38 @@ class PairColour:
     """(n,) numbers of the source's surface points that are compared."""
     target_points: np.ndarray
     """(m,) of the target's."""
-    surfaces: Callable[[int], tuple[Projection, Projection]]
-    """Every so many of the source's points in the target, and of the target's in the source."""
     _unmoved: dict[int, float] = field(default_factory=dict)
     _places: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
-    _left: dict[int, tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
+    _left: dict[int, tuple[_Features, _Features]] = field(default_factory=dict)
     _made: dict[tuple[int, int], tuple[Colours, Colours]] = field(default_factory=dict)
 
-    def at(
-        self,
-        source_points: np.ndarray,
-        target_points: np.ndarray,
-        surfaces: Callable[[int], tuple[Projection, Projection]],
-    ) -> PairColour:
+    def at(self, source_points: np.ndarray, target_points: np.ndarray) -> PairColour:
         """Return the colour of the same views at other points, which shares what was made of the images."""
-        return replace(self, source_points=source_points, target_points=target_points, surfaces=surfaces, _made={})
+        return replace(self, source_points=source_points, target_points=target_points, _made={})
 
     def band(self, blur_m: float) -> int:
         """Return the number of the band for surfaces of that blur."""
         blur_px = blur_m * self.target.frame.camera.fx / max(float(self.target.centroid_m[2]), 1e-3)
         return int(np.clip(np.round(np.log2(max(blur_px / FINEST_PX, 1.0))), 0, BANDS - 1))
 
-    def correlations(self, poses: Array, band: int, surface_m: float, *, stride: int) -> tuple[Array, Array]:
-        """Return correlations (n,) of the features of matching points under poses (n, 4, 4), and the share that match.
+    def log_likelihoods(self, scored: Array, band: int, max_independent: float, *, stride: int) -> Array:
+        """Return how much likelier (n,) in nats the target's colours are, given the source's (method.md, eq. 19).
 
         Args:
-            poses: target_from_source.
+            scored: (n, 6) `scores.scores` of poses, with the colours of a band.
             band: number of the band.
-            surface_m: noise of the surfaces, within which points match.
-            stride: every `stride`-th point is used.
+            max_independent: largest number of independent features.
+            stride: every `stride`-th point was used.
         """
-        forward, backward = self.colours(band, stride)
-        found = photometric.moments(rows(poses), self.surfaces(stride), (forward, backward), surface_m)
-        scale = np.sqrt(found[:, photometric.OWN_SQUARE] * found[:, photometric.OTHER_SQUARE])
-        share = found[:, photometric.MATCHES] / (len(forward.values) + len(backward.values))
-        return found[:, photometric.PRODUCT] / np.maximum(scale, 1e-12), share
-
-    def log_likelihoods(
-        self, poses: Array, blur_m: float, max_independent: float, *, surface_m: float, stride: int
-    ) -> Array:
-        """Return how much likelier (n,) in nats the target's colours are, given the source's (method.md, eq. 19)."""
-        band = self.scored_band(blur_m)
-        correlation, share = self.correlations(poses, band, surface_m, stride=stride)
-        count = share * self.independent(band, max_independent)
-        gain = -0.5 * count * np.log1p(-(np.clip(correlation, 0.0, _MOST) ** 2))
+        compared = sum(len(colours.values) for colours in self.colours(band, stride))
+        count = scored[:, scores.MATCHES] / compared * self.independent(band, max_independent)
+        gain = -0.5 * count * np.log1p(-(np.clip(correlations(scored), 0.0, _MOST) ** 2))
         return np.asarray(np.logaddexp(0.0, gain - 0.5 * np.log(np.maximum(count, 1.0))), dtype=np.float64)
+
+    def curvature(self, correlation: float, band: int, max_independent: float) -> float:
+        """Return by how much all points' mean square difference of features lowers `log_likelihoods`, twice."""
+        rho = float(np.clip(correlation, 0.0, _MOST))
+        return self.independent(band, max_independent) * rho / (1.0 - rho**2)
 
     def independent(self, band: int, most: float) -> float:
         """Return the number of independent features if all surface matched (method.md, eq. 19)."""
@@ -143,16 +128,14 @@ class PairColour:
         """
         colours = self.colours(band, 1)
         theirs, mirror = colours if forward else colours[::-1]
-        view, chosen = (self.source, self.source_points) if forward else (self.target, self.target_points)
-        other = self.target if forward else self.source
+        other, chosen = (self.target, self.source_points) if forward else (self.source, self.target_points)
         position = matches[:, point_to_plane.POSITION]
         camera = other.frame.camera
         z = np.maximum(position[:, 2], 1e-6)
         column = np.clip(np.round(camera.fx * position[:, 0] / z + camera.cx), 0, camera.width - 1)
         row = np.clip(np.round(camera.fy * position[:, 1] / z + camera.cy), 0, camera.height - 1)
-        cells = theirs.cells[(row * camera.width + column).astype(np.int64)].astype(np.float64)
-        pixels = view.pixels[chosen]
-        own = mirror.cells[pixels[:, 0] * view.frame.camera.width + pixels[:, 1], :3].astype(np.float64)
+        numbers = other.numbers[row.astype(np.int64), column.astype(np.int64)]
+        cells, own = theirs.cells[numbers].astype(np.float64), mirror.cells[chosen, :3].astype(np.float64)
         normals = matches[:, point_to_plane.OWN]
         # Along the surface a gradient turns with it; then it is taken along the other camera's rays.
         own = own @ carried[:3, :3].T
@@ -174,21 +157,17 @@ class PairColour:
         return self._made[band, stride]
 
     def _colours(self, band: int) -> tuple[Colours, Colours]:
-        (of_source, of_target), (in_source, in_target) = self._looked_up(band)
-        return Colours(of_source[self.source_points], in_target), Colours(of_target[self.target_points], in_source)
+        source, target = self._explained(band)
+        return (
+            Colours(source.values[self.source_points], target.cells, self.target.numbers.ravel()),
+            Colours(target.values[self.target_points], source.cells, self.source.numbers.ravel()),
+        )
 
-    def _looked_up(self, band: int) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """Return the features of all points of source and target in a band, and the cells of both images."""
+    def _explained(self, band: int) -> tuple[_Features, _Features]:
+        """Return what light does not explain of the features of all points of source and target in a band."""
         if band not in self._left:
-            views, share = (self.source, self.target), max(self.unmoved(band), 0.0)
-            source, target = (
-                _unexplained(view_features(view)[band], there, view_features(other)[band], share)
-                for view, other, there in zip(views, views[::-1], self._in_place(band), strict=True)
-            )
-            self._left[band] = (
-                (source[VALUE], target[VALUE]),
-                (_cells(self.source, source), _cells(self.target, target)),
-            )
+            share, (there, back) = max(self.unmoved(band), 0.0), self._in_place(band)
+            self._left[band] = _explained(self.source, band, there, share), _explained(self.target, band, back, share)
         return self._left[band]
 
     def patches(self, band: int) -> float:
@@ -202,7 +181,7 @@ class PairColour:
         What stays in its place while the object turns is light: highlights, shading, fixed pattern noise.
         """
         if band not in self._unmoved:
-            there, found = self._in_place(band)[0], self._partners[0][0] >= 0
+            there, found = self._in_place(band)[0], self._partners[0][0] < len(self.target.pixels)
             self._unmoved[band] = _correlation(view_features(self.source)[band][VALUE] * found, there[VALUE])
         return self._unmoved[band]
 
@@ -219,6 +198,21 @@ class PairColour:
     def _partners(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """See `_in_place`: of the source's points in the target, and vice versa."""
         return _aligned(self.source, self.target), _aligned(self.target, self.source)
+
+
+class _Features(NamedTuple):
+    """Features of a view's surface points, without what light explains of them."""
+
+    values: np.ndarray
+    """(n,) of unit variance."""
+    cells: np.ndarray
+    """(n + 1, 4) see `Colours`."""
+
+
+def correlations(scored: Array) -> Array:
+    """Return correlations (n,) of the features of matching points from `scores.scores` (n, 6)."""
+    scale = np.sqrt(scored[:, scores.OWN_SQUARE] * scored[:, scores.OTHER_SQUARE])
+    return np.asarray(scored[:, scores.PRODUCT] / np.maximum(scale, 1e-12), dtype=np.float64)
 
 
 def unshifted(equations: Array, shifts: Array) -> Array:
@@ -245,9 +239,9 @@ def _aligned(view: RayImage, other: RayImage) -> tuple[np.ndarray, np.ndarray]:
     """
     own, others = view_features(view)[_ALIGNED], view_features(other)[_ALIGNED]
     partners = _partners(view, other, np.zeros(2))
-    there = _in_other(others, partners) * (1.0 / _deviation(others))
+    there = _in_other(others, partners)
     slopes = there[[BY_COLUMN, BY_ROW]].astype(np.float64)
-    apart = (own[VALUE] * (1.0 / _deviation(own)) - there[VALUE]) * (partners[0] >= 0)
+    apart = (own[VALUE] - there[VALUE]) * (partners[0] < len(other.pixels))
     step = np.linalg.lstsq(slopes @ slopes.T, slopes @ apart, rcond=None)[0]
     width_px = FINEST_PX * 2**_ALIGNED  # farther features are not linear
     return _partners(view, other, step * min(1.0, width_px / max(float(np.linalg.norm(step)), 1e-12)))
@@ -262,15 +256,15 @@ def _partners(view: RayImage, other: RayImage, shift_px: Array) -> tuple[np.ndar
         shift_px: (2,) columns and rows from where the difference of the centroids brings them.
 
     Returns:
-        Number (n,) of the other view's point there, -1 for none; and columns and rows (n, 2) from its pixel.
+        Number (n,) of the other view's point there, see `RayImage.numbers`; and columns and rows (n, 2) from its pixel.
     """
     camera = other.frame.camera
-    numbers = np.full((camera.height, camera.width), -1, dtype=np.int32)
-    numbers[other.pixels[:, 0], other.pixels[:, 1]] = np.arange(len(other.pixels))
     found = np.empty(len(view.points_m), dtype=np.int32)
     offsets = np.zeros((len(view.points_m), 2), dtype=np.float32)
     lens = np.array([camera.fx, camera.fy, camera.cx + shift_px[0], camera.cy + shift_px[1]])
-    photometric.find_in_place(view.points_m, other.centroid_m - view.centroid_m, lens, numbers, found, offsets)
+    photometric.find_in_place(
+        view.points_m, other.centroid_m - view.centroid_m, lens, other.numbers, len(other.pixels), found, offsets
+    )
     return found, offsets
 
 
@@ -281,23 +275,22 @@ def _in_other(others: np.ndarray, partners: tuple[np.ndarray, np.ndarray]) -> np
     return there
 
 
-def _unexplained(features: np.ndarray, there: np.ndarray, others: np.ndarray, share: float) -> np.ndarray:
-    """Return features (3, n) of unit variance, less a share of the other view's in the same places (eq. 18).
+def _explained(view: RayImage, band: int, there: np.ndarray, share: float) -> _Features:
+    """Return a view's features in a band without a share of the other view's in the same places (eq. 18).
 
     Args:
-        features: (3, n) of a view.
+        view: the view.
+        band: number of the band.
         there: (3, n) of the other view in the same places.
-        others: (3, m) of the other view.
         share: that light makes up.
     """
-    left = features * (1.0 / _deviation(features)) - there * (share / _deviation(others))
-    left *= 1.0 / _deviation(left)
+    features, camera = view_features(view)[band], view.frame.camera
+    left = _Features(
+        np.empty(features.shape[1], dtype=np.float32),
+        np.zeros((features.shape[1] + 1, photometric.CELL_SIZE), dtype=np.float32),
+    )
+    photometric.explain_light(features, there, share, view.points_m, np.array([camera.fx, camera.fy]), *left)
     return left
-
-
-def _deviation(features: np.ndarray) -> float:
-    """Return the standard deviation of features (3, n); never quite 0."""
-    return max(float(np.std(features[VALUE])), 1e-6)
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
@@ -306,20 +299,16 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sum(a * b)) / scale if scale > 0.0 else 0.0
 
 
-def _cells(view: RayImage, features: np.ndarray) -> np.ndarray:
-    """Return cells (h · w, 4) of a view's features (3, n), see `photometric`."""
-    camera = view.frame.camera
-    pixels = view.pixels[:, 0] * camera.width + view.pixels[:, 1]
-    # Memory that nothing is written to costs nothing.
-    cells = np.zeros((camera.height * camera.width, photometric.CELL_SIZE), dtype=np.float32)
-    photometric.fill_cells(features, view.points_m, pixels, np.array([camera.fx, camera.fy]), cells)
-    return cells
-
-
 def view_features(view: RayImage) -> np.ndarray:
-    """Return the features of a view's surface points, see `features`; made once, as a view is part of several pairs."""
+    """Return the features of a view's surface points, see `features` and `photometric.winsorise`.
+
+    They are made once, as a view is part of several pairs.
+    """
     if view not in _KNOWN:
-        _KNOWN[view] = features(view.frame, view.pixels, view.normals)
+        found = features(view.frame, view.pixels, view.normals)
+        for band in found:
+            photometric.winsorise(band)
+        _KNOWN[view] = found
     return _KNOWN[view]
 
 
@@ -341,17 +330,15 @@ def features(frame: Frame, pixels: np.ndarray, normals: np.ndarray) -> np.ndarra
     places = pixels - low
     red, green, blue = frame.colour[pixels[:, 0], pixels[:, 1]].T
     logs = _LOGS[red] + _LOGS[green] + _LOGS[blue]
-    images = np.zeros((3, *(high - low)), dtype=np.float32)  # colours, shading, and which pixels are surface
+    most = 2 ** (BANDS - 1)  # sides are halved that often
+    images = np.zeros((3, *(-(-(high - low) // most) * most)), dtype=np.float32)  # colours, shading, where surface is
     images[:, places[:, 0], places[:, 1]] = logs - logs.mean(), _shading(logs, normals), np.ones(len(logs))
     scale, inner = 1, _blurred(images, FINEST_PX)
     for band in range(BANDS):
         outer = _blurred(images, 2.0 * FINEST_PX * 2**band / scale)
-        cell = places // scale
-        flat, away = cell[:, 0] * images.shape[-1] + cell[:, 1], (places + 0.5) / scale - (cell + 0.5)
-        layer, inside = _unshaded(*(_means(inner) - _means(outer)), images[2] > 0.0)
-        by_row, by_column = (_slope(layer, inside, axis).ravel()[flat] for axis in (0, 1))
-        found[band, VALUE] = layer.ravel()[flat] + by_row * away[:, 0] + by_column * away[:, 1]
-        found[band, BY_COLUMN], found[band, BY_ROW] = by_column / scale, by_row / scale
+        colours, shading = _means(inner) - _means(outer)
+        layer, inside = _unshaded(colours, shading, images[2] > 0.0)
+        photometric.sample_layer(layer, inside, places, scale, found[band])
         if band == 0:
             inner = outer
         else:  # the next band is taken from images of half the size
@@ -361,10 +348,10 @@ def features(frame: Frame, pixels: np.ndarray, normals: np.ndarray) -> np.ndarra
 
 def _shading(logs: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Return what harmonics of normals (n, 3) tell of logarithms of colours (n,) (Basri and Jacobs 2003)."""
-    basis = np.column_stack([np.ones(len(logs)), harmonics_of(normals, np.eye(4))])
     some = slice(None, None, max(len(logs) // _SHADED, 1))
-    inverse = np.linalg.pinv(basis[some].T @ basis[some], rcond=1e-4, hermitian=True)  # few faces tell few harmonics
-    return basis @ (inverse @ (basis[some].T @ logs[some]))
+    basis = np.column_stack([np.ones(len(logs[some])), harmonics_of(normals[some], np.eye(4))])
+    inverse = np.linalg.pinv(basis.T @ basis, rcond=1e-4, hermitian=True)  # few faces tell few harmonics
+    return shading_of(normals, inverse @ (basis.T @ logs[some]))
 
 
 def _unshaded(colours: np.ndarray, shading: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -382,10 +369,9 @@ def _unshaded(colours: np.ndarray, shading: np.ndarray, inside: np.ndarray) -> t
 
 
 def _halved(images: np.ndarray) -> np.ndarray:
-    """Return the means of blocks of 2 × 2 px of images (k, h, w)."""
-    padded = np.pad(images, [(0, 0), *((0, side % 2) for side in images.shape[1:])])
+    """Return the means of blocks of 2 × 2 px of images (k, h, w), whose sides are even."""
     return np.float32(0.25) * (
-        padded[:, ::2, ::2] + padded[:, 1::2, ::2] + padded[:, ::2, 1::2] + padded[:, 1::2, 1::2]
+        images[:, ::2, ::2] + images[:, 1::2, ::2] + images[:, ::2, 1::2] + images[:, 1::2, 1::2]
     )
 
 
@@ -397,14 +383,3 @@ def _blurred(images: np.ndarray, width_px: float) -> np.ndarray:
 def _means(blurred: np.ndarray) -> np.ndarray:
     """Return Gaussian means (k - 1, h, w) over surface, from blurred images of which the last is its share."""
     return np.asarray(blurred[:-1] / np.maximum(blurred[-1], np.float32(1e-3)))
-
-
-def _slope(image: np.ndarray, inside: np.ndarray, axis: int) -> np.ndarray:
-    """Return central differences of an image (h, w) per px; 0 where a neighbour is outside."""
-    slope = np.zeros_like(image)
-    middle, after, before = (
-        tuple(part if k == axis else slice(None) for k in (0, 1))
-        for part in (slice(1, -1), slice(2, None), slice(0, -2))
-    )
-    slope[middle] = 0.5 * (image[after] - image[before]) * inside[after] * inside[before]
-    return slope

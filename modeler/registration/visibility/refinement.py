@@ -84,10 +84,12 @@ class Refiner:
         halvings = min(self.halvings, int(np.log2(max(len(surface.residuals) / self.min_matches, 1.0))))
         if 2**halvings <= len(spread):  # the scatter of six equations would be singular
             return spread, np.zeros((6, 6)), np.zeros(6)
-        sensitivity, variability = surface.scatter(spread, halvings, pair.patches)
+        patches = point_to_plane.bisected(surface.arms, halvings)  # of colours, too: they are those of the same matches
+        members = (patches == np.arange(2**halvings)[:, None]).astype(np.float64)
+        sensitivity, variability = surface.scatter(spread, members, pair.patches)
         pulled = surface.pulled(spread)
         if pair.colour is not None and len(colours.residuals):
-            by_colour, scatter = colours.scatter(spread, halvings, pair.colour.patches(noise.band))
+            by_colour, scatter = colours.scatter(spread, members, pair.colour.patches(noise.band))
             shifts = np.asarray(np.linalg.solve(spread, pair.colour.shifts(mode)), dtype=np.float64)
             kept, felt = unshifted(by_colour, shifts), by_colour @ shifts
             sensitivity = sensitivity + kept @ by_colour
@@ -198,23 +200,21 @@ class Equations(NamedTuple):
         found = self.by_own.T @ (self.weights * self.focal_other) + self.by_other.T @ (self.weights * self.focal_own)
         return np.asarray(0.5 * basis.T @ found, dtype=np.float64)
 
-    def scatter(self, basis: Array, halvings: int, independent: float) -> tuple[Array, Array]:
+    def scatter(self, basis: Array, members: Array, independent: float) -> tuple[Array, Array]:
         """Return sensitivity (6, 6) and variability (6, 6) of the sum of the equations (method.md, eq. 14 and 15).
 
         Args:
             basis: (6, 6) of ξ.
-            halvings: the surface is bisected this many times.
-            independent: number of its patches whose errors are independent.
+            members: (p, n) which equations are of each patch of the surface: 1, else 0.
+            independent: number of patches whose errors are independent.
         """
         by_own, by_other = self.by_own @ basis, self.by_other @ basis
         # The noise of either surface's normals would add up in its own square; in their product it averages out.
         product = (by_own.T * self.weights) @ by_other
         scales, axes = np.linalg.eigh(0.5 * (product + product.T))
-        patches, count = point_to_plane.bisected(self.arms, halvings), 2**halvings
-        members = (patches == np.arange(count)[:, None]).astype(np.float64)
         by_both = 0.5 * (by_own + by_other)
         scores = members @ (by_both * (self.weights * self.residuals)[:, None])
-        variability = shrunk(scores, (by_both.T * self.weights) @ by_both) / visible_share(independent / count)
+        variability = shrunk(scores, (by_both.T * self.weights) @ by_both) / visible_share(independent / len(members))
         return (axes * np.maximum(scales, 0.0)) @ axes.T, variability
 
 

@@ -159,10 +159,10 @@ class Search:
     def _drawn(self, pair: PairLikelihood, density: AbstractPoseDensity, count: int, rng: np.random.Generator) -> Array:
         """Return starting poses (n, 4, 4): samples of the prior that match best at twice the coarsest blur."""
         poses, blur = density.sample(self.proposals * count, rng), self.finest * 2.0**self.stages
-        plain, share = pair.log_likelihoods(poses, blur * pair.size_m, stride=8)
+        found = pair.scores(poses, blur * pair.size_m, stride=8)
         # Coarse surface matches easily: a match counts as the range that it determines, relative to a guess.
-        scores = plain - np.log(blur) * share * pair.points
-        scores += pair.colour_gain(poses, blur * pair.size_m, stride=8) / pair.temper
+        matches = np.log(blur) * found.explained * pair.points
+        scores = found.surface - matches + found.colours / pair.temper
         return poses[np.argsort(-scores, kind="stable")[:count]]
 
     def _recognised(self, pair: PairLikelihood, density: AbstractPoseDensity) -> Array:
@@ -216,7 +216,5 @@ def _anywhere(prior: PoseGaussian) -> bool:
 
 def _spreads(pair: PairLikelihood, prior: PoseGaussian, poses: Array, blur_m: float) -> Array:
     """Return roots (n, 6, 6) of covariances from matching surface and the prior (method.md, eq. 11)."""
-    noise = pair.match_noise(poses[0], blur_m)._replace(surface_m=blur_m)
-    _, matrices = pair.normal_equations(poses, noise, stride=2)
-    precision = pair.temper * matrices + np.linalg.inv(prior.covariance)
+    precision = pair.curvatures(poses, blur_m, stride=_STRIDE) + np.linalg.inv(prior.covariance)
     return np.asarray(np.linalg.cholesky(np.linalg.inv(precision)), dtype=np.float64)
