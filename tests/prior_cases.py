@@ -201,7 +201,7 @@ CASES: dict[str, Case] = {
     "turntable to an earlier view, no table": Case(
         lambda camera: turntable(camera, newest=9), table=False, proposes=True, shaken=0.03
     ),
-    "held": Case(held),
+    "held": Case(held, proposes=True),
     "held to an earlier view": Case(lambda camera: replace(held(camera), newest=9), proposes=True, shaken=0.03),
     "poke": Case(poke),
     "velocity": Case(velocity, proposes=True),
@@ -211,6 +211,6 @@ CASES: dict[str, Case] = {
     "foreseen": Case(foreseen, proposes=True, shaken=0.03),
     "axes": Case(lambda _: AxesPrior(), proposes=True, shaken=0.1),
     "features": Case(lambda _: FeaturesPrior(), proposes=True, shaken=0.3),
-    "held and table": Case(lambda camera: ProductPrior(held(camera), TablePrior()), shaken=0.03),
+    "held and table": Case(lambda camera: ProductPrior(held(camera), TablePrior()), proposes=True, shaken=0.03),
     "velocity and held": Case(lambda camera: ProductPrior(velocity(camera), held(camera)), proposes=True, shaken=0.03),
 }

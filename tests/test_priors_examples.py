@@ -38,10 +38,10 @@ from modeler.priors import (
     VelocityPrior,
 )
 from modeler.priors.common_axis import common_axis
-from modeler.priors.mixtures import DefensiveMixture
+from modeler.priors.mixtures import Alternatives, DefensiveMixture
 from modeler.priors.poke import pushed
 from modeler.priors.turntable import AxisTurn, angles_and_axes
-from modeler.types import Array, Edge, InputError, Mode, Plane, RayImage, SharedAxis
+from modeler.types import AbstractPoseDensity, Array, Edge, InputError, Mode, Plane, RayImage, SharedAxis
 
 HERE = np.eye(4)
 SOURCE, TARGET = views(HERE)
@@ -270,7 +270,7 @@ def test_steps_count_once_however_many_edges_follow_from_them(prior: TurntablePr
     taught = prior.learned(solution(HERE, 3), ())
     samples = prior.between(SOURCE, TARGET).sample(300, np.random.default_rng(RNG))
     np.testing.assert_allclose(
-        taught.between(SOURCE, TARGET).log_evidence(samples), prior.between(SOURCE, TARGET).log_density(samples)
+        taught.between(SOURCE, TARGET).log_evidence(samples), prior.between(SOURCE, TARGET).log_evidence(samples)
     )
     earlier = taught.between(SOURCE, at(1, TARGET))
     assert isinstance(earlier, DefensiveMixture)
@@ -283,13 +283,50 @@ def test_steps_count_once_however_many_edges_follow_from_them(prior: TurntablePr
 # A robot's hand
 
 
+def as_held(prior: HeldPrior) -> AbstractPoseDensity:
+    """The density of a motion on which the hand keeps its grasp."""
+    density = prior.between(SOURCE, TARGET)
+    assert isinstance(density, DefensiveMixture)
+    assert isinstance(density.known, Alternatives)
+    return density.known.densities[0]
+
+
 def test_the_object_goes_with_the_hand(rng: np.random.Generator) -> None:
-    density = held(HERE).between(SOURCE, TARGET)
+    density = as_held(held(HERE))
     off = se3.log(se3.inverse(truth(HERE)) @ density.sample(4000, rng))
     np.testing.assert_allclose(np.degrees(off[:, :3].std(axis=0)), 3.0, rtol=0.05)
     place_m = hand(HERE)[1][3][:3, 3]
     shift_m = np.array([se3.transform(pose, place_m[None])[0] for pose in density.sample(2000, rng)])
     np.testing.assert_allclose(shift_m.std(axis=0), 0.008, rtol=0.08)
+
+
+@pytest.mark.parametrize(("steps", "grasp_changed"), [(1.0, 0.02), (3.0, 0.0588)])
+def test_a_hand_that_takes_the_object_anew_tells_nothing_of_its_motion(steps: float, grasp_changed: float) -> None:
+    """What the hand does between its grasps must not matter: the density there is that of the prior without a hand."""
+    times_s, poses = hand(HERE)
+    anew = HeldPrior(times_s, np.concatenate([poses[:3], poses[3:] @ se3.exp(np.array([3.0, 0, 0, 0, 0, 0.1]))]))
+    density = anew.relaxed(steps).between(SOURCE, TARGET)
+    without = GeneralPrior().relaxed(steps).between(SOURCE, TARGET)
+    pose = truth(HERE)[None]
+    expected = np.log(grasp_changed) + without.log_density(pose)
+    np.testing.assert_allclose(density.log_evidence(pose), expected, atol=1e-3)
+    apart = se3.rotation_angle(se3.inverse(truth(HERE)) @ density.sample(2000, np.random.default_rng(RNG)))
+    assert np.mean(apart < np.radians(90.0)) == pytest.approx(0.5, abs=0.05)  # the search looks at both
+
+
+def test_a_new_grasp_may_turn_the_object_in_any_way_where_limits_are_assumed() -> None:
+    unlimited = held(HERE).unlimited()
+    assert unlimited is not None
+    over = turned(np.radians(170.0))[None]
+    assert unlimited.between(SOURCE, TARGET).log_evidence(over) > -10.0
+    assert held(HERE).between(SOURCE, TARGET).log_evidence(over) < -100.0
+    assert replace(held(HERE), regrasped=GeneralPrior(40.0)).unlimited() is None
+
+
+@pytest.mark.parametrize("probability", [1.0, 2.0])
+def test_a_grasp_that_always_changes_is_no_grasp(probability: float) -> None:
+    with pytest.raises(InputError, match="regrasp_probability"):
+        replace(held(HERE), regrasp_probability=probability)
 
 
 def seen_before(index: int) -> RayImage:
@@ -326,7 +363,7 @@ def test_a_hand_whose_prior_grows_leaves_more_room() -> None:
 def test_a_missing_pose_is_interpolated_and_less_sure() -> None:
     times_s, poses = hand(HERE)
     sparse = HeldPrior(np.delete(times_s, 2), np.delete(poses, 2, axis=0))
-    whole, gappy = (prior.between(SOURCE, TARGET) for prior in (held(HERE), sparse))
+    whole, gappy = as_held(held(HERE)), as_held(sparse)
     pose = truth(HERE)[None]
     assert whole.log_density(pose) > gappy.log_density(pose)  # at its middle a wider bump is lower
     samples = gappy.sample(2000, np.random.default_rng(RNG))
@@ -474,9 +511,8 @@ def test_the_product_of_table_and_hand_keeps_both(rng: np.random.Generator) -> N
 
 
 def test_priors_that_contradict_each_other_are_refused() -> None:
-    away = replace(held(HERE), camera_from_hand=se3.exp(0.4 * np.arange(5.0)[:, None] * np.eye(6)[5]) @ hand(HERE)[1])
     with pytest.raises(InputError, match="frames 3 and 2"):
-        ProductPrior(away, GeneralPrior()).between(SOURCE, TARGET)
+        ProductPrior(turntable(HERE), GeneralPrior(max_rotation_deg=5.0)).between(SOURCE, TARGET)
 
 
 def test_a_guess_that_lies_outside_what_is_known_is_dropped() -> None:

@@ -10,7 +10,7 @@ from scipy.special import ndtr
 
 from modeler import se3
 from modeler.graph import PoseGraph, solve
-from modeler.priors import GeneralPrior, ProductPrior, TablePrior, TurntablePrior
+from modeler.priors import GeneralPrior, HeldPrior, ProductPrior, TablePrior, TurntablePrior
 from modeler.priors.mixtures import Gaussian
 from modeler.types import (
     AbstractPoseDensity,
@@ -187,6 +187,25 @@ def test_pairs_are_compared_with_their_prior(prior: AbstractPrior, found_deg: fl
     assert against is not None
     assert against.figure.holds is not contradicted
     assert (against.source, against.target) == (1, 0)
+
+
+@pytest.mark.parametrize(("changes", "together"), [(0, True), (1, True), (12, False)])
+def test_one_new_grasp_contradicts_no_hand_and_one_at_every_step_does(changes: int, together: bool) -> None:
+    angles_deg = [18.0 * k for k in range(13)]
+    views, poses = views_of(angles_deg), poses_of(angles_deg)
+    anew = se3.exp(np.array([np.pi, 0.0, 0.0, 0.0, 0.0, 0.1]))
+    grasp, hands = np.eye(4), []
+    for index, angle_deg in enumerate(angles_deg):
+        grasp = grasp @ anew if 0 < index <= changes else grasp
+        hands.append(turned(angle_deg) @ grasp)
+    distances = prior_distances(
+        [joined(k, k - 1, poses) for k in range(1, 13)], views, HeldPrior(np.arange(13.0), np.stack(hands))
+    )
+    against, figure = contradiction(distances), prior_figure(distances)
+    assert against is not None
+    assert figure is not None
+    assert against.figure.holds
+    assert figure.holds is together
 
 
 def test_a_tilted_object_contradicts_its_table() -> None:

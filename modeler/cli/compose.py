@@ -54,7 +54,7 @@ _GIVEN = {
         "axis_sigma_m",
         "max_shift_m",
     ),
-    "held": ("held_sigma_deg", "held_sigma_m", "max_gap_s", "max_offset_m"),
+    "held": ("held_sigma_deg", "held_sigma_m", "max_gap_s", "max_offset_m", "regrasp_probability"),
     "poke": ("poke_point_m", "poke_direction", "poke_length_m"),
     "velocity": ("velocity_sigma_deg", "velocity_sigma_m"),
     "axes": (),

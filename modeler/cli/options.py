@@ -167,6 +167,8 @@ class PriorOptions:
     """Standard deviation of slip and calibration error in the shift of one motion, along each axis (held)."""
     max_gap_s: Annotated[float | None, tyro.conf.arg(metavar="S"), default("1")] = None
     """Poses of the hand farther apart in time than this are not interpolated (held)."""
+    regrasp_probability: Annotated[float | None, tyro.conf.arg(metavar="P"), default("0.02")] = None
+    """Probability that the hand takes the object anew from one frame to the next (held)."""
     poke_point_m: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), default("as sequence.json says")] = None
     """Where the finger touches the object before it pushes, in camera coordinates (poke)."""
     poke_direction: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), default("as sequence.json says")] = None

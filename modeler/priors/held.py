@@ -1,4 +1,4 @@
-"""The held prior: a robot's hand carries the object, and its poses give the motion up to slip and calibration."""
+"""The held prior: a robot's hand carries the object, and its poses give the motion unless it takes the object anew."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.priors.checks import check_parameters
+from modeler.priors.checks import ParameterError, check_parameters
 from modeler.priors.general import GeneralPrior, reach_deg, relaxed_limits, turned_offset_m
-from modeler.priors.mixtures import KernelMixture, defensive_mixture
-from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, Frame, InputError, RayImage, Solution
+from modeler.priors.mixtures import Alternatives, KernelMixture, defensive_mixture
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, Frame, HandPoses, RayImage, Solution
 
 _STEP_DEG = 25.0  # step to which `max_offset_m` refers
-_SAME_TIME_S = 1e-3  # poses and frames at most so far apart count as simultaneous
+_REGRASPED_SHARE = 0.5  # of the samples: either may be true, and the search must look at both
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,9 @@ class HeldPrior(AbstractPrior):
 
     Calibration errors and slip are rotations and shifts at the hand. A frame between two poses gets an interpolated
     pose, whose uncertainty grows with their distance.
+
+    Between two frames the hand may have taken the object anew. Then its motion tells nothing, and `regrasped` holds;
+    the images decide which of the two it was.
     """
 
     times_s: Array = field(compare=False, repr=False)
@@ -35,6 +38,12 @@ class HeldPrior(AbstractPrior):
     """Standard deviation of slip and calibration error in the shift of one motion, along each axis, at the hand."""
     max_gap_s: float = 1.0
     """Poses farther apart in time than this are not interpolated."""
+    regrasp_probability: float = 0.02
+    """Probability that the hand takes the object anew from one frame to the next."""
+    regrasped: AbstractPrior = field(default_factory=lambda: GeneralPrior(limits_assumed=True))
+    """What is known of the object's motion then; evidence."""
+    steps: float = 1.0
+    """Number of steps that a motion may take."""
     max_offset_m: float = 0.04
     """Largest distance between the centroids where the hand is only a proposal (returns to earlier views); it
     grows with turns beyond 30 degrees."""
@@ -46,6 +55,8 @@ class HeldPrior(AbstractPrior):
     def __post_init__(self) -> None:
         """Check the parameters."""
         check_parameters(self)
+        if self.regrasp_probability >= 1.0:
+            raise ParameterError("regrasp_probability", self.regrasp_probability, "a probability below 1")
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source.
@@ -63,15 +74,27 @@ class HeldPrior(AbstractPrior):
         )
         moved = KernelMixture(motion[None], np.ones(1), hand_at_source[:3, 3], float(sigma_rad), float(sigma_m))
         if self.newest is None or target.index == self.newest:
-            return moved
-        # The hand's motion to an earlier view already counts in the edges between; here it may only propose.
+            elsewhere = self.regrasped.between(source, target)
+            probability = 1.0 - (1.0 - self.regrasp_probability) ** self.steps
+            known = Alternatives((moved, elsewhere), np.array([1.0 - probability, probability]))  # method.md, eq. 26
+            return defensive_mixture(known, [elsewhere], _REGRASPED_SHARE)
+        # The hand's motion to an earlier view already counts in the edges between; here it may only propose, within
+        # limits about it or, with another grasp, about none: shares of their volumes make the density even.
         offset_m = turned_offset_m(self.max_offset_m, float(se3.rotation_angle(motion)))
         limits = GeneralPrior(reach_deg(float(np.degrees(sigma_rad))), offset_m).between(source, target)
-        return defensive_mixture(replace(limits, middle=motion[:3, :3]), [moved])
+        within = (replace(limits, middle=motion[:3, :3]), self.regrasped.between(source, target))
+        volumes = np.exp([-float(part.log_density(part.sample(1, np.random.default_rng(0)))[0]) for part in within])
+        return defensive_mixture(Alternatives(within, volumes / volumes.sum()), [moved])
 
     def relaxed(self, steps: float) -> HeldPrior:
-        """Return the prior with limits for several steps; their motion is the hand's."""
-        return replace(self, max_offset_m=relaxed_limits(_STEP_DEG, self.max_offset_m, steps)[1])
+        """Return the prior with limits for several steps; their motion is the hand's, unless it lets go on the way."""
+        offset_m = relaxed_limits(_STEP_DEG, self.max_offset_m, steps)[1]
+        return replace(self, max_offset_m=offset_m, regrasped=self.regrasped.relaxed(steps), steps=steps * self.steps)
+
+    def unlimited(self) -> HeldPrior | None:
+        """Return the prior by which a new grasp may turn the object in any way, where limits are assumed."""
+        regrasped = self.regrasped.unlimited()
+        return None if regrasped is None else replace(self, regrasped=regrasped)
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> HeldPrior:
         """Return the prior with the number of the last frame."""
@@ -83,24 +106,4 @@ class HeldPrior(AbstractPrior):
         Raises:
             InputError: where there are no poses near enough in time.
         """
-        after = int(np.searchsorted(self.times_s, frame.time_s))
-        for number in (after - 1, after):
-            if 0 <= number < len(self.times_s) and abs(self.times_s[number] - frame.time_s) <= _SAME_TIME_S:
-                return self.camera_from_hand[number], np.zeros(2)
-        if not 0 < after < len(self.times_s):
-            raise InputError(
-                f"{self.name}: has no pose for frame {frame.index} at {frame.time_s:g} s, its times are "
-                f"{self.times_s[0]:g} to {self.times_s[-1]:g} s; leave the frame out or complete the file"
-            )
-        gap_s = float(self.times_s[after] - self.times_s[after - 1])
-        if gap_s > self.max_gap_s + _SAME_TIME_S:
-            raise InputError(
-                f"{self.name}: has no pose for frame {frame.index} at {frame.time_s:g} s, those around it are "
-                f"{gap_s:g} s apart; complete the file, or allow larger gaps (max_gap_s)"
-            )
-        before, behind = self.camera_from_hand[after - 1], self.camera_from_hand[after]
-        share = (frame.time_s - self.times_s[after - 1]) / gap_s
-        way = se3.log(se3.inverse(before) @ behind)
-        # At the middle, the standard deviation is a quarter of the way, for a hand with uneven speed.
-        error = share * (1.0 - share) * np.array([np.linalg.norm(way[:3]), np.linalg.norm(way[3:])])
-        return before @ se3.exp(share * way), error
+        return HandPoses(self.times_s, self.camera_from_hand, self.max_gap_s, self.name).at(frame)

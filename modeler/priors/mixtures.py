@@ -198,6 +198,31 @@ class KernelMixture(AbstractPoseDensity):
 
 
 @dataclass(frozen=True, eq=False)
+class Alternatives(AbstractPoseDensity):
+    """One of several densities holds, and it is not known which: their weighted sum, all of it evidence."""
+
+    densities: tuple[AbstractPoseDensity, ...]
+    """The alternatives, each evidence."""
+    probabilities: Array
+    """(k,) of each, positive, summing to 1."""
+    evidence: bool = True
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw poses (count, 4, 4)."""
+        chosen = rng.choice(len(self.densities), count, p=self.probabilities)
+        poses = np.empty((count, 4, 4))
+        for number, density in enumerate(self.densities):
+            poses[chosen == number] = density.sample(int(np.count_nonzero(chosen == number)), rng)
+        return poses
+
+    def log_density(self, target_from_source: Array) -> Array:
+        """Return the log density (n,) of poses (n, 4, 4); -inf outside all supports."""
+        logs = [density.log_density(target_from_source) for density in self.densities]
+        weighted = np.stack(logs) + np.log(self.probabilities)[:, None]
+        return np.asarray(np.logaddexp.reduce(weighted, axis=0), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
 class DefensiveMixture(AbstractPoseDensity):
     """A mixture of proposals and independent knowledge within the latter's support; the latter alone is evidence.
 

@@ -12,6 +12,7 @@ from scipy.special import chdtri, ndtr, ndtri
 
 from modeler import se3
 from modeler.types import (
+    AbstractPoseDensity,
     AbstractPrior,
     Array,
     BoolArray,
@@ -130,11 +131,24 @@ def prior_distances(
             continue
         posterior = edge.posterior
         means = np.stack([mode.pose.mean for mode in posterior.modes] or [posterior.pose.mean])
-        usual = density.log_evidence(density.sample(_DRAWS, np.random.default_rng(0)))
         here = float(density.log_evidence(means).max())
         if np.isfinite(here):  # not at a limit of the search, where the posterior is cut off
-            found.append((edge, max(float(usual.max()) - here, 0.0)))
+            found.append((edge, _distance_nats(density, here)))
     return found
+
+
+def _distance_nats(density: AbstractPoseDensity, here: float) -> float:
+    """Return how far from the mode of a density, in nats of a Gaussian, a pose of log evidence `here` is.
+
+    Of a Gaussian that is the difference of the logs. What has a wide part of little mass, such as a grasp that may have
+    changed, is as near as it is usual: as likely as that a pose drawn from a Gaussian lies farther out.
+    """
+    drawn = density.sample(_DRAWS, np.random.default_rng(0))
+    logs = density.log_evidence(drawn)
+    weights = np.exp(logs - density.log_density(drawn))
+    rarer = float(weights[logs <= here].sum() / weights.sum())
+    height = max(float(logs.max()) - here, 0.0)
+    return min(height, 0.5 * float(chdtri(6, rarer))) if rarer > 0.0 else height
 
 
 def contradiction(distances: Sequence[tuple[Edge, float]]) -> Contradiction | None:

@@ -1,8 +1,8 @@
 """Build models of objects in a hand: `PYTHONPATH=tests python -m in_hand`.
 
-A robot's gripper carries eight shapes, its poses read with errors of 2° and 5 mm, and takes each anew halfway; a
-person's hand turns them before the camera at 60° a second, seen 15 times a second. Results are kept in the folder, and
-a study that was stopped goes on where it was.
+A robot's gripper carries eight shapes, its poses read with errors of 2° and 5 mm, and takes each anew halfway
+(`robot`) or not (`steady`); a person's hand turns them before the camera at 60° a second, seen 15 times a second.
+Results are kept in the folder, and a study that was stopped goes on where it was.
 """
 
 from __future__ import annotations

@@ -26,8 +26,9 @@ from sequences.rendering.shapes import placement
 from sequences.rendering.stage import matrix_of, place_of
 from sequences.rendering.trajectory import Hand, Place, Places
 
-Holder = Literal["robot", "person"]
-HOLDERS: Final[tuple[Holder, ...]] = ("robot", "person")
+Holder = Literal["robot", "steady", "person"]
+"""A robot that takes the object anew halfway, one that does not, or a person."""
+HOLDERS: Final[tuple[Holder, ...]] = ("robot", "steady", "person")
 SHAPES: Final = ("drill", "teapot", "figurine", "l_bracket", "rubber_duck", "toy_car", "stapler", "telephone")
 ROBOT_FRAMES, REGRASPED, ROBOT_STEP_DEG = 24, 12, 18.0
 """Of the robot: frames, the first one in its second grasp, and the turn from frame to frame."""
@@ -74,7 +75,7 @@ def stage(shape: str, holder: Holder) -> Stage:
     recipe = viewed(load_specimen(shape), rng, seed)
     view = replace(recipe.view, look_height_m=_HEIGHT_M, elevation_deg=20.0)
     recipe = replace(recipe, table=None, view=view)
-    if holder == "robot":
+    if holder != "person":
         motion = Hand(ROBOT_FRAMES, ROBOT_STEP_DEG, 3.0, 0.01, height_m=0.0)
     else:
         motion = Hand(PERSON_FRAMES, PERSON_STEP_DEG, 0.5, 0.002, wander=0.05, height_m=0.0)
@@ -92,21 +93,21 @@ def stage(shape: str, holder: Holder) -> Stage:
     hands = (gripper(recipe, first, _FINGER_M), gripper(recipe, second, _FINGER_M))
     return Stage(
         recipe,
-        PriorOptions(prior="general" if holder == "robot" else "velocity"),
+        PriorOptions(prior="velocity" if holder == "person" else "general"),
         masks=True,
         others=hands,
         occluder_of=lambda _, others: others[0] | others[1],
     )
 
 
-def hand_poses(recorded: Recorded) -> Array:
-    """Return camera_from_hand (n, 4, 4) as a robot reads it that takes the object anew."""
+def hand_poses(recorded: Recorded, regrasped: int) -> Array:
+    """Return camera_from_hand (n, 4, 4) as a robot reads it that takes the object anew at a frame."""
     rng = np.random.default_rng([recorded.stage.recipe.seed, 24])
     sigma = np.repeat([np.radians(SIGMA_DEG), SIGMA_M], 3)
     regrasp = se3.exp(np.array([np.pi, 0.0, 0.0, 0.0, 0.0, 0.1]))
     poses = []
     for frame, pose in recorded.truth().items():
-        held = pose if frame < REGRASPED else pose @ regrasp
+        held = pose if frame < regrasped else pose @ regrasp
         poses.append(held @ se3.exp(rng.normal(size=6) * sigma))
     return np.stack(poses)
 
@@ -115,9 +116,10 @@ def outcome(shape: str, holder: Holder) -> Outcome:
     """Build the model of one run and compare it with the truth."""
     recorded = Recorded(stage(shape, holder))
     modeler = compose.modeler(recorded, recorded.stage.told, MethodOptions(seed=0), ObjectOptions())
-    if holder == "robot":
+    if holder != "person":
         times_s = np.array([recorded.frame(index).time_s for index in recorded.indices])
-        modeler = replace(modeler, prior=HeldPrior(times_s, hand_poses(recorded)))
+        regrasped = REGRASPED if holder == "robot" else ROBOT_FRAMES
+        modeler = replace(modeler, prior=HeldPrior(times_s, hand_poses(recorded, regrasped)))
     hidden = _hidden(recorded)
     began = time.perf_counter()
     last, records = None, {}
