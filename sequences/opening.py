@@ -12,6 +12,7 @@ from sequences.base import AbstractSequence
 from sequences.bop import BopSequence
 from sequences.clouds import SUFFIXES as CLOUD_SUFFIXES
 from sequences.clouds import open_clouds
+from sequences.hand_shapes import with_hand
 from sequences.image_folders import COLOUR_FOLDERS, open_colour_depth, open_tum
 from sequences.input_files import check_links, entries, is_there
 from sequences.intrinsics import Overrides
@@ -40,7 +41,7 @@ def open_sequence(path: str | Path, overrides: Overrides | None = None) -> Abstr
     if str(path).startswith(SCHEME):
         return open_camera(str(path).removeprefix(SCHEME), overrides)
     try:
-        return _open(path, overrides)
+        return with_hand(_open(path, overrides))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
 

@@ -69,6 +69,11 @@ class AbstractRecording(AbstractSequence):
         """`model.ply`, where there is one: the true surface in m."""
         return self._beside("model.ply")
 
+    @property
+    def facts(self) -> Node | None:
+        """What `sequence.json` holds; None where there is none."""
+        return self._meta
+
     def absent(self, index: int) -> InputError:
         """Return the error that says that there is no frame of that number."""
         return InputError(f"{self.path}: has no frame {index}; its frames are {span(self.indices)}.")

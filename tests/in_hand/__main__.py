@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from in_hand.study import HOLDERS, SHAPES, Outcome, outcome, table
+from in_hand.study import HOLDERS, SHAPES, TOLD, Outcome, outcome, table
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -22,6 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="in_hand", description=__doc__)
     parser.add_argument("--holder", nargs="+", choices=HOLDERS, default=HOLDERS, help="whose hand")
     parser.add_argument("--shape", nargs="+", choices=SHAPES, default=SHAPES, help="which shapes")
+    parser.add_argument("--told", choices=TOLD, default="masks", help="what is handed over of the images")
     parser.add_argument("--out", type=Path, default=Path("runs/in_hand"), help="folder of the results")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -30,9 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     found = [Outcome(**{**json.loads(line), "reasons": tuple(json.loads(line)["reasons"])}) for line in lines]
     for holder in options.holder:
         for shape in options.shape:
-            if any((one.holder, one.shape) == (holder, shape) for one in found):
+            if any((one.holder, one.shape, one.told) == (holder, shape, options.told) for one in found):
                 continue
-            found.append(outcome(shape, holder))
+            found.append(outcome(shape, holder, options.told))
             with path.open("a") as stream:
                 print(json.dumps(asdict(found[-1])), file=stream)
             print(found[-1], file=sys.stderr, flush=True)

@@ -21,14 +21,20 @@ from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.export.report import RunMeta, frame_record, report_of
 from modeler.priors import HeldPrior
-from modeler.types import Array, Step
-from sequences.rendering.shapes import placement
+from modeler.types import Array, HandPoses, Step
+from sequences import AbstractSequence
+from sequences.hand_shapes import HandMarkedSequence, HandShape
+from sequences.rendering.renderer import RenderedSequence
+from sequences.rendering.shapes import Box, Compound, placement
 from sequences.rendering.stage import matrix_of, place_of
 from sequences.rendering.trajectory import Hand, Place, Places
 
 Holder = Literal["robot", "steady", "person"]
 """A robot that takes the object anew halfway, one that does not, or a person."""
 HOLDERS: Final[tuple[Holder, ...]] = ("robot", "steady", "person")
+Told = Literal["masks", "nothing", "shape"]
+"""What is handed over of the images: masks of object and hand, nothing, or the shape of the robot's hand."""
+TOLD: Final[tuple[Told, ...]] = ("masks", "nothing", "shape")
 SHAPES: Final = ("drill", "teapot", "figurine", "l_bracket", "rubber_duck", "toy_car", "stapler", "telephone")
 ROBOT_FRAMES, REGRASPED, ROBOT_STEP_DEG = 24, 12, 18.0
 """Of the robot: frames, the first one in its second grasp, and the turn from frame to frame."""
@@ -36,6 +42,8 @@ PERSON_FRAMES, PERSON_STEP_DEG = 96, 4.0
 """Of the person: a full turn and a little more at 60° a second, 15 frames a second."""
 SIGMA_DEG, SIGMA_M = 2.0, 0.005
 """Errors of the robot's hand poses."""
+MARGIN_M: Final = 0.012
+"""Of the hand's shape: two standard deviations of where the errors put it, 6 cm from the hand's frame."""
 _F_M: Final = 0.003
 _HEIGHT_M: Final = 0.15
 _FINGER_M: Final = 0.08  # wide, to hide a good part of the object
@@ -66,10 +74,11 @@ class Outcome:
     reasons: tuple[str, ...]
     seconds: float
     """Wall time of the run without rendering."""
+    told: Told = "masks"
 
 
-def stage(shape: str, holder: Holder) -> Stage:
-    """Return what is recorded and handed over: masks of the object and of the hand."""
+def stage(shape: str, holder: Holder, told: Told = "masks") -> Stage:
+    """Return what is recorded and handed over of the images."""
     seed = SHAPES.index(shape)
     rng = np.random.default_rng([seed, 9])
     recipe = viewed(load_specimen(shape), rng, seed)
@@ -94,9 +103,9 @@ def stage(shape: str, holder: Holder) -> Stage:
     return Stage(
         recipe,
         PriorOptions(prior="velocity" if holder == "person" else "general"),
-        masks=True,
+        masks=told == "masks",
         others=hands,
-        occluder_of=lambda _, others: others[0] | others[1],
+        occluder_of=lambda _, others: others[0] | others[1] if told == "masks" else None,
     )
 
 
@@ -112,18 +121,42 @@ def hand_poses(recorded: Recorded, regrasped: int) -> Array:
     return np.stack(poses)
 
 
-def outcome(shape: str, holder: Holder) -> Outcome:
+def hand_shape(recorded: Recorded) -> HandShape:
+    """Return the robot's gripper of the first grasp as capsules in the frame of its poses."""
+    recipe = recorded.stage.others[0]
+    hand_from_gripper = se3.inverse(recorded.truth()[0]) @ RenderedSequence(recipe).truth()[0]
+    assert isinstance(recipe.object, Compound)
+    ends_m, radii_m = [], []
+    for part in recipe.object.parts:
+        assert isinstance(part.shape, Box)
+        size_m = np.array(part.shape.size_m)
+        thin, wide, long = np.argsort(size_m)
+        radius_m, rows = 0.5 * size_m[thin], int(np.ceil(size_m[wide] / size_m[thin]))
+        for across_m in (np.arange(rows) + 0.5) * size_m[wide] / rows - 0.5 * size_m[wide]:
+            ends = np.tile(part.offset_m, (2, 1))
+            ends[:, wide] += across_m
+            ends[:, long] += np.array([-1.0, 1.0]) * (0.5 * size_m[long] - radius_m)
+            ends_m.append(se3.transform(hand_from_gripper, ends))
+            radii_m.append(radius_m)
+    return HandShape(np.array(ends_m), np.array(radii_m), MARGIN_M)
+
+
+def outcome(shape: str, holder: Holder, told: Told = "masks") -> Outcome:
     """Build the model of one run and compare it with the truth."""
-    recorded = Recorded(stage(shape, holder))
+    recorded = Recorded(stage(shape, holder, told))
     modeler = compose.modeler(recorded, recorded.stage.told, MethodOptions(seed=0), ObjectOptions())
+    given: AbstractSequence = recorded
     if holder != "person":
         times_s = np.array([recorded.frame(index).time_s for index in recorded.indices])
         regrasped = REGRASPED if holder == "robot" else ROBOT_FRAMES
-        modeler = replace(modeler, prior=HeldPrior(times_s, hand_poses(recorded, regrasped)))
+        poses = hand_poses(recorded, regrasped)
+        modeler = replace(modeler, prior=HeldPrior(times_s, poses))
+        if told == "shape":
+            given = HandMarkedSequence(recorded, hand_shape(recorded), HandPoses(times_s, poses))
     hidden = _hidden(recorded)
     began = time.perf_counter()
     last, records = None, {}
-    for event in modeler.run(recorded, compose.scene(modeler, recorded)):
+    for event in modeler.run(given, compose.scene(modeler, given)):
         if isinstance(event, Step):
             records[event.frame.index], last = frame_record(event), event
     assert last is not None
@@ -151,6 +184,7 @@ def outcome(shape: str, holder: Holder) -> Outcome:
         0 if report["trustworthy"] else 3,
         tuple(report["reasons"]),
         seconds,
+        told,
     )
 
 
@@ -169,9 +203,9 @@ def _hidden(recorded: Recorded) -> float:
 def table(outcomes: Sequence[Outcome]) -> str:
     """Return a line a run."""
     heads = ("hidden", "frames", "median", "worst", "NEES/6", "F 3 mm", "status", "s")
-    lines = [" " * 24 + "".join(f"{head:>9}" for head in heads)]
+    lines = [" " * 32 + "".join(f"{head:>9}" for head in heads)]
     for one in outcomes:
         cells = f"{one.hidden:.0%}", f"{one.placed}/{one.frames}", f"{one.median_deg:.2f}°", f"{one.worst_deg:.2f}°"
         cells += f"{one.nees:.2f}", f"{one.f_score:.3f}", f"{one.status}", f"{one.seconds:.0f}"
-        lines.append(f"{one.holder + ', ' + one.shape:24}" + "".join(f"{cell:>9}" for cell in cells))
+        lines.append(f"{', '.join((one.holder, one.shape, one.told)):32}" + "".join(f"{cell:>9}" for cell in cells))
     return "\n".join(lines)
