@@ -17,7 +17,7 @@ CELL_SIZE = 4
 
 _LEAST_DEVIATION = 1e-6  # of features; an image without any has none of unit variance
 _LIMIT = 3.0  # standard deviations, beyond which 0.3 % of normal features are
-_ROUNDS = 10  # of variance and limit, each by the other
+_ROUNDS, _SETTLED = 10, 1e-3  # of variance and limit, each by the other, at most; and where they end
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -115,7 +115,7 @@ def winsorise(features):
     Args:
         features: (3, n) of the surface points, in place: value, and derivatives by column and row in 1/px.
     """
-    count, scale, limit = features.shape[1], 1.0, np.inf
+    count, scale, limit = features.shape[1], 0.0, np.inf
     for _ in range(_ROUNDS):
         total, square = 0.0, 0.0
         for j in range(count):
@@ -123,8 +123,10 @@ def winsorise(features):
             total += value
             square += value * value
         variance = square / max(count, 1) - (total / max(count, 1)) ** 2
-        scale = max(math.sqrt(max(variance, 0.0)), _LEAST_DEVIATION)
+        last, scale = scale, max(math.sqrt(max(variance, 0.0)), _LEAST_DEVIATION)
         limit = _LIMIT * scale
+        if abs(scale - last) <= _SETTLED * scale:
+            break
     for j in range(count):
         inside = abs(features[0, j]) <= limit
         features[0, j] = min(max(features[0, j], -limit), limit) / scale
