@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import final
 
 import numpy as np
@@ -112,11 +113,20 @@ def with_hand(sequence: AbstractSequence) -> AbstractSequence:
             f"{node.path}: describes a hand, but there is no robot.txt; write lines `time tx ty tz qx qy qz qw` of "
             "camera_from_hand beside it, or take out the hand."
         )
-    poses = trajectory(sequence.robot_path)
+    return HandMarkedSequence(sequence, shape, hand_poses(sequence.robot_path))
+
+
+def hand_poses(path: Path) -> HandPoses:
+    """Read the poses of a hand from its robot.txt.
+
+    Raises:
+        InputError: where it cannot be read, or holds no pose.
+    """
+    poses = trajectory(path)
     if not poses:
-        raise InputError(f"{sequence.robot_path}: holds no pose; write lines `time tx ty tz qx qy qz qw`.")
+        raise InputError(f"{path}: holds no pose; write lines `time tx ty tz qx qy qz qw`.")
     times_s, hands = np.array([time_s for time_s, _ in poses]), np.array([pose for _, pose in poses])
-    return HandMarkedSequence(sequence, shape, HandPoses(times_s, hands, name=str(sequence.robot_path)))
+    return HandPoses(times_s, hands, name=str(path))
 
 
 def _shape(node: Node) -> HandShape:

@@ -12,8 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, Literal
 
-import numpy as np
-
 from modeler import registration
 from modeler.cli.options import Method, MethodOptions, ObjectOptions, PriorOptions
 from modeler.closure import Closer
@@ -38,7 +36,7 @@ from modeler.registration.baselines import kiss
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import NOMINAL_FOCAL, AbstractPrior, AbstractRegistrar, InputError
 from sequences import AbstractSequence
-from sequences.image_folders import trajectory
+from sequences.hand_shapes import hand_poses
 from sequences.input_files import frame_number
 
 _GIVEN = {
@@ -331,11 +329,8 @@ def _held(given: dict[str, Any], sequence: AbstractSequence | None) -> HeldPrior
             f"{sequence.name}: has no robot.txt for --prior held; write lines `time tx ty tz qx qy qz qw` of "
             "camera_from_hand there, or use another prior"
         )
-    poses = trajectory(sequence.robot_path)
-    if not poses:
-        raise InputError(f"{sequence.robot_path}: holds no pose; write lines `time tx ty tz qx qy qz qw`.")
-    times_s, hands = np.array([time for time, _ in poses]), np.array([pose for _, pose in poses])
-    return HeldPrior(times_s, hands, name=str(sequence.robot_path), **given)
+    poses = hand_poses(sequence.robot_path)
+    return HeldPrior(poses.times_s, poses.camera_from_hand, name=poses.name, **given)
 
 
 def _poke(given: dict[str, Any], sequence: AbstractSequence | None) -> PokePrior:
