@@ -13,7 +13,7 @@ from test_pipeline import FRAMES, Oracle, modeler, run, trajectory_error
 
 from modeler import se3
 from modeler.closure import Closer
-from modeler.pipeline import glancing
+from modeler.pipeline import Modeler, glancing
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker, preferred
 from modeler.rays import Sensor
@@ -23,6 +23,7 @@ from modeler.segmentation import Scene
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
+    AbstractRegistrar,
     Array,
     Edge,
     Mode,
@@ -153,6 +154,34 @@ def test_limits_that_are_assumed_hold_while_something_within_them_matches(
     assert posterior.usable == placed
     assert asked == [LIMIT_DEG, 2.0 * LIMIT_DEG, *([180.0] if assumed else [])]
     assert posterior.seconds == len(asked)
+
+
+@final
+@dataclass(frozen=True)
+class ContradictedWithin(AbstractRegistrar):
+    """Finds a turn of 25° within limits, which the images contradict, and the true one of 120° without."""
+
+    anywhere: Outcome = Outcome.CONVERGED
+
+    def register(
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+    ) -> Posterior:
+        wide = np.isfinite(density.log_density(turned(120.0)))
+        pose = PoseGaussian(turned(120.0 if wide else TRUE_DEG), COVARIANCE)
+        outcome = self.anywhere if wide else Outcome.CONVERGED
+        return Posterior(source.index, target.index, pose, outcome, 0.8, contradicted=not wide)
+
+
+@pytest.mark.parametrize(
+    ("assumed", "anywhere", "wanted_deg"),
+    [(True, Outcome.CONVERGED, 120.0), (True, Outcome.NO_OVERLAP, TRUE_DEG), (False, Outcome.CONVERGED, TRUE_DEG)],
+)
+def test_what_the_images_contradict_within_assumed_limits_is_looked_for_beyond(
+    *, assumed: bool, anywhere: Outcome, wanted_deg: float
+) -> None:
+    loop = Modeler(prior=Limits(assumed=assumed), registrar=ContradictedWithin(anywhere))
+    posterior = loop.register(view(1), view(0))
+    assert np.degrees(se3.rotation_angle(posterior.pose.mean)) == pytest.approx(wanted_deg)
 
 
 def of_modes(*modes: tuple[float, float]) -> Posterior:

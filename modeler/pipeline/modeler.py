@@ -111,13 +111,13 @@ class Modeler:
             source: one view.
             target: another.
             prior: what is known of the motion; None: the modeler's own, and any motion where its limits are assumed and
-                nothing within them matches.
+                nothing within them matches, or the images contradict what does.
 
         Raises:
             InputError: where the views lack what the prior needs.
         """
         found = self._register(self.registrar, source, target, self.prior if prior is None else prior)
-        unlimited = self.prior.unlimited() if prior is None and not found.usable else None
+        unlimited = self.prior.unlimited() if prior is None and not found.convincing else None
         return (
             found if unlimited is None else anywhere(found, self._register(self.registrar, source, target, unlimited))
         )

@@ -78,12 +78,12 @@ def register(
 
 
 def anywhere(within: Posterior, unlimited: Posterior) -> Posterior:
-    """Return which registration counts where nothing within assumed limits matched, with the time of both.
+    """Return which registration counts where nothing within assumed limits convinces, with the time of both.
 
     Of several places, none within the usual limits, none is known to be right.
 
     Args:
-        within: the registration in the limits, not usable.
+        within: the registration in the limits, not convincing.
         unlimited: that without limits.
     """
     found = unlimited if unlimited.outcome is Outcome.CONVERGED else within

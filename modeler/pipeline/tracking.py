@@ -194,7 +194,7 @@ class Tracker:
             known = prior.between(view, self.state.views[odometry.target])
             odometry = replace(preferred(odometry, wider, known), seconds=seconds)
         unlimited = prior.unlimited()
-        if unlimited is not None and not odometry.usable and not again:
+        if unlimited is not None and not odometry.convincing and not again:
             odometry = anywhere(odometry, self._pair(view, odometry.target, unlimited))
         posteriors = (odometry,)
         while not again and not self._placed(posteriors):

@@ -71,6 +71,8 @@ class Posterior:
     """Share (0..1) of the surface that both cameras should see, at the mean, that both do see."""
     least_overlap: float = field(default=0.0, kw_only=True)
     """Overlap below which the method considers the surfaces not to match, whatever the outcome."""
+    contradicted: bool = field(default=False, kw_only=True)
+    """Whether the images contradict the mean more than 99 of 100 right ones, where the method can tell."""
     samples: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """(n, 4, 4) samples of target_from_source; empty where the method draws none."""
     weights: Array = field(default_factory=lambda: np.zeros(0))
@@ -92,6 +94,11 @@ class Posterior:
     def usable(self) -> bool:
         """Whether the posterior may become an edge."""
         return self.outcome in (Outcome.CONVERGED, Outcome.AMBIGUOUS)
+
+    @property
+    def convincing(self) -> bool:
+        """Whether a pose came out that the images do not contradict."""
+        return self.usable and not self.contradicted
 
     @property
     def matches(self) -> bool:

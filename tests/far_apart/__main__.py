@@ -17,15 +17,18 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, final, get_args
 
 import numpy as np
 
 from far_apart.pairs import Limits, Pair, pairs
 from modeler.evaluation import rotation_error_deg
+from modeler.pipeline import Modeler
+from modeler.priors import GeneralPrior
 from modeler.registration import FpfhIcpRegistrar, KissIcpRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.baselines import kiss
-from modeler.types import AbstractPoseDensity, AbstractRegistrar
+from modeler.types import AbstractRegistrar, Posterior
 
 _MISSED_NATS: Final = 3.0
 
@@ -71,15 +74,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _trials(pair: Pair, limits: Iterable[Limits], seed: tuple[int, int], *, colour: bool) -> Iterator[Trial]:
     """Yield what is made of a pair."""
     ours = VisibilityRegistrar(VisibilityLikelihood(colour=colour))
-    methods: list[tuple[str, AbstractRegistrar, AbstractPoseDensity]] = [
-        *((f"visibility, {told}", ours, pair.density(told)) for told in limits),
-        ("fpfh-icp", FpfhIcpRegistrar(), pair.density("none")),
-    ]
+
+    def by(registrar: AbstractRegistrar, told: Limits) -> Posterior:
+        return registrar.register(pair.source, pair.target, pair.density(told), rng=np.random.default_rng(seed))
+
+    untold = Modeler(
+        registrar=ours, prior=GeneralPrior(limits_assumed=True), seed=seed[0]
+    )  # as `modeler register` does
+    methods = {f"visibility, {told}": partial(by, ours, told) for told in limits if told != "default"}
+    if "default" in limits:
+        methods["visibility, default"] = partial(untold.register, pair.source, pair.target)
+    methods["fpfh-icp"] = partial(by, FpfhIcpRegistrar(), "none")
     if kiss.installed():
-        methods.append(("kiss", KissIcpRegistrar(), pair.density("none")))
-    for method, registrar, density in methods:
+        methods["kiss"] = partial(by, KissIcpRegistrar(), "none")
+    for method, register in methods.items():
         began_s = time.process_time()
-        posterior = registrar.register(pair.source, pair.target, density, rng=np.random.default_rng(seed))
+        posterior = register()
         seconds = time.process_time() - began_s
         compared = ours.likelihood.between(pair.source, pair.target, np.random.default_rng(seed))
         poses = np.stack([pair.truth, posterior.pose.mean])

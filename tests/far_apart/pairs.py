@@ -64,13 +64,11 @@ class Pair:
         return _RIGHT_DEG.get(self.group, 5.0)
 
     def density(self, limits: Limits) -> AbstractPoseDensity:
-        """Return what is known of the motion."""
+        """Return what is known of the motion where limits are told, or that there are none."""
         if limits == "told":
             reach_deg = 50.0 if self.turn_deg < 40.0 else min(self.turn_deg + 20.0, 180.0)
             return GeneralPrior(reach_deg, 0.09).between(self.source, self.target)
-        if limits == "none":
-            return GeneralPrior(180.0, 0.2).between(self.source, self.target)
-        return GeneralPrior().between(self.source, self.target)
+        return GeneralPrior(180.0, 0.2).between(self.source, self.target)
 
 
 def pairs(half: Half, *, every: int = 1) -> Iterator[Pair]:

@@ -160,7 +160,8 @@ class VisibilityRegistrar(AbstractRegistrar):
             pose = replace(weighted_gaussian(samples, weights, pair.centre_m), by_focal=pose.by_focal)
         overlap = pair.overlap(modes[0].pose.mean)
         # Of very many poses, some match by chance; of few, the likeliest is right though a mask be cut off.
-        matches = not found.anywhere or pair.fits(modes[0].pose.mean, self.search.fine_m(pair))
+        contradicted = not pair.fits(modes[0].pose.mean, self.search.fine_m(pair))
+        matches = not (found.anywhere and contradicted)
         effective = 1.0 / sum(share**2 / mode.effective_samples for share, mode in weighed)
         return Posterior(
             source=pair.backward.image.index,
@@ -169,6 +170,7 @@ class VisibilityRegistrar(AbstractRegistrar):
             outcome=self._outcome(effective, pose, overlap if matches else 0.0, at_limit=at_limit),
             overlap=overlap,
             least_overlap=self.min_overlap,
+            contradicted=contradicted,
             samples=samples,
             weights=weights,
             modes=modes if len(modes) > 1 else (),
