@@ -19,6 +19,7 @@ from recordings import small_frames, small_truth, write_bundlesdf, write_open3d,
 from turning_box import COUNT, LOST, steps
 
 from modeler.cli import main
+from modeler.export import run_folder
 from modeler.types import Frame, Step
 from sequences import bundled, write_bop
 
@@ -27,6 +28,12 @@ from sequences import bundled, write_bop
 def rng():
     """Return a generator with a fixed seed."""
     return np.random.default_rng(0)
+
+
+@pytest.fixture(autouse=True)
+def no_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have reports written after every step, however slow the disk is."""
+    monkeypatch.setattr(run_folder, "_NO_TIME_S", np.inf)
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from modeler.export import (
     RunFolder,
     RunMeta,
     report_of,
+    run_folder,
     write_atomically,
 )
 from modeler.types import (
@@ -29,6 +30,16 @@ from modeler.types import (
 )
 
 FILES = {"trajectory.txt", "odometry.txt", "graph.g2o", "report.json", "cloud.ply", "model.ply"}
+
+
+def test_what_takes_long_is_done_a_tenth_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_folder, "_NO_TIME_S", 0.01)
+    pace = run_folder.Pace()
+    assert not pace.rests
+    pace.took(0.005)
+    assert not pace.rests
+    pace.took(60.0)
+    assert pace.rests
 
 
 def test_run_folder_is_complete_after_the_last_step(tmp_path: Path) -> None:
