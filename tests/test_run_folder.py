@@ -32,16 +32,6 @@ from modeler.types import (
 FILES = {"trajectory.txt", "odometry.txt", "graph.g2o", "report.json", "cloud.ply", "model.ply"}
 
 
-def test_what_takes_long_is_done_a_tenth_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_folder, "_NO_TIME_S", 0.01)
-    pace = run_folder.Pace()
-    assert not pace.rests
-    pace.took(0.005)
-    assert not pace.rests
-    pace.took(60.0)
-    assert pace.rests
-
-
 def test_run_folder_is_complete_after_the_last_step(tmp_path: Path) -> None:
     run = RunFolder.open(tmp_path / "runs" / "box")
     steps = made_up_steps()
@@ -145,6 +135,7 @@ def test_run_has_finished_when_its_registrations_are_forgotten(tmp_path: Path) -
 def test_a_folder_that_takes_long_to_write_is_written_less_often(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(run_folder, "_NO_TIME_S", 0.01)
     now_s, written = 0.0, []
     run, steps = RunFolder.open(tmp_path), made_up_steps(40)
 
