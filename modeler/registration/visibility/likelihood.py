@@ -424,18 +424,20 @@ class PairLikelihood:
 
         They are those of squared distances, and of squared differences of features by which correlations fall.
         """
-        colours, weight = self._colours(0, stride), 0.0
+        band, weight = 0, 0.0
         if self.colour is not None:
             band = self.colour.scored_band(blur_m)
             found = self._summed(poses[:1], blur_m, band, stride=1, typical_misfit=_STATED_MISFIT)
-            colours = self.colour.colours(band, stride)
             most = self.forward.model.max_independent_colours
             weight = self.colour.curvature(correlations(found)[0], band, most) / self.points
-        g, found = gauss_newton.normal_equations(
-            rows(poses), self.surfaces(stride), colours, np.float32(weight), self.centre_m, blur_m
+        colours = self._colours(band, stride)
+        _, (of_surface, of_colours) = (
+            np.moveaxis(part, 1, 0)
+            for part in gauss_newton.normal_equations(
+                rows(poses), self.surfaces(stride), colours, np.float32(weight), self.centre_m, blur_m
+            )
         )
-        self.__dict__["grad"] = stride * (self.temper * g[:, 0] + g[:, 1])
-        return stride * (self.temper * found[:, 0] + found[:, 1])
+        return stride * (self.temper * of_surface + of_colours)
 
     def descend(self, poses: Array, blur_m: float, regulariser: Regulariser, *, steps: int) -> Array:
         """Return poses (n, 4, 4) after Gauss-Newton steps on matching surface (method.md, eq. 10)."""
