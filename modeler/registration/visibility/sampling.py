@@ -17,6 +17,11 @@ from modeler.types import AbstractPoseDensity, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
 
+_NEGLIGIBLE = 1e-6  # of the heaviest weight: lighter samples take no part in fits of two Gaussians
+_EM_STEPS = 12  # proposals need no convergence
+_LEAST_PART = 0.05  # of the weight, which few samples hold, determines no Gaussian
+_WHITE_FLOOR = 1e-4  # of a variance, where all samples have 1
+
 
 @dataclass(frozen=True, eq=False)
 class GaussianMixture:
@@ -165,9 +170,9 @@ class _Draws:
 class AdaptiveSampler:
     """Adaptive multiple importance sampling (Cornuet, Marin, Mira and Robert 2012; method.md, eq. 12).
 
-    Each round draws from Gaussians with the moments of the weighted samples so far. All samples are weighted against
+    Each round draws from a Gaussian with the moments of the weighted samples so far. All samples are weighted against
     the mixture of all proposals, so that a bad one costs samples, not correctness. While the weights are too uneven to
-    determine a covariance, they are tempered for the next proposal.
+    determine a covariance, they are tempered for the next proposal, which is of two Gaussians.
     """
 
     draws: int = 400
@@ -204,8 +209,12 @@ class AdaptiveSampler:
         drawn, fitted = weighed(first, log_count + proposal.log_density(first)), None
         log_weights = drawn.log_weights
         while (effective := effective_samples(log_weights)) < self.samples and len(drawn.poses) < self.max_draws:
-            power = 1.0 if effective >= self.min_effective else _power(log_weights, self.min_effective)
-            new = _fitted(drawn.poses, normalised(power * log_weights), centre_m).times(self.draws)
+            if effective >= self.min_effective:
+                new = _fitted(drawn.poses, normalised(log_weights), centre_m)
+            else:
+                power = _power(log_weights, self.min_effective)
+                new = _fitted_two(drawn.poses, normalised(power * log_weights), centre_m)
+            new = new.times(self.draws)
             fitted = new if fitted is None else fitted.plus(new)
             poses = new.sample(self.draws, rng)
             log_density = np.logaddexp(log_count + proposal.log_density(poses), fitted.log_density(poses))
@@ -226,6 +235,39 @@ def _fitted(poses: Array, weights: Array, centre_m: Array) -> GaussianMixture:
     mean, covariance = se3.mean(poses, weights, about_m=centre_m)
     spread = np.asarray(np.linalg.cholesky(covariance + FLOOR), dtype=np.float64)
     return GaussianMixture(mean[None], spread[None], np.zeros(1), centre_m)
+
+
+def _fitted_two(poses: Array, weights: Array, centre_m: Array) -> GaussianMixture:
+    """Return two Gaussians of weighted poses (n, 4, 4), by expectation maximisation; one where one is enough.
+
+    A narrow peak on a broad ridge, as of a label on a ball, is fitted by no single Gaussian.
+    """
+    one = _fitted(poses, weights, centre_m)
+    heavy = weights > _NEGLIGIBLE * weights.max()
+    poses, weights = poses[heavy], weights[heavy]
+    xi = se3.difference(one.means[0], poses, centre_m)
+    white = np.asarray(np.linalg.solve(one.spreads[0], xi.T).T, dtype=np.float64)
+    near = np.argsort(np.sum(white**2, axis=1))
+    core = np.zeros(len(weights))
+    core[near[np.cumsum(weights[near]) <= 0.5 * weights.sum()]] = 1.0
+    members = weights * np.stack([core, 1.0 - core])
+    for _ in range(_EM_STEPS):
+        if np.any(members.sum(axis=1) < _LEAST_PART * weights.sum()):
+            return one
+        likely = np.stack([_log_gaussian(white, of) for of in members])
+        members = weights * np.exp(likely - np.logaddexp(*likely))
+    parts = [_fitted(poses, of / of.sum(), centre_m).times(0.5) for of in members]
+    return parts[0].plus(parts[1])
+
+
+def _log_gaussian(white: Array, weights: Array) -> Array:
+    """Return the log density (n,) of points (n, 6) in their weighted Gaussian times its weight, but for a constant."""
+    total = weights.sum()
+    centred = white - weights @ white / total
+    covariance = (centred.T * weights) @ centred / total + _WHITE_FLOOR * np.eye(white.shape[1])
+    root = np.linalg.cholesky(covariance)
+    squares = np.sum(np.linalg.solve(root, centred.T) ** 2, axis=0)
+    return np.asarray(np.log(total) - np.log(np.diag(root)).sum() - 0.5 * squares, dtype=np.float64)
 
 
 def thinned(weights: Array, count: int, rng: np.random.Generator) -> tuple[npt.NDArray[np.int64], Array]:
