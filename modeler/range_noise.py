@@ -1,14 +1,15 @@
-"""Over how many pixels a depth camera errs alike, from what surrounds the object: tables, floors, walls.
+"""How a depth camera errs, from what surrounds the object: tables, floors, walls.
 
-A plane is linear in inverse depth, so what is left of a plane fitted to a tile of the image is noise, and its
-autocorrelation tells over how many pixels errors are alike. One frame is enough, and noise that does not change from
-frame to frame, as that of a projected pattern, is seen like any other (method.md, eq. 23).
+A plane is linear in inverse depth, so what is left of a plane fitted to a tile of the image is noise. Its
+autocorrelation tells over how many pixels errors are alike (method.md, eq. 23), and the same tile in two frames, how
+much of it stays from frame to frame, as what belongs to a projected pattern or to the lens (eq. 27).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from itertools import combinations
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -20,12 +21,21 @@ _MIN_TILES: Final = 10  # of a size
 _MARGIN_PX: Final = 8  # from the object and its mixed pixels
 _FRAMES: Final = 4  # more show the same surface again
 _NOT_PLANE: Final = 4.0  # times the median of the tiles' variances
+_BALL_PX: Final = 6  # side of the squares over which errors are averaged, as by the smoothing of surface
 
 
-def noise_area(looks: Sequence[tuple[Frame, BoolArray]]) -> float | None:
-    """Return the correlated area of the noise around an object in px; None where too little of that is plane.
+class RangeNoise(NamedTuple):
+    """How a depth camera errs."""
 
-    It is the integral of the autocorrelation of inverse depth over the image: 1 where pixels err independently.
+    area_px: float
+    """Integral of the autocorrelation of inverse depth over the image: 1 px² where pixels err independently."""
+    pattern_share: float | None = None
+    """Share of the variance of errors, averaged as smoothing does, that stays from frame to frame; None where no two
+    frames show the same plane."""
+
+
+def range_noise(looks: Sequence[tuple[Frame, BoolArray]]) -> RangeNoise | None:
+    """Return how a camera errs on what surrounds an object; None where too little of that is plane.
 
     Args:
         looks: frames with masks (h, w) of the object, of which a few are looked at. Pixels without depth are 0 or NaN.
@@ -33,10 +43,14 @@ def noise_area(looks: Sequence[tuple[Frame, BoolArray]]) -> float | None:
     few = [looks[k] for k in np.linspace(0, len(looks) - 1, min(_FRAMES, len(looks))).astype(np.int64).tolist()]
     images = [_inverse(frame.depth_m, mask) for frame, mask in few]
     for tile_px in _TILES_PX:
-        tiles = [_tiles(image, tile_px) for image in images]
-        found = _measured(np.concatenate(tiles), tile_px) if tiles else None
-        if found is not None:
-            return found
+        residuals = [_left_of_planes(image, tile_px) for image in images]
+        limit = _NOT_PLANE * _median_variance(residuals)
+        calm = [np.mean(left**2, axis=1) <= limit for left in residuals]  # False where NaN
+        if sum(np.count_nonzero(kept) for kept in calm) < _MIN_TILES or limit == 0.0:
+            continue
+        noise = np.concatenate([left[kept] for left, kept in zip(residuals, calm, strict=True)])
+        area_px = _correlated_area(noise.reshape(-1, tile_px, tile_px))
+        return RangeNoise(area_px, _pattern_share(residuals, calm, tile_px))
     return None
 
 
@@ -46,26 +60,46 @@ def _inverse(depth_m: Float32Array, mask: BoolArray) -> Array:
     return np.divide(1.0, depth_m, out=np.full(depth_m.shape, np.nan), where=measured)
 
 
-def _tiles(inverse: Array, tile_px: int) -> Array:
-    """Return those tiles (n, tile²) of an image (h, w) that have no NaN."""
+def _left_of_planes(inverse: Array, tile_px: int) -> Array:
+    """Return what planes fitted to the tiles of an image (h, w) leave of them (n, tile²); NaN where one has holes."""
     rows, columns = (size // tile_px for size in inverse.shape)
     whole = inverse[: rows * tile_px, : columns * tile_px].reshape(rows, tile_px, columns, tile_px)
-    tiles = whole.swapaxes(1, 2).reshape(-1, tile_px**2)
-    return np.asarray(tiles[np.isfinite(tiles).all(axis=1)])
+    return _without_plane(whole.swapaxes(1, 2).reshape(-1, tile_px**2), tile_px)
 
 
-def _measured(tiles: Array, tile_px: int) -> float | None:
-    """Return the correlated area in px of the noise of tiles (n, tile²); None where few are plane."""
-    if len(tiles) < _MIN_TILES:
-        return None
-    rows, columns = np.divmod(np.arange(tile_px**2), tile_px)
-    plane, _ = np.linalg.qr(np.stack([np.ones(tile_px**2), rows, columns], axis=1))
-    left = tiles - (tiles @ plane) @ plane.T
-    variance = np.sum(left**2, axis=1) / (tile_px**2 - 3)
-    calm = variance <= _NOT_PLANE * np.median(variance)
-    if np.count_nonzero(calm) < _MIN_TILES or not variance[calm].any():
-        return None
-    return _correlated_area(left[calm].reshape(-1, tile_px, tile_px))
+def _without_plane(tiles: Array, tile_px: int) -> Array:
+    """Return tiles (n, tile²) without the plane that fits each best."""
+    down, across = np.divmod(np.arange(tile_px**2), tile_px)
+    plane, _ = np.linalg.qr(np.stack([np.ones(tile_px**2), down, across], axis=1))
+    return np.asarray(tiles - (tiles @ plane) @ plane.T)
+
+
+def _median_variance(residuals: Sequence[Array]) -> float:
+    """Return the median variance of whole tiles (n, tile²) of several images; 0 where there are none."""
+    variances = np.concatenate([np.mean(left**2, axis=1) for left in residuals]) if residuals else np.zeros(0)
+    whole = variances[np.isfinite(variances)]
+    return float(np.median(whole)) if len(whole) else 0.0
+
+
+def _pattern_share(residuals: Sequence[Array], calm: Sequence[BoolArray], tile_px: int) -> float | None:
+    """Return the share of the variance that stays from frame to frame, of errors averaged over squares."""
+    squares = tile_px // _BALL_PX
+    means = [
+        _without_plane(
+            left.reshape(-1, squares, _BALL_PX, squares, _BALL_PX).mean(axis=(2, 4)).reshape(len(left), -1), squares
+        )
+        for left in residuals
+    ]
+    common, whole, count = 0.0, 0.0, 0
+    for one, other in combinations(range(len(means)), 2):
+        if len(means[one]) != len(means[other]):
+            continue
+        both = calm[one] & calm[other]
+        a, b = means[one][both], means[other][both]
+        common += float(np.sum(a * b))
+        whole += 0.5 * float(np.sum(a**2) + np.sum(b**2))
+        count += int(np.count_nonzero(both))
+    return float(np.clip(common / whole, 0.0, 1.0)) if count >= _MIN_TILES and whole > 0.0 else None
 
 
 def _correlated_area(noise: Array) -> float:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from modeler.kernels import planes
+from modeler.range_noise import RangeNoise
 from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
 from modeler.types import COLOUR_SHIFT_PX, BoolArray, Frame, Plane, RayImage
 
@@ -41,14 +42,22 @@ class Sensor:
 
     The default is that of noise smoothed over 1 px, as our renderer's. `measured` has that of a scene.
     """
+    pattern_share: float = 0.0
+    """Share of the variance of errors that is fixed-pattern noise: a pixel repeats it from frame to frame.
+
+    Captures show 0.3 to 0.9; `measured` has that of a scene.
+    """
     min_cosine: float = 0.35
     """Least cosine between normal and viewing ray: surface seen at a flatter angle gives no points."""
     max_silhouette_px: float = 60.0
     """Distance from the silhouette at which its transform is cut off."""
 
-    def measured(self, noise_area_px: float | None) -> Sensor:
-        """Return the sensor with the correlated area of its noise that a scene shows; None where it shows none."""
-        return self if noise_area_px is None else replace(self, noise_area_px=noise_area_px)
+    def measured(self, noise: RangeNoise | None) -> Sensor:
+        """Return the sensor with what a scene shows of how its errors are alike; None where it shows nothing."""
+        if noise is None:
+            return self
+        share = self.pattern_share if noise.pattern_share is None else noise.pattern_share
+        return replace(self, noise_area_px=noise.area_px, pattern_share=share)
 
     def refocused(self, view: RayImage, log_factor: float) -> RayImage:
         """Return a view as it is under another focal length: x and y of every point shrink as it grows.
@@ -90,7 +99,7 @@ class Sensor:
             )
             surface = outline & (depth_m > 0)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        ball, sigma_inverse, sharing = self._smoothing(frame, mask, outline)
+        ball, sigma_inverse, (sharing, area_px) = self._smoothing(frame, mask, outline)
         # The object may go on behind what hides it, so its silhouette is known only beyond.
         covered = outline if frame.occluder is None else outline | frame.occluder
         cells = planes.local_planes(
@@ -118,11 +127,13 @@ class Sensor:
             pixels=pixels,
             layers={"cells": cells, "variance_m2": variance_m2},
             sharing=sharing,
+            error_area_px=area_px,
+            pattern_share=self.pattern_share,
         )
 
     def _smoothing(
         self, frame: Frame, measured: BoolArray, outline: BoolArray
-    ) -> tuple[tuple[float, int, int], float, float]:
+    ) -> tuple[tuple[float, int, int], float, tuple[float, float]]:
         """Return how an object is smoothed (method.md, eq. 1 and 2).
 
         Args:
@@ -132,11 +143,12 @@ class Sensor:
 
         Returns:
             Radius of the ball in m, in px at the nearest point, and the stride between its pixels; the least standard
-            deviation of inverse depth (1/m); and the number of measured pixels that share the noise of one.
+            deviation of inverse depth (1/m); and the number of measured pixels that share the noise of one, with the
+            area in px over which errors are alike.
         """
         rows, columns = _places(measured)
         if rows.size == 0:  # nothing to smooth
-            return (0.0, 1, 1), 0.0, 1.0
+            return (0.0, 1, 1), 0.0, (1.0, 1.0)
         depth_m = frame.depth_m[rows, columns]
         nearest_m, middle_m = (float(value) for value in np.percentile(depth_m, [2, 50]))
         metres_per_px = middle_m / frame.camera.fx
@@ -150,9 +162,10 @@ class Sensor:
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours
         ball = (radius_m, reach_px, 2 if reach_px > 4 and enough else 1)
         # method.md, eq. 23
-        sharing = max(density * (np.pi * (radius_m / metres_per_px) ** 2 + _ALIKE * self.noise_area_px), 1.0)
+        ball_px = np.pi * (radius_m / metres_per_px) ** 2
+        sharing = max(density * (ball_px + _ALIKE * self.noise_area_px), 1.0)
         # A tenth of the sensor's noise: neighbouring pixels err alike, so that residuals understate it.
-        return ball, 0.1 * self.sigma_r_m / middle_m**2, float(sharing)
+        return ball, 0.1 * self.sigma_r_m / middle_m**2, (float(sharing), float(ball_px + self.noise_area_px))
 
 
 def _window(mask: BoolArray, margin: int) -> tuple[slice, slice]:

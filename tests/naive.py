@@ -50,6 +50,7 @@ def visibility(pose, projection, parameters):
     """Log-likelihood of one pose and number of explained points: every point in turn, as `kernels.point_likelihood`."""
     fx, fy, cx, cy, width, height = projection.camera.astype(np.float64)
     low, high, flat, steep = projection.cosines.astype(np.float64)
+    share, per_square_px = projection.pattern.astype(np.float64)
     cells, points = projection.cells.reshape(int(height), int(width), -1), projection.points.T.astype(np.float64)
     blur, silhouette_px, clearance_m, max_point_cost, normal_cost, unmeasured_gain, typical_misfit = map(
         np.float64, parameters[:7]
@@ -78,7 +79,9 @@ def visibility(pose, projection, parameters):
             in_front = plane @ position + cell[planes.DISTANCE]
             agreement = normal @ plane
             square = in_front**2 / (point[6] + cell[planes.VARIANCE] + blur**2)
-            match = typical_misfit - 0.5 * square - normal_cost * (1 - agreement)
+            where = position[:2] / position[2] * (fx, fy) + (cx, cy)
+            common = share * max(1 - per_square_px * np.sum((where - point[7:9]) ** 2), 0) ** 2
+            match = typical_misfit - 0.5 * square - 0.5 * common - normal_cost * (1 - agreement)
             explained += faces * (0.5 * square < 4.5 and agreement > 0.8)
             seen = np.log((1 - hidden) * np.exp(max(match, -700)) + hidden)
             if in_front > 0 and match < np.log(hidden):

@@ -8,7 +8,7 @@ from calibration.by_camera import CameraStudy, Trial, equal_volume, main, summar
 from calibration.depth_cameras import CAMERAS, TimeOfFlight, World
 from calibration.specimens import Specimen
 
-from modeler.range_noise import noise_area
+from modeler.range_noise import range_noise
 from modeler.types import Frame
 
 CUBE = np.array([[x, y, z] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (0.6, 0.7)])
@@ -30,9 +30,13 @@ def test_noise_is_of_the_size_and_the_correlation_that_the_camera_has(name: str)
     expected_mm = {"laser stripe": 0.1, "time of flight": 1.07, "independent pixels": 1.79}.get(name)
     if expected_mm is not None:
         assert 1e3 * np.std(depth_m[around] - 0.8) == pytest.approx(expected_mm, rel=0.25)
-    area_px = noise_area([(Frame(0, 0.0, depth_m, camera.camera, seen.on_object), seen.on_object)])
-    assert area_px is not None
-    assert (area_px > 20.0) == (name in ("Kinect 1", "D415, holes filled", "D435"))
+    again = camera.measure(WORLD, np.random.default_rng(1), 0).astype(np.float32)
+    frames = [Frame(0, 0.0, shown, camera.camera, seen.on_object) for shown in (depth_m, again)]
+    noise = range_noise([(frame, seen.on_object) for frame in frames])
+    assert noise is not None
+    assert (noise.area_px > 20.0) == (name in ("Kinect 1", "D415, holes filled", "D435"))
+    fixed = {"Kinect 1": 0.5, "D415, holes filled": 0.75, "D435": 0.75}.get(name, 0.0)
+    assert noise.pattern_share == pytest.approx(fixed, abs=0.15)
 
 
 def test_holes_are_filled_by_the_camera_that_fills_them_only() -> None:

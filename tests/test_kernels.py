@@ -95,6 +95,7 @@ def random_cells(rng):
 
 CAMERA = np.array([*INTRINSICS, SHAPE[1], SHAPE[0]], dtype=np.float32)
 FACING = np.array([0.1, 0.35, 0.3, 0.7], dtype=np.float32)
+PATTERN = np.array([0.7, 1 / 50], dtype=np.float32)
 HIDDEN = 0.3
 
 
@@ -109,9 +110,10 @@ def random_projection(rng, count=40):
     """Points with normals, and cells independent of them."""
     normals = rng.normal(size=(count, 3)) - [0, 0, 1.5]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points = np.hstack([random_points(rng, count), normals, rng.uniform(1e-7, 1e-4, (count, 1))])
+    pixels = rng.uniform((0, 0), (SHAPE[1], SHAPE[0]), (count, 2))
+    points = np.hstack([random_points(rng, count), normals, rng.uniform(1e-7, 1e-4, (count, 1)), pixels])
     cells = random_cells(rng).reshape(-1, planes.CELL_SIZE)
-    return Projection(np.ascontiguousarray(points.T, dtype=np.float32), cells, CAMERA, FACING)
+    return Projection(np.ascontiguousarray(points.T, dtype=np.float32), cells, CAMERA, FACING, PATTERN)
 
 
 def far_from_borders(projection, poses):
@@ -188,8 +190,8 @@ def test_the_class_of_a_point_follows_from_where_it_lies():
         ([0.0, 0.0, -0.8], towards, point_likelihood.UNKNOWN),
         ([0.0, 0.2, 0.8], towards, point_likelihood.IN_SUPPORT),
     ]
-    points = np.array([[*position, *normal, 1e-6] for position, normal, _ in cases], dtype=np.float32).T.copy()
-    projection = Projection(points, cells.reshape(-1, planes.CELL_SIZE), CAMERA, FACING)
+    points = np.array([[*position, *normal, 1e-6, 0, 0] for position, normal, _ in cases], dtype=np.float32).T.copy()
+    projection = Projection(points, cells.reshape(-1, planes.CELL_SIZE), CAMERA, FACING, PATTERN)
     table = (0.0, -1.0, 0.0, 0.15, 500.0)
     classes = point_likelihood.classify(rows(np.eye(4)), projection, parameters(0.001, table))
     assert classes.tolist() == [want for *_, want in cases]

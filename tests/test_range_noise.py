@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from modeler.range_noise import noise_area
+from modeler.range_noise import range_noise
 from modeler.rays import Sensor
 from modeler.segmentation import Segmenter
 from modeler.types import Camera, Frame
@@ -31,33 +31,53 @@ def plane_frame(sigma_inverse: float, width_px: float, *, bend: float = 0.0, ind
 @pytest.mark.parametrize("sigma_inverse", [3e-4, 3e-3])
 @pytest.mark.parametrize("width_px", [0.0, 1.0, 3.0])
 def test_the_correlated_area_is_found_whatever_the_strength(sigma_inverse: float, width_px: float) -> None:
-    area_px = noise_area([(plane_frame(sigma_inverse, width_px, index=k), MASK) for k in range(4)])
+    noise = range_noise([(plane_frame(sigma_inverse, width_px, index=k), MASK) for k in range(4)])
+    assert noise is not None
     # Of a Gaussian mean of width s the autocorrelation is one of width √2 s. Wide errors pass for the plane's in part.
-    assert area_px == pytest.approx(max(4.0 * np.pi * width_px**2, 1.0), rel=0.1 if width_px < 3.0 else 0.35)
+    assert noise.area_px == pytest.approx(max(4.0 * np.pi * width_px**2, 1.0), rel=0.1 if width_px < 3.0 else 0.35)
 
 
 def test_edges_and_the_object_do_not_count() -> None:
     frame = plane_frame(1e-3, 0.0)
     depth_m = frame.depth_m.copy()
     depth_m[:, 300:] += 0.4  # a step
-    assert noise_area([(Frame(0, 0.0, depth_m, CAMERA, MASK), MASK)]) == pytest.approx(1.0, abs=0.1)
+    noise = range_noise([(Frame(0, 0.0, depth_m, CAMERA, MASK), MASK)])
+    assert noise is not None
+    assert noise.area_px == pytest.approx(1.0, abs=0.1)
+    assert noise.pattern_share is None  # one frame cannot tell
 
 
 @pytest.mark.parametrize("nothing", [np.nan, 0.0])
 def test_without_surroundings_nothing_is_said(nothing: float) -> None:
     frame = plane_frame(1e-3, 0.0)
     alone = np.where(MASK, frame.depth_m, np.float32(nothing)).astype(np.float32)
-    assert noise_area([(Frame(0, 0.0, alone, CAMERA, MASK), MASK)]) is None
-    assert noise_area([]) is None
+    assert range_noise([(Frame(0, 0.0, alone, CAMERA, MASK), MASK)]) is None
+    assert range_noise([]) is None
+
+
+@pytest.mark.parametrize("width_px", [0.0, 2.0])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9])
+def test_the_share_that_stays_from_frame_to_frame_is_found(share: float, width_px: float) -> None:
+    fixed = plane_frame(1e-3, width_px, index=99)
+    frames = []
+    for k in range(4):
+        inverse = np.sqrt(1.0 - share) / plane_frame(1e-3, width_px, index=k).depth_m + np.sqrt(share) / fixed.depth_m
+        frames.append(Frame(k, float(k), (1.0 / inverse).astype(np.float32), CAMERA, MASK))
+    noise = range_noise([(frame, MASK) for frame in frames])
+    assert noise is not None
+    assert noise.pattern_share == pytest.approx(share, abs=0.05)
 
 
 def test_a_scene_tells_the_sensor() -> None:
     scene = Segmenter().scene([plane_frame(2e-3, 2.0, index=k) for k in range(3)])
-    assert scene.noise_area_px is not None
-    assert Sensor(0.001, 0.0007).measured(scene.noise_area_px) == Sensor(
-        0.001, 0.0007, noise_area_px=scene.noise_area_px
+    noise = scene.range_noise
+    assert noise is not None
+    assert noise.pattern_share is not None
+    assert Sensor(0.001, 0.0007).measured(noise) == Sensor(
+        0.001, 0.0007, noise_area_px=noise.area_px, pattern_share=noise.pattern_share
     )
-    assert Sensor().measured(Segmenter().scene([]).noise_area_px) == Sensor()
+    assert Sensor().measured(noise._replace(pattern_share=None)).pattern_share == Sensor().pattern_share
+    assert Sensor().measured(Segmenter().scene([]).range_noise) == Sensor()
 
 
 def test_the_more_pixels_err_alike_the_fewer_patches_a_view_has() -> None:

@@ -1,5 +1,7 @@
 """Sharpening by matching surface: its equations against a plain twin, and what it may and may not make sure."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from naive import point_to_plane_equations
@@ -11,6 +13,7 @@ from modeler.kernels import point_to_plane
 from modeler.rays import Sensor
 from modeler.registration.posterior import weighted_gaussian
 from modeler.registration.visibility import VisibilityLikelihood
+from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.likelihood import MatchNoise
 from modeler.registration.visibility.refinement import Refiner, shrunk, visible_share
 from modeler.se3 import rows
@@ -41,8 +44,10 @@ def sigmas_about(poses, centre_m):
     return pose.mean, np.sqrt(variances[:3].sum()), np.sqrt(variances[3:].sum())
 
 
-def test_normal_equations_are_those_of_the_matching_points(rng):
+def test_normal_equations_are_those_of_the_matching_points_and_the_fixed_pattern(rng):
     pair, truth, centre_m = bundled_pair("box")
+    wide = FixedPattern(0.6, 1500.0)  # so that it reaches most matches
+    pair = replace(pair, forward=replace(pair.forward, pattern=wide), backward=replace(pair.backward, pattern=wide))
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng, count=5)
     gradients, matrices = pair.normal_equations(poses, MatchNoise(0.001), stride=1)
     for pose, gradient, matrix in zip(poses, gradients, matrices, strict=True):
@@ -51,8 +56,14 @@ def test_normal_equations_are_those_of_the_matching_points(rng):
             # In the target, ξ moves points about the transformed centre, rotated; in the source by -ξ.
             turned = np.kron(np.eye(2), pose[:3, :3] if sign > 0.0 else -np.eye(3))
             about = se3.transform(pose, centre_m[None])[0] if sign > 0.0 else centre_m
-            equations = point_to_plane_equations(directed.matches(rows(carried), 0.001), about)
-            want = want[0] + turned.T @ equations[0], want[1] + turned.T @ equations[1] @ turned
+            matches = directed.matches(rows(carried), 0.001)
+            equations = point_to_plane_equations(matches, about)
+            matched = matches[matches[:, point_to_plane.WEIGHT] > 0.0]
+            slopes, _ = directed.pattern.derivatives(matched, directed.image.frame.camera)
+            arms = matched[:, point_to_plane.POSITION] - about
+            of_pattern = -np.hstack([np.cross(arms, slopes), slopes]).sum(axis=0)
+            assert np.abs(of_pattern).max() > 0.0
+            want = want[0] + turned.T @ (equations[0] + of_pattern), want[1] + turned.T @ equations[1] @ turned
         np.testing.assert_allclose(gradient, want[0], rtol=1e-4, atol=1e-5 * abs(want[0]).max())
         np.testing.assert_allclose(matrix, want[1], rtol=1e-4, atol=1e-5 * abs(want[1]).max())
 

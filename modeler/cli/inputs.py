@@ -172,7 +172,7 @@ class Part:
     def sensor(self) -> Sensor:
         """Noise of the camera that took the sequence."""
         modeler, scene = self._looking
-        return modeler.sensor.measured(scene.noise_area_px)
+        return modeler.sensor.measured(scene.range_noise)
 
     @cached_property
     def _looking(self) -> tuple[Modeler, Scene]:

@@ -174,7 +174,7 @@ class Experiment:
         """Return what makes the view of a frame, or tells why there is none."""
         noise = recorded.sensor()
         scene = self.segmenter.scene([recorded.frame(index) for index in telling(indices)])
-        sensor = (Sensor() if noise is None else Sensor(*noise)).measured(scene.noise_area_px)
+        sensor = (Sensor() if noise is None else Sensor(*noise)).measured(scene.range_noise)
         return lambda index: self._view(recorded.frame(index), scene, sensor)
 
     def _view(self, frame: Frame, scene: Scene, sensor: Sensor) -> RayImage | Outcome:

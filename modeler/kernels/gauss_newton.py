@@ -9,7 +9,20 @@ import numpy.typing as npt
 
 from modeler.kernels.lie_group import difference, retract
 from modeler.kernels.photometric import CELL_SIZE, fetch_colours, linearise_features
-from modeler.kernels.point_likelihood import VECTOR_MATHS, ZERO, buffers, invert, project
+from modeler.kernels.point_likelihood import (
+    COLUMN,
+    FACING,
+    PATTERN,
+    ROW,
+    VECTOR_MATHS,
+    ZERO,
+    X,
+    Y,
+    Z,
+    buffers,
+    invert,
+    project,
+)
 from modeler.kernels.point_to_plane import linearise
 from modeler.kernels.threads import over_rows
 
@@ -75,7 +88,7 @@ def new_workspace(surfaces):
     count = max(surfaces[0].points.shape[1], surfaces[1].points.shape[1])
     cells, rows = np.empty((CELL_SIZE, count), dtype=np.float32), np.empty((_ROWS, count), dtype=np.float32)
     small = np.empty(12), np.empty(3), np.empty(6), np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
-    return buffers(count), cells, rows, small
+    return buffers(count), cells, rows, (*small, np.empty(6))
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
@@ -99,7 +112,7 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
         matrix: (2, 6, 6) out, likewise.
     """
     (transformed, pixels, found), colour, rows, small = workspace
-    carried, about, part, block, rotated, turned, turned_block = small
+    carried, about, part, block, rotated, turned, turned_block, apart = small
     surface_m2 = np.float32(surface_m * surface_m)
     gradient[:] = 0.0
     matrix[:] = 0.0
@@ -121,6 +134,7 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
                     about[k] = centre[k]
             project(carried, surface, transformed, pixels, found)
             linearise(surface.points, transformed, found, about, surface_m2, rows)
+            push_apart(surface, transformed, about, rows, apart)
         elif features.values.shape[0] == 0:
             continue
         else:
@@ -129,6 +143,9 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
                 surface.points, features.values, transformed, found, colour, about, surface_m2, weight, rows
             )
         accumulate(rows, count, part, block)
+        if kind == 0:
+            for k in range(6):
+                part[k] += apart[k]
         if direction == 0:
             rotate_to_source(pose, part, block, rotated, turned, turned_block)
         else:
@@ -156,6 +173,38 @@ def accumulate(rows, count, gradient, matrix):
             for j in range(count):
                 total += rows[8, j] * rows[v, j]
             matrix[u, v] = matrix[v, u] = np.float64(total)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def push_apart(surface, transformed, about, rows, gradient):
+    """Write what the fixed pattern adds to the gradient (6,) by ζ about a point (3,) (method.md, eq. 27).
+
+    Args:
+        surface: the `Projection` of the points.
+        transformed: (9, n), see `project`.
+        about: the point in m.
+        rows: (9, n) of `linearise`; only matches count.
+        gradient: out.
+    """
+    gradient[:] = 0.0
+    share, per_square = surface.pattern[0], surface.pattern[1]
+    fx, fy, cx, cy = surface.camera[0], surface.camera[1], surface.camera[2], surface.camera[3]
+    for j in range(surface.points.shape[1]):
+        if transformed[PATTERN, j] <= ZERO or rows[7, j] <= ZERO:
+            continue
+        x, y, z = transformed[X, j], transformed[Y, j], transformed[Z, j]
+        across, down = fx * x / z + cx - surface.points[COLUMN, j], fy * y / z + cy - surface.points[ROW, j]
+        alike = 1.0 - (across * across + down * down) * per_square
+        slope = 2.0 * share * transformed[FACING, j] * alike * per_square / z
+        gx, gy = slope * fx * across, slope * fy * down
+        gz = -(gx * x + gy * y) / z
+        x, y, z = x - about[0], y - about[1], z - about[2]
+        gradient[0] += y * gz - z * gy
+        gradient[1] += z * gx - x * gz
+        gradient[2] += x * gy - y * gx
+        gradient[3] += gx
+        gradient[4] += gy
+        gradient[5] += gz
 
 
 @numba.njit(cache=True)

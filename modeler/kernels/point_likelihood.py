@@ -49,9 +49,10 @@ VECTOR_MATHS = {"contract", "arcp", "nsz", "reassoc"}
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)  # a plain 0.5 would make double precision of all
 
 # Rows of the points, and of `transform_points`.
-VARIANCE_M2 = 6
-X, Y, Z, POINT_NORMAL_X, POINT_NORMAL_Y, POINT_NORMAL_Z, FACING, COVERAGE = 0, 1, 2, 3, 4, 5, 6, 7
-TRANSFORMED_ROWS = 8
+VARIANCE_M2, COLUMN, ROW = 6, 7, 8
+POINT_ROWS = 9
+X, Y, Z, POINT_NORMAL_X, POINT_NORMAL_Y, POINT_NORMAL_Z, FACING, COVERAGE, PATTERN = 0, 1, 2, 3, 4, 5, 6, 7, 8
+TRANSFORMED_ROWS = 9
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -60,13 +61,15 @@ class Projection(NamedTuple):
     """One direction of a comparison: points of one view, and the camera and cells of the other."""
 
     points: FloatArray
-    """(7, n) position in m, unit normal, variance along the normal in m²."""
+    """(9, n) position in m, unit normal, variance along the normal in m², and column and row in px in its own view."""
     cells: FloatArray
     """(h · w, 8) of the other view, see `planes`."""
     camera: FloatArray
     """(6,) fx, fy, cx, cy, width and height in px of the other view."""
     cosines: FloatArray
     """(4,) cosines between which f rises from 0 to 1, and g (method.md, eq. 4)."""
+    pattern: FloatArray
+    """(2,) share χ of the variance that both views have in common at the same pixel, and 1/R² in 1/px² (eq. 27)."""
 
 
 @numba.njit(cache=True, forceinline=True)
@@ -86,8 +89,8 @@ def transform_points(pose, projection, transformed, pixels):
     Args:
         pose: (12,) rows of the 3×4 matrix.
         projection: the points and the other camera.
-        transformed: (8, n) out: position, normal, how much the point faces the camera (f, 0..1), and how reliably the
-            camera measures it (g, 0..1).
+        transformed: (9, n) out: position, normal, how much the point faces the camera (f, 0..1), how reliably the
+            camera measures it (g, 0..1), and which share of a match's variance both views have in common (eq. 27).
         pixels: (n,) out: number of the pixel it falls on, row by row; -1 outside the image or behind the camera.
     """
     p0, p1, p2, p3 = np.float32(pose[0]), np.float32(pose[1]), np.float32(pose[2]), np.float32(pose[3])
@@ -96,6 +99,7 @@ def transform_points(pose, projection, transformed, pixels):
     points, (fx, fy, cx, cy, width, height) = projection.points, projection.camera
     low, per_range = projection.cosines[0], ONE / (projection.cosines[1] - projection.cosines[0])
     flat, per_turn = projection.cosines[2], ONE / (projection.cosines[3] - projection.cosines[2])
+    share, per_square = projection.pattern[0], projection.pattern[1]
     for j in range(points.shape[1]):
         a, b, c, d, e, f = points[0, j], points[1, j], points[2, j], points[3, j], points[4, j], points[5, j]
         x = p0 * a + p1 * b + p2 * c + p3
@@ -118,6 +122,9 @@ def transform_points(pose, projection, transformed, pixels):
         )
         transformed[FACING, j] = min(max((cosine - low) * per_range, ZERO), ONE)
         transformed[COVERAGE, j] = min(max((cosine - flat) * per_turn, ZERO), ONE)
+        across, down = column - HALF - points[COLUMN, j], row - HALF - points[ROW, j]
+        alike = max(ONE - (across * across + down * down) * per_square, ZERO)
+        transformed[PATTERN, j] = share * alike * alike
         pixels[j] = pixel if inside else np.int32(-1)
 
 
@@ -144,7 +151,7 @@ def project(pose, projection, transformed, pixels, looked_up):
 
 @numba.njit(cache=True, forceinline=True)
 def buffers(count):
-    """Return buffers for `project` of n = `count` points: transformed points (8, n), pixels (n,), cells (8, n)."""
+    """Return buffers for `project` of n = `count` points: transformed points (9, n), pixels (n,), cells (8, n)."""
     transformed, pixels = np.empty((TRANSFORMED_ROWS, count), dtype=np.float32), np.empty(count, dtype=np.int32)
     return transformed, pixels, np.empty((CELL_SIZE, count), dtype=np.float32)
 
@@ -224,8 +231,8 @@ def sum_over_points(points, transformed, looked_up, parameters):
     All cases are evaluated for every point, and one selected: code without branches is vectorised.
 
     Args:
-        points: (7, n), see `Projection`.
-        transformed: (8, n) and
+        points: (9, n), see `Projection`.
+        transformed: (9, n) and
         looked_up: (8, n), see `project`.
         parameters: see `LikelihoodParameters`.
     """
@@ -238,7 +245,9 @@ def sum_over_points(points, transformed, looked_up, parameters):
         agreement = normal_agreement(transformed, looked_up, j)
         variance = points[VARIANCE_M2, j] + looked_up[VARIANCE, j] + parameters.blur_m * parameters.blur_m
         half_square = HALF * in_front * in_front / variance
-        match = parameters.typical_misfit - half_square - parameters.normal_cost * (ONE - agreement)
+        # With what the fixed pattern would have added, were it not the same in both views.
+        misfit = half_square + HALF * transformed[PATTERN, j]
+        match = parameters.typical_misfit - misfit - parameters.normal_cost * (ONE - agreement)
         matches = (half_square < HALF * MAX_SIGMAS * MAX_SIGMAS) & (agreement > MIN_AGREEMENT)
         position = (min(max(match, TABLE_LOW), TABLE_HIGH) - TABLE_LOW) * _PER_STEP
         node = min(np.int32(position), last)
@@ -290,18 +299,20 @@ def residual_excess(pose, projection, blur_m):
     """Return the excess of squared residuals over their variances under one pose (12,) (method.md, eq. 8).
 
     Returns:
-        Sum in m² of the squared distances less the variances of point and plane, over the points that face the camera
-        and are within `LOOSE_SIGMAS` standard deviations, `blur_m` included; and their number.
+        Sum in m² of the squared distances less what is expected of the variances of point and plane, over the points
+        that face the camera and are within `LOOSE_SIGMAS` standard deviations, `blur_m` included; and their number,
+        each counted by the share of its variance that shows.
     """
     transformed, pixels, looked_up = buffers(projection.points.shape[1])
     project(pose, projection, transformed, pixels, looked_up)
-    total, count = 0.0, 0
+    total, count = 0.0, 0.0
     for j in range(pixels.shape[0]):
         if looked_up[KIND, j] != SURFACE or transformed[FACING, j] < 0.5:
             continue
         square = np.float64(plane_distance(transformed, looked_up, j)) ** 2
         known = np.float64(projection.points[VARIANCE_M2, j]) + np.float64(looked_up[VARIANCE, j])
         if square < LOOSE_SIGMAS * LOOSE_SIGMAS * (known + blur_m * blur_m):
-            total += square - known
-            count += 1
+            apart = 1.0 - np.float64(transformed[PATTERN, j])
+            total += square - apart * known
+            count += apart
     return total, count

@@ -5,6 +5,7 @@ import numpy as np
 
 from modeler.kernels.planes import KIND, NORMAL_X, NORMAL_Y, NORMAL_Z, SURFACE, VARIANCE
 from modeler.kernels.point_likelihood import (
+    COLUMN,
     FACING,
     HALF,
     MAX_SIGMAS,
@@ -12,6 +13,7 @@ from modeler.kernels.point_likelihood import (
     POINT_NORMAL_X,
     POINT_NORMAL_Y,
     POINT_NORMAL_Z,
+    ROW,
     VARIANCE_M2,
     VECTOR_MATHS,
     ZERO,
@@ -24,8 +26,9 @@ from modeler.kernels.point_likelihood import (
     project,
 )
 
-# Columns of `matches`: transformed position, own normal, the surface's normal, distance from it, weight, f.
-POSITION, OWN, OTHER, RESIDUAL, WEIGHT, FACING_WEIGHT = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11
+# Columns of `matches`: transformed position, own normal, the surface's normal, distance from it, weight, f, and shift.
+POSITION, OWN, OTHER, SHIFT = slice(0, 3), slice(3, 6), slice(6, 9), slice(12, 14)
+RESIDUAL, WEIGHT, FACING_WEIGHT, COLUMNS = 9, 10, 11, 14
 
 _OF_SURFACE = np.float32(SURFACE)
 
@@ -50,12 +53,13 @@ def matches(pose, projection, surface_m):
         surface_m: noise of the surfaces in m beyond that of points and planes.
 
     Returns:
-        (n, 12): position in m, own normal and normal of the surface there, all in the other camera's frame; distance
-        in m in front of that surface; weight in 1/m², 0 where nothing matches; f (0..1).
+        (n, 14): position in m, own normal and normal of the surface there, all in the other camera's frame; distance
+        in m in front of that surface; weight in 1/m², 0 where nothing matches; f (0..1); shift in px from the point's
+        pixel in its own view, to the right and down.
     """
     transformed, pixels, cells = buffers(projection.points.shape[1])
     project(pose, projection, transformed, pixels, cells)
-    found = np.zeros((pixels.shape[0], 12))
+    found, (fx, fy, cx, cy, _, _) = np.zeros((pixels.shape[0], COLUMNS)), projection.camera
     for j in range(pixels.shape[0]):
         residual = plane_distance(transformed, cells, j)
         weight = match_weight(projection.points, transformed, cells, residual, np.float32(surface_m * surface_m), j)
@@ -65,6 +69,9 @@ def matches(pose, projection, surface_m):
             for k in range(3):
                 found[j, 6 + k] = cells[NORMAL_X + k, j]
             found[j, RESIDUAL], found[j, WEIGHT], found[j, FACING_WEIGHT] = residual, weight, transformed[FACING, j]
+            x, y, z = transformed[X, j], transformed[Y, j], transformed[Z, j]
+            found[j, SHIFT.start] = fx * x / z + cx - projection.points[COLUMN, j]
+            found[j, SHIFT.start + 1] = fy * y / z + cy - projection.points[ROW, j]
     return found
 
 

@@ -98,11 +98,11 @@ class Modeler:
 
     def start(self, scene: Scene) -> Run:
         """Return a run before its first frame."""
-        return Run(replace(self, sensor=self.sensor.measured(scene.noise_area_px)), scene)
+        return Run(replace(self, sensor=self.sensor.measured(scene.range_noise)), scene)
 
     def prepare(self, frame: Frame, scene: Scene) -> Prepared:
         """Segment a frame and prepare it for registration."""
-        return prepare(frame, scene, self.segmenter, self.sensor.measured(scene.noise_area_px))
+        return prepare(frame, scene, self.segmenter, self.sensor.measured(scene.range_noise))
 
     def register(self, source: RayImage, target: RayImage, prior: AbstractPrior | None = None) -> Posterior:
         """Return the posterior of target_from_source. The result depends on views, prior and seed alone.

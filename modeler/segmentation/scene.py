@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from modeler.range_noise import RangeNoise
 from modeler.segmentation.depth_images import (
     DepthNoise,
     Labels,
@@ -68,8 +69,8 @@ class Scene:
     """Whether the frames show nothing but the object."""
     noise: DepthNoise | None = None
     """Noise of the depth camera, where it exceeds what was expected."""
-    noise_area_px: float | None = None
-    """Over how many pixels the camera errs alike, as what surrounds the object shows; None where little is plane."""
+    range_noise: RangeNoise | None = None
+    """How the camera errs, as what surrounds the object shows; None where little is plane."""
 
 
 def telling(indices: Sequence[int], *, count: int = 15) -> tuple[int, ...]:

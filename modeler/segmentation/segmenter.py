@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 from scipy import ndimage
 
-from modeler.range_noise import noise_area
+from modeler.range_noise import range_noise
 from modeler.segmentation.depth_images import (
     DepthNoise,
     Labels,
@@ -335,7 +335,7 @@ class Segmenter:
         """
         masked = [(frame, frame.mask) for frame in frames if frame.mask is not None]
         if len(masked) == len(frames):
-            return Scene(noise_area_px=noise_area(masked))
+            return Scene(range_noise=range_noise(masked))
         shown = [frame for frame in frames if frame.mask is None]
         shown = [frame for frame in shown if frame.depth_m.shape == shown[0].depth_m.shape]
         shown = [_interpolated(frame) for frame in shown]
@@ -356,8 +356,8 @@ class Segmenter:
         areas, rivals = [look.area_m2 for _, look in looks], [look.rival for _, look in looks]
         zone = np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
         sure = scene.sure and float(np.median(rivals)) < _RIVAL
-        area_px = noise_area([(frame, look.mask) for frame, look in looks])
-        return replace(scene, zone_m=zone, areas_m2=(min(areas), max(areas)), sure=sure, noise_area_px=area_px)
+        noise = range_noise([(frame, look.mask) for frame, look in looks])
+        return replace(scene, zone_m=zone, areas_m2=(min(areas), max(areas)), sure=sure, range_noise=noise)
 
     def segment(self, frame: Frame, scene: Scene) -> Segmentation:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.

@@ -14,6 +14,7 @@ from modeler.closure import Closer, MapView
 from modeler.priors import turntable_in
 from modeler.priors.mixtures import Gaussian
 from modeler.registration import VisibilityLikelihood
+from modeler.registration.visibility.likelihood import point_rows
 from modeler.suggestion.candidates import Candidate
 from modeler.suggestion.edge_forecast import TURNS_RAD, USUAL_NOISE, EdgeForecast, ForeseenEdge, ForeseenView
 from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information
@@ -372,14 +373,14 @@ class Belief:
         share = 1.0 - self.new_share(shown)
         count = int(self.forecast.likelihood.points * share)
         some = seen[np.linspace(0, len(seen) - 1, max(min(count, len(seen)), 1)).astype(np.intp)]
-        variances_m2 = np.full((len(some), 1), self._variance_m2)
+        variances_m2 = np.full(len(some), self._variance_m2)
         ahead, frame = self._frames_ahead(candidate), self.last.frame
         frame = Frame(frame.index + ahead, frame.time_s + ahead, frame.depth_m, frame.camera)
         image = replace(self.last, frame=frame, points_m=points_m[seen], normals=normals[seen], layers={})
         unseen = ~self.cells.seen[visible]
         return ForeseenView(
             image=image,
-            points=np.hstack([points_m[some], normals[some], variances_m2]),
+            points=point_rows(points_m[some], normals[some], variances_m2, frame.camera),
             weight=self.forecast.likelihood.points * share / len(some),
             unseen_m=points_m[unseen],
             unseen_normals=normals[unseen],

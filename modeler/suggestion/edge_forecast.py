@@ -17,6 +17,7 @@ from modeler import se3
 from modeler.kernels import point_to_plane, scores
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration.posterior import PRIOR_SAMPLES, weighted_gaussian
+from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.likelihood import (
     DirectedLikelihood,
     MatchNoise,
@@ -61,7 +62,7 @@ class ForeseenView:
     image: RayImage
     """Its points, as far as they are known; it has no picture."""
     points: Array
-    """(n, 7) position in m, unit normal and variance along the normal in m²."""
+    """(n, 9), see `point_rows`."""
     weight: float
     """How many points of a real view each of them stands for."""
     unseen_m: Array
@@ -202,7 +203,8 @@ class EdgeForecast:
         if not np.isfinite(density.log_density(target_from_source[None])[0]):
             return None
         centre_m = source.image.centroid_m
-        directed = DirectedLikelihood(self.likelihood, source.points, target, target.size_m)
+        pattern = FixedPattern.between(source.image, target)
+        directed = DirectedLikelihood(self.likelihood, source.points, target, target.size_m, pattern)
         points = 2.0 * self.likelihood.points
         matrix = (
             2.0 * source.weight * matched(directed, target_from_source, self.noise_m, centre_m, source.normal_variance)

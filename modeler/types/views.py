@@ -153,6 +153,10 @@ class RayImage:
     """Standard deviation in px of the shift of colours beside depth from one image to the next."""
     sharing: float = 1.0
     """Number of surface points that share the noise of a pixel, in the sensor and by smoothing."""
+    error_area_px: float = 1.0
+    """Integral of the autocorrelation of the errors of surface points over the image in px."""
+    pattern_share: float = 0.0
+    """Share of the variance of these errors that is fixed-pattern noise: a pixel repeats it from frame to frame."""
 
     @property
     def index(self) -> int:

@@ -12,6 +12,7 @@ import numpy as np
 
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import likelihood
+from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.types import Array, RayImage
 
@@ -58,6 +59,12 @@ class _StatedNoise(PairLikelihood):
 
     def surface_noise_m(self, pose: Array, blur_m: float) -> float:
         return blur_m
+
+
+def _without_pattern(pair: PairLikelihood) -> PairLikelihood:
+    """Return a pair whose views have no errors in common."""
+    forward, backward = (replace(side, pattern=FixedPattern()) for side in (pair.forward, pair.backward))
+    return replace(pair, forward=forward, backward=backward)
 
 
 class _NoPatches(PairLikelihood):
@@ -115,6 +122,7 @@ REMOVED: Final = (
     Variant("estimated misfit μ", "removed", _of(_StatedMisfit)),
     Variant("estimated noise b", "removed", _of(_StatedNoise)),
     Variant("patches (fewer independent points when small)", "removed", _of(_NoPatches)),
+    Variant("fixed pattern", "removed", replace(_DEFAULT, likelihood=_Other(change=_without_pattern))),
     Variant("cost of no overlap", "removed", _with(likelihood__no_overlap_cost=0.0)),
     Variant("cost of normals", "removed", _with(likelihood__normal_cost=0.0)),
     Variant("all modes but the best", "removed", _with(max_modes=1)),

@@ -128,7 +128,7 @@ def viewed(frames: Sequence[Frame], stated: str) -> list[RayImage]:
     """Return the views of a sequence; nothing is told of the camera's noise."""
     segmenter = Segmenter()
     scene = segmenter.scene([frames[k] for k in telling(range(len(frames)))])
-    sensor = Sensor().measured(scene.noise_area_px)
+    sensor = Sensor().measured(scene.range_noise)
     return [sensor.ray_image(frame, segmenter.segment(frame, scene).plane) for frame in frames]
 
 

@@ -199,8 +199,8 @@ def rendered_views(sequence: RenderedSequence) -> dict[int, RayImage]:
     segmenter = Segmenter()
     frames = {index: sequence.frame(index) for index in sequence.indices}
     scene = segmenter.scene([frames[index] for index in telling(sequence.indices)])
-    # By one frame, so that what is made of a pair does not depend on how many there are.
-    sensor = Sensor(*sequence.sensor()).measured(segmenter.scene([frames[sequence.indices[0]]]).noise_area_px)
+    # By two frames, so that what is made of a pair does not depend on how many there are.
+    sensor = Sensor(*sequence.sensor()).measured(segmenter.scene([frames[k] for k in sequence.indices[:2]]).range_noise)
     return {index: sensor.ray_image(frame, segmenter.segment(frame, scene).plane) for index, frame in frames.items()}
 
 

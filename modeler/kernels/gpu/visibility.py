@@ -34,6 +34,7 @@ VARIANCE, KIND, DEPTH, SILHOUETTE = (
     wp.constant(field) for field in (planes.VARIANCE, planes.KIND, planes.DEPTH, planes.SILHOUETTE)
 )
 DISTANCE, POINT_VARIANCE = wp.constant(planes.DISTANCE), wp.constant(twin.VARIANCE_M2)
+COLUMN, ROW = wp.constant(twin.COLUMN), wp.constant(twin.ROW)
 TABLE_LOW, TABLE_HIGH = wp.constant(float(twin.TABLE_LOW)), wp.constant(float(twin.TABLE_HIGH))
 LAST, PER_STEP = wp.constant(twin.TABLE_STEPS - 1), wp.constant(float(twin._PER_STEP))
 MIN_AGREEMENT, MAX_SIGMAS = wp.constant(float(twin.MIN_AGREEMENT)), wp.constant(float(twin.MAX_SIGMAS))
@@ -49,6 +50,7 @@ class Direction:
     cells: wp.array[Cell]
     camera: Camera
     cosines: wp.vec4
+    pattern: wp.vec2
     blur_m: wp.float32
     silhouette_px: wp.float32
     clearance_m: wp.float32
@@ -61,13 +63,21 @@ class Direction:
 
 
 @wp.func
-def of_surface(of: Direction, cell: Cell, position: wp.vec3, normal: wp.vec3, variance: wp.float32, faces: wp.float32):
+def of_surface(
+    of: Direction,
+    cell: Cell,
+    position: wp.vec3,
+    normal: wp.vec3,
+    variance: wp.float32,
+    common: wp.float32,
+    faces: wp.float32,
+):
     """Return what a point that falls on surface adds (method.md, eq. 5), and f if the surface explains it, else 0."""
     plane = wp.vec3(cell[0], cell[1], cell[2])
     in_front = cell[DISTANCE] + wp.dot(plane, position)
     agreement = wp.dot(plane, normal)
     half_square = 0.5 * in_front * in_front / (variance + cell[VARIANCE] + of.blur_m * of.blur_m)
-    match = of.typical_misfit - half_square - of.normal_cost * (1.0 - agreement)
+    match = of.typical_misfit - half_square - 0.5 * common - of.normal_cost * (1.0 - agreement)
     step = (wp.clamp(match, TABLE_LOW, TABLE_HIGH) - TABLE_LOW) * PER_STEP
     node = wp.min(wp.int32(step), LAST)
     seen = of.table[node] + (step - wp.float32(node)) * (of.table[node + 1] - of.table[node])
@@ -111,7 +121,10 @@ def sum_over_points(
             kind = cell[KIND]
         gain, by_surface = wp.float32(0.0), wp.float32(0.0)
         if kind == SURFACE:
-            gain, by_surface = of_surface(of, cell, position, normal, of.points[POINT_VARIANCE, j], faces)
+            across, down = column - 0.5 - of.points[COLUMN, j], row - 0.5 - of.points[ROW, j]
+            alike = wp.max(1.0 - (across * across + down * down) * of.pattern[1], 0.0)
+            common = of.pattern[0] * alike * alike
+            gain, by_surface = of_surface(of, cell, position, normal, of.points[POINT_VARIANCE, j], common, faces)
         elif kind == BACKGROUND:
             if position[2] < cell[DEPTH] - of.clearance_m:
                 beyond = cell[SILHOUETTE] / of.silhouette_px
@@ -162,6 +175,7 @@ def _direction(projection: Projection, parameters: LikelihoodParameters, device:
     direction.cells = sent(projection.cells, device, Cell)
     direction.table = sent(parameters.table, device)
     direction.camera, direction.cosines = Camera(*projection.camera), wp.vec4(*projection.cosines)
+    direction.pattern = wp.vec2(*projection.pattern)
     direction.support = Support(*parameters.support)
     for name in LikelihoodParameters._fields[:7]:
         setattr(direction, name, float(getattr(parameters, name)))

@@ -15,9 +15,10 @@ from modeler.kernels import gauss_newton, gpu, point_likelihood, point_to_plane,
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
+from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.photometric import UNDECIDED, PairColour, correlations, unshifted, weight_of
 from modeler.se3 import matrices, rows
-from modeler.types import Array, RayImage
+from modeler.types import Array, Camera, RayImage
 
 _MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
 _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a share of its pixels' lateral noise: they err independently
@@ -90,8 +91,9 @@ class VisibilityLikelihood:
         """Return the likelihood of target_from_source, at surface points drawn with `rng`."""
         size_m = 0.5 * (source.size_m + target.size_m)
         chosen = spread_points(source, self.points, rng), spread_points(target, self.points, rng)
-        forward = DirectedLikelihood(self, _points(source, chosen[0]), target, size_m)
-        backward = DirectedLikelihood(self, _points(target, chosen[1]), source, size_m)
+        pattern = FixedPattern.between(source, target)
+        forward = DirectedLikelihood(self, _points(source, chosen[0]), target, size_m, pattern)
+        backward = DirectedLikelihood(self, _points(target, chosen[1]), source, size_m, pattern)
         seen = self.colour and source.frame.colour is not None and target.frame.colour is not None
         if not seen:
             return PairLikelihood(forward, backward, size_m)
@@ -113,18 +115,20 @@ class DirectedLikelihood:
 
     model: VisibilityLikelihood
     points: Array
-    """(n, 7) position in m, unit normal, variance along the normal in m²."""
+    """(n, 9) position in m, unit normal, variance along the normal in m², column and row in px in its own view."""
     image: RayImage
     """The view in which the points are looked up."""
     size_m: float
     """Size of the object, see `PairLikelihood`."""
+    pattern: FixedPattern
+    """What the errors of both views have in common."""
 
     def classify(self, pose: Array) -> np.ndarray:
         """Return the class (n,) of each point under one pose (12,): `point_likelihood.classify`."""
         return point_likelihood.classify(pose, self.projection(1), self.parameters(0.0))
 
-    def residual_excess(self, pose: Array, blur_m: float) -> tuple[float, int]:
-        """Return Σ (r² - s² - v) in m² over the matches under a pose (12,), and their number (method.md, eq. 8)."""
+    def residual_excess(self, pose: Array, blur_m: float) -> tuple[float, float]:
+        """Return the two sums over the matches under a pose (12,) of which eq. 8 of method.md has the ratio."""
         return point_likelihood.residual_excess(pose, self.projection(1), float(np.hypot(blur_m, self._min_blur_m)))
 
     def misfits(self, pose: Array, blur_m: float) -> Array:
@@ -133,7 +137,8 @@ class DirectedLikelihood:
         found = found[found[:, point_to_plane.WEIGHT] > 0.0]
         variance = found[:, point_to_plane.FACING_WEIGHT] / found[:, point_to_plane.WEIGHT]
         agreement = np.sum(found[:, point_to_plane.OWN] * found[:, point_to_plane.OTHER], axis=1)
-        return 0.5 * found[:, point_to_plane.RESIDUAL] ** 2 / variance + self.model.normal_cost * (1.0 - agreement)
+        squares = found[:, point_to_plane.RESIDUAL] ** 2 / variance + self.pattern.common(found)
+        return 0.5 * squares + self.model.normal_cost * (1.0 - agreement)
 
     def matches(self, pose: Array, blur_m: float) -> Array:
         """Return the match of each point under one pose (12,): `point_to_plane.matches`."""
@@ -143,7 +148,7 @@ class DirectedLikelihood:
         """Return every `stride`-th point and the other view's cells, as kernels take them."""
         if stride not in self._projections:
             columns = np.ascontiguousarray(self._columns[:, ::stride])
-            self._projections[stride] = Projection(columns, self._cells, self._camera, _COSINES)
+            self._projections[stride] = Projection(columns, self._cells, self._camera, _COSINES, self.pattern.packed())
         return self._projections[stride]
 
     def parameters(self, blur_m: float, typical_misfit: float = _STATED_MISFIT) -> LikelihoodParameters:
@@ -467,6 +472,19 @@ def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> IntAr
 
 
 def _points(view: RayImage, chosen: IntArray) -> Array:
-    """Return position in m, unit normal and variance along the normal in m² (n, 7) of surface points."""
-    variance = np.asarray(view.layers["variance_m2"], dtype=np.float64)[chosen, None]
-    return np.hstack([view.points_m[chosen], view.normals[chosen], variance])
+    """Return the surface points of a view with these numbers as `point_rows` does."""
+    variances_m2 = np.asarray(view.layers["variance_m2"], dtype=np.float64)[chosen]
+    return point_rows(view.points_m[chosen], view.normals[chosen], variances_m2, view.frame.camera)
+
+
+def point_rows(points_m: Array, normals: Array, variances_m2: Array, camera: Camera) -> Array:
+    """Return points (n, 9) as a `DirectedLikelihood` takes them.
+
+    Args:
+        points_m: (n, 3) in the frame of the view that shows them.
+        normals: (n, 3) unit normals.
+        variances_m2: (n,) along the normals.
+        camera: of that view.
+    """
+    pixels = points_m[:, :2] / points_m[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    return np.hstack([points_m, normals, variances_m2[:, None], pixels])

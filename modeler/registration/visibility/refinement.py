@@ -16,6 +16,7 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import point_to_plane
 from modeler.registration.posterior import FLOOR
+from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.likelihood import DirectedLikelihood, MatchNoise, PairLikelihood
 from modeler.registration.visibility.photometric import unshifted
 from modeler.se3 import rows
@@ -189,6 +190,10 @@ class Equations(NamedTuple):
     """(n,) derivatives of the residuals by the logarithm of the focal length, from the point's own normal."""
     focal_other: Array
     """(n,) likewise, from the other surface's."""
+    pattern_slopes: Array
+    """(n, 6) derivatives of what the fixed pattern counts."""
+    pattern_curvatures: Array
+    """(2, 6, 6) second derivatives, of all of either direction."""
 
     def pulled(self, basis: Array) -> Array:
         """Return the derivative (6,) of the right side of the normal equations by the logarithm of the focal length.
@@ -210,10 +215,10 @@ class Equations(NamedTuple):
         """
         by_own, by_other = self.by_own @ basis, self.by_other @ basis
         # The noise of either surface's normals would add up in its own square; in their product it averages out.
-        product = (by_own.T * self.weights) @ by_other
+        product = (by_own.T * self.weights) @ by_other + basis.T @ self.pattern_curvatures.sum(axis=0) @ basis
         scales, axes = np.linalg.eigh(0.5 * (product + product.T))
         by_both = 0.5 * (by_own + by_other)
-        scores = members @ (by_both * (self.weights * self.residuals)[:, None])
+        scores = members @ (by_both * (self.weights * self.residuals)[:, None] + self.pattern_slopes @ basis)
         variability = shrunk(scores, (by_both.T * self.weights) @ by_both) / visible_share(independent / len(members))
         return (axes * np.maximum(scales, 0.0)) @ axes.T, variability
 
@@ -236,9 +241,19 @@ def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Eq
             own, other = (used[:, k] @ to_source[:3, :3].T for k in (point_to_plane.OWN, point_to_plane.OTHER))
             derivatives = [sign * np.hstack([np.cross(arms, normals), normals]) for normals in (own, other)]
             residuals, weights = used[:, point_to_plane.RESIDUAL], used[:, point_to_plane.WEIGHT]
-            parts[kind].append((arms, *derivatives, residuals, weights, *focal))
+            pattern = directed.pattern if kind == 0 else FixedPattern()
+            slopes, curvatures = pattern.derivatives(used, directed.image.frame.camera)
+            slopes, levers = slopes @ to_source[:3, :3].T, _levers(arms) @ to_source[:3, :3]
+            by_pattern = sign * np.hstack([np.cross(arms, slopes), slopes])
+            bent = np.einsum("nik,nkl,njl->ij", levers, curvatures, levers, optimize=True)[None]
+            parts[kind].append((arms, *derivatives, residuals, weights, *focal, by_pattern, bent))
     surface, colours = (Equations(*(np.concatenate(columns) for columns in zip(*part, strict=True))) for part in parts)
     return surface, colours
+
+
+def _levers(arms: Array) -> Array:
+    """Return by how much each of six motions moves points (n, 6, 3), given their positions (n, 3) about the centre."""
+    return np.concatenate([se3.hat(arms), np.broadcast_to(np.eye(3), (len(arms), 3, 3))], axis=1)
 
 
 def following(carried: Array, positions: Array) -> Array:
