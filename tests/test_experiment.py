@@ -57,6 +57,25 @@ def test_pairs_frames_at_an_offset_of_the_sequence(pairing: Pairing, pairs: list
     assert list(pairing.pairs((1, 3, 7))) == pairs
 
 
+@dataclass(frozen=True)
+class ContradictedWithin(AbstractRegistrar):
+    """Knows the truth where any motion is possible; within limits, the images contradict its answer."""
+
+    def register(
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+    ) -> Posterior:
+        wide = np.isfinite(density.log_density(se3.exp(np.array([[3.0, 0.0, 0.0, 0.0, 0.0, 0.0]])))).all()
+        found = Oracle(off_rad=0.0 if wide else 0.6).register(source, target, density, rng=rng)
+        return found if wide else replace(found, contradicted=True)
+
+
+@pytest.mark.parametrize(("assumed", "error_deg"), [(True, 0.0), (False, 34.4)])
+def test_limits_that_are_assumed_are_left_as_a_registration_leaves_them(*, assumed: bool, error_deg: float) -> None:
+    prior, methods = GeneralPrior(limits_assumed=assumed), {"method": ContradictedWithin()}
+    trials = experiment(methods=methods, prior=prior).trials(Recording())
+    assert [trial.rotation_error_deg for trial in trials] == pytest.approx([error_deg] * 5, abs=2.0)
+
+
 def test_pairs_of_the_dragon_protocol_are_thirty_a_step() -> None:
     pairs = list(Pairing(offsets=(1, 2, 3, 4), both_ways=True, closed=True).pairs(range(15)))
     assert len(set(pairs)) == 4 * 30

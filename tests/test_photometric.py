@@ -188,10 +188,10 @@ def test_equations_of_features_are_those_of_planes_with_their_gradient(printed):
     np.testing.assert_allclose(matrices_of[0, 1], want[1], rtol=0.02, atol=0.02 * abs(want[1]).max())
 
 
-def registered(views: Views, *, colour: bool) -> Posterior:
+def registered(views: Views, *, colour: bool, seed: int = 0) -> Posterior:
     registrar = VisibilityRegistrar(VisibilityLikelihood(colour=colour))
     density = TablePrior().between(*views)
-    return registrar.register(*views, density, rng=np.random.default_rng(0))
+    return registrar.register(*views, density, rng=np.random.default_rng(seed))
 
 
 def rotation_error_deg(posterior: Posterior, truth: Array) -> float:
@@ -206,6 +206,11 @@ def test_a_label_tells_the_spin_that_depth_leaves_open(printed):
     sigma_deg = np.rad2deg(np.sqrt(np.trace(both.pose.covariance[:3, :3])))
     assert sigma_deg < 5.0
     assert rotation_error_deg(both, truth) < 3.0 * sigma_deg
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_peak_that_a_label_makes_on_the_ridge_of_a_spin_is_drawn(printed, seed):
+    assert registered(printed[0], colour=True, seed=seed).usable
 
 
 def test_what_stays_in_its_place_is_found_though_centroids_err(printed):

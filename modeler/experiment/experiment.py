@@ -11,7 +11,7 @@ import numpy as np
 
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.experiment.trials import Trial
-from modeler.pipeline import prepare, register
+from modeler.pipeline import anywhere, prepare, register
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import (
@@ -190,7 +190,7 @@ class Experiment:
     def _registered(
         self, method: AbstractRegistrar, source: RayImage, target: RayImage, trusted: Sequence[Edge]
     ) -> Posterior | str:
-        """Return a method's answer, or why the prior has none to begin with.
+        """Return a method's answer, as `modeler register` gives it, or why the prior has none to begin with.
 
         Args:
             method: what registers them.
@@ -198,12 +198,15 @@ class Experiment:
             target: the view that it is registered to.
             trusted: the answers before that the method stands by, for a prior that learns.
         """
+
+        def attempt(prior: AbstractPrior) -> Posterior:
+            return register(method, source, target, prior.between(source, target), seed=self.seed)
+
         try:
             prior = self.prior.learned(Solution(), trusted) if self.learn else self.prior
-            density = prior.between(source, target)
+            return anywhere(attempt(prior), prior, attempt)
         except InputError as error:
             return str(error)
-        return register(method, source, target, density, seed=self.seed)
 
 
 def _blank(sequence: str, method: str, pair: Pair, truth: Array | None) -> Trial:

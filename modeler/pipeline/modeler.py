@@ -116,11 +116,8 @@ class Modeler:
         Raises:
             InputError: where the views lack what the prior needs.
         """
-        found = self._register(self.registrar, source, target, self.prior if prior is None else prior)
-        unlimited = self.prior.unlimited() if prior is None and not found.convincing else None
-        return (
-            found if unlimited is None else anywhere(found, self._register(self.registrar, source, target, unlimited))
-        )
+        attempt = partial(self._register, self.registrar, source, target)
+        return attempt(prior) if prior is not None else anywhere(attempt(self.prior), self.prior, attempt)
 
     def suggest(
         self, known: Step, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None

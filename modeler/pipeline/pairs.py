@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter
 from modeler.types import (
     AbstractPoseDensity,
+    AbstractPrior,
     AbstractRegistrar,
     Frame,
     Outcome,
@@ -77,14 +79,19 @@ def register(
     return registrar.register(source, target, density, rng=rng)
 
 
-def anywhere(within: Posterior, unlimited: Posterior) -> Posterior:
-    """Return which registration counts where nothing within assumed limits convinces, with the time of both.
+def anywhere(within: Posterior, prior: AbstractPrior, attempt: Callable[[AbstractPrior], Posterior]) -> Posterior:
+    """Return a registration, or that of any motion where it does not convince and limits of its prior were assumed.
 
     Of several places, none within the usual limits, none is known to be right.
 
     Args:
-        within: the registration in the limits, not convincing.
-        unlimited: that without limits.
+        within: the registration with the prior.
+        prior: what is known of the motion.
+        attempt: registers the same pair with another prior.
     """
-    found = unlimited if unlimited.outcome is Outcome.CONVERGED else within
-    return replace(found, seconds=within.seconds + unlimited.seconds)
+    unlimited = None if within.convincing else prior.unlimited()
+    if unlimited is None:
+        return within
+    other = attempt(unlimited)
+    found = other if other.outcome is Outcome.CONVERGED else within
+    return replace(found, seconds=within.seconds + other.seconds)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import final
 
 import numpy as np
@@ -193,9 +193,8 @@ class Tracker:
             seconds = odometry.seconds + wider.seconds
             known = prior.between(view, self.state.views[odometry.target])
             odometry = replace(preferred(odometry, wider, known), seconds=seconds)
-        unlimited = prior.unlimited()
-        if unlimited is not None and not odometry.convincing and not again:
-            odometry = anywhere(odometry, self._pair(view, odometry.target, unlimited))
+        if not again:
+            odometry = anywhere(odometry, prior, partial(self._pair, view, odometry.target))
         posteriors = (odometry,)
         while not again and not self._placed(posteriors):
             target = self.closer.relocalisation_target(posteriors, self.state.map_view)
