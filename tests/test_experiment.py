@@ -64,7 +64,8 @@ class ContradictedWithin(AbstractRegistrar):
     def register(
         self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
-        wide = np.isfinite(density.log_density(se3.exp(np.array([[3.0, 0.0, 0.0, 0.0, 0.0, 0.0]])))).all()
+        turned = se3.moved(np.eye(4)[None], np.array([[3.0, 0.0, 0.0, 0.0, 0.0, 0.0]]), source.centroid_m)
+        wide = np.isfinite(density.log_density(turned)).all()
         found = Oracle(off_rad=0.0 if wide else 0.6).register(source, target, density, rng=rng)
         return found if wide else replace(found, contradicted=True)
 
