@@ -29,6 +29,7 @@ from modeler.types import (
     Camera,
     Edge,
     Frame,
+    HandPoses,
     Outcome,
     Plane,
     PoseGaussian,
@@ -157,7 +158,7 @@ def turntable(camera: Array, **given: object) -> TurntablePrior:
 
 def held(camera: Array) -> HeldPrior:
     """A hand."""
-    return HeldPrior(*hand(camera))
+    return HeldPrior(HandPoses(*hand(camera)))
 
 
 def poke(camera: Array) -> PokePrior:

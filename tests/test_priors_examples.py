@@ -41,7 +41,7 @@ from modeler.priors.common_axis import common_axis
 from modeler.priors.mixtures import Alternatives, DefensiveMixture
 from modeler.priors.poke import pushed
 from modeler.priors.turntable import AxisTurn, angles_and_axes
-from modeler.types import AbstractPoseDensity, Array, Edge, InputError, Mode, Plane, RayImage, SharedAxis
+from modeler.types import AbstractPoseDensity, Array, Edge, HandPoses, InputError, Mode, Plane, RayImage, SharedAxis
 
 HERE = np.eye(4)
 SOURCE, TARGET = views(HERE)
@@ -304,7 +304,8 @@ def test_the_object_goes_with_the_hand(rng: np.random.Generator) -> None:
 def test_a_hand_that_takes_the_object_anew_tells_nothing_of_its_motion(steps: float, grasp_changed: float) -> None:
     """What the hand does between its grasps must not matter: the density there is that of the prior without a hand."""
     times_s, poses = hand(HERE)
-    anew = HeldPrior(times_s, np.concatenate([poses[:3], poses[3:] @ se3.exp(np.array([3.0, 0, 0, 0, 0, 0.1]))]))
+    regrasped = np.concatenate([poses[:3], poses[3:] @ se3.exp(np.array([3.0, 0, 0, 0, 0, 0.1]))])
+    anew = HeldPrior(HandPoses(times_s, regrasped))
     density = anew.relaxed(steps).between(SOURCE, TARGET)
     without = GeneralPrior().relaxed(steps).between(SOURCE, TARGET)
     pose = truth(HERE)[None]
@@ -340,7 +341,7 @@ def test_a_hand_that_turned_far_leaves_room_for_what_is_seen(steps: int) -> None
     """What is seen lies before the middle of the object, so that a true motion parts the centroids of two views."""
     upright = np.array([0.0, 1.0, 0.0])
     poses = np.array([turned(k * STEP, upright) for k in range(6)])
-    prior = HeldPrior(0.5 * np.arange(6.0), poses, newest=9)
+    prior = HeldPrior(HandPoses(0.5 * np.arange(6.0), poses), newest=9)
     source, target = (seen_before(k) for k in (steps, 0))
     true = poses[0] @ se3.inverse(poses[steps])
     apart_m = np.linalg.norm(se3.transform(true, source.centroid_m[None])[0] - target.centroid_m)
@@ -362,7 +363,7 @@ def test_a_hand_whose_prior_grows_leaves_more_room() -> None:
 
 def test_a_missing_pose_is_interpolated_and_less_sure() -> None:
     times_s, poses = hand(HERE)
-    sparse = HeldPrior(np.delete(times_s, 2), np.delete(poses, 2, axis=0))
+    sparse = HeldPrior(HandPoses(np.delete(times_s, 2), np.delete(poses, 2, axis=0)))
     whole, gappy = as_held(held(HERE)), as_held(sparse)
     pose = truth(HERE)[None]
     assert whole.log_density(pose) > gappy.log_density(pose)  # at its middle a wider bump is lower
@@ -374,7 +375,7 @@ def test_a_missing_pose_is_interpolated_and_less_sure() -> None:
 @pytest.mark.parametrize(("kept", "says"), [([0, 4], "2 s apart"), ([0, 1], "0 to 0.5 s"), ([3, 4], "1.5 to 2 s")])
 def test_a_pose_that_is_too_far_away_is_refused(kept: list[int], says: str) -> None:
     times_s, poses = hand(HERE)
-    prior = HeldPrior(times_s[kept], poses[kept], name="run/robot.txt")
+    prior = HeldPrior(HandPoses(times_s[kept], poses[kept], name="run/robot.txt"))
     with pytest.raises(InputError, match=rf"^run/robot\.txt: has no pose for frame [23] at .*{says}"):
         prior.between(SOURCE, TARGET)
 

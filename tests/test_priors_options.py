@@ -155,12 +155,12 @@ def test_a_robots_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "robot.txt"
     path.write_text("# time tx ty tz qx qy qz qw\n0 1 2 3 0 0 0 1\n0.5 1 2 4 0 0 1 0\n")
     sequence = Telling({"kind": "held"}, path)
-    found = chosen_prior(PriorOptions(held_sigma_deg=2.0), sequence)
+    found = chosen_prior(PriorOptions(held_sigma_deg=2.0, max_gap_s=0.7), sequence)
     assert isinstance(found, HeldPrior)
-    assert (found.held_sigma_deg, found.name) == (2.0, str(path))
-    np.testing.assert_array_equal(found.times_s, [0.0, 0.5])
+    assert (found.held_sigma_deg, found.hand.max_gap_s, found.hand.name) == (2.0, 0.7, str(path))
+    np.testing.assert_array_equal(found.hand.times_s, [0.0, 0.5])
     np.testing.assert_allclose(
-        found.camera_from_hand[1], [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 4], [0, 0, 0, 1]], atol=1e-12
+        found.hand.camera_from_hand[1], [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 4], [0, 0, 0, 1]], atol=1e-12
     )
 
 

@@ -21,6 +21,7 @@ from modeler.types import (
     Edge,
     Failed,
     Frame,
+    HandPoses,
     LowOverlap,
     Mode,
     Outcome,
@@ -199,7 +200,7 @@ def test_one_new_grasp_contradicts_no_hand_and_one_at_every_step_does(changes: i
         grasp = grasp @ anew if 0 < index <= changes else grasp
         hands.append(turned(angle_deg) @ grasp)
     distances = prior_distances(
-        [joined(k, k - 1, poses) for k in range(1, 13)], views, HeldPrior(np.arange(13.0), np.stack(hands))
+        [joined(k, k - 1, poses) for k in range(1, 13)], views, HeldPrior(HandPoses(np.arange(13.0), np.stack(hands)))
     )
     against, figure = contradiction(distances), prior_figure(distances)
     assert against is not None

@@ -9,7 +9,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from typing import Any, Literal
 
 from modeler import registration
@@ -329,8 +329,10 @@ def _held(given: dict[str, Any], sequence: AbstractSequence | None) -> HeldPrior
             f"{sequence.name}: has no robot.txt for --prior held; write lines `time tx ty tz qx qy qz qw` of "
             "camera_from_hand there, or use another prior"
         )
-    poses = hand_poses(sequence.robot_path)
-    return HeldPrior(poses.times_s, poses.camera_from_hand, name=poses.name, **given)
+    hand = hand_poses(sequence.robot_path)
+    max_gap_s = given.get("max_gap_s", hand.max_gap_s)
+    others = {name: value for name, value in given.items() if name != "max_gap_s"}
+    return HeldPrior(replace(hand, max_gap_s=max_gap_s), **others)
 
 
 def _poke(given: dict[str, Any], sequence: AbstractSequence | None) -> PokePrior:

@@ -11,7 +11,7 @@ from modeler import se3
 from modeler.priors.checks import ParameterError, check_parameters
 from modeler.priors.general import GeneralPrior, reach_deg, relaxed_limits, turned_offset_m
 from modeler.priors.mixtures import Alternatives, KernelMixture, defensive_mixture
-from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, Frame, HandPoses, RayImage, Solution
+from modeler.types import AbstractPoseDensity, AbstractPrior, Edge, HandPoses, RayImage, Solution
 
 _STEP_DEG = 25.0  # step to which `max_offset_m` refers
 _REGRASPED_SHARE = 0.5  # of the samples: either may be true, and the search must look at both
@@ -28,16 +28,12 @@ class HeldPrior(AbstractPrior):
     the images decide which of the two it was.
     """
 
-    times_s: Array = field(compare=False, repr=False)
-    """(n,) times of the hand's poses, increasing, on the clock of the frames."""
-    camera_from_hand: Array = field(compare=False, repr=False)
-    """(n, 4, 4) poses of the hand in camera coordinates."""
+    hand: HandPoses
+    """Where the hand was."""
     held_sigma_deg: float = 3.0
     """Standard deviation of slip and calibration error in the rotation of one motion, about each axis."""
     held_sigma_m: float = 0.008
     """Standard deviation of slip and calibration error in the shift of one motion, along each axis, at the hand."""
-    max_gap_s: float = 1.0
-    """Poses farther apart in time than this are not interpolated."""
     regrasp_probability: float = 0.02
     """Probability that the hand takes the object anew from one frame to the next."""
     regrasped: AbstractPrior = field(default_factory=lambda: GeneralPrior(limits_assumed=True))
@@ -47,14 +43,13 @@ class HeldPrior(AbstractPrior):
     max_offset_m: float = 0.04
     """Largest distance between the centroids where the hand is only a proposal (returns to earlier views); it
     grows with turns beyond 30 degrees."""
-    name: str = "the hand's trajectory"
-    """Source of the poses, for messages."""
     newest: int | None = None
     """The last frame of a running sequence: motions to it are evidence; None: no sequence, all motions are."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
         check_parameters(self)
+        check_parameters(self.hand)
         if self.regrasp_probability >= 1.0:
             raise ParameterError("regrasp_probability", self.regrasp_probability, "a probability below 1")
 
@@ -64,8 +59,8 @@ class HeldPrior(AbstractPrior):
         Raises:
             InputError: where the hand's pose at one of the views is unknown.
         """
-        hand_at_source, error_at_source = self._hand(source.frame)
-        hand_at_target, error_at_target = self._hand(target.frame)
+        hand_at_source, error_at_source = self.hand.at(source.frame)
+        hand_at_target, error_at_target = self.hand.at(target.frame)
         motion = hand_at_target @ se3.inverse(hand_at_source)
         sigma_rad, sigma_m = np.sqrt(
             np.array([np.radians(self.held_sigma_deg), self.held_sigma_m]) ** 2
@@ -99,11 +94,3 @@ class HeldPrior(AbstractPrior):
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> HeldPrior:
         """Return the prior with the number of the last frame."""
         return replace(self, newest=max(solution.trajectory, default=None))
-
-    def _hand(self, frame: Frame) -> tuple[Array, Array]:
-        """Return the hand's pose (4, 4) at a frame, and its standard deviation (2,) from interpolation: rad, m.
-
-        Raises:
-            InputError: where there are no poses near enough in time.
-        """
-        return HandPoses(self.times_s, self.camera_from_hand, self.max_gap_s, self.name).at(frame)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,9 +17,9 @@ _SAME_TIME_S = 1e-3  # poses and frames at most so far apart count as simultaneo
 class HandPoses:
     """The poses of a hand by time, interpolated in between."""
 
-    times_s: Array
+    times_s: Array = field(repr=False)
     """(n,) increasing, on the clock of the frames."""
-    camera_from_hand: Array
+    camera_from_hand: Array = field(repr=False)
     """(n, 4, 4) poses of the hand in camera coordinates."""
     max_gap_s: float = 1.0
     """Poses farther apart in time than this are not interpolated."""

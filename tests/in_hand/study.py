@@ -149,10 +149,10 @@ def outcome(shape: str, holder: Holder, told: Told = "masks") -> Outcome:
     if holder != "person":
         times_s = np.array([recorded.frame(index).time_s for index in recorded.indices])
         regrasped = REGRASPED if holder == "robot" else ROBOT_FRAMES
-        poses = hand_poses(recorded, regrasped)
-        modeler = replace(modeler, prior=HeldPrior(times_s, poses))
+        poses = HandPoses(times_s, hand_poses(recorded, regrasped))
+        modeler = replace(modeler, prior=HeldPrior(poses))
         if told == "shape":
-            given = HandMarkedSequence(recorded, hand_shape(recorded), HandPoses(times_s, poses))
+            given = HandMarkedSequence(recorded, hand_shape(recorded), poses)
     hidden = _hidden(recorded)
     began = time.perf_counter()
     last, records = None, {}
