@@ -20,6 +20,7 @@ from PIL import Image
 from modeler import se3
 from modeler.experiment import Pairing, Trial, evaluate, sparse_view, summaries
 from modeler.experiment.experiment import viewed
+from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.types import (
@@ -75,6 +76,26 @@ def test_limits_that_are_assumed_are_left_as_a_registration_leaves_them(*, assum
     prior, methods = GeneralPrior(limits_assumed=assumed), {"method": ContradictedWithin()}
     trials = experiment(methods=methods, prior=prior).trials(Recording())
     assert [trial.rotation_error_deg for trial in trials] == pytest.approx([error_deg] * 5, abs=2.0)
+
+
+@pytest.mark.parametrize("assumed", [True, False])
+@pytest.mark.parametrize("method", [Oracle(), ContradictedWithin()])
+def test_a_trial_is_what_register_gives_of_the_pair(method: AbstractRegistrar, assumed: bool) -> None:
+    prior, recording, sensor = GeneralPrior(limits_assumed=assumed), Recording(), Sensor(0.002, 0.001)
+    single = Modeler(prior=prior, registrar=method, sensor=sensor, seed=3)
+    scene = single.segmenter.scene([recording.frame(index) for index in recording.indices])
+    for found in experiment(methods={"one": method}, prior=prior, seed=3).trials(recording):
+        views = [single.prepare(recording.frame(index), scene).view for index in (found.source, found.target)]
+        assert views[0] is not None
+        assert views[1] is not None
+        posterior = single.register(views[0], views[1])
+        assert (found.outcome, found.usable, found.seconds) == (
+            posterior.outcome.label,
+            posterior.usable,
+            posterior.seconds,
+        )
+        np.testing.assert_array_equal(found.target_from_source, posterior.pose.mean.ravel())
+        assert found.seconds == (0.5 if assumed and isinstance(method, ContradictedWithin) else 0.25)
 
 
 def test_pairs_of_the_dragon_protocol_are_thirty_a_step() -> None:

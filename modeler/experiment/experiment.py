@@ -15,6 +15,7 @@ from modeler.pipeline import anywhere, prepare, register
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, telling
 from modeler.types import (
+    AbstractPoseDensity,
     AbstractPrior,
     AbstractRegistrar,
     Array,
@@ -190,23 +191,27 @@ class Experiment:
     def _registered(
         self, method: AbstractRegistrar, source: RayImage, target: RayImage, trusted: Sequence[Edge]
     ) -> Posterior | str:
-        """Return a method's answer, as `modeler register` gives it, or why the prior has none to begin with.
+        """Return a method's answer, as `Modeler.register` gives it, or why the prior has none to begin with.
 
         Args:
             method: what registers them.
             source: a view.
             target: the view that it is registered to.
             trusted: the answers before that the method stands by, for a prior that learns.
+
+        Raises:
+            InputError: where the views lack what the method needs.
         """
-
-        def attempt(prior: AbstractPrior) -> Posterior:
-            return register(method, source, target, prior.between(source, target), seed=self.seed)
-
         try:
             prior = self.prior.learned(Solution(), trusted) if self.learn else self.prior
-            return anywhere(attempt(prior), prior, attempt)
+            density = prior.between(source, target)
         except InputError as error:
             return str(error)
+
+        def attempt(known: AbstractPoseDensity) -> Posterior:
+            return register(method, source, target, known, seed=self.seed)
+
+        return anywhere(attempt(density), prior, lambda unlimited: attempt(unlimited.between(source, target)))
 
 
 def _blank(sequence: str, method: str, pair: Pair, truth: Array | None) -> Trial:
