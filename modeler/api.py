@@ -67,7 +67,7 @@ def register(
         target_depth_m: (h, w), of the same camera.
         intrinsics: a `Camera`, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix.
         prior: what is known of the motion; None: rotations up to 50° and shifts of up to 4 cm, as `GeneralPrior`,
-            and any motion where none of these matches.
+            and any motion where none of these matches or the images contradict the one that does.
         masks: (h, w) of source and target, true on the object; None: the object is segmented.
         colours: (h, w, 3) 8-bit RGB of source and target, aligned to depth; None: only depth is compared.
         sensor: noise of the camera; None: the first Kinect's.
