@@ -45,3 +45,16 @@ def behind(use: Callable[[T], None]) -> Iterator[Callable[[T], None]]:
 
         yield put
         used.result()
+
+
+@contextmanager
+def ahead(make: Callable[[S], T]) -> Iterator[Callable[[S], Callable[[], T]]]:
+    """Begin to make things in a thread of its own, in the order in which they are begun, and ask for each later.
+
+    Where there is one thread only, each is made when it is asked for.
+    """
+    if not several():
+        yield lambda item: lambda: make(item)
+        return
+    with ThreadPoolExecutor(1, thread_name_prefix="ahead") as thread:
+        yield lambda item: thread.submit(make, item).result

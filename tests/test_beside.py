@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from modeler.beside import behind, both
+from modeler.beside import ahead, behind, both
 
 
 @pytest.fixture(params=[1, 2])
@@ -45,3 +45,20 @@ def test_what_fails_behind_is_raised_at_the_end_at_the_latest() -> None:
 
     with pytest.raises(OSError, match="1 cannot"), behind(use) as put:
         put(1)
+
+
+def test_what_is_made_ahead_is_made_in_order_and_fails_where_it_is_asked_for(threads: int) -> None:
+    made = list[int]()
+
+    def make(item: int) -> float:
+        made.append(item)
+        return 1.0 / item
+
+    with ahead(make) as making:
+        waiting = [making(item) for item in (2, 0, 4)]
+        assert threads > 1 or made == []
+        assert waiting[0]() == 0.5
+        with pytest.raises(ZeroDivisionError):
+            waiting[1]()
+        assert waiting[2]() == 0.25
+    assert made == [2, 0, 4]

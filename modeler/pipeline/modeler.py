@@ -6,10 +6,11 @@ from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import final
+from typing import TypeVar, final
 
 import numpy as np
 
+from modeler.beside import ahead
 from modeler.closure import Closer
 from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances, widened
 from modeler.graph import CommonAxis, MovingGraph, located, shared_noise
@@ -43,6 +44,8 @@ from modeler.types import (
 
 _FOCAL_REACH = 5.0  # prior standard deviations: nominal focal lengths of captures were off by up to 4.5
 _LEAST_SEGMENT = 3  # frames that fit each other: two may do so by chance
+
+T = TypeVar("T")
 
 
 @final
@@ -185,10 +188,11 @@ class Run:
         Raises:
             InputError: where two frames have the same number.
         """
-        for frame, last in _with_last(frames):
-            prepared = self.modeler.prepare(frame, self.scene)
-            self.state = self.state.read(prepared)
-            yield from self._place(prepared, self.state.latest, last=last)
+        with ahead(partial(self.modeler.prepare, scene=self.scene)) as preparing:
+            for prepared, last in _with_last(map(preparing, frames)):  # the next one, while this one is registered
+                found = prepared()
+                self.state = self.state.read(found)
+                yield from self._place(found, self.state.latest, last=last)
 
     def revisit(self) -> Iterator[Step | Searching]:
         """Register lost frames again, newest first, with the views that followed them; yield steps of those placed."""
@@ -375,14 +379,14 @@ class Run:
         )
 
 
-def _with_last(frames: Iterable[Frame]) -> Iterator[tuple[Frame, bool]]:
-    """Yield frames with whether they are the last, by reading one ahead."""
-    ahead = iter(frames)
-    for frame in ahead:
-        for following in ahead:
-            yield frame, False
-            frame = following
-        yield frame, True
+def _with_last(items: Iterable[T]) -> Iterator[tuple[T, bool]]:
+    """Yield items with whether they are the last, by taking one ahead."""
+    remaining = iter(items)
+    for item in remaining:
+        for following in remaining:
+            yield item, False
+            item = following
+        yield item, True
 
 
 def _left_out(prepared: Prepared, edges: Sequence[Edge], *, first: bool) -> Reason | None:
