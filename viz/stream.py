@@ -135,6 +135,17 @@ def graph_due(step: Step) -> bool:
     return step.last or count % max(1, count // _GRAPH_DRAWN) == 0
 
 
+def load() -> None:
+    """Import what streams need, which takes half a second, ahead of `open_stream`.
+
+    Raises:
+        OSError: where memory does not suffice.
+    """
+    if "rerun" not in sys.modules:
+        check_room(_ROOM)
+    from viz import blueprint, drawings, images, readings  # noqa: F401  # pyright: ignore[reportUnusedImport]
+
+
 def open_stream(
     name: str,
     *,
@@ -162,8 +173,7 @@ def open_stream(
         InputError: where `save` cannot be written, or `connect` is not an address.
         OSError: where memory does not suffice.
     """
-    if "rerun" not in sys.modules:
-        check_room(_ROOM)
+    load()
     import rerun as rr
 
     from viz import drawings, images, readings

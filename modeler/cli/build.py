@@ -7,6 +7,7 @@ import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -70,12 +71,13 @@ class Build:
         Raises:
             InputError: where the input or the folder cannot be used.
         """
+        from modeler.beside import both
         from modeler.cli import compose
         from modeler.cli.advice import comes_back
         from modeler.cli.inputs import estimated_camera
         from modeler.cli.outputs import check_run_folder
         from modeler.export import Remembered, RunFolder, RunMeta, alone
-        from viz.stream import ends_whole
+        from viz.stream import ends_whole, load
 
         began_s = time.perf_counter()
         _check(self)
@@ -99,7 +101,7 @@ class Build:
             say("the run had come to its end; --overwrite makes it anew")
             return _summarise(RunFolder(self.out).report(), self, modeler.prior)
         compile_kernels()
-        scene = compose.scene(modeler, whole)
+        scene, _ = both(partial(compose.scene, modeler, whole), load)
         with alone(self.out):
             before = RunFolder(self.out).changed_versions(meta) if self.resume else ()
             folder = RunFolder.open(self.out, overwrite=self.overwrite, resume=self.resume)
