@@ -72,7 +72,9 @@ class FocalCalibrator:
         return located(told_at, rounds=_MAX_ROUNDS, enough=_CONVERGED, reach=self.reach)
 
     def _registered(self, edge: Edge, made: _Made, register: Register, prior: AbstractPrior) -> Factor | None:
-        """Return an edge as it is under another focal length; None where it cannot be registered.
+        """Return an edge as it is under another focal length; None where nothing says how that changes it.
+
+        Where it cannot be registered again, as steps at the limit of what is found, it is as its derivative foretells.
 
         Args:
             edge: of the run, whose solution proposes where to search: the focal length changes it by a few degrees.
@@ -83,7 +85,8 @@ class FocalCalibrator:
         proposal = PredictedProposal(prior, collapse_modes(edge.posterior))
         posterior = register(made.view(edge.source), made.view(edge.target), proposal)
         if not posterior.usable:
-            return None
+            foretold = collapse_modes(edge.posterior.under(made.centre))
+            return Factor(edge, foretold) if foretold.by_focal.any() else None
         pose = collapse_modes(posterior)
         # Over a wide stretch: the derivatives that registrations state are noisier, which makes steps too small.
         ends = [register(made.view(edge.source, s), made.view(edge.target, s), proposal) for s in (-_NODE, _NODE)]

@@ -68,7 +68,7 @@ def test_a_posterior_states_how_its_mean_follows_the_focal_length() -> None:
     stated = np.mean([registered(0.0, seed).by_focal for seed in range(2)], axis=0)
     about_centre = se3.adjoint(se3.translation(-centre_m)) @ stated
     assert np.linalg.norm(wanted[3:]) > 0.05
-    np.testing.assert_allclose(about_centre[3:], wanted[3:], atol=0.01)
+    np.testing.assert_allclose(about_centre[3:], wanted[3:], atol=0.02)  # at 2 %: a standard deviation
     np.testing.assert_allclose(about_centre[:3], wanted[:3], atol=0.3)
 
 

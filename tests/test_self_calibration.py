@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import tabletop
 
+from modeler import se3
 from modeler.cli import main
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.self_calibration import FocalCalibrator
-from modeler.types import Edge, FocalLength, RayImage, Stated
+from modeler.types import AbstractPrior, Edge, FocalLength, Outcome, Posterior, RayImage, Stated
 from sequences import FocalFactor, RefocusedSequence, bundled, open_sequence, read_focal_factor
 
 STEPS = 12
@@ -62,6 +63,27 @@ def test_limits_on_one_step_do_not_cut_off_what_a_run_found_beyond_them() -> Non
     found = FocalCalibrator().estimate(views, edges, SENSOR, MODELER.register, GeneralPrior(max_rotation_deg=25.0))
     assert (found.told_by, found.loops) == ("loop", 1)
     assert abs(found.factor - 1.0) < 0.01
+
+
+def test_a_step_that_cannot_be_registered_again_stays_part_of_its_loop() -> None:
+    views, edges = seen(1.06)
+
+    def refusing(source: RayImage, target: RayImage, prior: AbstractPrior | None = None) -> Posterior:
+        posterior = MODELER.register(source, target, prior)
+        return replace(posterior, outcome=Outcome.NO_OVERLAP) if source.index == 4 else posterior
+
+    found = FocalCalibrator().estimate(views, edges, SENSOR, refusing, MODELER.prior)
+    assert found.told_by == "loop"
+    assert abs(1.06 * found.factor - 1.0) < 0.01
+
+
+def test_what_surface_does_not_determine_is_not_foretold_to_move_far() -> None:
+    """Of steps of a box of which two faces are seen: where it slides along them, the images hold its silhouette."""
+    views, edges = seen(0.93)
+    for edge in edges:
+        pose, from_centre = edge.posterior.pose, se3.translation(views[edge.source].centroid_m)
+        about_centre = se3.adjoint(se3.inverse(from_centre)) @ pose.by_focal
+        assert np.linalg.norm(about_centre[3:]) < 0.15  # m by unit: the box is 0.2 m long, and moves by 0.03 to 0.04
 
 
 def test_an_open_chain_tells_nothing() -> None:

@@ -100,8 +100,11 @@ class Refiner:
         positive = np.diag(np.maximum(scales, 0.0))
         information = positive @ np.linalg.solve(axes.T @ variability @ axes, positive)
         information = np.asarray(0.5 * (information + information.T), dtype=np.float64)
-        # In the basis the samples have unit covariance: they hold where the surface determines nothing.
-        by_focal = spread @ np.linalg.solve(np.eye(6) + (axes @ positive @ axes.T), pulled)
+        # Where the surface determines nothing, its solution follows noise of normals divided by nothing, and does not
+        # count: samples, too, follow as far as it determines them, I (1 + I)⁻¹, and what refines them by the rest.
+        followed = axes.T @ pulled / (1.0 + np.maximum(scales, 0.0))
+        kept = np.linalg.inv(np.eye(6) + information)
+        by_focal = spread @ axes @ (followed - kept @ kept @ followed)
         return spread @ axes, information, np.asarray(by_focal, dtype=np.float64)
 
 
