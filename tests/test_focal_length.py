@@ -14,7 +14,7 @@ from modeler import se3
 from modeler.closure.map_view import composed
 from modeler.evaluation import nees, rotation_error_deg, true_motion
 from modeler.fusion import widened
-from modeler.graph import MovingGraph, PoseGraph, solve
+from modeler.graph import MovingGraph, PoseGraph, located, solve
 from modeler.graph.focal import TURNS
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
@@ -108,6 +108,20 @@ def test_a_loop_tells_the_focal_length_and_the_poses_under_it(rng: np.random.Gen
     assert found.sigmas_after < 0.05 < found.sigmas_before
     for frame, pose in moving.at(0.03).poses.items():
         np.testing.assert_allclose(pose, se3.inverse(truth[0]) @ truth[frame], atol=1e-6)
+
+
+@pytest.mark.parametrize(("sigma", "believed"), [(0.004, True), (0.019, False)])
+def test_a_mean_far_from_the_prior_is_believed_only_where_loops_tell_it(sigma: float, believed: bool) -> None:
+    """Rounds of registration that each move it on, as a wrong edge makes them."""
+
+    def told_at(log_factor: float) -> FocalLength:
+        step = 0.07 if log_factor == 0.0 else 0.02
+        return FocalLength(step, sigma, prior_sigma=0.02, loops=1, sigmas_before=3.0, sigmas_after=2.0, by_focal={})
+
+    found = located(told_at, rounds=3, enough=1.0, reach=0.1)
+    assert (found.log_factor > 0.08, found.told_by) == ((True, "loop") if believed else (False, "prior"))
+    if not believed:
+        assert (found.log_factor, found.sigma) == (0.0, 0.02)
 
 
 def test_an_open_chain_tells_nothing_and_is_as_uncertain_as_the_focal_length(rng: np.random.Generator) -> None:

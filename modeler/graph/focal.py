@@ -23,7 +23,7 @@ TURNS = 0.004
 
 _STEP = 0.005  # for derivatives, at most, and a quarter of the prior's: some standard deviations that loops leave
 _ROUNDS = 4  # of Newton's method
-_REACH = 3.0  # prior standard deviations within which loops are asked
+_REACH = 3.0  # prior standard deviations within which loops are asked, and means are believed that loops hardly tell
 _GRID = 0.02  # of the logarithm at most, between the values that Newton's method starts from
 _SLOPES = 0.3  # relative error of an estimate: noise of the derivatives makes it too small, by 29 % on the bundled box
 
@@ -143,4 +143,7 @@ def located(told_at: Callable[[float], FocalLength], *, rounds: int, enough: flo
         if abs(centre - before) <= enough * told.sigma or number == rounds - 1:
             break
         told = told_at(centre)
+    if told.told_by == "prior" and abs(centre) > _REACH * np.sqrt(told.prior_sigma**2 - told.sigma**2):
+        # Further from the prior's mean than evidence that weak can lead: the rounds differ, since an edge is wrong.
+        centre, told = 0.0, replace(told, sigma=told.prior_sigma)
     return replace(told, log_factor=centre, sigmas_before=first.sigmas_before)
