@@ -9,6 +9,7 @@ import pytest
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg
+from modeler.kernels.mixture import separate_two
 from modeler.priors.general import GeneralDensity
 from modeler.registration.posterior import effective_samples, pareto_tail, weighted_gaussian
 from modeler.registration.visibility.sampling import (
@@ -209,3 +210,25 @@ def test_a_mixture_only_proposes(rng):
     density = mixture(rng)
     samples = density.sample(200, rng)
     np.testing.assert_array_equal(density.log_evidence(samples), density.known.log_density(samples))
+
+
+def test_a_narrow_peak_on_a_broad_ridge_is_separated_by_expectation_maximisation(rng: np.random.Generator) -> None:
+    count, peak = 2000, np.full(6, 0.4)
+    white = rng.normal(size=(count, 6))
+    white[: count // 4] = peak + 0.1 * white[: count // 4]
+    weights = rng.uniform(0.5, 1.5, count)
+    near = np.sum((white - peak) ** 2, axis=1) < 0.5
+    members = weights * np.stack([near, ~near])
+    assert separate_two(white, weights, members, 30, 0.05, 1e-4)
+    np.testing.assert_allclose(members.sum(axis=0), weights, rtol=1e-9)
+    narrow, rest = members
+    assert narrow.sum() / weights.sum() == pytest.approx(0.25, abs=0.02)
+    np.testing.assert_allclose(narrow @ white / narrow.sum(), peak, atol=0.02)
+    np.testing.assert_allclose(np.sqrt(narrow @ (white - peak) ** 2 / narrow.sum()), 0.1, rtol=0.1)
+    np.testing.assert_allclose(np.sqrt(rest @ white**2 / rest.sum()), 1.0, rtol=0.1)
+
+
+def test_a_gaussian_of_next_to_no_weight_is_not_determined(rng: np.random.Generator) -> None:
+    white, weights = rng.normal(size=(500, 6)), np.ones(500)
+    members = weights * np.stack([np.arange(500) < 3, np.arange(500) >= 3])
+    assert not separate_two(white, weights, members, 12, 0.05, 1e-4)

@@ -1,4 +1,4 @@
-"""Gaussians on SE(3): the density of their mixtures, and their distances."""
+"""Gaussians on SE(3): the density of their mixtures, their distances, and mixtures of two by EM."""
 
 import math
 
@@ -113,3 +113,62 @@ def mahalanobis_distances(means, roots, centre):
                 square += z[k] * z[k]
             result[i, j] = math.sqrt(square)
     return result
+
+
+@numba.njit(cache=True, error_model="numpy")
+def separate_two(white, weights, members, steps, least, floor):
+    """Divide weighted points between two Gaussians by expectation maximisation.
+
+    Args:
+        white: (n, 6) points.
+        weights: (n,).
+        members: (2, n) weight of each point in either Gaussian to start from; overwritten by the last.
+        steps: number of steps.
+        least: share of the weight below which a Gaussian is not determined.
+        floor: added to the variances.
+
+    Returns:
+        Whether both are determined.
+    """
+    count, total = len(weights), weights.sum()
+    likely, centred = np.empty((2, count)), np.empty((6, count))
+    for step in range(steps + 1):
+        for of in range(2):
+            share = members[of].sum()
+            if share < least * total:
+                return False
+            if step == steps:
+                continue
+            for u in range(6):
+                mean = 0.0
+                for j in range(count):
+                    mean += members[of, j] * white[j, u]
+                mean /= share
+                for j in range(count):
+                    centred[u, j] = white[j, u] - mean
+            root = np.zeros((6, 6))
+            for u in range(6):
+                for v in range(u + 1):
+                    moment = 0.0
+                    for j in range(count):
+                        moment += members[of, j] * centred[u, j] * centred[v, j]
+                    moment = moment / share + (floor if u == v else 0.0)
+                    for k in range(v):
+                        moment -= root[u, k] * root[v, k]
+                    root[u, v] = math.sqrt(moment) if u == v else moment / root[v, v]
+            top = math.log(share)
+            for u in range(6):
+                top -= math.log(root[u, u])
+            likely[of] = top
+            for u in range(6):
+                for k in range(u):
+                    for j in range(count):
+                        centred[u, j] -= root[u, k] * centred[k, j]
+                for j in range(count):
+                    centred[u, j] /= root[u, u]
+                    likely[of, j] -= 0.5 * centred[u, j] * centred[u, j]
+        if step < steps:
+            for j in range(count):
+                first = 1.0 / (1.0 + math.exp(likely[1, j] - likely[0, j]))
+                members[0, j], members[1, j] = weights[j] * first, weights[j] * (1.0 - first)
+    return True

@@ -20,7 +20,7 @@ from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.likelihood import DirectedLikelihood, MatchNoise, PairLikelihood
 from modeler.registration.visibility.photometric import unshifted
 from modeler.se3 import rows
-from modeler.types import Array
+from modeler.types import Array, Camera
 
 _MIN_LEVEL = 1e-4  # of the scatter, relative to its shape: residuals are no smaller than a hundredth of their stated sd
 
@@ -245,13 +245,28 @@ def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Eq
             derivatives = [sign * np.hstack([np.cross(arms, normals), normals]) for normals in (own, other)]
             residuals, weights = used[:, point_to_plane.RESIDUAL], used[:, point_to_plane.WEIGHT]
             pattern = directed.pattern if kind == 0 else FixedPattern()
-            slopes, curvatures = pattern.derivatives(used, directed.image.frame.camera)
-            slopes, levers = slopes @ to_source[:3, :3].T, _levers(arms) @ to_source[:3, :3]
-            by_pattern = sign * np.hstack([np.cross(arms, slopes), slopes])
-            bent = np.einsum("nik,nkl,njl->ij", levers, curvatures, levers, optimize=True)[None]
-            parts[kind].append((arms, *derivatives, residuals, weights, *focal, by_pattern, bent))
+            slopes, bent = _counted(pattern, used, arms, to_source[:3, :3], directed.image.frame.camera)
+            parts[kind].append((arms, *derivatives, residuals, weights, *focal, sign * slopes, bent))
     surface, colours = (Equations(*(np.concatenate(columns) for columns in zip(*part, strict=True))) for part in parts)
     return surface, colours
+
+
+def _counted(pattern: FixedPattern, used: Array, arms: Array, to_source: Array, camera: Camera) -> tuple[Array, Array]:
+    """Return first (n, 6) and second (1, 6, 6) derivatives by ξ of what is counted for the pattern: of all matches.
+
+    Args:
+        pattern: what errors of both views have in common.
+        used: (n, 14) matches, see `point_to_plane.matches`.
+        arms: (n, 3) their positions in the source's frame, about the centre.
+        to_source: (3, 3) rotation into that frame.
+        camera: in which they were looked up.
+    """
+    if pattern.share == 0.0:
+        return np.zeros((len(used), 6)), np.zeros((1, 6, 6))
+    slopes, curvatures = pattern.derivatives(used, camera)
+    slopes, levers = slopes @ to_source.T, _levers(arms) @ to_source
+    bent = np.einsum("nik,nkl,njl->ij", levers, curvatures, levers, optimize=True)[None]
+    return np.hstack([np.cross(arms, slopes), slopes]), np.asarray(bent, dtype=np.float64)
 
 
 def _levers(arms: Array) -> Array:

@@ -251,23 +251,10 @@ def _fitted_two(poses: Array, weights: Array, centre_m: Array) -> GaussianMixtur
     core = np.zeros(len(weights))
     core[near[np.cumsum(weights[near]) <= 0.5 * weights.sum()]] = 1.0
     members = weights * np.stack([core, 1.0 - core])
-    for _ in range(_EM_STEPS):
-        if np.any(members.sum(axis=1) < _LEAST_PART * weights.sum()):
-            return one
-        likely = np.stack([_log_gaussian(white, of) for of in members])
-        members = weights * np.exp(likely - np.logaddexp(*likely))
+    if not mixture.separate_two(white, weights, members, _EM_STEPS, _LEAST_PART, _WHITE_FLOOR):
+        return one
     parts = [_fitted(poses, of / of.sum(), centre_m).times(0.5) for of in members]
     return parts[0].plus(parts[1])
-
-
-def _log_gaussian(white: Array, weights: Array) -> Array:
-    """Return the log density (n,) of points (n, 6) in their weighted Gaussian times its weight, but for a constant."""
-    total = weights.sum()
-    centred = white - weights @ white / total
-    covariance = (centred.T * weights) @ centred / total + _WHITE_FLOOR * np.eye(white.shape[1])
-    root = np.linalg.cholesky(covariance)
-    squares = np.sum(np.linalg.solve(root, centred.T) ** 2, axis=0)
-    return np.asarray(np.log(total) - np.log(np.diag(root)).sum() - 0.5 * squares, dtype=np.float64)
 
 
 def thinned(weights: Array, count: int, rng: np.random.Generator) -> tuple[npt.NDArray[np.int64], Array]:
