@@ -17,7 +17,7 @@ from modeler.pipeline.pairs import Prepared
 from modeler.rays import Sensor
 from modeler.types import Edge, FocalLength, InputError, ObjectModel, PoseGaussian, Posterior, RayImage, Solution
 
-READY = 8  # views kept ready for registration; of others the images that a likelihood looks up are made again
+_READY_BYTES, _LEAST_READY = 128 * 2**20, 8  # of views kept ready, 13 of 640 × 480; however large, so many are
 _REVISITED = 3  # frames at most between a lost one and a view that followed it, to which it is registered again
 
 
@@ -102,7 +102,7 @@ class State:
             smoother=self.smoother.to(graph),
             views={**self.views, number: light.view},
             network=self.map_view.network,
-            ready=dict(list(ready.items())[-READY:]),
+            ready=newest_ready(ready),
             newest=newest,
             vain=0 if found else self.vain,
             lost={frame: other for frame, other in self.lost.items() if frame != number},
@@ -150,14 +150,18 @@ class State:
             sensor: that made the views.
         """
         moved = {edge: replace(edge, posterior=edge.posterior.under(log_factor)) for edge in self.graph.edges}
-        views = {frame: self.store.keep(sensor.refocused(view, log_factor)) for frame, view in self.views.items()}
+        views: dict[int, RayImage] = {}
+        ready: dict[int, RayImage] = {}
+        for frame, view in self.views.items():
+            refocused = sensor.refocused(view, log_factor)
+            views[frame], ready = self.store.keep(refocused), newest_ready({**ready, frame: refocused})
         graph = replace(self.graph, edges=tuple(moved.values()))
         newest = self.newest
         if newest is not None and newest.frame.index in views:
             newest = replace(newest, view=views[newest.frame.index])
         spans = tuple(moved[edge] for edge in self.spans)
         smoother = replace(self.smoother, focal=None).to(graph)
-        return replace(self, graph=graph, smoother=smoother, views=views, ready={}, newest=newest, spans=spans)
+        return replace(self, graph=graph, smoother=smoother, views=views, ready=ready, newest=newest, spans=spans)
 
     def again(self, register: Callable[[Sequence[tuple[int, int]]], Iterable[Posterior]]) -> State:
         """Return the state with the edges that take part registered again where that finds them at the same place.
@@ -207,6 +211,20 @@ class State:
         assert images.mask is not None
         found = replace(prepared.segmentation, mask=images.mask)
         return replace(prepared, frame=frame, segmentation=found, view=view)
+
+
+def newest_ready(views: Mapping[int, RayImage]) -> dict[int, RayImage]:
+    """Return the last of some views, those whose images for registration are to stay in memory.
+
+    Of others these images are made again.
+    """
+    kept, size = [], 0
+    for frame, view in reversed(list(views.items())):
+        size += sum(image.nbytes for image in view.layers.values())
+        if size > _READY_BYTES and len(kept) >= _LEAST_READY:
+            break
+        kept.append((frame, view))
+    return dict(reversed(kept))
 
 
 def _same_place(before: PoseGaussian, after: PoseGaussian) -> bool:

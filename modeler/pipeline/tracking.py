@@ -17,7 +17,7 @@ import numpy as np
 from modeler import se3
 from modeler.closure import Closer
 from modeler.pipeline.pairs import anywhere
-from modeler.pipeline.state import READY, State
+from modeler.pipeline.state import State, newest_ready
 from modeler.priors import PredictedProposal
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
@@ -163,8 +163,8 @@ class Tracker:
         if known is None:
             known = self.made.pop(view.index, None) or self.sensor.ray_image(view.frame, view.plane)
             self.made[view.index] = known
-            if len(self.made) > READY:
-                del self.made[next(iter(self.made))]
+            for frame in set(self.made) - set(newest_ready(self.made)):
+                del self.made[frame]
         return known
 
     def _glances(
