@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
@@ -24,6 +24,18 @@ def both(first: Callable[[], S], second: Callable[[], T]) -> tuple[S, T]:
     with ThreadPoolExecutor(1, thread_name_prefix="beside") as thread:
         other = thread.submit(second)
         return first(), other.result()
+
+
+def each(make: Callable[[S], T], items: Iterable[S]) -> Generator[T, None, None]:
+    """Yield what a function makes of items, in their order; two at a time where there is more than one thread.
+
+    While one runs Python, the other may compute. Where nobody waits for the rest, it is not begun.
+    """
+    if not several():
+        yield from map(make, items)
+        return
+    with ThreadPoolExecutor(2, thread_name_prefix="each") as threads:
+        yield from threads.map(make, items)
 
 
 @contextmanager

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from modeler.beside import ahead, behind, both
+from modeler.beside import ahead, behind, both, each
 
 
 @pytest.fixture(params=[1, 2])
@@ -62,3 +62,20 @@ def test_what_is_made_ahead_is_made_in_order_and_fails_where_it_is_asked_for(thr
             waiting[1]()
         assert waiting[2]() == 0.25
     assert made == [2, 0, 4]
+
+
+def test_each_of_several_comes_in_its_order_and_what_nobody_waits_for_is_not_begun(threads: int) -> None:
+    go, made = threading.Event(), list[int]()
+
+    def make(item: int) -> int:
+        assert threads == 1 or item == 0 or go.wait(5.0)
+        made.append(item)
+        return -item
+
+    results = each(make, range(9))
+    assert next(results) == 0
+    threading.Timer(0.1, go.set).start()
+    results.close()
+    assert made[0] == 0
+    assert len(made) <= (1 if threads == 1 else 3)
+    assert list(each(make, range(4))) == [0, -1, -2, -3]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import final
 
@@ -339,10 +338,11 @@ def test_a_pair_depends_on_the_seed_and_its_views_alone() -> None:
     assert not np.array_equal(other.pose.mean, whole.pose.mean)
 
 
-def test_same_seed_same_bits_side_by_side_or_one_after_the_other() -> None:
+def test_same_seed_same_bits_side_by_side_or_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
     one = run(registrar=Oracle(noise=1.0))[-1]
-    with ThreadPoolExecutor(2) as executor:
-        other = run(registrar=Oracle(noise=1.0), executor=executor)[-1]
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
+    other = run(registrar=Oracle(noise=1.0))[-1]
     assert len(one.edges_so_far) > 8
     for k, pose in one.solution.trajectory.items():
         assert np.array_equal(pose, other.solution.trajectory[k])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar, final
@@ -77,8 +76,6 @@ class Modeler:
     match (see `glancing`). None: every lost frame is searched for."""
     seed: int = 0
     """Each pair draws from a generator of its own, made from this and the two frame numbers."""
-    executor: Executor | None = None
-    """Where the pairs of one frame are registered side by side; None: one after the other. Results are the same."""
 
     def run(self, frames: Iterable[Frame], scene: Scene) -> Iterator[Event]:
         """Build a model and yield what happens: for each frame a `Step`, the last of which has the final model.
@@ -154,7 +151,7 @@ class Modeler:
     def tracker(self, state: State) -> Tracker:
         """Return what registers the views of a run with these components."""
         glance = None if self.glance is None else partial(self._register, self.glance)
-        return Tracker(state, self.prior, self.closer, self.sensor, self.register, glance, self.executor)
+        return Tracker(state, self.prior, self.closer, self.sensor, self.register, glance)
 
     def joiner(self, tracker: Tracker) -> Joiner:
         """Return what joins segments of a run."""

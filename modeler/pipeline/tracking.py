@@ -7,14 +7,15 @@ accept that the object turned so far: it must match better by as much as motions
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from threading import Lock
 from typing import final
 
 import numpy as np
 
 from modeler import se3
+from modeler.beside import each
 from modeler.closure import Closer
 from modeler.pipeline.pairs import anywhere
 from modeler.pipeline.state import State, newest_ready
@@ -68,12 +69,11 @@ class Tracker:
     """Of a source and a target."""
     glance: Callable[[RayImage, RayImage, AbstractPrior], Posterior] | None = None
     """As `register`, but gives hopeless pairs up early; None: the method has no such mode."""
-    executor: Executor | None = None
-    """Where pairs are registered side by side; None: one after the other."""
     refusals: dict[tuple[int, int], PriorRefused] = field(default_factory=dict)
     """Why the prior does not apply to a pair, by (source, target): filled as pairs are registered."""
     made: dict[int, RayImage] = field(default_factory=dict)
     """The views made ready again last, by frame number: pairs registered one after the other share them."""
+    _lock: Lock = field(default_factory=Lock)
 
     @cached_property
     def known(self) -> AbstractPrior:
@@ -161,10 +161,13 @@ class Tracker:
         """Return a view with the images that a likelihood looks up."""
         known = view if view.layers else self.state.ready.get(view.index)
         if known is None:
-            known = self.made.pop(view.index, None) or self.sensor.ray_image(view.frame, view.plane)
-            self.made[view.index] = known
-            for frame in set(self.made) - set(newest_ready(self.made)):
-                del self.made[frame]
+            with self._lock:
+                known = self.made.pop(view.index, None)
+            known = known or self.sensor.ray_image(view.frame, view.plane)
+            with self._lock:
+                self.made[view.index] = known
+                for frame in set(self.made) - set(newest_ready(self.made)):
+                    del self.made[frame]
         return known
 
     def _glances(
@@ -209,9 +212,8 @@ class Tracker:
         return self.closer.placement(posteriors, self.state.map_view, steps=steps)[0] is not None
 
     def _pairs(self, pairs: Sequence[tuple[RayImage, int]], priors: Sequence[AbstractPrior]) -> Iterator[Posterior]:
-        """Yield the posteriors of pairs, side by side where there is an executor."""
-        apply = map if self.executor is None else self.executor.map
-        yield from apply(lambda pair, prior: self._pair(pair[0], pair[1], prior), pairs, priors)
+        """Yield the posteriors of pairs, in their order."""
+        yield from each(lambda asked: self._pair(*asked[0], asked[1]), zip(pairs, priors, strict=True))
 
     def _pair(self, source: RayImage, target: int, prior: AbstractPrior, *, briefly: bool = False) -> Posterior:
         """Register a view against an accepted one; where the prior does not apply, that is the outcome."""

@@ -3,7 +3,7 @@
     PYTHONPATH=tests python -m kills --count 50 --seed 0
     PYTHONPATH=tests python -m kills --commands --count 10      every other command that writes, 10 times each
 
-Trajectory, graph, mesh and cloud must be the same to the byte, and each kill may cost one pair at most. What fails is
+Trajectory, graph, mesh and cloud must be the same to the byte, and each kill may cost two pairs at most. What fails is
 kept in the folder of --out, and the status is 1.
 """
 
