@@ -152,6 +152,26 @@ def test_modes_that_no_loop_distinguishes_keep_their_weights() -> None:
     assert sigma > np.radians(30.0)
 
 
+def test_modes_of_a_shape_that_looks_the_same_from_behind_all_stay_open() -> None:
+    """Every edge and every loop allows a half turn: each view may be turned, and no combination is better than others.
+
+    There are two thousand of them, far more than are optimised.
+    """
+    rng = np.random.default_rng(13)
+    truth = {k: se3.inverse(spin([0.0, 2.0 * np.pi * k / COUNT, 0.0])) for k in range(COUNT)}
+    pairs = [(k, k + 1) for k in range(COUNT - 1)] + [(k, k + 2) for k in range(COUNT - 2)] + [(0, COUNT - 1)]
+    edges = []
+    for target, source in pairs:
+        true = PoseGaussian(se3.inverse(truth[target]) @ truth[source], covariance(rng))
+        halves = [Mode(0.5, true), Mode(0.5, _spun(true, np.pi))]
+        edges.append(edge(target, source, true, "odometry" if source == target + 1 else "closure", modes=halves))
+    solution = solve(PoseGraph(tuple(edges)), {})
+    assert solution.outliers == ()
+    assert all(left.max() < 0.9 for left in solution.mode_weights.values())
+    turns = [np.sqrt(np.linalg.eigvalsh(solution.covariances[k][:3, :3])[-1]) for k in range(1, COUNT)]
+    assert min(turns) > np.radians(60.0)
+
+
 def test_modes_of_a_closure_are_decided_by_the_chain() -> None:
     rng = np.random.default_rng(8)
     graph, truth = ring(COUNT, rng, [])

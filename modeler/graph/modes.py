@@ -1,7 +1,8 @@
 """Edges whose posterior has several modes: which of them the loops and the other edges select.
 
 A hypothesis names one mode for every such edge on a loop. Hypotheses are first scored loop by loop, along the tree,
-thousands at once; the best few are then optimised, and their evidence is Laplace's (method.md, eq. G3).
+thousands at once; the best few are then optimised, and their evidence is Laplace's (method.md, eq. G3). Weights of
+modes are sums over all that are not far from the best: of a shape that looks the same from behind, thousands are equal.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from modeler.types import Array, Edge
 
 _BEAM = 4096  # hypotheses kept while loops are taken one by one: all of twelve edges with two modes
 _MAX_OPTIMISED = 8  # hypotheses that are optimised
-_MARGIN_NATS = 15.0  # below the best: hypotheses farther off are not optimised
+_MARGIN_NATS = 15.0  # below the best: hypotheses farther off together weigh less than 4096 exp(-15) = 0.001
 _DECIDED = 0.9999  # weight from which a mode is taken for the only one
 _MAX_REFUTED = 1.5  # outlier loops beyond the best hypothesis' before one is dropped: one loop may be wrong itself
 _MAX_PAIRED = 16  # edges up to which the modes of two of them are changed at once
@@ -161,11 +162,11 @@ def select_modes(
     decided = dict(settled)
     if best is not None:
         hypotheses, scores = best
-        near = scores >= scores[0] - _MARGIN_NATS
-        hypotheses, scores = hypotheses[near][:_MAX_OPTIMISED], scores[near][:_MAX_OPTIMISED]
         if len(hypotheses) > 1:
-            chosen = (dict(zip(search.edges, row, strict=True)) for row in hypotheses)
-            scores = np.array([search.evidence(tree, loops, root, modes, settled) for modes in chosen])
+            chosen = (dict(zip(search.edges, row, strict=True)) for row in hypotheses[:_MAX_OPTIMISED])
+            evidence = np.array([search.evidence(tree, loops, root, modes, settled) for modes in chosen])
+            # Scores along the tree differ from the evidence by what all of the best have nearly alike.
+            scores = np.concatenate([evidence, scores[len(evidence) :] + np.mean(evidence - scores[: len(evidence)])])
         shares = np.exp(scores - scores.max())
         shares = shares / shares.sum()
         for column, edge in enumerate(search.edges):
@@ -205,14 +206,13 @@ class _Search:
             scores = scores + self._loop_score(cycle, hypotheses)
             alive = scores >= scores.max() - _MAX_REFUTED * self.threshold
             hypotheses, scores = hypotheses[alive], scores[alive]
-        hypotheses = hypotheses[np.argsort(-scores, kind="stable")[:_MAX_OPTIMISED]]
+        hypotheses = _near(hypotheses, scores)[0]
         while True:  # recovers hypotheses that the beam dropped
             around = np.unique(np.concatenate([hypotheses, self._neighbours(hypotheses[0])]), axis=0)
-            scores = self._score(around)
-            order = np.argsort(-scores, kind="stable")[: 2 * _MAX_OPTIMISED]
-            if np.array_equal(around[order[0]], hypotheses[0]):
-                return around[order], scores[order]
-            hypotheses = around[order]
+            found, scores = _near(around, self._score(around))
+            if np.array_equal(found[0], hypotheses[0]):
+                return found, scores
+            hypotheses = found
 
     def evidence(
         self,
@@ -276,3 +276,10 @@ class _Search:
 def _chosen(factor: Factor, modes: Mapping[Edge, int]) -> Factor:
     """Return a factor with the mode that a hypothesis names."""
     return Factor(factor.edge, factor.edge.posterior.modes[modes[factor.edge]].pose) if factor.edge in modes else factor
+
+
+def _near(hypotheses: npt.NDArray[np.int64], scores: Array) -> tuple[npt.NDArray[np.int64], Array]:
+    """Return the hypotheses (h, edges) whose scores (h,) are not far from the best, best first."""
+    order = np.argsort(-scores, kind="stable")
+    order = order[scores[order] >= scores[order[0]] - _MARGIN_NATS][:_BEAM]
+    return hypotheses[order], scores[order]
