@@ -134,6 +134,25 @@ def test_what_stands_on_a_turntable_does_not_include_the_turntable(rng):
         assert abs(one.plane.height_m(plate[None])[0]) < 3.0 * one.plane.sigma_offset_m
 
 
+def dish(world, turn_deg):
+    """Return a world with a dish: a floor 11 mm above the table, within a rim of 30 mm."""
+    world.box((0.0, 0.0, 0.0055), (0.07, 0.07, 0.0055), turn_deg=turn_deg, label=OBJECT)
+    turn = Rotation.from_euler("z", turn_deg, degrees=True)
+    for x_m, y_m, half_m in ((0.065, 0.0, (0.005, 0.07, 0.015)), (0.0, 0.065, (0.07, 0.005, 0.015))):
+        for sign in (1.0, -1.0):
+            world.box(turn.apply((sign * x_m, sign * y_m, 0.015)), half_m, turn_deg=turn_deg, label=OBJECT)
+    return world
+
+
+@pytest.mark.parametrize("tilt_deg", [35.0, 50.0, 60.0])
+def test_the_floor_of_a_dish_is_neither_its_support_nor_a_wall(tilt_deg, rng):
+    worlds = [dish(World(tilt_deg=tilt_deg).table(), 25.0 * k) for k in range(6)]
+    shots = [world.frame(k, rng) for k, world in enumerate(worlds)]
+    for one in judge([frame for frame, _ in shots], [mask for _, mask in shots], least=0.9):
+        assert one.plane is not None
+        assert abs(one.plane.height_m(worlds[0].origin_m[None])[0]) < 3.0 * one.plane.sigma_offset_m
+
+
 def test_one_frame_is_enough_on_a_bare_table(rng):
     frames, masks = turned(3, rng)
     segmenter = Segmenter()

@@ -268,7 +268,7 @@ def fit_beside(ground: Float32Array, body: Float32Array, *, guess: Array, noise:
 
 
 def surroundings(points: Float32Array, found: BoolArray) -> BoolArray:
-    """Return the pixels (h, w) around an object, where its support may be seen.
+    """Return the pixels (h, w) around an object, beyond its outline, where its support may be seen.
 
     Args:
         points: (h, w, 3) image of points.
@@ -281,8 +281,13 @@ def surroundings(points: Float32Array, found: BoolArray) -> BoolArray:
     square = np.zeros(found.shape, dtype=np.float32)
     for axis in range(3):
         square += (points[..., axis] - np.float32(centre[axis])) ** 2
-    beside: BoolArray = np.logical_not(ndimage.binary_dilation(found, iterations=2))
-    return beside & (square < (_REACH_SIZES * size) ** 2)
+    return ~outline(found) & (square < (_REACH_SIZES * size) ** 2)
+
+
+def outline(found: BoolArray) -> BoolArray:
+    """Return the pixels (h, w) within 2 px of some, and what these enclose: the floor of a dish is not its support."""
+    near = ndimage.binary_dilation(found, iterations=2)
+    return np.asarray(ndimage.binary_fill_holes(near), dtype=np.bool_)
 
 
 def extent(points: Float32Array) -> tuple[Array, float]:

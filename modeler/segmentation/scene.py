@@ -26,6 +26,7 @@ from modeler.segmentation.planes import (
     dominant_planes,
     fit_beside,
     heights,
+    outline,
     parallel,
     surroundings,
     upright,
@@ -189,26 +190,30 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
 
     A static piece above the support that lies within the image may belong to the object: the middle of a mug on a
     turntable looks static, and only its handle moves. Without a support, nothing static is the object. Nor are walls
-    behind all that moves: planes that extend beyond the image, or show more than it covers. They go on behind it.
+    behind all that moves: planes that extend beyond the image, or show more beside it than it covers. They go on behind
+    it.
     """
     back = layers.back_m[..., 2]
-    above = layers.still & ~found
+    body, rim = layers.front_m[found], _rim(layers.back_m)
+    tolerance_m, body_tolerance_m = noise.tolerance_m(back), noise.tolerance_m(body[:, 2])
+    above, beside = layers.still & ~found, layers.still & ~outline(found)
     if support is not None:
-        above &= heights(layers.back_m, support) > noise.tolerance_m(back)
+        over_m = heights(layers.back_m, support)
+        above &= over_m > tolerance_m
+        beside &= np.abs(over_m) > tolerance_m
+        rim[np.abs(heights(rim, support)) < noise.tolerance_m(rim[:, 2])] = np.nan
     labels = pieces(back, above)
     touching = np.bincount(labels[edge_of(np.isfinite(back))], minlength=int(labels.max()) + 1)
     outside = touching >= _TOUCHING_PX
     outside |= support is None
     outside[0] = False
     depth = np.where(outside[labels], back, np.float32(np.inf))
-    body, rim = layers.front_m[found], _rim(layers.back_m)
-    tolerance_m, body_tolerance_m = noise.tolerance_m(back), noise.tolerance_m(body[:, 2])
     for plane in planes:
         is_support = support is not None and bool((plane == support).all())
         if is_support or np.mean(heights(body, plane) > -body_tolerance_m) < _IN_FRONT_SHARE:
             continue
         in_front_m = heights(layers.back_m, plane)
-        on = layers.still & (np.abs(in_front_m) < tolerance_m)
+        on = beside & (np.abs(in_front_m) < tolerance_m)
         if np.count_nonzero(on) < np.count_nonzero(found) and not _beyond_image(plane, rim, noise):
             continue
         facing = layers.rays @ plane[:3].astype(np.float32)
