@@ -50,6 +50,7 @@ def untrusted(
             {"prior": "turntable", "step-deg": "DEG"},
         ),
         (untrusted("unsure_rotation"), priors.TurntablePrior(25.0), None),
+        (untrusted("unsure_focal"), priors.TablePrior(), {"camera": "camera.json"}),
         (untrusted("prior_contradicted"), priors.TurntablePrior(25.0, 2.0), {"step-sigma-deg": "6"}),
         (untrusted("prior_contradicted"), priors.TablePrior(), {"prior": "general"}),
         (untrusted("never_came_back"), priors.GeneralPrior(), None),

@@ -20,6 +20,7 @@ from modeler.types import (
     Consistency,
     Edge,
     Failed,
+    FocalLength,
     Frame,
     HandPoses,
     LowOverlap,
@@ -105,6 +106,7 @@ def joined(source: int, target: int, poses: Mapping[int, Array], *, kind: Any = 
 
 
 STEPS_DEG = [0.0, 25.0, 50.0, 75.0]
+LONGER_DEG = [1.01 * angle_deg for angle_deg in STEPS_DEG]
 
 
 def test_other_frames_see_through_what_is_in_the_wrong_place() -> None:
@@ -343,6 +345,7 @@ def whole_run(
     refused: Reason | None = None,
     expected: bool = False,
     depth_scale_sigma: float = 0.0,
+    focal: FocalLength | None = None,
 ) -> tuple[list[str], dict[str, bool]]:
     """Codes of what is wrong with a run whose poses are true, and which figures hold."""
     views, poses = views_of(angles_deg), poses_of(angles_deg)
@@ -360,7 +363,7 @@ def whole_run(
         posteriors=(),
         edges=(),
         left_out=None,
-        solution=solve(PoseGraph(edges=edges, first=0), {}),
+        solution=solve(PoseGraph(edges=edges, first=0), {}, focal=focal),
         model=None,
         edges_so_far=edges,
         views=views,
@@ -369,6 +372,16 @@ def whole_run(
     verdict = judged(step, frames, prior=prior, closure_expected=expected, depth_scale_sigma=depth_scale_sigma)
     assert verdict.trustworthy == (not verdict.shortcomings)
     return [found.code for found in verdict.shortcomings], {name: fig.holds for name, fig in verdict.evidence.items()}
+
+
+@pytest.mark.parametrize(("sigma", "codes"), [(0.0, []), (0.005, []), (0.03, ["unsure_focal"])])
+def test_poses_that_hang_on_the_focal_length_are_not_to_be_trusted(sigma: float, codes: list[str]) -> None:
+    """Rotations that are larger by as much as the focal length, over three steps of 25°."""
+    longer = {frame: pose @ se3.inverse(poses_of(STEPS_DEG)[frame]) for frame, pose in poses_of(LONGER_DEG).items()}
+    by_focal = {frame: se3.log(moved) / 0.01 for frame, moved in longer.items()}
+    focal = FocalLength(0.0, sigma, sigma, 0, 0.0, 0.0, by_focal)
+    found, _ = whole_run(STEPS_DEG, prior=TurntablePrior(-25.0), focal=focal)
+    assert found == codes
 
 
 def test_a_sound_run_is_trusted_and_shows_its_evidence() -> None:

@@ -186,6 +186,7 @@ def remedy(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
         **dict.fromkeys(("seen_through", "absent"), _surface),
         **dict.fromkeys(("little_overlap", "other_modes"), _more_known),
         **dict.fromkeys(("unsure_rotation", "unsure_place"), _more_known),
+        "unsure_focal": _full_turn,
         "unsure_size": _known_camera,
     }
     found = (by_code[code](report, prior) for code in codes if code in by_code)
@@ -211,6 +212,14 @@ def _camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
         return _more_known(report, prior)
     first = "modeler calibrate-camera {run} --out camera.json"
     return Remedy("estimate the focal length from the loop, and build with it", {"camera": "camera.json"}, first)
+
+
+def _full_turn(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
+    """Return how the focal length of a camera is learned where this run hardly tells it."""
+    if report["closed"]:
+        return _camera(report, prior)
+    words = "turn the object until it comes back, or take the focal length from another run, of a full turn"
+    return Remedy(words, {"camera": "camera.json"}, "modeler calibrate-camera FULL_TURN --out camera.json")
 
 
 def _known_camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:

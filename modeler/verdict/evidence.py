@@ -295,6 +295,23 @@ def spread_of_places(views: Mapping[int, RayImage], solution: Solution, factor: 
     return _widest(sigmas_m, WRONG_M)
 
 
+def spread_by_focal_length(views: Mapping[int, RayImage], solution: Solution, frame: int) -> tuple[float, float]:
+    """Return what not knowing the focal length alone makes of a pose's uncertainty: sd in degrees, and of place in m.
+
+    Args:
+        views: by frame number.
+        solution: the poses.
+        frame: number of one of them.
+    """
+    focal = solution.focal
+    if focal is None or frame not in focal.by_focal:
+        return 0.0, 0.0
+    moved = focal.sigma * focal.by_focal[frame]  # of object coordinates (eq. G14)
+    place_m = se3.transform(solution.trajectory[frame], views[frame].centroid_m[None])[0]
+    shift_m = moved[3:] + np.cross(moved[:3], place_m)
+    return float(np.degrees(np.linalg.norm(moved[:3]))), float(np.linalg.norm(shift_m))
+
+
 def one_axis_sd(covariance: Array, wrong: float) -> float:
     """Return the standard deviation of an error along one axis that is wrong as often as a vector (3,).
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -17,6 +17,7 @@ from modeler.types import (
     AbstractPrior,
     Edge,
     Failed,
+    FocalLength,
     LowOverlap,
     OptimisationOutlier,
     Outcome,
@@ -42,6 +43,7 @@ from modeler.verdict.evidence import (
     prior_distances,
     prior_figure,
     size_figure,
+    spread_by_focal_length,
     spread_of_places,
     spread_of_rotations,
 )
@@ -81,7 +83,7 @@ class Shortcoming:
     """For programs: `doubt`, `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
     `prior_contradicted`, `loop_open`, `edges_disagree`, `closures_refused`, `unconfirmed`, `never_came_back`,
     `not_tried`, `seen_through`, `absent`, `little_overlap`, `other_modes`, `unsure_rotation`,
-    `unsure_place` or `unsure_size`."""
+    `unsure_place`, `unsure_focal` or `unsure_size`."""
     words: str
     """For people."""
 
@@ -227,17 +229,33 @@ def _found(
 
 def _spreads(step: Step, edges: Sequence[Edge]) -> list[_Finding]:
     """Return how uncertain the poses of a whole run are."""
-    found, factor = [], misfit(edges, step.solution)
+    found, factor, focal = [], misfit(edges, step.solution), step.solution.focal
     if (turn := spread_of_rotations(step.solution, factor)) is not None:
         words = f"frame {turn.frame} may be turned by {turn.figure.value:.1f}° (one standard deviation)"
         words += f", {turn.count - 1} more by over {turn.figure.limit:.1f}°" if turn.count > 1 else ""
-        found.append(_Finding("pose_sd_deg", turn.figure, "unsure_rotation", words))
+        by_focal_deg, _ = spread_by_focal_length(step.views, step.solution, turn.frame)
+        found.append(_explained(_Finding("pose_sd_deg", turn.figure, "unsure_rotation", words), by_focal_deg, focal))
     if (place := spread_of_places(step.views, step.solution, factor)) is not None:
         value_mm, limit_mm = 1000.0 * place.figure.value, 1000.0 * place.figure.limit
         words = f"frame {place.frame} may be {value_mm:.1f} mm from its place (one standard deviation)"
         words += f", {place.count - 1} more over {limit_mm:.1f} mm" if place.count > 1 else ""
-        found.append(_Finding("pose_sd_m", place.figure, "unsure_place", words))
+        _, by_focal_m = spread_by_focal_length(step.views, step.solution, place.frame)
+        found.append(_explained(_Finding("pose_sd_m", place.figure, "unsure_place", words), by_focal_m, focal))
     return found
+
+
+def _explained(spread: _Finding, by_focal: float, focal: FocalLength | None) -> _Finding:
+    """Return how uncertain poses are, with the reason where most of the variance is the focal length's.
+
+    Args:
+        spread: the finding.
+        by_focal: standard deviation that the focal length alone makes, in the finding's unit.
+        focal: what is known of the focal length.
+    """
+    if focal is None or 2.0 * by_focal**2 < spread.figure.value**2:
+        return spread
+    why = f"mostly because the focal length is known to {100.0 * focal.sigma:.1f} % only"
+    return replace(spread, code="unsure_focal", words=f"{spread.words}, {why}")
 
 
 def _size(step: Step, depth_scale_sigma: float) -> list[_Finding]:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from modeler.cli.options import PriorOptions
-from modeler.types import Array, BoolArray, Frame, SensorNoise
+from modeler.types import Array, BoolArray, Frame
 from sequences import AbstractSequence
 from sequences.rendering.meshes import Mesh
 from sequences.rendering.recipe import Recipe
@@ -100,9 +100,8 @@ class Recorded(AbstractSequence):
             if not (self.stage.foreign and index >= self.stage.since)
         }
 
-    def sensor(self) -> SensorNoise:
-        """Return the camera's noise."""
-        return self._first.sensor()
+    def sensor(self) -> None:
+        """Return None: of most cameras nothing is told."""
 
     @property
     def motion(self) -> Mapping[str, object] | None:
