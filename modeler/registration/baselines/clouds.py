@@ -7,7 +7,8 @@ use the centre, to start from, and the spread, for directions that the surfaces 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -17,7 +18,17 @@ from scipy.linalg import solve_triangular
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.types import AbstractPoseDensity, Array, BoolArray, InputError, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import (
+    AbstractPoseDensity,
+    AbstractRegistrar,
+    Array,
+    BoolArray,
+    InputError,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+)
 
 _START_SAMPLES = 1000
 _SPACING_POINTS = 400
@@ -211,27 +222,43 @@ class Fit:
     """Share of the source's points that have a partner."""
 
 
-def registered(
-    views: tuple[RayImage, RayImage],
-    density: AbstractPoseDensity,
-    rng: np.random.Generator,
-    *,
-    min_fitness: float,
-    fit: Callable[[Array], Fit | None],
-) -> Posterior:
-    """Return what a method finds from the prior's centre, as a posterior with its time.
+@dataclass(frozen=True)
+class AbstractCloudRegistrar(AbstractRegistrar):
+    """A method that fits one cloud to another, and states the residual-scaled inverse Hessian as its covariance."""
 
-    Args:
-        views: source and target.
-        density: the prior, for where to start.
-        rng: source of the prior's samples.
-        min_fitness: smallest share of matched points that counts as overlap.
-        fit: the method, from a start (4, 4); None where too few points are left.
-    """
-    began = time.perf_counter()
-    begin = start(*views, density, rng)
-    found = posterior(*views, begin, fit(begin.target_from_source), min_fitness)
-    return replace(found, seconds=time.perf_counter() - began)
+    min_points: int = 12
+    """Fewest points a side."""
+    min_fitness: float = 0.1
+    """Smallest share of matched points that counts as overlap."""
+
+    @abstractmethod
+    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
+        """Return what is found from a start; None where too few points are left.
+
+        Args:
+            source: the view whose points are carried.
+            target: the view on which they are laid.
+            begin: (4, 4) the prior's centre.
+            rng: source of all randomness.
+
+        Raises:
+            InputError: where the views lack what the method compares.
+        """
+
+    def register(
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+    ) -> Posterior:
+        """Return the fit from the prior's centre; what the surfaces leave open has the prior's spread.
+
+        Raises:
+            InputError: where the views lack what the method compares.
+        """
+        began = time.perf_counter()
+        begin = start(source, target, density, rng)
+        found = posterior(
+            source, target, begin, self.fit(source, target, begin.target_from_source, rng), self.min_fitness
+        )
+        return replace(found, seconds=time.perf_counter() - began)
 
 
 def posterior(source: RayImage, target: RayImage, begin: Start, fit: Fit | None, min_fitness: float) -> Posterior:

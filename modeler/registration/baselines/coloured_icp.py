@@ -8,9 +8,9 @@ from typing import final
 import numpy as np
 from scipy.spatial import KDTree
 
-from modeler.registration.baselines.clouds import Cloud, Fit, Matches, nearest, plane_residuals, registered
-from modeler.registration.baselines.icp import Linearised, by_levels, descended
-from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Posterior, RayImage
+from modeler.registration.baselines.clouds import Cloud, Fit, Matches, nearest, plane_residuals
+from modeler.registration.baselines.icp import AbstractMultiscaleRegistrar, Linearised, by_levels, descended
+from modeler.types import Array, RayImage
 
 _FLAT = 1e-9  # share of the mean spread; only holds gradients still along which there are no neighbours
 _FEWEST = 4  # points, itself included, that show how intensity changes around a point
@@ -18,46 +18,26 @@ _FEWEST = 4  # points, itself included, that show how intensity changes around a
 
 @final
 @dataclass(frozen=True)
-class ColouredIcpRegistrar(AbstractRegistrar):
+class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
     """Match nearest points and fit planes and intensity together, level by level (Park, Zhou and Koltun 2017).
 
     As Open3D's coloured ICP, with its weights. The arithmetic is our own, since Open3D adds up its residuals in
     whatever order its threads finish, so that no two runs need agree to the last bit.
     """
 
-    voxels: tuple[float, ...] = (1 / 8, 1 / 16, 1 / 32, 1 / 64)
-    """Edge of the thinning cubes at each level, coarse to fine, as a share of the object's size."""
-    reach: float = 2.0
-    """Largest distance of partners, in cubes."""
     geometry: float = 0.968
     """Weight of squared distances in m against those of intensity, which have the rest."""
     neighbours: int = 30
     """Most points from which the gradient of intensity is taken, itself included, within twice the reach."""
-    iterations: int = 60
-    """Largest number of steps per level."""
-    min_points: int = 12
-    """Fewest points a side; levels that thinning leaves with fewer are passed over."""
-    min_fitness: float = 0.1
-    """Smallest share of matched points that counts as overlap."""
 
-    def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
-    ) -> Posterior:
-        """Return the local optimum nearest to the prior's centre, with its residual-scaled inverse Hessian.
+    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the local optimum nearest to the start.
 
         Raises:
             InputError: where a view has no colour.
         """
         clouds = Cloud.coloured(source), Cloud.coloured(target)
-        return registered(
-            (source, target),
-            density,
-            rng,
-            min_fitness=self.min_fitness,
-            fit=lambda begin: by_levels(
-                clouds, begin, voxels=self.voxels, min_points=self.min_points, level=self.level
-            ),
-        )
+        return by_levels(clouds, begin, voxels=self.voxels, min_points=self.min_points, level=self.level)
 
     def level(self, source: Cloud, target: Cloud, pose: Array, voxel_m: float) -> Fit:
         """Return the local optimum nearest to a pose (4, 4), for clouds with intensity thinned to cubes."""

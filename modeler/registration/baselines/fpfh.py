@@ -12,16 +12,16 @@ from scipy.spatial import KDTree
 from modeler import se3
 from modeler.features import fpfh, kabsch, mutual_matches
 from modeler.registration.baselines.clouds import (
+    AbstractCloudRegistrar,
     Cloud,
     Fit,
     cube_edges_m,
     matched,
     plane_residuals,
-    registered,
     whitened_jacobian,
 )
 from modeler.registration.baselines.icp import IcpRegistrar
-from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Posterior, RayImage
+from modeler.types import Array, RayImage
 
 _DRAW = 3  # correspondences that fix a motion
 _BATCH = 2_000  # draws between two looks at the stopping rule
@@ -29,7 +29,7 @@ _BATCH = 2_000  # draws between two looks at the stopping rule
 
 @final
 @dataclass(frozen=True)
-class FpfhRegistrar(AbstractRegistrar):
+class FpfhRegistrar(AbstractCloudRegistrar):
     """Match points by Fast Point Feature Histograms (Rusu et al. 2009) and take the motion most matches agree with.
 
     Open3D computes the features. The RANSAC follows its tutorial step for step (mutual matches, edge lengths,
@@ -52,23 +52,10 @@ class FpfhRegistrar(AbstractRegistrar):
     """Draws end once a better motion would have turned up with this probability."""
     scored_points: int = 400
     """Points of the source, drawn at random, by which motions are compared."""
-    min_points: int = 12
-    """Fewest points a side after thinning."""
-    min_fitness: float = 0.1
-    """Smallest share of matched points that counts as overlap."""
 
-    def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
-    ) -> Posterior:
-        """Return the motion that most feature matches agree with, and the residual-scaled inverse Hessian there."""
-        clouds = Cloud.of(source), Cloud.of(target)
-        return registered(
-            (source, target),
-            density,
-            rng,
-            min_fitness=self.min_fitness,
-            fit=lambda begin: self.search(*clouds, begin, rng),
-        )
+    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the motion that most feature matches agree with."""
+        return self.search(Cloud.of(source), Cloud.of(target), begin, rng)
 
     def search(self, source: Cloud, target: Cloud, otherwise: Array, rng: np.random.Generator) -> Fit | None:
         """Return the motion that most feature matches agree with; None where too few points are left to match.
@@ -149,7 +136,7 @@ def _draws_needed(agreement: float, confidence: float) -> float:
 
 @final
 @dataclass(frozen=True)
-class FpfhIcpRegistrar(AbstractRegistrar):
+class FpfhIcpRegistrar(AbstractCloudRegistrar):
     """Take the motion that most FPFH matches agree with, and start point-to-plane ICP there."""
 
     fpfh: FpfhRegistrar = field(default_factory=FpfhRegistrar)
@@ -157,14 +144,8 @@ class FpfhIcpRegistrar(AbstractRegistrar):
     icp: IcpRegistrar = field(default_factory=lambda: IcpRegistrar(voxels=(1 / 32, 1 / 64)))
     """The refinement, with no coarse levels, whose basins are wide enough to leave a good start."""
 
-    def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
-    ) -> Posterior:
-        """Return the local optimum nearest to the feature matches' motion, with its residual-scaled inverse Hessian."""
+    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the local optimum nearest to the feature matches' motion."""
         clouds = Cloud.of(source), Cloud.of(target)
-
-        def fit(begin: Array) -> Fit | None:
-            coarse = self.fpfh.search(*clouds, begin, rng)
-            return None if coarse is None else self.icp.refine(*clouds, coarse.target_from_source)
-
-        return registered((source, target), density, rng, min_fitness=self.icp.min_fitness, fit=fit)
+        coarse = self.fpfh.search(*clouds, begin, rng)
+        return None if coarse is None else self.icp.refine(*clouds, coarse.target_from_source)

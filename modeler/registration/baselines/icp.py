@@ -11,49 +11,46 @@ from scipy.spatial import KDTree
 
 from modeler import se3
 from modeler.registration.baselines.clouds import (
+    AbstractCloudRegistrar,
     Cloud,
     Fit,
     cube_edges_m,
     matched,
     plane_residuals,
-    registered,
     residual_variance,
     whitened_jacobian,
 )
-from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Posterior, RayImage
+from modeler.types import Array, RayImage
 
 _STEP = 1e-6  # rad and m: a smaller step ends a level
 _DAMPING = 1e-9  # share of the mean curvature; only holds directions still that no plane sees
 
 
-@final
 @dataclass(frozen=True)
-class IcpRegistrar(AbstractRegistrar):
-    """Match nearest points within reach and move onto their planes, level by level (Chen and Medioni 1992).
-
-    As Open3D's multi-scale point-to-plane ICP with Tukey's weights. The arithmetic is our own, since Open3D adds up
-    its residuals in whatever order its threads finish, so that no two runs need agree to the last bit.
-    """
+class AbstractMultiscaleRegistrar(AbstractCloudRegistrar):
+    """A method that matches nearest points, from coarse to fine; levels left with too few points are passed over."""
 
     voxels: tuple[float, ...] = (1 / 8, 1 / 16, 1 / 32, 1 / 64)
     """Edge of the thinning cubes at each level, coarse to fine, as a share of the object's size."""
     reach: float = 2.0
-    """Largest distance of partners, in cubes; a pair so far from plane to point has no weight left."""
+    """Largest distance of partners, in cubes."""
     iterations: int = 60
     """Largest number of steps per level."""
-    min_points: int = 12
-    """Fewest points a side."""
-    min_fitness: float = 0.1
-    """Smallest share of matched points that counts as overlap."""
 
-    def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
-    ) -> Posterior:
-        """Return the local optimum nearest to the prior's centre, with its residual-scaled inverse Hessian."""
-        clouds = Cloud.of(source), Cloud.of(target)
-        return registered(
-            (source, target), density, rng, min_fitness=self.min_fitness, fit=lambda begin: self.refine(*clouds, begin)
-        )
+
+@final
+@dataclass(frozen=True)
+class IcpRegistrar(AbstractMultiscaleRegistrar):
+    """Match nearest points within reach and move onto their planes, level by level (Chen and Medioni 1992).
+
+    As Open3D's multi-scale point-to-plane ICP with Tukey's weights: a pair whose point is as far from the plane as the
+    reach has no weight left. The arithmetic is our own, since Open3D adds up its residuals in whatever order its
+    threads finish, so that no two runs need agree to the last bit.
+    """
+
+    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the local optimum nearest to the start."""
+        return self.refine(Cloud.of(source), Cloud.of(target), begin)
 
     def refine(self, source: Cloud, target: Cloud, target_from_source: Array) -> Fit | None:
         """Return the local optimum nearest to a pose (4, 4); None where too few points are left to match."""
@@ -148,39 +145,18 @@ def _tukey(ratios: Array) -> Array:
 
 @final
 @dataclass(frozen=True)
-class GicpRegistrar(AbstractRegistrar):
+class GicpRegistrar(AbstractMultiscaleRegistrar):
     """Align by small_gicp's GICP (Segal et al. 2009) from coarse to fine, and report its Hessian.
 
     small_gicp's tangent has rotation first and perturbs from the right, as ours does. It runs on one thread, since
     sums over threads are not the same from run to run.
     """
 
-    voxels: tuple[float, ...] = (1 / 8, 1 / 16, 1 / 32, 1 / 64)
-    """Edge of the thinning cubes at each level, coarse to fine, as a share of the object's size."""
-    reach: float = 2.0
-    """Largest distance of partners, in cubes."""
     neighbours: int = 10
     """Points from which the shape of a neighbourhood is taken."""
-    iterations: int = 60
-    """Largest number of steps per level."""
-    min_points: int = 12
-    """Fewest points a side; levels that thinning leaves with fewer are passed over."""
-    min_fitness: float = 0.1
-    """Smallest share of matched points that counts as overlap."""
 
-    def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
-    ) -> Posterior:
-        """Return the local optimum nearest to the prior's centre, with its residual-scaled inverse Hessian."""
-        return registered(
-            (source, target),
-            density,
-            rng,
-            min_fitness=self.min_fitness,
-            fit=lambda begin: self._fit(source, target, begin),
-        )
-
-    def _fit(self, source: RayImage, target: RayImage, target_from_source: Array) -> Fit | None:
+    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the local optimum nearest to the start."""
         import small_gicp  # slow to load, and only needed here
 
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
@@ -188,7 +164,7 @@ class GicpRegistrar(AbstractRegistrar):
         # Between centred clouds, the damping of small_gicp's steps favours neither rotation nor translation.
         source_from_centred = se3.translation(source.centroid_m)
         target_from_centred = se3.translation(target.centroid_m)
-        pose = se3.inverse(target_from_centred) @ target_from_source @ source_from_centred
+        pose = se3.inverse(target_from_centred) @ begin @ source_from_centred
         centred = source.points_m - source.centroid_m, target.points_m - target.centroid_m
         jacobian, fitness = None, 0.0
         for voxel_m in cube_edges_m(Cloud.of(source), Cloud.of(target), self.voxels):

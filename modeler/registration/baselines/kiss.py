@@ -12,9 +12,9 @@ from typing import Any, final
 
 import numpy as np
 
-from modeler.registration.baselines.clouds import Cloud, Fit, cube_edges_m, registered
+from modeler.registration.baselines.clouds import AbstractCloudRegistrar, Cloud, Fit, cube_edges_m
 from modeler.registration.baselines.icp import IcpRegistrar
-from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, InputError, Posterior, RayImage
+from modeler.types import Array, InputError, RayImage
 
 MISSING = "KISS-Matcher is not installed; install it with: pip install 'modeler[peers]'"
 
@@ -26,7 +26,7 @@ def installed() -> bool:
 
 @final
 @dataclass(frozen=True)
-class KissIcpRegistrar(AbstractRegistrar):
+class KissIcpRegistrar(AbstractCloudRegistrar):
     """Take the motion that KISS-Matcher finds (Lim et al., ICRA 2025), and start point-to-plane ICP there.
 
     Faster-PFH features, matches pruned by the largest k-core of their compatibility (ROBIN), and a robust solver. Its
@@ -39,10 +39,8 @@ class KissIcpRegistrar(AbstractRegistrar):
     icp: IcpRegistrar = field(default_factory=lambda: IcpRegistrar(voxels=(1 / 32, 1 / 64)))
     """The refinement, with no coarse levels, whose basins are wide enough to leave a good start."""
 
-    def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
-    ) -> Posterior:
-        """Return the local optimum nearest to KISS-Matcher's motion, with its residual-scaled inverse Hessian.
+    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the local optimum nearest to KISS-Matcher's motion.
 
         Raises:
             InputError: where KISS-Matcher is not installed.
@@ -50,13 +48,9 @@ class KissIcpRegistrar(AbstractRegistrar):
         if not installed():
             raise InputError(MISSING)
         clouds = Cloud.of(source), Cloud.of(target)
-
-        def fit(begin: Array) -> Fit | None:
-            if min(len(cloud.points_m) for cloud in clouds) < self.icp.min_points:
-                return None
-            return self.icp.refine(*clouds, self.search(*clouds, begin))
-
-        return registered((source, target), density, rng, min_fitness=self.icp.min_fitness, fit=fit)
+        if min(len(cloud.points_m) for cloud in clouds) < self.min_points:
+            return None
+        return self.icp.refine(*clouds, self.search(*clouds, begin))
 
     def search(self, source: Cloud, target: Cloud, otherwise: Array) -> Array:
         """Return the motion (4, 4) that KISS-Matcher finds; `otherwise` where it finds none.
