@@ -22,7 +22,7 @@ TURNS = 0.004
 """Relative error of all turns alike, which loops take for one of the focal length: measured on renders."""
 
 _STEP = 0.005  # for derivatives, at most, and a quarter of the prior's: some standard deviations that loops leave
-_ROUNDS = 4  # of Newton's method
+_ROUNDS = 8  # of Newton's method at most; near the optimum two or three are enough
 _REACH = 3.0  # prior standard deviations within which loops are asked, and means are believed that loops hardly tell
 _GRID = 0.02  # of the logarithm at most, between the values that Newton's method starts from
 _SLOPES = 0.3  # relative error of an estimate: noise of the derivatives makes it too small, by 29 % on the bundled box
@@ -68,6 +68,8 @@ class MovingGraph:
             less, middle, more = (cost(best + shift) for shift in (-step, 0.0, step))
             curvature = max((less - 2.0 * middle + more) / step**2, 1.0 / prior_sigma**2)
             move = float(np.clip((less - more) / (2.0 * step * curvature), -2.0 * prior_sigma, 2.0 * prior_sigma))
+            while cost(best + move) > middle and abs(move) > step:  # far from the optimum steps may lead beyond it
+                move *= 0.5
             best += move
             if abs(move) * np.sqrt(curvature) < 0.01:
                 break
