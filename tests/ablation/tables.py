@@ -99,7 +99,7 @@ def table(file: Path) -> str:
     records = [json.loads(line) for line in file.read_text().splitlines()]
     parts = {
         "Ordinary pairs": [record for record in records if record["block"] != "hard"],
-        "Little surface in common": [record for record in records if record["block"] == "hard"],
+        "Little overlap": [record for record in records if record["block"] == "hard"],
     }
     return "\n\n".join(f"### {title}\n\n{_table(part)}" for title, part in parts.items() if part)
 
