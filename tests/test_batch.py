@@ -56,7 +56,7 @@ def test_each_sequence_is_built_once_and_its_status_is_kept(cli: Run, tmp_path: 
     before = len(book(out))
     again = cli("batch", good, bad, worse, "--out", out)
     assert again.status == 3
-    assert "2 done, 1 failed twice, 0 to be taken up again, 0 to be built" in again.err
+    assert "2 done, 1 failed twice, 0 to be resumed, 0 to be built" in again.err
     assert len(book(out)) == before
     assert rows(out) == told
     assert cli("batch", good, "--out", out).status == 0
@@ -159,20 +159,20 @@ def test_rows_of_a_manifest_have_options_of_their_own(cli: Run, tmp_path: Path) 
 
 FAULTS = {
     "no column": ("a,b\n1,2\n", "no column sequence"),
-    "strange column": ("sequence,sku\ns,1\n", "column sku is no option"),
-    "column of another kind": ("sequence,resume\ns,yes\n", "column resume is no option"),
+    "strange column": ("sequence,sku\ns,1\n", "column sku is not an option"),
+    "column of another kind": ("sequence,resume\ns,yes\n", "column resume is not an option"),
     "column twice": ("sequence,step_deg,step-deg\ns,1,1\n", "twice"),
     "no sequence": ("sequence,prior\n,table\n", "row 2 names no sequence"),
-    "too few cells": ("sequence,prior\ns\n", "row 2 has not as many cells"),
-    "too many cells": ("sequence\ns,1,2\n", "row 2 has not as many cells"),
+    "too few cells": ("sequence,prior\ns\n", "row 2 has a different number of cells"),
+    "too many cells": ("sequence\ns,1,2\n", "row 2 has a different number of cells"),
     "wrong value": ("sequence,step-deg\ns,1\ns,fast\n", "row 3: "),
     "no flag": ("sequence,colour\ns,perhaps\n", "write yes or no"),
     "sequence twice": ("sequence\ns\ns\n", "row 3: is the same sequence as"),
     "name twice": ("sequence,name\ns,a\nt,A\n", "the name A is given twice"),
-    "name no folder": ("sequence,name\ns,../a\n", "no name for a folder"),
+    "name no folder": ("sequence,name\ns,../a\n", "is not a valid folder name"),
     "empty": ("", "no column sequence"),
     "no row": ("sequence\n", "no sequence to build"),
-    "quotes": ('sequence\n"s"x\n', "no table in CSV"),
+    "quotes": ('sequence\n"s"x\n', "not a CSV table"),
 }
 
 
@@ -217,7 +217,7 @@ def test_an_executor_of_ones_own_is_a_callable(cli: Run, tmp_path: Path, monkeyp
     sys.modules.pop("my_engine")
     ended = cli("batch", folder, sequence(tmp_path / "t"), "--out", out, "--executor", "my_engine:make")
     assert ended.status == 2
-    assert "makes no concurrent.futures.Executor" in ended.err
+    assert "returns no concurrent.futures.Executor" in ended.err
 
 
 def test_workers_fit_into_memory_and_cores(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -310,7 +310,7 @@ def test_the_input_is_told_by_its_content(tmp_path: Path) -> None:
 
 def test_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
     (tmp_path / TABLE).write_text("no table")
-    with pytest.raises(InputError, match="no list of models"):
+    with pytest.raises(InputError, match="not a list of models"):
         read_table(tmp_path / TABLE)
 
 

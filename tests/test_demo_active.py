@@ -31,7 +31,7 @@ def test_a_robot_turns_the_object_as_suggested_and_leaves_a_run(cli: Run, tmp_pa
     assert {path.name for path in (out / "run").iterdir()} >= FILES
     again = cli("suggest", out / "run")
     assert again.status == 0
-    assert "of what can be seen was seen" in again.err
+    assert "of the visible surface observed" in again.err
 
 
 def test_what_the_robot_cannot_do_is_refused(cli: Run, tmp_path: Path) -> None:

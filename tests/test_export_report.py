@@ -91,7 +91,7 @@ def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
         return replace(step, edges_so_far=tuple(edges))
 
     report = _spoilt(refuse, META, tmp_path)
-    assert report["reasons"] == ["none of 1 closures closed a loop; the last refused, frame 9 on frame 3: it lies"]
+    assert report["reasons"] == ["none of 1 closures closed a loop; the last rejected one, frame 9 on frame 3: it lies"]
 
     def break_off(step: Step) -> Step:  # 5 -> 7 falls, so that the closure 9 -> 3 is all that holds the rest
         edges = [replace(edge, accepted=(edge.source, edge.target) != (7, 5)) for edge in step.edges_so_far]
@@ -99,7 +99,7 @@ def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
 
     report = _spoilt(break_off, META, tmp_path)
     assert report["closed"] is False
-    assert report["reasons"] == ["what joins the first frames to the last is confirmed by nothing: no loop was closed"]
+    assert report["reasons"] == ["the edge between the first frames and the last is unconfirmed: no loop was closed"]
 
     def see_little(step: Step) -> Step:
         edges = [replace(edge, posterior=replace(edge.posterior, overlap=0.45)) for edge in step.edges_so_far]
@@ -141,7 +141,7 @@ def test_report_doubts_a_model_some_of_whose_frames_may_be_turned(tmp_path: Path
     assert _spoilt(vague(), META, tmp_path)["reasons"] == []
     one, some = (_spoilt(vague(*frames), META, tmp_path) for frames in ((7,), (5, 7, 9)))
     assert (one["closed"], one["trustworthy"]) == (True, False)
-    assert one["reasons"] == ["frame 7 may be turned by 9.0° (one standard deviation)"]
+    assert one["reasons"] == ["the rotation of frame 7 is uncertain by 9.0° (one standard deviation)"]
     assert some["reasons"][0].endswith("(one standard deviation), 2 more by over 1.5°")
 
 

@@ -309,7 +309,7 @@ def test_recording_a_live_camera_needs_an_end(
         lambda path, *_: begin(camera, 2) if str(path) == "realsense:" else open_sequence(path),
     )
     assert main(["convert", "realsense:", "--out", str(tmp_path / "bop")]) == 2
-    assert "say how many frames to record" in capsys.readouterr().err
+    assert "limit the number of frames to record" in capsys.readouterr().err
     assert main(["convert", "realsense:", "--frames", ":5", "--out", str(tmp_path / "bop")]) == 0
     assert open_sequence(tmp_path / "bop").indices == (0, 1, 2, 3, 4)
 

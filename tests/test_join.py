@@ -181,10 +181,10 @@ def test_sequences_of_a_joined_run_may_have_moved(
         out.unlink()
         pose_file(out).unlink()
         for wrong, words in (
-            ([], "say where it is with --sequence"),
+            ([], "give its new place with --sequence"),
             (options[:2], "--sequence is given too few times"),
             ([*options, *options[:2]], "--sequence is given 3 times"),
-            (options[2:] + options[:2], "shows something else than the one"),
+            (options[2:] + options[:2], "differs from the one"),
         ):
             assert main([*command, *wrong]) == 2
             assert words in capfd.readouterr().err
@@ -212,7 +212,7 @@ def test_a_textured_export_shows_the_colours(runs: tuple[Path, Path, Path, dict[
         (["--triangles", "2", "--out", "a.stl"], "--triangles 2 is too few"),
         (["--voxel-m", "-1", "--out", "a.stl"], "--voxel-m -1 is out of range"),
         (["--texture", "--tint", "views", "--out", "a.glb"], "give one of them"),
-        (["--watertight", "--sequence", "nowhere", "--out", "a.stl"], "say where it is with --sequence"),
+        (["--watertight", "--sequence", "nowhere", "--out", "a.stl"], "give its new place with --sequence"),
     ],
 )
 def test_exports_that_cannot_be_are_said_in_one_line(
@@ -268,7 +268,7 @@ def test_joins_that_cannot_be_are_said_in_one_line(
     (tmp_path / "notes.txt").write_text("mine")
     for arguments, words in (
         ([str(runs[0]), str(runs[1]), "--out", str(tmp_path)], "not empty"),
-        ([str(runs[0]), str(tmp_path / "none"), "--out", str(tmp_path / "new")], "there is no report"),
+        ([str(runs[0]), str(tmp_path / "none"), "--out", str(tmp_path / "new")], "no report"),
         ([str(runs[0]), str(runs[1]), "--out", str(tmp_path / "new"), "--pairs", "0"], "--pairs 0"),
         ([str(runs[0]), f"{runs[0]}/../{runs[0].name}", "--out", str(tmp_path / "new")], "name two runs"),
     ):

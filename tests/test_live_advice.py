@@ -162,4 +162,4 @@ def test_a_run_that_is_advised_has_a_tab_for_it(steps: list[Step]) -> None:
 def test_where_nothing_can_be_done_nothing_is_to_be_gained(modeler: Modeler, steps: list[Step]) -> None:
     belief = modeler.belief(steps[0].views, steps[0].solution, steps[0].edges_so_far)
     assert "next: turn" in in_short(suggest(belief, [Candidate("turn", turn_deg=30.0)]))
-    assert in_short(suggest(belief, [])) == "nothing more is to be gained"
+    assert in_short(suggest(belief, [])) == "nothing more to gain"

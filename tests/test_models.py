@@ -151,7 +151,7 @@ def test_another_sequence_is_not_taken_for_that_of_the_run(scene: Path, built: P
     for command in (page, ("export", run, "--out", tmp_path / "m.ply", "--voxel-m", "0.005")):
         status, out, err = cli(*command, "--sequence", bundled("tube"))
         assert (status, out, err.count("\n")) == (2, "", 1)
-        assert "tube: frame 0 shows something else" in err
+        assert "tube: frame 0 differs from the one" in err
         assert str(run) in err
         status, _, err = cli(*command, "--sequence", moved, "--sequence", moved)
         assert (status, err.count("\n")) == (2, 1)

@@ -74,7 +74,7 @@ NO_RUN = "not empty, and not the folder of a run"
         ("export R --out mine.ply", "mine.ply: exists already"),
         ("export R --out mine.obj --texture", "mine.mtl: exists already"),
         ("export R --out mine.ply --bop", "mine.ply: exists already"),
-        ("export R --out other --overwrite", "unknown mesh format|no ending"),
+        ("export R --out other --overwrite", "unknown mesh format|no suffix"),
         ("report R --out page.html", "page.html: exists already"),
         ("report R --out R/trajectory.txt --overwrite", READ),
         ("report R --out S/page.html", READ),

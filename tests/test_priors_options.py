@@ -177,8 +177,8 @@ def test_pokes_are_read() -> None:
 @pytest.mark.parametrize(
     ("options", "sequence", "says"),
     [
-        (PriorOptions(prior="magic"), None, "no prior 'magic'"),
-        (PriorOptions(prior="table+"), None, "no prior ''"),
+        (PriorOptions(prior="magic"), None, "unknown prior 'magic'"),
+        (PriorOptions(prior="table+"), None, "unknown prior ''"),
         (PriorOptions(prior="velocity+velocity"), None, "names velocity twice"),
         (PriorOptions(prior="turntable"), None, "give --step-deg"),
         (PriorOptions(prior="held"), None, "one sequence at a time"),
@@ -188,7 +188,7 @@ def test_pokes_are_read() -> None:
         (
             PriorOptions(prior="table", step_deg=3.0),
             None,
-            "--step-deg is no parameter of --prior table",
+            "--step-deg is not a parameter of --prior table",
         ),
         (PriorOptions(prior="table+turntable", max_rotation_deg=3.0), TURNTABLE, "--max-rotation-deg"),
         (PriorOptions(prior="turntable", step_deg=float("nan")), None, "--step-deg nan is out of range"),
@@ -199,7 +199,7 @@ def test_pokes_are_read() -> None:
         ),
         (PriorOptions(prior="held", held_sigma_m=-0.1), TURNTABLE, "--held-sigma-m -0.1 is out of range"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"one": POKE}}), "poke 'one'"),
-        (PriorOptions(), Telling({"kind": "poke", "pokes": {"9" * 5000: POKE}}), "has no frame number"),
+        (PriorOptions(), Telling({"kind": "poke", "pokes": {"9" * 5000: POKE}}), "must have a frame number"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": POKE | {"length_m": 10**400}}}), "poke '1' must be"),
         (PriorOptions(prior="turntable"), Telling({"kind": "turntable", "step_deg": 10**400}), "give --step-deg"),
         (PriorOptions(), Telling({"kind": "turntable", "step_deg": 1e308}), "telling: sequence.json: step_deg 1e+308"),
@@ -242,7 +242,7 @@ def test_a_prior_of_the_users_own_is_used_with_its_fields() -> None:
         ("broken_priors:Slow", (), "ZeroDivisionError"),
         ("own_priors:Thawed", (), "frozen dataclass"),
         ("own_priors:OWN", (), "cannot be imported"),
-        ("os:path", (), "is no prior"),
+        ("os:path", (), "is not a prior"),
         ("own_priors:Choosy", (), "never"),
         ("own_priors:Slow", ("speed=3",), "has axis, max_turn_deg"),
         ("own_priors:Slow", ("axis",), "NAME=VALUE"),

@@ -108,7 +108,7 @@ class Elements(HTMLParser):
 
 @pytest.mark.usefixtures("_undrawn")
 def test_the_evidence_is_explained_and_stands_beside_its_limits(run: Path, page: str, tmp_path: Path) -> None:
-    section = page.partition("<h2>What was checked</h2>")[2].partition("<h2>")[0]
+    section = page.partition("<h2>Checks</h2>")[2].partition("<h2>")[0]
     evidence = json.loads((run / "report.json").read_text())["evidence"]
     assert set(evidence) >= {"unsure_masks", "motion_m", "other_modes"}
     assert section.count("</td></tr>") == len(evidence)
@@ -145,7 +145,7 @@ def test_every_section_is_there(page: str) -> None:
     assert ODD_NAME in headings
     wanted = [
         "Model",
-        "What was checked",
+        "Checks",
         "Symmetries",
         "Camera poses",
         "Uncertainty",
@@ -357,7 +357,7 @@ def test_the_command_writes_the_page_and_says_where(run: Path, tmp_path: Path, c
     out.unlink()
     assert main(["report", str(run), "--out", str(out), "--sequence", str(bundled("box"))]) == 2
     said = capsys.readouterr().err
-    assert "box: frame 0 shows something else" in said
+    assert "box: frame 0 differs from the one" in said
     assert str(run) in said
     assert not out.exists()
 

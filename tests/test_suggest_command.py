@@ -22,7 +22,7 @@ def test_a_run_gets_a_ranked_list_of_words(cli: Run, built: Path) -> None:
     assert len(lines) == 8
     assert lines[0].startswith(("turn by ", "poke at "))
     assert all("% new surface" in line for line in lines)
-    assert "of what can be seen was seen" in ended.err
+    assert "of the visible surface observed" in ended.err
     assert ended == cli("suggest", built)
 
 
@@ -53,14 +53,14 @@ def test_what_the_prior_excludes_is_said(cli: Run, built: Path, tmp_path: Path) 
     given.write_text('[{"kind": "turn", "turn_deg": 170}]')
     ended = cli("suggest", built, "--candidates", given)
     assert (ended.status, ended.out) == (0, "")
-    assert "1 of 1 candidates are beyond what the run's prior allows" in ended.err
+    assert "1 of 1 candidates are excluded by the run's prior" in ended.err
 
 
 def test_a_goal_decides_the_status(cli: Run, built: Path) -> None:
     near, far = cli("suggest", built, "--until-seen", "0.1"), cli("suggest", built, "--until-seen", "1")
     assert (near.status, far.status) == (0, 3)
-    assert near.err.startswith("modeler: good enough: ")
-    assert far.err.startswith("modeler: not yet good enough: ")
+    assert near.err.startswith("modeler: goal reached: ")
+    assert far.err.startswith("modeler: goal not reached: ")
     assert cli("suggest", built, "--until-sigma-mm", "0.001", "--until-seen", "0.1").status == 3
 
 

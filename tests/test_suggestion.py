@@ -219,7 +219,7 @@ def test_laying_it_down_shows_what_it_stood_on_with_the_odds_of_joining(box: Bel
     assert found.new_surface > 0.0
     assert found.pose_nats == 0.0
     assert 0.5 < found.right < 1.0
-    assert "placed right with" in suggest(box, [Candidate("lay")]).ranked[0].words
+    assert "placed correctly with" in suggest(box, [Candidate("lay")]).ranked[0].words
 
 
 def test_a_turn_beyond_the_prior_is_no_candidate(box: Belief) -> None:
@@ -274,5 +274,5 @@ def test_the_goal_is_what_the_user_says(box: Belief) -> None:
     assert not Goal(pose_deg=90.0, seen=1.0).reached(box)
     assert not Goal(pose_deg=90.0, seen=0.0, sigma_m=1e-6).reached(box)
     said = suggest(box, [Candidate("lay")], Goal(pose_deg=90.0, seen=0.0)).summary
-    assert said.startswith("nothing more is to be gained: every pose within ")
+    assert said.startswith("nothing more to gain: every pose within ")
     assert said.endswith("lay it on its side for the rest")

@@ -190,8 +190,8 @@ def test_the_last_words_tell_by_how_much_the_loop_was_open(run: list[Step], reco
     centroids_m = {frame: view.centroid_m for frame, view in last.views.items()}
     opening = loop_opening(last.edges_so_far, last.solution, centroids_m)
     assert opening is not None
-    words = f"was open by {np.degrees(opening.rotation_rad):.1f}° and {1000.0 * opening.translation_m:.1f} mm"
-    assert words in recording[entities.NOW][last.frame.index]["text"][0]
+    opened = f"{np.degrees(opening.rotation_rad):.1f}° and {1000.0 * opening.translation_m:.1f} mm"
+    assert f"has a closure error of {opened}" in recording[entities.NOW][last.frame.index]["text"][0]
 
 
 def test_what_the_graph_leaves_to_the_modes_of_a_pair_is_told(run: list[Step]) -> None:

@@ -60,7 +60,7 @@ def tab(first: RayImage | None) -> rrb.Container:
     cells = rrb.Spatial3DView(
         origin=entities.WORLD,
         contents=[SEEN_CELLS, UNSEEN_CELLS, entities.CAMERAS, entities.POSITION_3_SIGMA],
-        name="Seen (grey), and where unseen surface may be (orange)",
+        name="Observed (grey), and where unseen surface may be (orange)",
         eye_controls=None if first is None else _eye(first),
     )
     frame = rrb.Spatial2DView(
@@ -68,7 +68,7 @@ def tab(first: RayImage | None) -> rrb.Container:
     )
     words = rrb.TextDocumentView(origin=WORDS, name="What to do next, best first")
     times = rrb.Horizontal(
-        rrb.TimeSeriesView(origin=SEEN, name="Seen, % of what can be seen"),
+        rrb.TimeSeriesView(origin=SEEN, name="Observed, % of the visible surface"),
         rrb.TimeSeriesView(origin=POSE_SD, name="Largest standard deviation of a rotation, °"),
     )
     return rrb.Horizontal(

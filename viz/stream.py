@@ -105,7 +105,7 @@ class RerunStream:
             try:
                 self.recording.flush(timeout_sec=_PATIENCE_S)
             except RuntimeError as error:
-                _log.info("the viewer did not receive everything: %s", error)
+                _log.info("the viewer did not receive all data: %s", error)
         # Disconnecting completes the file, but first takes leave of the viewers, and for ever of one that is frozen.
         leave = threading.Thread(target=self.recording.disconnect, daemon=True)
         leave.start()

@@ -87,7 +87,7 @@ def start_window(recordings: Sequence[Path] = ()) -> Viewer:
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError(
-            "cannot open the viewer: no display (DISPLAY is not set); use --web and open the page it names"
+            "cannot open the viewer: no display (DISPLAY is not set); use --web and open the page that it prints"
         )
     port = _free_port()
     sink = _sink(port)

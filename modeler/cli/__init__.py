@@ -126,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             say(f"{error.filename}: cannot be used ({error.strerror}); check the path and its permissions")
             return 2
         _close_stdout()
-        say(f"output cannot be written ({os.strerror(error.errno)}); make room, or send it elsewhere")
+        say(f"output cannot be written ({os.strerror(error.errno)}); free disk space, or redirect it")
         return 2
     except KeyboardInterrupt:
         say("interrupted")
@@ -217,7 +217,7 @@ def _check_environment() -> None:
     """
     threads, interpreted = (os.environ.get(f"NUMBA_{name}", "") for name in ("NUM_THREADS", "DISABLE_JIT"))
     if threads and not (threads.isdecimal() and int(threads) > 0):
-        say(f"NUMBA_NUM_THREADS={threads} is no number of threads; set it to 1 or more, or unset it")
+        say(f"NUMBA_NUM_THREADS={threads} is not a number of threads; set it to 1 or more, or unset it")
         raise SystemExit(2)
     if interpreted not in ("", "0"):
         say(f"NUMBA_DISABLE_JIT={interpreted} would leave the kernels uncompiled; unset it")

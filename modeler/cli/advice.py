@@ -1,4 +1,4 @@
-"""What the outcome of a run suggests to do otherwise, in terms of options."""
+"""Advice on a run: what to change, in terms of options."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FAR_DEG: Final = 100.0  # over which 1 % of a rotation is 1°, a third of what 
 _BY_OPTIONS: Final = {
     Outcome.TOO_FEW_POINTS: "The object covers too few pixels; check the mask, --roi and --max-depth-m.",
     Outcome.UNSURE_MASK: (
-        "The object is hard to tell from its surroundings; give --roi, --max-depth-m, or masks that hold nothing else."
+        "The object is hard to segment; give --roi, --max-depth-m, or masks that hold only the object."
     ),
 }
 
@@ -101,7 +101,7 @@ def other_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
         return ""
     signed_deg = round(float(np.copysign(found_deg, table.step_deg)), 1)
     return (
-        f"the views turned by {found_deg:.1f}° from one frame number to the next, not by the stated "
+        f"the views turned by {found_deg:.1f}° from one frame number to the next, not by the given "
         f"{stated_deg:g}° ± {table.step_sigma_deg:g}°; "
         + (f"try --step-deg {signed_deg:.1f}" if signed_deg else "did the table turn?")
     )
@@ -134,8 +134,8 @@ def told_focal_length(camera: Mapping[str, Any]) -> str:
         return ""
     loops, given_px = "1 loop" if camera["loops"] == 1 else f"{camera['loops']} loops", fx_px / factor
     return (
-        f"the focal length is {fx_px:.1f} ± {sigma * fx_px:.1f} px, {given_px:.1f} px was given; {loops} close to "
-        f"{camera['sigmas_after']:.1f} sd with it, to {camera['sigmas_before']:.1f} sd as given"
+        f"the focal length is {fx_px:.1f} ± {sigma * fx_px:.1f} px, {given_px:.1f} px was given; closure error of "
+        f"{loops}: {camera['sigmas_after']:.1f} sd with it, {camera['sigmas_before']:.1f} sd as given"
     )
 
 
@@ -152,7 +152,7 @@ def unchecked_focal_length(report: Mapping[str, Any]) -> str:
     if report["closed"] or not report["trustworthy"] or turned_deg < _FAR_DEG:
         return ""
     return (
-        f"no loop checks the focal length: an error of 1 % would be one of about {0.01 * turned_deg:.1f}° over the "
+        f"no loop checks the focal length: an error of 1 % would cause about {0.01 * turned_deg:.1f}° over the "
         f"{turned_deg:.0f}° that the object turned"
     )
 
@@ -195,13 +195,13 @@ def remedy(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
 
 def _region(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
     region = {"roi": "X0 Y0 X1 Y1", "max-depth-m": "M"}
-    return Remedy("say where the object is: the pixels around it in all frames, and the depth behind it", region)
+    return Remedy("specify where the object is: the pixels around it in all frames, and the largest depth", region)
 
 
 def _surface(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
     """Return a look at the masks where a loop and all else confirm the poses, else a stronger prior."""
     if report["closed"] and set(report["reason_codes"]) <= {"seen_through", "absent", "unsure_size"}:
-        words = "the loop confirms the poses; see in the report whether masks or filled holes hold more than the object"
+        words = "the loop confirms the poses; check in the report whether masks or filled holes exceed the object"
         return Remedy(words, first="modeler report {run}")
     return _more_known(report, prior)
 
@@ -218,14 +218,14 @@ def _full_turn(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None
     """Return how the focal length of a camera is learned where this run hardly tells it."""
     if report["closed"]:
         return _camera(report, prior)
-    words = "turn the object until it comes back, or take the focal length from another run, of a full turn"
+    words = "turn the object fully around, or take the focal length from another run with a full turn"
     return Remedy(words, {"camera": "camera.json"}, "modeler calibrate-camera FULL_TURN --out camera.json")
 
 
 def _known_camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
     """Return how to say which of focal length and depth is right."""
     first = "modeler calibrate-camera {run} --known focal-length --out known.json"
-    words = "if the sequence's focal length is a calibrated one, say so (if its depth is right, --known depth)"
+    words = "if the given focal length is calibrated (if the depth is accurate instead: --known depth)"
     return Remedy(words, {"camera": "known.json"}, first)
 
 
@@ -235,7 +235,7 @@ def _without_prior(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | 
         return None
     if isinstance(prior, TurntablePrior):
         return Remedy("allow for a larger error of the step", {"step-sigma-deg": f"{3.0 * prior.step_sigma_deg:g}"})
-    return Remedy("see what the images say without it", {"prior": "general"})
+    return Remedy("register without this prior", {"prior": "general"})
 
 
 def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
@@ -246,11 +246,11 @@ def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | Non
     if report.get("up") is not None and isinstance(prior, GeneralPrior):
         wide = max(turns, default=0.0) >= prior.max_rotation_deg - _NEAR_LIMIT_DEG
         options = {"max-rotation-deg": _twice_deg(prior.max_rotation_deg)} if wide else {}
-        return Remedy("say that the object stays on its table", {"prior": "table", **options})
-    words, step, sigma = "say how far it was turned from frame to frame, and how evenly", "DEG", "DEG"
+        return Remedy("use the prior that the object stays on its table", {"prior": "table", **options})
+    words, step, sigma = "give the rotation from frame to frame and its standard deviation", "DEG", "DEG"
     turned_deg = float(np.median(turns)) if turns else 0.0
     if turns and _sigma_deg(report["edges"]) > max(_ROUGH * turned_deg, 1.0):
-        words += ": the images leave that open"
+        words += ", which the images do not determine"
     elif turned_deg >= 1.0:
         step, sigma = f"{turned_deg:.0f}", f"{max(_ROUGH * turned_deg, 1.0):.0f}"
     return Remedy(words, {"prior": "turntable", "step-deg": step, "step-sigma-deg": sigma})
@@ -306,4 +306,4 @@ def ends_without(frames: Sequence[Mapping[str, Any]]) -> str:
     late, early = seen[0] > ids[0], seen[-1] < ids[-1]
     when = [f"from frame {seen[0]} on"] * late + [f"up to frame {seen[-1]}"] * early
     only = f"{seen[0] if late else ''}:{seen[-1] + 1 if early else ''}"
-    return f"the object is seen {', '.join(when)}; --frames {only} takes those frames alone"
+    return f"the object is visible {', '.join(when)}; --frames {only} selects those frames"

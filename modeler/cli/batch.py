@@ -1,4 +1,4 @@
-"""`modeler batch`: many sequences to models, on whatever engine there is."""
+"""`modeler batch`: many sequences to models, on any engine."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ _RETURNS_S = 120.0  # within which an engine that was lost is expected back
 
 @dataclass(frozen=True)
 class Batch:
-    """Build models of many sequences, each into a run folder of its own below DIR, and list them in DIR/models.parquet.
+    """Build models of many sequences, each into its own run folder below DIR, and list them in DIR/models.parquet.
 
-    The options of `modeler build` hold for every sequence. What is on the disk counts: the same command again passes
-    over what is done, resumes what was interrupted, and tries once more what failed once. Ctrl-C, or a kill, loses the
-    pair under way of each sequence and nothing else.
+    The options of `modeler build` apply to every sequence. When repeated, the same command skips finished sequences,
+    resumes interrupted ones, and retries those that failed once. Ctrl-C, or a kill, loses only the pair in progress of
+    each sequence.
 
-    Exit status: 0 where every model can be trusted, 3 where some model cannot or is missing, 2 for wrong usage.
+    Exit status: 0 if every model can be trusted, 3 if some cannot or are missing, 2 for wrong usage.
     """
 
     sequences: Annotated[
@@ -49,20 +49,20 @@ class Batch:
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = field(kw_only=True)
     """Folder for the run folders and the list of models."""
     manifest: Annotated[Path | None, tyro.conf.arg(metavar="FILE.csv"), default("none")] = None
-    """Table of sequences: a column `sequence`, perhaps `name` for that of the run folder, and any option of
-    `modeler build` as a column, for that row alone: prior, step-deg, frames, ..."""
+    """Table of sequences: a column `sequence`, optionally `name` for the run folder, and any option of `modeler build`
+    as a column, for that row alone: prior, step-deg, frames, ..."""
     executor: Annotated[str, tyro.conf.arg(metavar="ENGINE")] = "processes"
     """processes: on this machine. dask:ADDRESS: on the Dask cluster of that scheduler.
-    slurm:FOLDER: jobs of Slurm, which are written to FOLDER; processes where there is no Slurm.
-    module:callable: what the callable, given --workers, returns: a concurrent.futures.Executor."""
+    slurm:FOLDER: Slurm jobs, with files in FOLDER; local processes without Slurm.
+    module:callable: the concurrent.futures.Executor that the callable returns for --workers."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N"), default("as cores and memory allow")] = None
-    """How many sequences at a time (of Slurm: in the queue); a cluster has its own number."""
+    """Number of sequences at a time (Slurm: in the queue); a cluster has its own number."""
     overwrite: bool = False
-    """Build anew what was built with other options or from other input."""
+    """Build sequences again that were built with other options or from other input."""
     again: bool = False
-    """Try again what has failed twice."""
+    """Retry sequences that failed twice."""
     pages: bool = False
-    """Write the report of each model as a page, too (some 10 s each)."""
+    """Also write the HTML report of each model (some 10 s each)."""
     model: ModelOptions = field(default_factory=ModelOptions)
     prior: PriorOptions = field(default_factory=PriorOptions)
     method: MethodOptions = field(default_factory=MethodOptions)
@@ -85,7 +85,7 @@ class Batch:
         from modeler.types import InputError
 
         if self.workers is not None and self.workers < 1:
-            raise InputError(f"--workers {self.workers} does no work; give a whole number from 1 on")
+            raise InputError(f"--workers {self.workers} is out of range; give a whole number from 1")
         check_engine(self.executor)
         check_folder(self.out, self.sequences)
         with alone(self.out):
@@ -96,12 +96,12 @@ class Batch:
             if changed and not self.overwrite:
                 raise InputError(
                     f"{self.out / changed[0]}: was built with other options or from other input, as were "
-                    f"{len(changed)} in all; give --overwrite to build these anew, or choose another --out"
+                    f"{len(changed)} in all; give --overwrite to build these again, or choose another --out"
                 )
             ends = [ended(job.name, read_note(job.note), fresh=False) for job in jobs if stands[job] in _OVER]
             waiting = [job for job in jobs if stands[job] not in _OVER]
             stand = Counter(stands.values())
-            words = f"{stand['done']} done, {stand['failed']} failed twice, {stand['interrupted']} to be taken up again"
+            words = f"{stand['done']} done, {stand['failed']} failed twice, {stand['interrupted']} to be resumed"
             words = f"{len(jobs)} {_sequences(len(jobs))}: {words}, {stand['new'] + stand['changed']} to be built"
             if not waiting:
                 say(words)
@@ -186,7 +186,7 @@ def _work(options: Batch, jobs: Sequence[Job], words: str) -> Iterator[Ended]:
             time.sleep(1.0)
             continue
         if waiting:
-            say("the engine was lost: waiting for it")
+            say("the connection to the engine was lost: waiting for it")
             given_up_s = time.monotonic() + _RETURNS_S
 
 

@@ -41,18 +41,18 @@ class Build:
     """
 
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SEQUENCE")]
-    """Folder of pictures (BOP, TUM RGB-D, Open3D, BundleSDF, your own) or of organised clouds (PCD, PLY).
-    ROS bag, MCAP, RealSense or Azure Kinect recording; realsense: for a camera that is plugged in."""
+    """Folder of images (BOP, TUM RGB-D, Open3D, BundleSDF, your own) or of organised clouds (PCD, PLY).
+    ROS bag, MCAP, RealSense or Azure Kinect recording; realsense: for a connected camera."""
     out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
-    """Run folder to make: model.ply, cloud.ply, trajectory.txt, graph.g2o, report.json, recording.rrd and more."""
+    """Run folder to create: model.ply, cloud.ply, trajectory.txt, graph.g2o, report.json, recording.rrd and more."""
     overwrite: bool = False
     """Replace the results of an earlier run in the folder."""
     resume: bool = False
-    """Go on with an interrupted run of the same options: pairs that it has registered are not registered again."""
+    """Continue an interrupted run with the same options; registered pairs are reused."""
     watch: bool = False
-    """Another program is still writing into SEQUENCE: take the frames as they come."""
+    """Process frames while another program is still writing into SEQUENCE."""
     idle_s: Annotated[float, tyro.conf.arg(metavar="S")] = 10.0
-    """With --watch: the sequence is over when nothing has come for so long (or a file `done` has, or after Ctrl-C)."""
+    """With --watch: end the sequence after so long without a new frame (or at a file `done`, or at Ctrl-C)."""
     view: bool = False
     """Watch in the Rerun viewer."""
     web: bool = False
@@ -98,7 +98,7 @@ class Build:
         )
         if self.resume and RunFolder(self.out).finished(meta):
             RunFolder(self.out).pairs.drop()  # what a kill at the very end left of them
-            say("the run had come to its end; --overwrite makes it anew")
+            say("the run is already complete; give --overwrite to build it again")
             return _summarise(RunFolder(self.out).report(), self, modeler.prior)
         compile_kernels()
         scene, _ = both(partial(compose.scene, modeler, whole), load)
@@ -109,14 +109,14 @@ class Build:
             registrar = Remembered(modeler.registrar, folder.pairs, meta.versions)
             modeler = replace(modeler, registrar=registrar, glance=glance)
             if before:
-                say(f"was begun with {', '.join(before)}: pairs are registered anew")
+                say(f"the run was begun with {', '.join(before)}: its pairs are registered again")
             if remark:
                 say(remark)
             report = _run(self, modeler, (frames, scene), folder, meta, began_s=began_s)
             folder.finish()
         recording = folder.path / "recording.rrd"
         if not ends_whole(recording):
-            say(f"{recording}: is cut off (is the disk full?); the rest is whole")
+            say(f"{recording}: is truncated (is the disk full?); all other files are complete")
         return _summarise(report, self, modeler.prior)
 
     def settings(self) -> dict[str, object]:
@@ -284,8 +284,9 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
     say(f"{accepted} of {frames}, {loop}, {took}: {options.out}")
     if opening := report.get("loop"):
         say(
-            f"the loop was open by {opening['opening_deg']:.1f}° and {1000.0 * opening['opening_m']:.1f} mm, "
-            f"{opening['sigmas']:.1f} times what its {opening['edges']} edges and the closure state"
+            f"loop closure error before optimisation: {opening['opening_deg']:.1f}° and "
+            f"{1000.0 * opening['opening_m']:.1f} mm, "
+            f"{opening['sigmas']:.1f} standard deviations of {opening['edges']} edges and the closure"
         )
     if (camera := report.get("camera")) and (words := told_focal_length(camera)):
         say(words)
@@ -295,7 +296,7 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
         say(f"not to be trusted: {first}{more}")
         if sense_in_doubt(report, prior):
-            say("the stated direction of rotation is assumed; if it may be the other, give --step-sign unknown")
+            say("the given direction of rotation is assumed; if it may be the opposite, give --step-sign unknown")
     for remark in (other_step(report["edges"], prior), ends_without(report["frames"]), unchecked_focal_length(report)):
         if remark:
             say(remark)

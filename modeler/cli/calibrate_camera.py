@@ -23,23 +23,23 @@ _OPEN = 0.005  # of sizes: less is not worth a line
 class CalibrateCamera:
     """Estimate a depth camera's focal length from a run in which the object came back to its first view.
 
-    Under a wrong focal length every turn comes out too small or too large, and a full turn does not close. Depth whose
-    relief is too flat or too deep, as smoothing and hole filling make it, does the same: loops tell the two together,
-    and the size of the model depends on which it is. `modeler build SEQUENCE --camera FILE` uses the result for any
-    sequence of the same camera.
+    A wrong focal length makes all rotations too small or too large, so that a full turn does not close. Depth with too
+    flat a relief, as from smoothing and hole filling, has the same effect: loops cannot separate the two, and the size
+    of the model depends on which it is. `modeler build SEQUENCE --camera FILE` uses the result for any sequence of the
+    same camera.
     """
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Run folder, as `modeler build` makes it, of a full turn. Its loop may have been refused as contradicting the
-    chain; its frames must be right one by one."""
+    """Run folder of `modeler build`, of a full turn. Its loop may have been rejected as contradicting the chain; its
+    consecutive pairs must be right."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """JSON file to write."""
     overwrite: bool = False
-    """Replace the file where there is one."""
+    """Replace an existing file."""
     known: Literal["neither", "focal-length", "depth"] = "neither"
-    """What the sequence states rightly: focal-length (a calibrated camera: it is the depth that is stretched), depth
-    (unfiltered, of a camera whose focal length is nominal). neither: half of it is ascribed to each, and a model that
-    could be wrong by more than 5 mm for that is not trusted."""
+    """What is accurate in the sequence: focal-length (a calibrated camera; the depth is wrong) or depth (unfiltered;
+    the focal length is nominal). neither: half of the error is attributed to each, and a model that may be wrong by
+    more than 5 mm for this reason is not trusted."""
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:
@@ -74,8 +74,8 @@ class CalibrateCamera:
         say(f"{_said(found, used_px)}: {self.out}")
         if found.told_by == "loop" and stated.depth_scale_sigma >= _OPEN:
             say(
-                f"or the relief of its depth is wrong by {100.0 * open_by:.0f} %; sizes are known to "
-                f"{100.0 * stated.depth_scale_sigma:.0f} %: say with --known which of the two is right"
+                f"or the relief of the depth is wrong by {100.0 * open_by:.0f} %; sizes are known only to "
+                f"{100.0 * stated.depth_scale_sigma:.0f} %: give --known to say which of the two is accurate"
             )
         return 0 if found.told_by == "loop" else 3
 
@@ -84,17 +84,17 @@ def _said(found: FocalLength, used_px: float) -> str:
     loops = "1 loop" if found.loops == 1 else f"{found.loops} loops"
     if found.told_by == "prior" and found.loops:
         return (
-            f"the focal length stays uncertain after {loops}: {found.sigmas_before:.1f} sd open as given, "
-            f"{found.sigmas_after:.1f} sd with the best one; if that is much, an edge is wrong, see the worst pairs in "
-            "the run's report"
+            f"{loops} do not determine the focal length: closure error of {found.sigmas_before:.1f} sd as given, "
+            f"{found.sigmas_after:.1f} sd with the best one; if this is large, an edge is wrong: see the worst pairs "
+            "in the run's report"
         )
     if found.told_by == "prior":
         return (
-            "no loop determines the focal length; turn the object fully, with steps that overlap, and say what is "
-            "known of its motion (--prior table)"
+            "no loop determines the focal length; turn the object fully, with overlapping steps, and use a motion "
+            "prior (--prior table)"
         )
     focal_px, sigma_px = used_px * found.factor, used_px * found.factor * found.sigma
     return (
         f"the focal length is {focal_px:.1f} ± {sigma_px:.1f} px, {used_px:.1f} px was given; "
-        f"{loops} close to {found.sigmas_after:.1f} sd with it, to {found.sigmas_before:.1f} sd as given"
+        f"closure error of {loops}: {found.sigmas_after:.1f} sd with it, {found.sigmas_before:.1f} sd as given"
     )

@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CalibrateSensor:
-    """Measure a depth camera's noise, across and along the ray, from a few frames of a scene that stands still.
+    """Measure a depth camera's noise, across and along the ray, from a few frames of a static scene.
 
-    Put a box or two at the distances that matter before a farther background, keep everything still, and record ten
+    Put a box or two at the relevant distances in front of a farther background, keep everything still, and record ten
     frames. `modeler build SEQUENCE --sensor FILE` uses the result for any sequence of the same camera.
     """
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
-    """At least 3 frames in any format that is read."""
+    """At least 3 frames in any supported format."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """JSON file to write."""
     overwrite: bool = False
-    """Replace the file where there is one."""
+    """Replace an existing file."""
     given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
@@ -85,7 +85,7 @@ def _facts(name: str, found: Calibration, sensor: dict[str, float]) -> dict[str,
 
 
 def _table(found: Calibration) -> list[str]:
-    """Return what was measured, a line for each distance and angle, beside what the model says."""
+    """Return the measured noise and that of the fitted model, one line per distance and angle."""
     lines = [f"across the ray  {found.model.lateral_px:.2f} px, from {len(found.borders)} borders", "along the ray"]
     lines.append("  distance   angle    pixels   measured      model")
     for one in found.bins:

@@ -165,7 +165,7 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
     for part in parts:
         if part not in _GIVEN and ":" not in part:
             raise InputError(
-                f"--prior {name}: there is no prior {part!r}; there are {', '.join(map(repr, _GIVEN))}, "
+                f"--prior {name}: unknown prior {part!r}; known are {', '.join(map(repr, _GIVEN))}, "
                 "your own as module:Class, and several joined by +"
             )
         if parts.count(part) > 1:
@@ -180,7 +180,7 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
     if {"table", "turntable"} <= set(known):  # the axis is the table's normal: to multiply would count the table twice
         if "max_rotation_deg" in given:
             raise InputError(
-                "--max-rotation-deg is no parameter of a turntable on its table; --step-deg gives the rotation."
+                "--max-rotation-deg is not a parameter of a turntable on its table; --step-deg gives the rotation."
             )
         known.remove("table")
         of["turntable"]["needs_table"] = True
@@ -221,10 +221,10 @@ def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[s
     """Return the name of the prior, and in words what was assumed because no option states it."""
     name, assumed = prior_name(options, sequence), []
     if options.prior is None and name != "general":
-        assumed.append(f"prior {name}, as sequence.json says")
+        assumed.append(f"prior {name}, from sequence.json")
     step_deg = _number((sequence.motion or {}).get("step_deg"))
     if "turntable" in name.split("+") and options.step_deg is None and step_deg is not None:
-        assumed.append(f"step {step_deg:g}°, as sequence.json says")
+        assumed.append(f"step {step_deg:g}°, from sequence.json")
     step_deg = step_deg if options.step_deg is None else options.step_deg
     apart = min((late - early for early, late in itertools.pairwise(sequence.indices)), default=1)
     if "turntable" in name.split("+") and step_deg is not None and apart > 1:
@@ -269,7 +269,7 @@ def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:
         raise InputError(f"--prior {name}: cannot be imported ({type(error).__name__}: {error}); correct it") from error
     frozen = getattr(getattr(kind, "__dataclass_params__", None), "frozen", False)
     if not (isinstance(kind, type) and issubclass(kind, AbstractPrior) and is_dataclass(kind) and frozen):
-        raise InputError(f"--prior {name}: is no prior; derive a frozen dataclass from modeler.types.AbstractPrior")
+        raise InputError(f"--prior {name}: is not a prior; derive a frozen dataclass from modeler.types.AbstractPrior")
     known = {field.name for field in fields(kind) if field.init}
     values = {}
     for argument in arguments:
@@ -285,7 +285,7 @@ def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:
     try:
         prior = kind(**values)
     except Exception as error:
-        raise InputError(f"--prior {name}: cannot be made ({error}); see --prior-args") from error
+        raise InputError(f"--prior {name}: cannot be created ({error}); see --prior-args") from error
     assert isinstance(prior, AbstractPrior)
     return prior
 
@@ -310,7 +310,7 @@ def _turntable(given: dict[str, Any], motion: Mapping[str, object]) -> Turntable
     given = dict(given)
     if "step_deg" not in given:
         if not step_deg:
-            raise InputError("--prior turntable needs the turn from frame to frame; give --step-deg")
+            raise InputError("--prior turntable needs the rotation from frame to frame; give --step-deg")
         given["step_deg"] = step_deg
         if sigma_deg is not None and sigma_deg > 0.0:
             given.setdefault("step_sigma_deg", sigma_deg)
@@ -352,7 +352,9 @@ def _one_poke(where: str, frame: str, entry: object) -> tuple[int, Poke]:
     """Return a push as `sequence.json` has it, and the first frame after it; `where` is for messages."""
     number = frame_number(frame)
     if number is None:
-        raise InputError(f"{where}: poke {frame!r} has no frame number for a key; use that of the first frame after it")
+        raise InputError(
+            f"{where}: poke {frame!r} must have a frame number as its key; use that of the first frame after it"
+        )
     values = entry if isinstance(entry, dict) else {}
     point_m, direction, length_m = (values.get(name) for name in ("point_m", "direction", "length_m"))
     threes = [
@@ -363,7 +365,7 @@ def _one_poke(where: str, frame: str, entry: object) -> tuple[int, Poke]:
     if any(None in three for three in threes) or not any(threes[1]) or length_m is None or not 0.0 < length_m <= 10.0:
         raise InputError(
             f'{where}: poke {frame!r} must be {{"point_m": [x, y, z], "direction": [x, y, z], "length_m": l}} '
-            "in camera coordinates; correct it there"
+            "in camera coordinates; correct it"
         )
     return number, Poke(threes[0], threes[1], length_m)  # pyright: ignore[reportArgumentType]
 

@@ -201,13 +201,13 @@ class Console:
             case Step():
                 self._show_step(event)
             case Searching(frame):
-                self._bar.update(self._task, description=f"trying frame {frame} again")
+                self._bar.update(self._task, description=f"retrying frame {frame}")
             case Refining(done, int(total)):
                 self._show_stage("registering more pairs", done, total)
             case Refining():
                 self._show_stage("choosing more pairs", 0, 1)
             case Fusing():
-                self._show_stage("making the model", 0, 1)
+                self._show_stage("fusing the model", 0, 1)
 
     def _show_step(self, step: Step) -> None:
         """Show what became of a frame; a lost frame that is placed later has a second step, and so has the last."""
@@ -225,7 +225,7 @@ class Console:
         if step.left_out is not None and before is None:
             self._tell(frame, f"left out: {self._why(step.left_out, step.posteriors)}")
         elif accepted and before is False:
-            self._tell(frame, "placed after all")
+            self._tell(frame, "placed on retry")
         elif accepted:
             self._release()
 

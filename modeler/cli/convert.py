@@ -25,19 +25,19 @@ LIVE_REACH_M = 16.0
 class Convert:
     """Write any input as a BOP scene folder, the native layout; or the poses of a run for other programs.
 
-    A run folder as INPUT gives its poses: as scene_gt.json (BOP) where OUT ends in .json, as a TUM trajectory where
+    Of a run folder as INPUT, it writes the poses: as scene_gt.json (BOP) if OUT ends in .json, as a TUM trajectory if
     it ends in .txt.
     """
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
-    """A sequence in any format that is read, or a run folder."""
+    """A sequence in any supported format, or a run folder."""
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
-    """BOP scene folder to make; scene_gt.json or poses.txt for a run."""
+    """BOP scene folder to create; scene_gt.json or poses.txt for a run."""
     overwrite: bool = False
-    """Replace the poses of a run that OUT holds; a folder is never replaced."""
-    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as INPUT says")] = None
+    """Replace an existing file of poses; a folder is never replaced."""
+    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("from INPUT")] = None
     """Noise of the depth camera, as `modeler calibrate-sensor` measured it, to write into sequence.json."""
-    camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as INPUT says")] = None
+    camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("from INPUT")] = None
     """Focal length of the depth camera, as `modeler calibrate-camera` estimated it."""
     selection: FrameOptions = field(default_factory=FrameOptions)
     given: InputOptions = field(default_factory=InputOptions)
@@ -60,14 +60,16 @@ class Convert:
             check_files([self.out], run_inputs([self.input]), overwrite=self.overwrite)
             return _poses(self.input, self.out)
         if self.out.suffix in (".json", ".txt"):
-            raise InputError(f"{self.input}: is no folder of a run, whose poses {self.out} could hold; give one")
+            raise InputError(f"{self.input}: is not a run folder with poses for {self.out}; give a run folder")
         check_folder(self.out, [path for path in (self.input, self.sensor, self.camera) if path is not None])
         whole = open_sequence(self.input, self.given.stated())
         whole = calibrated(whole, self.sensor, self.camera)
         kept = frame_range(self.selection.frames)
         sequence = whole.select(self.selection.every, kept)
         if sequence.live and kept.stop is None:
-            raise InputError(f"{self.input}: has no end; say how many frames to record, for instance --frames :30.")
+            raise InputError(
+                f"{self.input}: has no end; limit the number of frames to record, for instance --frames :30."
+            )
         with reading() as watched:
             found = survey(watched(sequence.recorded(), "reading"))
             farthest_m = LIVE_REACH_M if sequence.live else found.farthest_m

@@ -1,4 +1,4 @@
-"""`modeler demo-active`: a simulated robot that does what `modeler suggest` says."""
+"""`modeler demo-active`: a simulated robot that follows `modeler suggest`."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ _REACH_DEG = 100.0  # of turns, and limit of the table prior: beyond it views ha
 
 @dataclass(frozen=True)
 class DemoActive:
-    """Show a simulated robot that turns an object as `modeler suggest` says until its model is good enough.
+    """Simulate a robot that turns an object as `modeler suggest` suggests until its model is good enough.
 
-    The renderer is its camera; turns have errors of 2°. Makes OUT/scene, the sequence, and OUT/run, its run folder,
-    whose recording shows at each step what was seen, what may be seen yet, and the ranked list.
+    The renderer is its camera; turns have errors of 2°. Creates OUT/scene, the sequence, and OUT/run, its run folder.
+    The recording shows at each step the observed surface, where unseen surface may be, and the ranked list.
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
-    """Folder to make."""
+    """Folder to create."""
     shape: Annotated[str, tyro.conf.arg(metavar="RECIPE")] = "figurine"
     """Recipe in JSON or TOML, or the name of a built-in one."""
     actions: Annotated[int, tyro.conf.arg(metavar="N")] = 12
-    """Most actions."""
+    """Maximum number of actions."""
     until_seen: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.95
-    """Goal: this share (0 to 1) of what turns on the table can show was seen."""
+    """Goal: share (0 to 1) of the surface visible by turns on the table that was observed."""
     until_pose_deg: Annotated[float, tyro.conf.arg(metavar="DEG")] = 1.0
-    """Goal: the rotation of every pose is known to this standard deviation."""
+    """Goal: largest standard deviation of a pose's rotation."""
     seed: Annotated[int, SEED] = 0
-    """Of noise and of the robot's errors."""
+    """Seed of the noise and of the robot's errors."""
     view: bool = False
     """Watch in the Rerun viewer."""
     web: bool = False

@@ -56,7 +56,7 @@ def check_engine(name: str) -> None:
     kind, _, what = name.partition(":")
     if name != "processes" and not what:
         raise InputError(
-            f"--executor {name} is none; give processes, dask:ADDRESS, slurm:FOLDER, or module:callable for your own"
+            f"--executor {name} is unknown; give processes, dask:ADDRESS, slurm:FOLDER, or module:callable for your own"
         )
     package = {"dask": "distributed", "slurm": "submitit"}.get(kind)
     if package is not None and importlib.util.find_spec(package) is None:
@@ -171,7 +171,9 @@ def _own(name: str, module: str, attribute: str, workers: int | None) -> Executo
     try:
         executor = getattr(importlib.import_module(module), attribute)(workers)
     except Exception as error:  # whatever a user's module raises
-        raise InputError(f"--executor {name}: cannot be made ({type(error).__name__}: {error}); correct it") from error
+        raise InputError(
+            f"--executor {name}: cannot be created ({type(error).__name__}: {error}); correct it"
+        ) from error
     if not isinstance(executor, Executor):
-        raise InputError(f"--executor {name}: makes no concurrent.futures.Executor; derive it from that")
+        raise InputError(f"--executor {name}: returns no concurrent.futures.Executor; derive it from that class")
     return executor

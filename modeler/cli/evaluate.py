@@ -26,19 +26,19 @@ _SAME_M = 1e-5  # to which files of one surface agree
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Register pairs of frames whose true motion is known, by several methods, and tell how far off they are.
+    """Register pairs of frames with known true motion by several methods, and report their errors.
 
-    Writes results.json, results.csv and rotation_errors.png (box plots), and prints a table. Of run folders, the model
-    is compared with the true surface instead (model.ply of a rendered sequence, BOP's models folder), and so is one
-    made of the same frames with their true poses: models.json, models.csv and a table. Runs for which that is not known
-    are left out, and the status is 2.
+    Writes results.json, results.csv and rotation_errors.png (box plots), and prints a table. For run folders, it
+    compares the model with the true surface instead (model.ply of a rendered sequence, BOP's models folder), and also a
+    model of the same frames with their true poses: models.json, models.csv and a table. Runs without ground truth are
+    left out, and the status is 2.
     """
 
     sequences: Annotated[
         tyro.conf.Positional[tuple[Path, ...]],
         tyro.conf.arg(metavar="SEQUENCE|RUN...", help_behavior_hint="(at least one)"),
     ]
-    """Sequences with ground truth (scene_gt.json; none is needed with --closed), or run folders made of such."""
+    """Sequences with ground truth (scene_gt.json; none is needed with --closed), or their run folders."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder for the results."""
     overwrite: bool = False
@@ -46,16 +46,16 @@ class Evaluate:
     methods: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ",".join(
         name for name in get_args(Method) if name not in OF_EXTRAS
     )
-    """Methods to compare; kiss, which needs the extra peers, only where it is named."""
+    """Methods to compare; kiss needs the extra peers and runs only if named."""
     offsets: Annotated[str, tyro.conf.arg(metavar="N,...")] = "1"
     """Differences of frame numbers to compare; each gives a table of its own."""
     both_ways: bool = False
     """Register each pair in both directions, not only the later frame to the earlier."""
     closed: bool = False
-    """Take the sequence for a full turn, its last frame followed by its first.
-    The rotation that remains of all steps in sequence, and the sum of their angles, are printed too, without truth."""
+    """Treat the sequence as a full turn: its last frame is followed by its first.
+    The remaining rotation of all composed steps, and the sum of their angles, are printed too, without ground truth."""
     learn: bool = False
-    """The prior learns from the pairs before, as in `build`: the unknown axis and sense of a turntable."""
+    """Let the prior learn from earlier pairs, as in `build`: the unknown axis and sign of a turntable."""
     points: Annotated[int | None, tyro.conf.arg(metavar="N"), default("all")] = None
     """Keep N of the object's surface points per view, drawn at random, to simulate sparse clouds."""
     seed: Annotated[int, SEED] = 0
@@ -79,7 +79,7 @@ class Evaluate:
         if not self.sequences:
             raise InputError("no sequence to evaluate; name at least one folder")
         if self.points is not None and self.points < 1:
-            raise InputError(f"--points {self.points} leaves nothing; give a whole number from 1 on")
+            raise InputError(f"--points {self.points} is out of range; give a whole number from 1")
         runs = [path for path in self.sequences if (path / "report.json").is_file()]
         if not runs:
             names = ("results.json", "results.csv", "rotation_errors.png")
@@ -89,7 +89,7 @@ class Evaluate:
             lacking = next((path for path in self.sequences if not path.exists()), None)
             if lacking is not None:
                 raise InputError(f"{lacking}: no such folder; give folders of runs")
-            raise InputError("sequences and run folders are evaluated apart; give one kind at a time")
+            raise InputError("sequences and run folders are evaluated separately; give one kind at a time")
         outs = [self.out / name for name in ("models.json", "models.csv")]
         check_files(outs, run_inputs(runs), overwrite=self.overwrite)
         return _evaluate_models(runs, self.out, self.seed)

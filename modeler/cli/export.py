@@ -25,26 +25,26 @@ if TYPE_CHECKING:
 class Export:
     """Write the fused mesh of a run as PLY, OBJ, GLB or STL, in m.
 
-    It stands with the centre of its base at the origin and z up, in GLB y; FILE.pose.json beside it has the pose that
-    takes it back to where the first camera saw it. What --watertight, --texture and --voxel-m ask for is made anew
-    from the frames, so the sequence must be there.
+    The centre of its base is the origin and z is up, in GLB y; FILE.pose.json has the pose that maps it back to where
+    the first camera saw it. --watertight, --texture and --voxel-m fuse again from the frames, so the sequence must be
+    available.
     """
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Run folder, as `modeler build` makes it."""
+    """Run folder of `modeler build`."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.{ply,obj,glb,stl}")]
-    """File to write; its ending selects the format. STL carries no colour. With --for a file or a folder."""
+    """File to write; its suffix selects the format. STL has no colour. With --for a file or a folder."""
     purpose: Annotated[Purpose | None, tyro.conf.arg(name="for"), default("none")] = None
-    """Write all that a program needs, read it back and say what was checked: foundationpose (FILE.obj with texture),
+    """Write all files for a program, read them back and check them: foundationpose (FILE.obj with texture),
     bop (FOLDER with models and onboarding_static), mujoco and urdf (FOLDER with meshes, convex parts, mass, inertia),
     print (watertight FILE.stl in mm with a flat bottom)."""
     overwrite: bool = False
-    """Replace files that are there."""
+    """Replace existing files."""
     origin: Annotated[Origin | None, default("base")] = None
     """Origin: the centre of the base, the centroid of the surface, the centre of its box, or the first camera, whose
     axes (x right, y down, z forward) are then kept, as in the run's own model.ply."""
     up: Annotated[Up | None, default("y for GLB, z otherwise")] = None
-    """Axis that is up: away from the support; where none was seen, as the ring of the cameras or the image tells."""
+    """Up axis: the support's normal; without a support, from the ring of cameras or the image."""
     watertight: bool = False
     """Fill unobserved regions with interpolated surface. In PLY its vertices have 0 `views` and a `sigma_m` of -1."""
     triangles: Annotated[int | None, tyro.conf.arg(metavar="N"), default("all")] = None
@@ -56,13 +56,14 @@ class Export:
     bop: bool = False
     """Write a BOP model: PLY in mm, origin in the centre of its box, and its entry in models_info.json."""
     tint: Annotated[Literal["views", "sigma"] | None, default("none")] = None
-    """Colour vertices by the number of views that saw them or by their standard deviation; made-up surface is pink."""
-    voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("as the data")] = None
-    """Side of a voxel: detail of the mesh."""
-    density_kg_m3: Annotated[float | None, default("1000, as of water")] = None
+    """Colour vertices by the number of views that saw them or by their standard deviation; interpolated surface is "
+    "pink."""
+    voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("from the data")] = None
+    """Side of a voxel."""
+    density_kg_m3: Annotated[float | None, default("1000, that of water")] = None
     """Density of the solid, with --for mujoco and urdf."""
-    mass_kg: Annotated[float | None, default("of the density")] = None
-    """Mass, where it is known, instead of a density."""
+    mass_kg: Annotated[float | None, default("from the density")] = None
+    """Mass, instead of a density."""
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:
@@ -180,7 +181,7 @@ def _check_numbers(options: Export) -> None:
         if value is not None and not 0.0 < value < 1e6:
             raise InputError(f"--{name} {value:g} is out of range; give a positive number")
     if options.density_kg_m3 is not None and options.mass_kg is not None:
-        raise InputError("--density-kg-m3 and --mass-kg are two ways to tell the mass; give one of them")
+        raise InputError("--density-kg-m3 and --mass-kg both give the mass; give one of them")
 
 
 def _volume(options: Export) -> FusionVolume | None:

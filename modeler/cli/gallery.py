@@ -14,17 +14,17 @@ from modeler.cli.options import default
 
 @dataclass(frozen=True)
 class Gallery:
-    """Write one HTML page about the models in a folder: pictures and figures, to sort and filter. It needs no network.
+    """Write one HTML page about the models in a folder: pictures and values, to sort and filter. It needs no network.
 
-    The list DIR/models.parquet is brought up to date as well.
+    Also updates the list DIR/models.parquet.
     """
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
-    """Folder of run folders, as `modeler batch` fills it."""
+    """Folder of run folders, from `modeler batch`."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html"), default("DIR/gallery.html")] = None
     """Page to write."""
     overwrite: bool = False
-    """Replace the page where there is one."""
+    """Replace an existing page."""
 
     def run(self) -> int:
         """Write the page.
@@ -47,7 +47,7 @@ class Gallery:
         check_files([out], [], overwrite=self.overwrite)
         rows = models_in(self.folder)
         if not rows:
-            raise InputError(f"{self.folder}: holds no folder of a run; give the folder that modeler batch has filled")
+            raise InputError(f"{self.folder}: holds no run folder; give the --out of modeler batch")
         write_table(self.folder / TABLE, rows)
         pictures, links = {}, {}
         with bar() as progress:

@@ -1,4 +1,4 @@
-"""`modeler info`: what an input holds."""
+"""`modeler info`: describes an input."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Info:
-    """Say what was found at a path: format, frames, resolution, depth, intrinsics, masks, colour, what is missing.
+    """Describe the input at a path: format, frames, resolution, depth, intrinsics, masks, colour, what is missing.
 
-    Every frame is read once, so that what is said is true of the whole input.
+    Every frame is read once, so that the output covers the whole input.
     """
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]

@@ -66,7 +66,7 @@ def while_it_lasts(camera: AbstractSequence) -> Iterator[Frame]:
     try:
         yield from camera
     except InputError as error:
-        say(f"{str(error).rstrip('.')}: going on with the frames so far")
+        say(f"{str(error).rstrip('.')}: continuing with the frames so far")
 
 
 @contextmanager
@@ -159,8 +159,8 @@ class Part:
             view = modeler.prepare(self.sequence.frame(frame), scene).view
             if view is None or abs(len(view.points_m) - points[frame]) > _ALIKE * points[frame]:
                 raise InputError(
-                    f"{self.sequence.name}: frame {frame} shows something else than the one that {self.run} was made "
-                    "from, or another version finds the object otherwise there; say where that sequence is with "
+                    f"{self.sequence.name}: frame {frame} differs from the one that {self.run} was made "
+                    "from, or another version segments it differently; give the original sequence with "
                     "--sequence, or build the run again"
                 )
             if log_factor:
@@ -222,10 +222,10 @@ def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> t
         moved = (replace(part, offset=part.offset + int(settings["offset"])) for part in second)
         return (*first, *moved)
     if places is not None and not places:
-        raise InputError(f"--sequence is given too few times; say where the sequence of {run} is, too, in order")
+        raise InputError(f"--sequence is given too few times; give that of {run}, too, in order")
     where = Path(report["sequence"]) if places is None else places.popleft()
     if not where.exists():
-        raise InputError(f"{where}: the sequence of {run} is not there; say where it is with --sequence")
+        raise InputError(f"{where}: the sequence of {run} does not exist; give its new place with --sequence")
     sensor, camera = (Path(settings[name]) if name in settings else None for name in ("sensor", "camera"))
     return (Part(run, report, calibrated(open_sequence(where), sensor, camera)),)
 

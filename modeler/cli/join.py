@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Join:
-    """Join two runs of the same object in different postures, so that the model has what each of them hides.
+    """Join two runs of the same object in different postures, so that the model has no hidden side.
 
-    They are joined as a build joins what it shows before and after an object was put down otherwise: the models are
-    aligned from every side, pairs of their views registered, and the frames of both fused into one model in the object
-    frame of RUN_A.
+    They are joined like the segments of a build before and after the object was laid down differently: the models are
+    aligned from many initial rotations, pairs of their views registered, and the frames of both fused into one model in
+    the object frame of RUN_A.
     """
 
     run_a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_A")]
@@ -34,11 +34,11 @@ class Join:
     run_b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_B")]
     """Run folder of the other (lying, say)."""
     out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
-    """Run folder to make. Frames of RUN_B are numbered on from those of RUN_A."""
+    """Run folder to create. Frame numbers of RUN_B continue those of RUN_A."""
     overwrite: bool = False
     """Replace the results of an earlier run in the folder."""
     pairs: Annotated[int, tyro.conf.arg(metavar="N")] = 6
-    """Pairs of views, one of each run, that are registered."""
+    """Number of pairs of views, one of each run, to register."""
     seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same result, to the bit."""
 
@@ -69,8 +69,8 @@ class Join:
         count = alignments[0].accepted
         if not count:
             raise InputError(
-                f"{self.run_a} and {self.run_b}: no alignment of the models fits their views; are they "
-                "of the same object, and do they share enough surface?"
+                f"{self.run_a} and {self.run_b}: no alignment of the models fits their views; check "
+                "that they show the same object and share enough surface"
             )
         graph = PoseGraph(edges=(*first.edges, *second.edges, *edges), first=min(first.solution.trajectory))
         guess = dict(first.solution.trajectory) | {
@@ -108,7 +108,7 @@ def _check(options: Join) -> None:
     from modeler.types import InputError
 
     if options.pairs < 1:
-        raise InputError(f"--pairs {options.pairs} leaves nothing to join by; give at least 1")
+        raise InputError(f"--pairs {options.pairs} is out of range; give at least 1")
     if options.run_a.resolve() == options.run_b.resolve():
         raise InputError(f"RUN_A and RUN_B are both {options.run_a}; name two runs")
     check_run_folder(options.out, run_inputs([options.run_a, options.run_b]), overwrite=options.overwrite)

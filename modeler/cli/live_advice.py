@@ -62,5 +62,5 @@ def in_short(found: Suggestions) -> str:
     """Return in a few words what to do next."""
     best = for_the_hand(found)
     if found.reached or best is None:
-        return "nothing more is to be gained"
+        return "nothing more to gain"
     return f"next: {best.words.split(':')[0]}"

@@ -60,23 +60,23 @@ def read_manifest(path: Path, common: tuple[str, ...] = ()) -> list[Row]:
         columns = {column: column.strip().replace("_", "-") for column in lines.fieldnames or ()}
         rows = list(lines)
     except csv.Error as error:
-        raise InputError(f"{path}: is no table in CSV ({error}); correct it there") from None
+        raise InputError(f"{path}: is not a CSV table ({error}); correct it") from None
     flags = {one.name.replace("_", "-"): isinstance(one.default, bool) for group in _GROUPS for one in fields(group)}
     known = ("sequence", "name", *flags)
     if "sequence" not in columns.values():
         raise InputError(f"{path}: has no column sequence; write one line of names, and a row for each sequence")
     strange = [column for column in columns.values() if column not in known]
     if strange or len(set(columns.values())) < len(columns):
-        wrong = f"column {strange[0]} is no option of modeler build" if strange else "a column is there twice"
+        wrong = f"column {strange[0]} is not an option of modeler build" if strange else "a column occurs twice"
         raise InputError(f"{path}: {wrong}; it takes {', '.join(known)}")
     found = []
     for number, cells in enumerate(rows, start=2):
         place = f"{path}: row {number}"
         if None in cells or None in cells.values():
-            raise InputError(f"{place} has not as many cells as there are columns; correct it there")
+            raise InputError(f"{place} has a different number of cells than columns; correct it")
         values = {columns[column]: cell.strip() for column, cell in cells.items()}
         if not values["sequence"]:
-            raise InputError(f"{place} names no sequence; correct it there")
+            raise InputError(f"{place} names no sequence; correct it")
         options = {column: cell for column, cell in values.items() if column in flags and cell}
         try:
             arguments = _arguments(tuple(options.items()), common)
@@ -154,7 +154,7 @@ def named(rows: Sequence[Row], out: Path) -> Mapping[str, Row]:
             paths[path] = row.place
         name = row.name or known.get(path) or _free(row.sequence, path, taken | given | used)
         if name != _clean(name):
-            raise InputError(f"{row.place}: {name} is no name for a folder; use letters, digits, and - _ . + within")
+            raise InputError(f"{row.place}: {name} is not a valid folder name; use letters, digits, and - _ . + within")
         if name.casefold() in used:
             raise InputError(f"{row.place}: the name {name} is given twice; give each its own")
         used.add(name.casefold())

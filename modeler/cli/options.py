@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def default(text: str) -> object:
-    """Return what lets help tell in words what an option is where it is not given."""
+    """Return a help hint that states in words the value of an option that is not given."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {text})")
 
 
@@ -54,27 +54,27 @@ class MovedOptions:
 
 StrictPaths = Annotated[
     bool,
-    tyro.conf.arg(help="Refuse a sequence in which a link leads out of it; else it is followed, for reading only."),
+    tyro.conf.arg(help="Reject sequences with links that lead out of them; else links are followed, for reading only."),
 ]
 """`--strict-paths`, of every command that opens sequences."""
 
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """What the camera is like, and how fine the model."""
+    """Camera calibration and resolution of the model."""
 
-    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as SEQUENCE says")] = None
+    sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("from SEQUENCE")] = None
     """Noise of the depth camera, as `modeler calibrate-sensor` measured it."""
-    camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("as SEQUENCE says")] = None
+    camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("from SEQUENCE")] = None
     """Focal length of the depth camera, as `modeler calibrate-camera` estimated it."""
-    voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("as the data")] = None
-    """Side of a voxel of the model: its detail."""
+    voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("from the data")] = None
+    """Side of a voxel of the model."""
     strict_paths: StrictPaths = False
 
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Which frames."""
+    """Selection of frames."""
 
     every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Use the first frame and every N-th after it."""
@@ -91,7 +91,7 @@ class ObjectOptions:
     )
     """Look for the object within these pixels: columns X0 to X1, rows Y0 to Y1, ends not included."""
     max_depth_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("no limit")] = None
-    """Take nothing farther away than this for the object."""
+    """Largest depth of the object."""
 
 
 def as_arguments(options: object) -> tuple[str, ...]:
@@ -119,38 +119,38 @@ _Three = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class PriorOptions:
-    """What is known of the motion between two frames."""
+    """Prior on the motion between two frames."""
 
-    prior: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME[+NAME]"), default("as sequence.json says, else general")
-    ] = None
+    prior: Annotated[str | None, tyro.conf.arg(metavar="NAME[+NAME]"), default("from sequence.json, else general")] = (
+        None
+    )
     """general: any motion within limits of rotation and shift.
     table: the object stays on the table it stands on.
     turntable: it turns by a commanded step about one axis.
     held: a robot's hand carries it (robot.txt).
-    poke: somebody pushes it along the table.
-    Guesses that only tell where to look: velocity (the motion goes on), axes (long objects stay aligned), features.
+    poke: a finger pushes it along the table.
+    Proposals only: velocity (constant velocity), axes (aligned principal axes), features (matching features).
     module:Class: your own, an AbstractPrior that is a frozen dataclass, imported from the current folder or PYTHONPATH.
-    What is joined by + holds together: held+table, features+table."""
+    + combines priors: held+table, features+table."""
     prior_args: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE..."), default("the class's own")] = ()
-    """Fields of your own prior, values as Python writes them: step_deg=25 axis=(0,0,1) (module:Class)."""
+    """Fields of your own prior, values in Python syntax: step_deg=25 axis=(0,0,1) (module:Class)."""
     max_rotation_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("50")] = None
     """Largest rotation between two frames (general, table)."""
     max_offset_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.04")] = None
-    """Largest distance between the centroids of what two frames see (general, held)."""
+    """Largest distance between the centroids of the object in two frames (general, held)."""
     max_shift_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.05")] = None
     """Largest shift of the object on the table, or across the axis (table, turntable)."""
-    step_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("as sequence.json says")] = None
+    step_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("from sequence.json")] = None
     """Turn from one frame number to the next, right-handed about the axis, which points up (turntable)."""
     step_sigma_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("1")] = None
     """Standard deviation of one step (turntable)."""
     step_sign: Annotated[
         Literal["known", "unknown"] | None,
-        default("known if the step is negative, or the axis or sequence.json given"),
+        default("known if the step is negative, or the axis or sequence.json is given"),
     ] = None
     """Whether the sign of the step is known, or the table may turn in either direction (turntable)."""
     axis_direction: Annotated[
-        _Three | None, tyro.conf.arg(metavar="X Y Z"), default("normal to the table where one is seen, else about up")
+        _Three | None, tyro.conf.arg(metavar="X Y Z"), default("the table's normal if one is seen, else about up")
     ] = None
     """Direction of the axis in camera coordinates: x right, y down, z forward (turntable)."""
     axis_point_m: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), default("anywhere")] = None
@@ -168,13 +168,13 @@ class PriorOptions:
     max_gap_s: Annotated[float | None, tyro.conf.arg(metavar="S"), default("1")] = None
     """Poses of the hand farther apart in time than this are not interpolated (held)."""
     regrasp_probability: Annotated[float | None, tyro.conf.arg(metavar="P"), default("0.02")] = None
-    """Probability that the hand takes the object anew from one frame to the next (held)."""
-    poke_point_m: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), default("as sequence.json says")] = None
-    """Where the finger touches the object before it pushes, in camera coordinates (poke)."""
-    poke_direction: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), default("as sequence.json says")] = None
-    """Which way the finger moves, in camera coordinates (poke)."""
-    poke_length_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("as sequence.json says")] = None
-    """How far the finger pushes (poke)."""
+    """Probability of a regrasp from one frame to the next (held)."""
+    poke_point_m: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), default("from sequence.json")] = None
+    """Point where the finger first touches the object, in camera coordinates (poke)."""
+    poke_direction: Annotated[_Three | None, tyro.conf.arg(metavar="X Y Z"), default("from sequence.json")] = None
+    """Direction of the finger's motion in camera coordinates (poke)."""
+    poke_length_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("from sequence.json")] = None
+    """Length of the push (poke)."""
     velocity_sigma_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("5")] = None
     """Standard deviation of the change of rotation from one motion to the next, about each axis (velocity)."""
     velocity_sigma_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.01")] = None
@@ -198,7 +198,7 @@ class PriorOptions:
         for parameter in sorted(given.keys() - set(accepted)):
             others = " or ".join(prior for prior, parameters in of.items() if parameter in parameters)
             raise InputError(
-                f"{_flag(parameter)} is no parameter of --prior {name}; leave it out, or give --prior {others}."
+                f"{_flag(parameter)} is not a parameter of --prior {name}; leave it out, or give --prior {others}."
             )
         for parameter, value in given.items():
             try:
@@ -215,7 +215,7 @@ class PriorOptions:
 
 Method = Literal["visibility", "paper", "icp", "gicp", "coloured-icp", "fpfh", "fpfh-icp", "kiss"]
 OF_EXTRAS: Final[tuple[Method, ...]] = ("kiss",)
-"""Methods that need an extra, which are run only where they are asked for."""
+"""Methods that need an extra; they run only if named."""
 
 
 @dataclass(frozen=True)
@@ -224,9 +224,9 @@ class MethodOptions:
 
     method: Method = "visibility"
     """visibility: ours. paper: Wüthrich et al. 2012. The others are baselines (kiss needs the extra peers)."""
-    colour: Annotated[bool, default("they are, where frames have them")] = True
+    colour: Annotated[bool, default("compare, if frames have colour")] = True
     """Do not compare the colours of matching surface."""
-    device: Annotated[Literal["cpu", "cuda"] | None, default("cuda where one is present and pays, else cpu")] = None
+    device: Annotated[Literal["cpu", "cuda"] | None, default("cuda if present and faster, else cpu")] = None
     """Where poses are sampled and scored: cuda needs an NVIDIA GPU and the extra gpu (visibility, paper)."""
     seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same result, to the bit."""
@@ -234,13 +234,13 @@ class MethodOptions:
 
 @dataclass(frozen=True)
 class InputOptions:
-    """What counts more than what the input says."""
+    """Values that override the input's."""
 
     intrinsics: Annotated[
-        tuple[float, float, float, float] | None, tyro.conf.arg(metavar="FX FY CX CY"), default("as the input says")
+        tuple[float, float, float, float] | None, tyro.conf.arg(metavar="FX FY CX CY"), default("from the input")
     ] = None
     """Intrinsics of the depth camera in px."""
-    depth_scale_mm: Annotated[float | None, tyro.conf.arg(metavar="MM"), default("as the input says")] = None
+    depth_scale_mm: Annotated[float | None, tyro.conf.arg(metavar="MM"), default("from the input")] = None
     """Millimetres per unit of stored depth."""
     depth_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), default("the only one")] = None
     """Topic of the depth images in a ROS bag."""

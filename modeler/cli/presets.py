@@ -56,12 +56,12 @@ class Preset:
         if self.purpose in _FILES:
             if options.out.suffix.lower() != _FILES[self.purpose]:
                 raise InputError(
-                    f"{options.out}: --for {self.purpose} writes {_FILES[self.purpose]}; give --out such a name"
+                    f"{options.out}: --for {self.purpose} writes {_FILES[self.purpose]}; give --out such a suffix"
                 )
         else:
             check_folder(options.out, inputs)
             if os.path.lexists(options.out) and not options.out.is_dir():
-                raise InputError(f"{options.out}: is no folder; choose another --out")
+                raise InputError(f"{options.out}: is not a folder; choose another --out")
         report = files.RunFolder(options.run_folder).result()
         if not report.get("poses"):
             raise InputError(f"{options.run_folder}: no frame of this run was accepted; report.json says why")
@@ -139,7 +139,7 @@ class Preset:
         self._tell(place)
         checks = mesh_checks(out, most_triangles=physics.MOST_TRIANGLES)
         if texture is None:
-            return checks.also(True, "no texture, for the frames have no colour")
+            return checks.also(True, "no texture, as the frames have no colour")
         mesh = loaded(out)
         height, width = texture.image.shape[:2]
         uv = np.asarray(mesh.visual.uv)
@@ -164,7 +164,7 @@ class Preset:
         corners_m = np.asarray(mesh.vertices, dtype=np.float64) / 1000.0
         area_m2 = solids.bottom_area_m2(corners_m, np.asarray(mesh.faces))
         footprint_m2 = float(np.prod(np.ptp(corners_m[:, :2], axis=0)))
-        how = "" if base_known else " (cut there, for no support was seen)"
+        how = "" if base_known else " (cut there, as no support was seen)"
         size = " x ".join(f"{length:.1f}" for length in 1000.0 * np.ptp(corners_m, axis=0))
         return (
             Checks()
@@ -173,7 +173,7 @@ class Preset:
             .also(
                 area_m2 > _LEAST_FOOTPRINT * footprint_m2,
                 f"bottom flat on {1e4 * area_m2:.1f} cm²{how}",
-                f"its bottom is flat on {1e4 * area_m2:.1f} cm² alone",
+                f"its bottom is flat on only {1e4 * area_m2:.1f} cm²",
             )
             .also(True, f"{size} mm")
         )
@@ -220,7 +220,7 @@ class Preset:
         return (
             mesh_checks(of.visual, most_triangles=physics.MOST_TRIANGLES)
             .also(True, f"closed around {1e6 * body.volume_m3:.1f} cm³")
-            .also(solids.is_possible_inertia(body.inertia_kg_m2), "inertia of a real body")
+            .also(solids.is_possible_inertia(body.inertia_kg_m2), "physically possible inertia")
             .also(
                 all(loaded(of.part(k)).is_convex for k in range(len(parts.meshes))), parts.method, "a part not convex"
             )

@@ -24,9 +24,9 @@ class Register:
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SEQUENCE")]
     """A sequence in any format that `modeler build` takes."""
     source: Annotated[tyro.conf.Positional[int], tyro.conf.arg(metavar="SOURCE")]
-    """Number of the frame whose points are carried over."""
+    """Number of the source frame, whose points are transformed."""
     target: Annotated[tyro.conf.Positional[int], tyro.conf.arg(metavar="TARGET")]
-    """Number of the frame to whose camera coordinates they are carried."""
+    """Number of the target frame, to whose camera coordinates they are transformed."""
     strict_paths: StrictPaths = False
     prior: PriorOptions = field(default_factory=PriorOptions)
     method: MethodOptions = field(default_factory=MethodOptions)

@@ -18,7 +18,7 @@ class Render:
     recipe: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RECIPE")]
     """Recipe in JSON or TOML, or the name of a built-in one: box, flashlight, tube and more."""
     out: Annotated[Path, tyro.conf.arg(metavar="SEQUENCE")]
-    """BOP scene folder to make."""
+    """BOP scene folder to create."""
     seed: Annotated[int | None, SEED, default("the recipe's own")] = None
     """Seed of the camera's noise and of the object's motion."""
 

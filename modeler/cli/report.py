@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 class Report:
     """Write one HTML page about a run: model, trajectory, uncertainty, errors, pairs, settings. It needs no network.
 
-    Errors and coverage are shown where the sequence is still where it was, and has ground truth.
+    Errors and coverage are shown if the sequence is available and has ground truth.
     """
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Run folder, as `modeler build` makes it."""
+    """Run folder of `modeler build`."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html"), default("RUN/report.html")] = None
     """Page to write."""
     overwrite: bool = False
-    """Replace the page where there is one."""
+    """Replace an existing page."""
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:

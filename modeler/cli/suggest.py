@@ -21,24 +21,24 @@ _SHOWN = 8  # of the ranked list, without --all
 
 @dataclass(frozen=True)
 class Suggest:
-    """Say what to do next: the turn, poke or view that tells most of an object's poses and surface.
+    """Suggest what to do next: the turn, poke or view with the most information on poses and surface.
 
-    Prints a ranked list: what each action should bring, as predicted from the model, its uncertainty and what no view
-    has seen. With a goal (--until-...), the status is 0 where it is reached, and 3 where it is not.
+    Prints a ranked list with the predicted gain of each action, from the model, its uncertainty and unobserved surface.
+    With a goal (--until-...), the status is 0 if it is reached, else 3.
     """
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Run folder, as `modeler build` makes it."""
+    """Run folder of `modeler build`."""
     candidates: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("turns, pokes, laying it down")] = None
-    """What can be done, with costs: JSON or TOML, or CSV of poses (docs/reference.md, "What to do next")."""
+    """Possible actions with costs: JSON or TOML, or CSV of poses (docs/reference.md, "What to do next")."""
     until_sigma_mm: Annotated[float | None, tyro.conf.arg(metavar="MM"), default("none")] = None
-    """Goal: the surface of every view is known to this standard deviation, by noise and pose."""
+    """Goal: largest standard deviation of the surface of a view, from noise and pose."""
     until_seen: Annotated[float | None, tyro.conf.arg(metavar="SHARE"), default("none")] = None
-    """Goal: this share (0 to 1) of what turns on the table can show was seen."""
+    """Goal: share (0 to 1) of the surface visible by turns on the table that was observed."""
     until_pose_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("none")] = None
-    """Goal: the rotation of every pose is known to this standard deviation."""
+    """Goal: largest standard deviation of a pose's rotation."""
     all: bool = False
-    """List every action, not the best few."""
+    """List all actions, not only the best."""
     json: bool = False
     """Write the list as JSON, for programs."""
     moved: MovedOptions = field(default_factory=MovedOptions)
@@ -59,7 +59,7 @@ class Suggest:
         run = reopened(self.run_folder, self.moved.sequence)
         part, *others = run.parts
         if others:
-            raise InputError(f"{self.run_folder}: joins several runs; ask about one of them")
+            raise InputError(f"{self.run_folder}: joins several runs; give one of them")
         found = suggest(part.modeler().belief(run.views, run.solution, run.edges), given, goal)
         if self.json:
             print(json.dumps([each.record() for each in found.ranked], allow_nan=False, indent=1))
@@ -68,7 +68,7 @@ class Suggest:
             for each in () if found.reached else shown:
                 print(each.words)
         if given is not None and found.excluded:
-            say(f"{found.excluded} of {len(given)} candidates are beyond what the run's prior allows, or show nothing")
+            say(f"{found.excluded} of {len(given)} candidates are excluded by the run's prior, or show nothing")
         trusted = bool(run.report["trustworthy"])
         if not asked:
             say(found.summary)
@@ -107,7 +107,7 @@ class Suggest:
 
 def _verdict(summary: str, *, reached: bool, trusted: bool) -> str:
     if reached and trusted:
-        return f"good enough: {summary}"
+        return f"goal reached: {summary}"
     if reached:
-        return f"would be good enough, but the run is not to be trusted (see its report.json): {summary}"
-    return f"not yet good enough: {summary}"
+        return f"goal reached, but the run cannot be trusted (see its report.json): {summary}"
+    return f"goal not reached: {summary}"

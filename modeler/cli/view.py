@@ -16,7 +16,7 @@ class View:
     """Open the recording of a run in the Rerun viewer."""
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Run folder, as `modeler build` makes it."""
+    """Run folder of `modeler build`."""
     web: bool = False
     """Serve the viewer in the browser, on 127.0.0.1 only, until Ctrl-C."""
 

@@ -80,7 +80,7 @@ def _entries(path: Path) -> dict[str, Any]:
         raise InputError(f"{path.parent}: cannot be used ({error.strerror}); choose another place") from error
     entries = read_json(path) if os.path.lexists(path) else {}
     if not isinstance(entries, dict) or not all(number.isdecimal() for number in entries):
-        raise InputError(f"{path}: lists no objects by their numbers; mend it or choose another folder")
+        raise InputError(f"{path}: lists no objects by their numbers; correct it or choose another folder")
     return entries
 
 

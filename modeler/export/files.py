@@ -99,7 +99,7 @@ def alone(folder: Path) -> Iterator[None]:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise InputError(
-                    f"{folder}: another run is writing to it; wait for its end, or choose another place"
+                    f"{folder}: another run is writing to it; wait until it ends, or choose another place"
                 ) from None
         yield
     finally:

@@ -45,7 +45,7 @@ def format_of(out: Path) -> str:
     """
     suffix = out.suffix.lower()
     if suffix not in FORMATS:
-        what = f"unknown mesh format {suffix!r}" if suffix else "no ending says the mesh format"
+        what = f"unknown mesh format {suffix!r}" if suffix else "no suffix selects the mesh format"
         raise InputError(f"{out}: {what}; use {', '.join(FORMATS)}")
     return suffix
 
@@ -87,7 +87,7 @@ def write_mesh(
     """
     suffix = format_of(out)
     if texture is not None and suffix not in TEXTURED:
-        raise InputError(f"{out}: {suffix[1:]} holds no texture; use {' or '.join(TEXTURED)}, or leave out the texture")
+        raise InputError(f"{out}: {suffix[1:]} has no textures; use {' or '.join(TEXTURED)}, or leave out the texture")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -206,7 +206,7 @@ def simplified(model: ObjectModel, triangles: int) -> ObjectModel:
     fewer.compute_vertex_normals()
     vertices_m = np.asarray(fewer.vertices)
     if not len(fewer.triangles):
-        raise InputError(f"{triangles} triangles leave nothing of the mesh; allow more")
+        raise InputError(f"{triangles} triangles are too few for this mesh; allow more")
     _, nearest = KDTree(model.vertices_m).query(vertices_m)
     return replace(
         model,
@@ -232,7 +232,7 @@ def tinted(model: ObjectModel, tint: Tint) -> ObjectModel:
     """
     views, sigmas_m = model.vertex_views, model.vertex_sigmas_m
     if views is None or sigmas_m is None:
-        raise InputError("the model does not tell who saw its vertices; build it again with this version")
+        raise InputError("the model has no view counts of its vertices; build it again with this version")
     rgb = sigma_rgb(sigmas_m) if tint == "sigma" else _scale_rgb(views / MOST_VIEWS)
     rgb[views == 0] = MADE_UP_RGB
     return replace(model, vertex_colours=np.rint(rgb).astype(np.uint8))

@@ -81,7 +81,7 @@ def read_table(path: Path) -> list[dict[str, Any]]:
         return table.select(list(_COLUMNS)).cast(_schema()).to_pylist()
     except (pa.ArrowException, KeyError) as error:
         what = " ".join(str(error).split())
-        raise InputError(f"{path}: is no list of models ({what}); run modeler batch again") from None
+        raise InputError(f"{path}: is not a list of models ({what}); run modeler batch again") from None
 
 
 def _schema() -> pa.Schema:

@@ -31,8 +31,8 @@ _ORIGINS: Final[Mapping[Origin, str]] = {
 }
 _UP_WORDS: Final[Mapping[UpSource, str]] = {
     "support": "the normal of the support",
-    "ring": "the axis of the cameras' ring, for no support was seen",
-    "camera": "the upper edge of the first image, for neither a support nor a ring of cameras was seen",
+    "ring": "the axis of the cameras' ring, as no support was seen",
+    "camera": "the upper edge of the first image, as neither a support nor a ring of cameras was seen",
 }
 
 

@@ -50,7 +50,7 @@ def read_model(path: Path) -> ObjectModel:
     from trimesh.visual import ColorVisuals
 
     if not os.path.lexists(path):
-        raise InputError(f"{path}: there is no such mesh; give a run folder in which `modeler build` has finished")
+        raise InputError(f"{path}: no such mesh; give a run folder of a finished `modeler build`")
     content = io.BytesIO(read_regular(path))
     try:
         mesh = trimesh.load(content, file_type="ply", process=False)  # load_mesh would drop the normals
@@ -60,7 +60,7 @@ def read_model(path: Path) -> ObjectModel:
         raise InputError(f"{path}: holds no triangles; more views are needed for a surface")
     vertices_m, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     if not np.isfinite(vertices_m).all() or triangles.min() < 0 or triangles.max() >= len(vertices_m):
-        raise InputError(f"{path}: is damaged, its triangles have corners that are none; build the model again")
+        raise InputError(f"{path}: is damaged: its triangles have invalid corners; build the model again")
     columns = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
     names = columns.dtype.names or () if isinstance(columns, np.ndarray) else tuple(columns)
     visual = mesh.visual
@@ -124,22 +124,22 @@ def fault(report: Mapping[str, Any]) -> str | None:
     """
     for name, test in _WHOLE.items():
         if not test(report.get(name)):
-            return f"{name!r} is missing or is not what it should be"
+            return f"{name!r} is missing or invalid"
     for name, value in report.items():
         if name not in ("frames", "edges", "poses") and not all(map(_is_text, (name, *_texts(value)))):
-            return f"{name!r} holds text that no file can hold"
+            return f"{name!r} holds text that no file can contain"
     for name, tests in (("frames", _FRAME), ("edges", _EDGE), ("poses", _POSE)):
         for place, record in enumerate(report[name]):
             wrong = _wrong(record, tests) or _impossible(record)
             if wrong is not None:
-                return f"{wrong} of entry {place} of {name!r} is missing or is not what it should be"
+                return f"{wrong} of entry {place} of {name!r} is missing or invalid"
     frames, poses = ([record["id"] for record in report[name]] for name in ("frames", "poses"))
     if len({*frames}) < len(frames) or len({*poses}) < len(poses) or not {*poses} <= {*frames}:
-        return "'frames' or 'poses' has a frame twice, or 'poses' has frames that 'frames' has not"
+        return "'frames' or 'poses' has a frame twice, or 'poses' has frames missing in 'frames'"
     if any(edge["source"] == edge["target"] for edge in report["edges"]):
         return "an entry of 'edges' joins a frame to itself"
     wrong = _wrong(report["settings"], _SETTINGS, may_lack=frozenset(_SETTINGS))
-    return None if wrong is None else f"{wrong} of 'settings' is not what it should be"
+    return None if wrong is None else f"{wrong} of 'settings' is invalid"
 
 
 def _wrong(record: Any, tests: Mapping[str, Test], may_lack: frozenset[str] = _LATER) -> str | None:

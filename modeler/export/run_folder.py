@@ -154,7 +154,7 @@ class RunFolder:
         """
         path = self.path / _REPORT
         if not os.path.lexists(path):
-            raise InputError(f"{path}: there is no report; is {self.path} the folder of a run?")
+            raise InputError(f"{path}: no report; give a run folder instead of {self.path}")
         report = read_json(path)
         if not isinstance(report, dict) or report.get("schema") != 1:
             raise InputError(f"{path}: not a report of schema 1; build the run again")
@@ -191,7 +191,7 @@ class RunFolder:
             if was != is_now:
                 raise InputError(
                     f"{self.path}: cannot resume, {name.replace('_', '-')} was {was} and is now {is_now}; "
-                    "use the same, or build the run anew"
+                    "use the same, or build the run again"
                 )
         return report.get("complete") is True and not self.pairs.folder.exists()
 

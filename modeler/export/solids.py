@@ -85,7 +85,7 @@ def convex_parts(model: ObjectModel, seed: int = 0) -> ConvexParts:
     """
     if importlib.util.find_spec("coacd") is None:
         hull = _hull(model.vertices_m)
-        return ConvexParts((hull,), "one convex hull, for CoACD is not installed (pip install 'modeler[physics]')")
+        return ConvexParts((hull,), "one convex hull, as CoACD is not installed (pip install 'modeler[physics]')")
     import coacd  # pyright: ignore[reportMissingImports]
 
     coacd.set_log_level("error")

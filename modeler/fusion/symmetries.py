@@ -58,7 +58,7 @@ class Symmetries:
         part = "; it looks like a body of revolution, but was not seen all around" if self.seen_in_part else ""
         coloured = "" if self.with_colour is None else f"; with colour: {self.with_colour.count_words}"
         return (
-            f"symmetries of the shape within {1000.0 * self.tolerance_m:.1f} mm, as far as it was seen: "
+            f"symmetries of the shape within {1000.0 * self.tolerance_m:.1f} mm, of the observed part: "
             f"{self.count_words}{part}{coloured}"
         )
 

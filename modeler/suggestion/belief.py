@@ -134,7 +134,7 @@ class Belief:
         """
         posed = {frame: view for frame, view in views.items() if frame in solution.trajectory and len(view.points_m)}
         if not posed:
-            raise InputError("no view with surface points has a pose: there is nothing to go on from")
+            raise InputError("no view with surface points has a pose; build the run again")
         ready = lru_cache(maxsize=None)(ready)
         noise_m = USUAL_NOISE * float(np.median([view.sigma_r_m for view in posed.values()]))
         forecast = EdgeForecast(VisibilityLikelihood() if likelihood is None else likelihood, noise_m)

@@ -1,4 +1,4 @@
-"""Which action tells most, in words; and whether anything more needs to be told."""
+"""Ranks actions by predicted gain, in words, and tests whether the goal is reached."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def _action(candidate: Candidate, *, either: bool) -> str:
     if candidate.action == "pose":
         return candidate.name
     if candidate.action == "lay":
-        return "lay it on its side, as a run of its own to join"
+        return "lay it on its side, as a separate run to join"
     way = (
         "either way"
         if either
@@ -190,7 +190,7 @@ def _effect(belief: Belief, found: Prediction) -> str:
         parts.append(f"spin known to {_degrees(after_deg)}")
     parts.append(f"{100.0 * found.new_surface:.0f} % new surface")
     if found.right < 0.9:
-        parts.append(f"placed right with {100.0 * found.right:.0f} %")
+        parts.append(f"placed correctly with {100.0 * found.right:.0f} %")
     return ", ".join(parts)
 
 
@@ -202,15 +202,15 @@ def _summary(belief: Belief, ranked: Sequence[Suggestion], *, reached: bool) -> 
     """Return in words how well the model is known, and what is left to do."""
     state = (
         f"every pose within {_degrees(belief.pose_deg)}, surface within {1000.0 * belief.sigma_m:.1f} mm, "
-        f"{100.0 * belief.seen:.0f} % of what can be seen was seen"
+        f"{100.0 * belief.seen:.0f} % of the visible surface observed"
     )
     if not reached:
         kinds = [each.prediction.candidate.action for each in ranked]
         useless = "poke" in kinds and "turn" in kinds and kinds.index("turn") < kinds.index("poke")
-        return f"{state}; no poke tells more than a turn" if useless else state
+        return f"{state}; no poke is more informative than a turn" if useless else state
     lays = [each for each in ranked if each.prediction.candidate.action == "lay"]
     rest = "; lay it on its side for the rest" if lays else ""
-    return f"nothing more is to be gained: {state}{rest}"
+    return f"nothing more to gain: {state}{rest}"
 
 
 def _rounded(value: float) -> float | None:

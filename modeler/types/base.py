@@ -33,12 +33,12 @@ class Outcome(enum.Enum):
     )
     UNSURE_MASK = (
         "unsure mask",
-        "The object is hard to tell from its surroundings; give a region of interest, a largest depth, or masks that "
-        "hold nothing else.",
+        "The object is hard to segment; give a region of interest, a largest depth, or masks that hold only the "
+        "object.",
     )
     NOT_KNOWN = (
         "prior does not apply",
-        "These views lack what the prior goes by; show it to the camera, or use another.",
+        "These views lack what the prior needs; show it to the camera, or use another prior.",
     )
 
     label: str

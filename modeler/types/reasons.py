@@ -210,12 +210,14 @@ def summary(reason: Reason) -> str:
         case Relocalised(overlap, support):
             return f"joins in place of the failed previous view: overlap {overlap:.2f}{_supported(support)}"
         case JoinsSegments(share, rival_deg):
-            rival = f", else turned by {rival_deg:.0f}°" if share < 1.0 else ""
+            rival = f", otherwise turned by {rival_deg:.0f}°" if share < 1.0 else ""
             return f"joins two segments, with a probability of {100.0 * share:.3g} %{rival}"
         case NotJoined(views):
-            return f"fits {views - 1} other frames that were left out, but nothing tells how these lie on the others"
+            return (
+                f"fits {views - 1} other frames that were left out, but their alignment with the rest is undetermined"
+            )
         case ElsewhereThanSegments(angle_deg):
-            return f"contradicts how the models of the two segments lie on each other, by {angle_deg:.0f}°"
+            return f"contradicts the alignment of the two segments by {angle_deg:.0f}°"
         case Failed(outcome):
             return outcome.label
         case PriorRefused(message):
@@ -229,13 +231,13 @@ def summary(reason: Reason) -> str:
         case LowEvidence(log_evidence, median_nats):
             return f"the images contradict it: log evidence {log_evidence:.0f}, median of other edges {median_nats:.0f}"
         case NotPlaced():
-            return "neither the previous view nor another one places the frame with certainty"
+            return "neither the previous view nor another one places the frame reliably"
         case OpenRotation(sigma_deg):
-            return f"it leaves the rotation about an axis open by ±{sigma_deg:.0f}°, and the graph knows it no better"
+            return f"the rotation about an axis is uncertain by ±{sigma_deg:.0f}°, and the graph does not reduce this"
         case Consistency():
             return _agreement(reason)
         case OptimisationOutlier():
-            return "the optimisation left it out: all other edges contradict it"
+            return "the optimisation rejected it: all other edges contradict it"
         case Stated(words):
             return words
 
@@ -243,7 +245,7 @@ def summary(reason: Reason) -> str:
 def _supported(support: NearExtrapolation | ConfirmedBy | None) -> str:
     match support:
         case NearExtrapolation(angle_deg):
-            return f", {angle_deg:.0f}° from the motion going on"
+            return f", {angle_deg:.0f}° from the extrapolated motion"
         case ConfirmedBy(frame):
             return f", frame {frame} agrees"
         case None:

@@ -204,8 +204,9 @@ class LoopOpening:
     def words(self) -> str:
         """The opening in words."""
         return (
-            f"the loop from frame {self.target} to {self.source} was open by {np.degrees(self.rotation_rad):.1f}° and "
-            f"{1000.0 * self.translation_m:.1f} mm, {self.sigmas:.1f} times what its edges state"
+            f"the loop from frame {self.target} to {self.source} has a closure error of "
+            f"{np.degrees(self.rotation_rad):.1f}° and "
+            f"{1000.0 * self.translation_m:.1f} mm, {self.sigmas:.1f} times its standard deviation"
         )
 
 

@@ -48,7 +48,7 @@ from modeler.verdict.evidence import (
     spread_of_rotations,
 )
 
-_NO_SURFACE: Final = "poses are wrong, masks hold more than the object, or it changed its shape"
+_NO_SURFACE: Final = "poses are wrong, masks include more than the object, or it changed its shape"
 _LITTLE_OVERLAP: Final = 0.5  # views farther apart are registered wrongly now and then, and surely so
 
 
@@ -178,51 +178,51 @@ def _found(
     accepted = [frame for frame in frames if frame.accepted]
     if accepted:
         unsure = sum(frame.mask == Outcome.UNSURE_MASK.label for frame in accepted)
-        words = f"the masks of {unsure} of {len(accepted)} frames are unsure: this may be the model of something else"
+        words = f"the masks of {unsure} of {len(accepted)} frames are unsure: another object may have been modelled"
         found.append(_Finding("unsure_masks", Figure(unsure / len(accepted), MAX_UNSURE), "unsure_masks", words))
     if (moved_m := displacement(views, solution)) is not None:
         words = (
-            f"nothing shows that the object moved: its surface by {1000.0 * moved_m.value:.1f} mm at most, which the "
-            f"camera's noise hides (up to {1000.0 * moved_m.limit:.1f} mm)"
+            f"the object did not move measurably: its surface moved by {1000.0 * moved_m.value:.1f} mm at most, and "
+            f"the camera's noise hides up to {1000.0 * moved_m.limit:.1f} mm"
         )
         found.append(_Finding("motion_m", moved_m, "no_motion", words))
     distances = [] if prior is None else prior_distances(edges, views, prior)
     if (against := contradiction(distances)) is not None:
         words = (
             f"the images contradict the prior: from frame {against.target} to {against.source} the object moved "
-            f"{against.figure.value:.0f} standard deviations from what the prior expects"
+            f"{against.figure.value:.0f} standard deviations from the prior"
         )
         found.append(_Finding("prior_sds", against.figure, "prior_contradicted", words))
     if (together := prior_figure(distances)) is not None:
         words = (
-            f"the images contradict the prior in all pairs together: squared distances from what it expects are "
+            f"the images contradict the prior in all pairs together: squared distances from it are "
             f"{together.value:.1f} times those of its standard deviations (up to {together.limit:.1f} by chance)"
         )
         found.append(_Finding("prior_chi2", together, "prior_contradicted", words))
     centroids_m = {frame: view.centroid_m for frame, view in views.items()}
     if (loop := loop_figure(loop_openings(step.edges_so_far, solution, centroids_m))) is not None:
         opening, figure = loop
-        words = f"{opening.words}: the focal length or the depth scale is wrong, or an edge"
+        words = f"{opening.words}: the focal length, the depth scale or an edge is wrong"
         found.append(_Finding("loop_sigmas", figure, "loop_open", words))
     if (fit := graph_figure(edges, solution)) is not None:
         words = (
-            f"the edges contradict each other: their squared residuals are {fit.value:.1f} times what their "
-            f"covariances state (up to {fit.limit:.1f} by chance)"
+            f"the edges contradict each other: their squared residuals are {fit.value:.1f} times those "
+            f"expected from their covariances (up to {fit.limit:.1f} by chance)"
         )
         found.append(_Finding("graph_chi2", fit, "edges_disagree", words))
     if (free := free_space(views, solution.trajectory)) is not None:
         words = (
-            f"other frames see through {100.0 * free.seen_through.value:.0f} % of the surface of frame {free.frame} by "
-            f"more than {1000.0 * WRONG_M:.0f} mm: {_NO_SURFACE}"
+            f"{100.0 * free.seen_through.value:.0f} % of the surface of frame {free.frame} violates the free space of "
+            f"other frames by more than {1000.0 * WRONG_M:.0f} mm: {_NO_SURFACE}"
         )
         found.append(_Finding("seen_through", free.seen_through, "seen_through", words))
         words = (
-            f"{100.0 * free.absent.value:.0f} % of the surface of frame {free.bare_frame} is not there by most frames "
-            f"that look: {_NO_SURFACE}"
+            f"{100.0 * free.absent.value:.0f} % of the surface of frame {free.bare_frame} is contradicted by most "
+            f"frames that observe it: {_NO_SURFACE}"
         )
         found.append(_Finding("absent", free.absent, "absent", words))
     others = other_modes(edges, solution, views)
-    words = f"with a probability of {100.0 * others.value:.0f} % some pair is at another of its modes"
+    words = f"with a probability of {100.0 * others.value:.0f} %, some pair is at a wrong mode"
     found.append(_Finding("other_modes", others, "other_modes", words))
     return found
 
@@ -231,14 +231,14 @@ def _spreads(step: Step, edges: Sequence[Edge]) -> list[_Finding]:
     """Return how uncertain the poses of a whole run are."""
     found, factor, focal = [], misfit(edges, step.solution), step.solution.focal
     if (turn := spread_of_rotations(step.solution, factor)) is not None:
-        words = f"frame {turn.frame} may be turned by {turn.figure.value:.1f}° (one standard deviation)"
+        words = f"the rotation of frame {turn.frame} is uncertain by {turn.figure.value:.1f}° (one standard deviation)"
         words += f", {turn.count - 1} more by over {turn.figure.limit:.1f}°" if turn.count > 1 else ""
         by_focal_deg, _ = spread_by_focal_length(step.views, step.solution, turn.frame)
         found.append(_explained(_Finding("pose_sd_deg", turn.figure, "unsure_rotation", words), by_focal_deg, focal))
     if (place := spread_of_places(step.views, step.solution, factor)) is not None:
         value_mm, limit_mm = 1000.0 * place.figure.value, 1000.0 * place.figure.limit
-        words = f"frame {place.frame} may be {value_mm:.1f} mm from its place (one standard deviation)"
-        words += f", {place.count - 1} more over {limit_mm:.1f} mm" if place.count > 1 else ""
+        words = f"the position of frame {place.frame} is uncertain by {value_mm:.1f} mm (one standard deviation)"
+        words += f", {place.count - 1} more by over {limit_mm:.1f} mm" if place.count > 1 else ""
         _, by_focal_m = spread_by_focal_length(step.views, step.solution, place.frame)
         found.append(_explained(_Finding("pose_sd_m", place.figure, "unsure_place", words), by_focal_m, focal))
     return found
@@ -254,7 +254,7 @@ def _explained(spread: _Finding, by_focal: float, focal: FocalLength | None) -> 
     """
     if focal is None or 2.0 * by_focal**2 < spread.figure.value**2:
         return spread
-    why = f"mostly because the focal length is known to {100.0 * focal.sigma:.1f} % only"
+    why = f"mostly because the focal length is known only to {100.0 * focal.sigma:.1f} %"
     return replace(spread, code="unsure_focal", words=f"{spread.words}, {why}")
 
 
@@ -264,8 +264,8 @@ def _size(step: Step, depth_scale_sigma: float) -> list[_Finding]:
         return []
     figure = size_figure(step.views, step.solution.trajectory, depth_scale_sigma)
     words = (
-        f"the model's size is known to {100.0 * depth_scale_sigma:.0f} % only, {1000.0 * figure.value:.0f} mm of its "
-        "surface: its loops tell the focal length and the relief of its depth together"
+        f"the model's size is known only to {100.0 * depth_scale_sigma:.0f} %, {1000.0 * figure.value:.0f} mm of its "
+        "surface: loops cannot separate errors of focal length and depth"
     )
     return [_Finding("size_m", figure, "unsure_size", words)]
 
@@ -318,19 +318,19 @@ def _open_loop(step: Step, edges: Sequence[Edge], *, closure_expected: bool) -> 
         last = refused[-1]
         why = explain(OptimisationOutlier() if last in step.solution.outliers else last.reason)
         pair = f"frame {last.source} on frame {last.target}"
-        words = f"none of {len(closures)} closures closed a loop; the last refused, {pair}: {why}"
+        words = f"none of {len(closures)} closures closed a loop; the last rejected one, {pair}: {why}"
         return [Shortcoming("closures_refused", words)]
     if joining:
-        words = "what joins the first frames to the last is confirmed by nothing: no loop was closed"
+        words = "the edge between the first frames and the last is unconfirmed: no loop was closed"
         return [Shortcoming("unconfirmed", words)]
     if closure_expected:
-        words = "the object never came back to an earlier view, so that no loop was closed"
+        words = "the object never came back to an earlier view, so no loop was closed"
         return [Shortcoming("never_came_back", words)]
     joins = any(edge.kind == "join" for edge in edges)
     back = None if closures or joins else _came_back(step.solution)
     if back is not None:
         frame, first = back
-        words = f"frame {frame} shows the object from the side of frame {first} again, and no loop was tried"
+        words = f"frame {frame} shows the same side of the object as frame {first}, but no loop was tried"
         return [Shortcoming("not_tried", words)]
     return []
 
@@ -338,7 +338,7 @@ def _open_loop(step: Step, edges: Sequence[Edge], *, closure_expected: bool) -> 
 def _unconfirmed_join(edges: Sequence[Edge]) -> list[Shortcoming]:
     """Return that segments are joined by a single pair of views, where they are."""
     alone = [edge for edge in edges if edge.kind == "join" and not joined_without(edge, edges)]
-    words = "what joins frames {} and {}, of two segments, is confirmed by no other pair of views"
+    words = "the edge between frames {} and {}, of two segments, is not confirmed by another pair of views"
     return [Shortcoming("unconfirmed", words.format(edge.target, edge.source)) for edge in alone[:1]]
 
 
@@ -371,7 +371,7 @@ def _little_overlap(edges: Sequence[Edge]) -> list[Shortcoming]:
         Shortcoming(
             "little_overlap",
             f"frames {edge.source} and {edge.target} share little surface (overlap {edge.posterior.overlap:.2f}), and "
-            "no other edge confirms how they were joined",
+            "no other edge confirms their registration",
         )
         for edge in edges
         if edge.posterior.overlap < _LITTLE_OVERLAP and not joined_without(edge, edges)

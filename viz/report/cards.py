@@ -28,14 +28,14 @@ _TERMS: Final = {
     "odometry": "to the previous frame; this is how a frame gets its first pose",
     "span": "over several frames, to make their poses more precise",
     "closure": "to a view that the object had turned away from; it closes the loop",
-    "join": "between two segments, such as views before and after the object was put down otherwise",
-    "converged": "one narrow pose explains both images; other outcomes say what is wrong, and what to do",
-    "rejected": "did not join the pose graph, for the reason written below it",
+    "join": "between two segments, such as views before and after the object was laid down differently",
+    "converged": "one well-determined pose explains both images; other outcomes state the problem and the remedy",
+    "rejected": "did not join the pose graph, for the reason given below it",
     "rotation sd, translation sd": "standard deviation along the least certain axis, at the object's centre",
-    "overlap": "of the surface that both views should see, how much both saw; from 50 % on it is enough",
-    "effective samples": "how many independent samples the estimate is worth; it needs 100",
+    "overlap": "share of the commonly visible surface that both views observed; 50 % is sufficient",
+    "effective samples": "number of equivalent independent samples; at least 100 are needed",
     "sd from the poses": "how far the pair is from the final poses, in its own sd; about 1 is expected",
-    "modes": "separate poses that explain the images too, each with its probability",
+    "modes": "alternative poses that also explain the images, each with its probability",
 }
 
 
@@ -88,9 +88,8 @@ def mask_cards(result: Result, pictures: Mapping[int, Thumbnails]) -> Sequence[s
                 f"alt=''><p>{', '.join(words)}</p></div>"
             )
     note = (
-        "The outline of what was taken for the object in each frame. It should follow the object all around: what it "
-        "holds too much becomes part of the model, what it leaves out is missing. Unsure: the object could not be told "
-        "from its surroundings for certain."
+        "The segmented object in each frame. The outline should follow the object all around: anything else inside "
+        "becomes part of the model, anything outside is missing. Unsure: the object could not be segmented reliably."
     )
     return [f"<h2>Masks</h2><p class='quiet'>{note}</p><div class='masks'>{''.join(cards)}</div>"] if cards else []
 

@@ -1,4 +1,4 @@
-"""The figures behind the verdict on a run, each explained and beside its limit."""
+"""The values behind the verdict on a run, each with an explanation and its limit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Check:
 CHECKS: Final = {
     "unsure_masks": Check(
         "frames with an unsure mask",
-        "The object could not be told from its surroundings. Where that is the rule, anything may be modelled.",
+        "The object could not be segmented reliably. If this is the rule, anything may have been modelled.",
         100.0,
         " %",
     ),
@@ -36,37 +36,38 @@ CHECKS: Final = {
         " mm",
     ),
     "prior_sds": Check(
-        "farthest pair from what the prior expects",
-        "The prior is what was known of the motion. An estimate many standard deviations (sd) from it contradicts it.",
+        "largest distance of a pair from the prior",
+        "The prior describes the motion before the images are compared. Many standard deviations (sd) from it are a "
+        "contradiction.",
         1.0,
         " sd",
     ),
     "prior_chi2": Check(
         "mean squared distance of all pairs from the prior",
-        "In units of the prior's variance. Many small deviations to one side show in the mean: a wrong step, say.",
+        "In units of the prior's variance. The mean reveals many small deviations to one side, such as from a wrong "
+        "step.",
     ),
     "loop_sigmas": Check(
-        "widest open loop, before optimisation",
-        "By how much the chain of consecutive pairs misses a view seen before, in sd that its covariances state; 1 is "
-        "expected. More: a wrong pair, or errors that all pairs share, as a wrong focal length makes.",
+        "largest loop closure error, before optimisation",
+        "By how much the chain of consecutive pairs misses an earlier view, in sd of its covariances; 1 is expected. "
+        "More: a wrong pair, or errors common to all pairs, such as from a wrong focal length.",
         1.0,
         " sd",
     ),
     "graph_chi2": Check(
         "mean squared residual of the edges",
-        "How far the registrations are from the poses that fit all of them best, in units of their variance; 1 is "
-        "expected.",
+        "Distance of the registrations from the optimised poses, in units of their variance; 1 is expected.",
     ),
     "seen_through": Check(
-        "surface of a frame that others see through",
-        "Another camera measured something behind it, where it should block the view: one of the two poses is wrong.",
+        "free-space violations: surface of a frame in the free space of others",
+        "Another frame measured something behind it, although it should occlude that: one of the two poses is wrong.",
         100.0,
         " %",
     ),
     "absent": Check(
-        "surface of a frame that is not there",
-        "Most other frames that look at it see through it: the pose of this frame is wrong, or its mask holds more "
-        "than the object.",
+        "false surface: surface of a frame contradicted by others",
+        "It lies in the free space of most frames that observe it: the pose of this frame is wrong, or its mask "
+        "includes more than the object.",
         100.0,
         " %",
     ),
@@ -74,21 +75,21 @@ CHECKS: Final = {
         "largest sd of a pose's rotation", "At the limit, one pose in twenty is off by more than 3°.", 1.0, "°"
     ),
     "pose_sd_m": Check(
-        "largest sd of a pose's place",
-        "At the limit, one pose in twenty puts the surface more than 5 mm from where it belongs.",
+        "largest sd of a pose's position",
+        "At the limit, one pose in twenty displaces the surface by more than 5 mm.",
         1000.0,
         " mm",
     ),
     "size_m": Check(
-        "error of the surface that the camera's scale leaves open",
-        "Loops cannot tell a wrong focal length from depth of too flat a relief, and sizes depend on which it is.",
+        "surface error due to unknown scale",
+        "Loops cannot distinguish a wrong focal length from too flat a depth relief, and sizes depend on which it is.",
         1000.0,
         " mm",
     ),
     "other_modes": Check(
         "probability of another mode",
-        "Where several poses explain a pair of images, as for symmetric objects, each is a mode: the probability that "
-        "some pair is at another one than the model assumes.",
+        "If several poses explain a pair of images, as for symmetric objects, each is a mode. This is the probability "
+        "that some pair is at another mode than the model assumes.",
         100.0,
         " %",
     ),
@@ -104,7 +105,7 @@ def evidence_table(evidence: Mapping[str, Mapping[str, Any]]) -> str:
     rows = [_row(CHECKS.get(name, Check(name.replace("_", " "), "")), figure) for name, figure in evidence.items()]
     if not rows:
         return ""
-    return f"<h2>What was checked</h2><table class='evidence'>{''.join(rows)}</table>"
+    return f"<h2>Checks</h2><table class='evidence'>{''.join(rows)}</table>"
 
 
 def _row(check: Check, figure: Mapping[str, Any]) -> str:

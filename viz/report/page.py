@@ -59,8 +59,8 @@ def _opening(loop: Mapping[str, float] | None) -> list[tuple[str, str, str]]:
     if loop is None:
         return []
     value = f"{loop['opening_deg']:.1f}°, {loop['sigmas']:.1f} sd"
-    why = "by how much the chain of pairs misses its start; 1 sd (standard deviation) is what the pairs state"
-    return [(value, "open loop, before optimisation", why)]
+    why = "by how much the chain of pairs misses its start; 1 sd (standard deviation) is expected"
+    return [(value, "loop closure error, before optimisation", why)]
 
 
 def _focal_length(camera: Mapping[str, Any] | None) -> list[tuple[str, str, str]]:
@@ -69,12 +69,14 @@ def _focal_length(camera: Mapping[str, Any] | None) -> list[tuple[str, str, str]
         return []
     value = f"{fx_px:.1f} ± {fx_px * camera['focal_factor_sigma']:.1f} px"
     if not camera["loops"]:
-        return [(value, "focal length", "as given: no loop tells it, and poses are as uncertain as it makes them")]
+        return [
+            (value, "focal length", "as given: not observable without a loop; its uncertainty is part of the poses'")
+        ]
     why = (
-        f"{fx_px / camera['factor_in_run']:.1f} px was given; loops close to {camera['sigmas_after']:.1f} sd with this "
-        f"one, to {camera['sigmas_before']:.1f} as given; poses and surface are those under this one"
+        f"{fx_px / camera['factor_in_run']:.1f} px was given; loop closure error {camera['sigmas_after']:.1f} sd with "
+        f"this one, {camera['sigmas_before']:.1f} sd as given; poses and surface are those under this one"
     )
-    return [(value, "focal length, as loops tell it", why)]
+    return [(value, "focal length, estimated from loops", why)]
 
 
 def _head(result: Result, mesh: Mesh | None) -> str:

@@ -16,7 +16,7 @@ from modeler.types import Array, InputError
 
 _MEANING: Final = (
     "Rotations that map the model onto itself: in any two of these poses it looks the same, so that a pose estimator "
-    "cannot tell one from the other. What was not seen is not compared."
+    "cannot tell one from the other. Unobserved surface is not compared."
 )
 
 _VERTICAL: Final = "the vertical"
