@@ -27,7 +27,7 @@ def bundled(name: str) -> Path:
     """Return the folder of a sequence that comes with the package: `box`, `flashlight` or `tube`.
 
     Raises:
-        InputError: where there is none of that name.
+        InputError: if there is none of that name.
     """
     folder = Path(__file__).parent / "bundled"
     names = sorted(path.name for path in folder.iterdir() if path.is_dir())

@@ -33,22 +33,22 @@ class AbstractSequence(ABC):
         """Return the frame with number `index`.
 
         Raises:
-            InputError: where there is no such frame or it cannot be read.
+            InputError: if there is no such frame or it cannot be read.
         """
 
     @abstractmethod
     def truth(self) -> dict[int, Array] | None:
-        """Return the true camera_from_model (4, 4), in m, by frame number; None where it is not known.
+        """Return the true camera_from_model (4, 4), in m, by frame number; None if it is not known.
 
         Frames whose truth is not known are left out.
 
         Raises:
-            InputError: where the ground truth cannot be read.
+            InputError: if the ground truth cannot be read.
         """
 
     @abstractmethod
     def sensor(self) -> SensorNoise | None:
-        """Return the noise of its camera; None where the sequence does not say."""
+        """Return the noise of its camera; None if the sequence does not say."""
 
     @property
     @abstractmethod
@@ -67,7 +67,7 @@ class AbstractSequence(ABC):
 
     @property
     def model_path(self) -> Path | None:
-        """The true surface as a mesh in m, in the model frame of `truth()`; None where it is not known."""
+        """The true surface as a mesh in m, in the model frame of `truth()`; None if it is not known."""
         return None
 
     @property
@@ -114,7 +114,7 @@ class AbstractSequence(ABC):
             frames: keep frame numbers from `start` up to but not including `stop`.
 
         Raises:
-            InputError: where nothing is left.
+            InputError: if nothing is left.
         """
         check_every(every)
         start, stop = (None, None) if frames is None else (frames.start, frames.stop)
@@ -149,11 +149,11 @@ class AbstractDerived(AbstractSequence):
         return self.whole.frame(index)
 
     def truth(self) -> dict[int, Array] | None:
-        """Return the true camera_from_model (4, 4) by frame number; None where it is not known."""
+        """Return the true camera_from_model (4, 4) by frame number; None if it is not known."""
         return self.whole.truth()
 
     def sensor(self) -> SensorNoise | None:
-        """Return the noise of its camera; None where the sequence does not say."""
+        """Return the noise of its camera; None if the sequence does not say."""
         return self.whole.sensor()
 
     @property
@@ -173,7 +173,7 @@ class AbstractDerived(AbstractSequence):
 
     @property
     def model_path(self) -> Path | None:
-        """The true surface as a mesh in m; None where it is not known."""
+        """The true surface as a mesh in m; None if it is not known."""
         return self.whole.model_path
 
     @property
@@ -227,7 +227,7 @@ class SelectedSequence(AbstractDerived):
         return self.whole.frame(index)
 
     def truth(self) -> dict[int, Array] | None:
-        """Return the true camera_from_model (4, 4) by frame number; None where it is not known."""
+        """Return the true camera_from_model (4, 4) by frame number; None if it is not known."""
         truth = self.whole.truth()
         return None if truth is None else {index: truth[index] for index in self.kept if index in truth} or None
 
@@ -265,7 +265,7 @@ def check_every(every: int) -> None:
     """Check a stride.
 
     Raises:
-        InputError: where it is less than 1.
+        InputError: if it is less than 1.
     """
     if every < 1:
         raise InputError(f"--every {every} keeps no frame; give a whole number of at least 1.")
@@ -275,7 +275,7 @@ def frame_range(text: str) -> slice:
     """Read a range of frame numbers `A:B`, half-open; either end may be left out.
 
     Raises:
-        InputError: where the text is no such range.
+        InputError: if the text is no such range.
     """
     match = re.fullmatch(r"([0-9]*):([0-9]*)", text.strip())
     if match is None:

@@ -41,7 +41,7 @@ def intrinsics(node: Node) -> Intrinsics:
     """Return (fx, fy, cx, cy) in px of one entry of `scene_camera.json`.
 
     Raises:
-        InputError: where `cam_K` is missing or is not the matrix of a pinhole camera.
+        InputError: if `cam_K` is missing or is not the matrix of a pinhole camera.
     """
     entry = node.need("cam_K")
     found = of_matrix(entry.numbers(9).reshape(3, 3))
@@ -54,7 +54,7 @@ def depth_scale_mm(node: Node) -> float:
     """Return the millimetres per unit of depth of one entry of `scene_camera.json`.
 
     Raises:
-        InputError: where it is missing or absurd; 1000 would be units per metre mistaken for it.
+        InputError: if it is missing or absurd; 1000 would be units per metre mistaken for it.
     """
     return node.need("depth_scale").number(1e-6, 100.0)
 
@@ -63,7 +63,7 @@ def camera_from_model(node: Node) -> Array:
     """Return the pose (4, 4), in m, of one object of `scene_gt.json`.
 
     Raises:
-        InputError: where rotation or translation is missing or not valid.
+        InputError: if rotation or translation is missing or not valid.
     """
     entry = node.need("cam_R_m2c")
     written = entry.numbers(9).reshape(3, 3)
@@ -115,7 +115,7 @@ class BopSequence(AbstractRecording):
         """Check everything that can be checked without decoding an image.
 
         Raises:
-            InputError: where the folder is no readable scene.
+            InputError: if the folder is no readable scene.
         """
         _ = self._depth_paths, self._intrinsics, self._times_s, self.name, self.sensor(), self.motion
 
@@ -255,7 +255,7 @@ class BopSequence(AbstractRecording):
         return {self._intrinsics[index][0]: index for index in reversed(self.indices)}
 
     def _masks(self, index: int, size: tuple[int, ...]) -> tuple[BoolArray | None, BoolArray | None]:
-        """Return the masks (h, w) of object and occluder; None where there is no file."""
+        """Return the masks (h, w) of object and occluder; None if there is no file."""
         stem = self._depth_paths[index].stem
         path = self.path / MASKS / f"{stem}_000000.png"
         labels = read_labels(path) if is_there(path) else None
@@ -314,7 +314,7 @@ def write_bop(
         files: more files by name, such as `model.ply` and `robot.txt`.
 
     Raises:
-        InputError: where the folder is not empty or cannot be written, or depth does not fit into 16 bits.
+        InputError: if the folder is not empty or cannot be written, or depth does not fit into 16 bits.
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -364,7 +364,7 @@ def _fill(
 
 
 def _raw_depth(frame: Frame, depth_scale_mm: float) -> npt.NDArray[np.uint16]:
-    """Return depth in units of the file; 0 where nothing was measured."""
+    """Return depth in units of the file; 0 if nothing was measured."""
     measured = np.isfinite(frame.depth_m)
     units = np.rint(np.where(measured, frame.depth_m, 0.0) * (1000.0 / depth_scale_mm))
     if units.max(initial=0.0) > np.iinfo(np.uint16).max or units.min(initial=0.0) < 0.0:
@@ -399,7 +399,7 @@ def true_mesh(sequence: AbstractSequence) -> Mesh:
     in the dataset's `models` folder, in mm.
 
     Raises:
-        InputError: where there is none or it cannot be read.
+        InputError: if there is none or it cannot be read.
     """
     if sequence.model_path is not None:
         return read_mesh(sequence.model_path, 1.0)

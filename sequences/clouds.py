@@ -46,7 +46,7 @@ class CloudSequence(AbstractRecording):
         """Check the first cloud's header and `sequence.json`.
 
         Raises:
-            InputError: where they cannot be used.
+            InputError: if they cannot be used.
         """
         _ = self.name, self.sensor(), self.motion, organised(self.clouds[self.indices[0]])
 
@@ -114,7 +114,7 @@ def open_clouds(path: Path, overrides: Overrides) -> CloudSequence:
     """Open a folder of organised clouds, or one such file.
 
     Raises:
-        InputError: where it is not readable as such.
+        InputError: if it is not readable as such.
     """
     found = list_images(path, SUFFIXES) if path.is_dir() else {path.stem: path}
     numbers = frame_numbers(list(found)) or {stem: place for place, stem in enumerate(found)}
@@ -127,7 +127,7 @@ def organised(path: Path) -> tuple[int, int]:
     """Return the (width, height) of a cloud as its header says.
 
     Raises:
-        InputError: where it is no cloud or is not organised as an image.
+        InputError: if it is no cloud or is not organised as an image.
     """
     try:
         with open_regular(path) as file:
@@ -168,7 +168,7 @@ def fit_intrinsics(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
     """Return the intrinsics of the camera that saw points (h, w, 3), by least squares over all of them.
 
     Raises:
-        InputError: where no pinhole camera that looks along z saw them.
+        InputError: if no pinhole camera that looks along z saw them.
     """
     rows, columns = np.nonzero(np.isfinite(points).all(axis=2) & (points[..., 2] > 1e-9))
     if rows.size < 100:

@@ -57,7 +57,7 @@ def read_focal_factor(path: Path) -> FocalFactor:
     """Read a factor that `modeler calibrate-camera` has stored.
 
     Raises:
-        InputError: where the file is missing or says something else.
+        InputError: if the file is missing or says something else.
     """
     node = read_tree(path)
     return FocalFactor(
@@ -79,7 +79,7 @@ class RefocusedSequence(AbstractDerived):
     """The focal length."""
 
     def sensor(self) -> SensorNoise | None:
-        """Return the noise of its camera, with how well loops told its focal length; None where nothing says."""
+        """Return the noise of its camera, with how well loops told its focal length; None if nothing says."""
         noise = self.whole.sensor()
         if self.focal.told_by != "loop" or self.focal.factor_sigma == 0.0:
             return noise
@@ -89,7 +89,7 @@ class RefocusedSequence(AbstractDerived):
         """Return the frame with number `index`.
 
         Raises:
-            InputError: where its camera is not the one that the focal length is of.
+            InputError: if its camera is not the one that the focal length is of.
         """
         return self._refocused(self.whole.frame(index))
 

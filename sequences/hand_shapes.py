@@ -91,7 +91,7 @@ class HandMarkedSequence(AbstractDerived):
         """Return a frame with the hand marked.
 
         Raises:
-            InputError: where the hand's pose is not known, too.
+            InputError: if the hand's pose is not known, too.
         """
         frame = self.whole.frame(index)
         marks = self.shape.marked(frame, self.poses.at(frame)[0])
@@ -102,7 +102,7 @@ def with_hand(sequence: AbstractSequence) -> AbstractSequence:
     """Return a sequence with the hand marked whose shape its `sequence.json` states; without one, itself.
 
     Raises:
-        InputError: where the shape cannot be read, or the hand's poses are missing.
+        InputError: if the shape cannot be read, or the hand's poses are missing.
     """
     node = sequence.facts.get("hand") if isinstance(sequence, AbstractRecording) and sequence.facts else None
     if node is None:
@@ -120,7 +120,7 @@ def hand_poses(path: Path) -> HandPoses:
     """Read the poses of a hand from its robot.txt.
 
     Raises:
-        InputError: where it cannot be read, or holds no pose.
+        InputError: if it cannot be read, or holds no pose.
     """
     poses = trajectory(path)
     if not poses:

@@ -68,7 +68,7 @@ def _stream(path: Path | EmbeddedImage) -> Iterator[IO[bytes]]:
     """Open an image for reading.
 
     Raises:
-        InputError: where it is no regular file, missing or cannot be opened.
+        InputError: if it is no regular file, missing or cannot be opened.
     """
     if isinstance(path, EmbeddedImage):
         yield io.BytesIO(path.content)
@@ -110,7 +110,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of an image from its header.
 
     Raises:
-        InputError: where the file is missing or no image.
+        InputError: if the file is missing or no image.
     """
     try:
         with _stream(path) as stream, warnings.catch_warnings(), _unlogged():
@@ -138,7 +138,7 @@ def read_depth(path: Path | EmbeddedImage) -> npt.NDArray[np.uint16]:
     """Return a 16-bit PNG or TIFF (h, w) in raw units; 0 = no measurement.
 
     Raises:
-        InputError: where the file is missing, broken, too large or not 16-bit greyscale.
+        InputError: if the file is missing, broken, too large or not 16-bit greyscale.
     """
     image = _open(path, ("PNG", "TIFF"))
     if image.mode not in ("I;16", "I;16B", "I"):
@@ -154,7 +154,7 @@ def read_mask(path: Path) -> BoolArray:
     """Return a mask (h, w), True where the image is not black. Of `read_labels`, occluders count too.
 
     Raises:
-        InputError: where the file is missing, broken or too large.
+        InputError: if the file is missing, broken or too large.
     """
     return read_labels(path) != 0
 
@@ -167,7 +167,7 @@ def read_labels(path: Path) -> npt.NDArray[np.uint8]:
     """Return the values of a mask (h, w): 0 or `OCCLUDED` of 8-bit images of those values, else 255.
 
     Raises:
-        InputError: where the file is missing, broken or too large.
+        InputError: if the file is missing, broken or too large.
     """
     image = _open(path, ("PNG",))
     pixels = np.asarray(image if image.mode in ("1", "L", "I;16", "I") else image.convert("L"))
@@ -178,7 +178,7 @@ def read_labels(path: Path) -> npt.NDArray[np.uint8]:
 def object_and_occluder(
     labels: npt.NDArray[np.uint8], occluder: BoolArray | None
 ) -> tuple[BoolArray, BoolArray | None]:
-    """Return the masks (h, w) of an object and of what hides it, None where nobody said.
+    """Return the masks (h, w) of an object and of what hides it, None if nobody said.
 
     Args:
         labels: (h, w), of `read_labels`.
@@ -194,7 +194,7 @@ def read_colour(path: Path | EmbeddedImage) -> npt.NDArray[np.uint8]:
     """Return a PNG, JPEG or TIFF, in colour or grey, as RGB (h, w, 3).
 
     Raises:
-        InputError: where the file is missing, broken or too large.
+        InputError: if the file is missing, broken or too large.
     """
     image = _open(path, ("PNG", "JPEG", "TIFF"))
     if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip rather than scale
@@ -221,7 +221,7 @@ def check_size(path: Path, found: tuple[int, ...], depth: tuple[int, ...]) -> No
     """Refuse a mask or colour of another size than its depth image, each (h, w).
 
     Raises:
-        InputError: where it is.
+        InputError: if it is.
     """
     if found != depth:
         raise InputError(
@@ -234,7 +234,7 @@ def resize_to_depth(path: Path, colour: npt.NDArray[np.uint8], depth: tuple[int,
     """Return colour (h, w, 3) in the size of its depth image, shrunk where it is finer and of the same shape.
 
     Raises:
-        InputError: where it is of another shape, or coarser.
+        InputError: if it is of another shape, or coarser.
     """
     height, width = depth
     if is_finer(colour.shape[1::-1], (width, height)):
@@ -258,7 +258,7 @@ def check_same_size(path: Path, size: tuple[int, ...], alike: Path, said: str) -
         said: what says that the intrinsics are the same, and what to do.
 
     Raises:
-        InputError: where it is.
+        InputError: if it is.
     """
     width, height = image_size(alike)
     if size != (height, width):

@@ -74,7 +74,7 @@ class ImageFolderSequence(AbstractRecording):
         """Check `sequence.json`.
 
         Raises:
-            InputError: where it cannot be used.
+            InputError: if it cannot be used.
         """
         _ = self.name, self.sensor(), self.motion
 
@@ -104,7 +104,7 @@ class ImageFolderSequence(AbstractRecording):
         return Frame(index, files.time_s, metres(raw, self.depth_scale_mm), camera, mask, colour, occluder)
 
     def truth(self) -> dict[int, Array] | None:
-        """Return the true camera_from_model (4, 4), in m, by frame number; None where it is not known."""
+        """Return the true camera_from_model (4, 4), in m, by frame number; None if it is not known."""
         return self.read_truth()
 
     @property
@@ -144,7 +144,7 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
     """Open a folder with `depth.txt` and, where they are there, `rgb.txt`, `groundtruth.txt`, `mask/` and `mask_hand/`.
 
     Raises:
-        InputError: where it is not readable as such.
+        InputError: if it is not readable as such.
     """
     depth = _list(path / "depth.txt", 2)
     if not depth:
@@ -199,7 +199,7 @@ def trajectory(path: Path) -> list[tuple[float, Array]]:
     """Return times in s and poses (4, 4) in m of a file with lines `time tx ty tz qx qy qz qw`.
 
     Raises:
-        InputError: where a line says something else, or times do not grow.
+        InputError: if a line says something else, or times do not grow.
     """
     poses = []
     for time_s, words in _list(path, 8):
@@ -240,7 +240,7 @@ def _list(path: Path, words: int) -> list[tuple[float, list[str]]]:
     """Return the time and the other words of each line that is no comment.
 
     Raises:
-        InputError: where a line has too few words or no time, or times do not grow.
+        InputError: if a line has too few words or no time, or times do not grow.
     """
     lines: list[tuple[float, list[str]]] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -264,7 +264,7 @@ def _listed(root: Path, by: str, name: str) -> Path:
     """Return an image file named in a list.
 
     Raises:
-        InputError: where there is none, or its name leads out of the sequence.
+        InputError: if there is none, or its name leads out of the sequence.
     """
     name = name.strip()
     if not name.isprintable():
@@ -289,7 +289,7 @@ def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
     Depth is in mm unless the file of intrinsics or the user gives another unit, as in both programs.
 
     Raises:
-        InputError: where it is not readable as such.
+        InputError: if it is not readable as such.
     """
     depth = list_images(path / "depth", (".png", ".tif", ".tiff"))
     if not depth:
@@ -369,7 +369,7 @@ def _partners(
     """Return the images of a folder by the name of the depth image to which they belong, and the names of the others.
 
     Raises:
-        InputError: where neither names nor numbers nor order match them.
+        InputError: if neither names nor numbers nor order match them.
     """
     folder = first_folder(root, names)
     if folder is None:

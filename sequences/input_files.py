@@ -55,7 +55,7 @@ def entries(folder: Path) -> list[Path]:
     """Return what lies in a folder by name; nothing where there is no such folder.
 
     Raises:
-        InputError: where it may not be read.
+        InputError: if it may not be read.
     """
     try:
         return sorted(folder.iterdir())
@@ -78,7 +78,7 @@ def list_images(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
         suffixes: in lower case, such as `.png`.
 
     Raises:
-        InputError: where the folder may not be read, or two images share a name.
+        InputError: if the folder may not be read, or two images share a name.
     """
     found: dict[str, Path] = {}
     for path in entries(folder):
@@ -99,7 +99,7 @@ def check_link(path: Path, root: Path) -> None:
     """Refuse a path that leads out of its sequence, by a link or by its name.
 
     Raises:
-        InputError: where it does.
+        InputError: if it does.
     """
     target, home = os.path.realpath(path), os.path.realpath(root)
     if os.path.commonpath([target, home]) != home:
@@ -110,7 +110,7 @@ def check_links(root: Path) -> None:
     """Refuse a folder in which a link, at whatever depth, leads out of it, whether or not the link would be read.
 
     Raises:
-        InputError: where one does, or a folder may not be read.
+        InputError: if one does, or a folder may not be read.
     """
 
     def unreadable(error: OSError) -> None:
@@ -193,7 +193,7 @@ class Node:
         return [Node(value, self.path, (*self.keys, str(i))) for i, value in enumerate(self.value)]
 
     def get(self, key: str) -> Node | None:
-        """Return one entry of an object; None where it is absent or null."""
+        """Return one entry of an object; None if it is absent or null."""
         node = self.items().get(key)
         return None if node is None or node.value is None else node
 
@@ -240,7 +240,7 @@ def read_tree(path: Path) -> Node:
     """Parse a JSON file, or a TOML file by its suffix.
 
     Raises:
-        InputError: where the file is missing or is not JSON or TOML.
+        InputError: if the file is missing or is not JSON or TOML.
     """
     kind = "TOML" if path.suffix == ".toml" else "JSON"
     text = read_text(path, kind)
@@ -261,7 +261,7 @@ def read_text(path: Path, kind: str = "text") -> str:
         kind: what it should be, for error messages.
 
     Raises:
-        InputError: where it is no regular file, missing, larger, or not UTF-8.
+        InputError: if it is no regular file, missing, larger, or not UTF-8.
     """
     try:
         return read_regular(path, MAX_BYTES).decode("utf-8-sig")

@@ -37,7 +37,7 @@ class Overrides:
         """Check the numbers.
 
         Raises:
-            InputError: where they cannot be.
+            InputError: if they cannot be.
         """
         if self.intrinsics is not None and not sane(self.intrinsics):
             shown = " ".join(f"{value:g}" for value in self.intrinsics)
@@ -114,7 +114,7 @@ def find_intrinsics(folder: Path, overrides: Overrides) -> CameraFacts | None:
         overrides: values that take precedence.
 
     Raises:
-        InputError: where a file of intrinsics cannot be read.
+        InputError: if a file of intrinsics cannot be read.
     """
     if overrides.intrinsics is not None:
         return CameraFacts(overrides.intrinsics, "--intrinsics")
@@ -203,7 +203,7 @@ def _pinhole(node: Node) -> Intrinsics:
 
 
 def of_matrix(matrix: Array) -> Intrinsics | None:
-    """Return fx, fy, cx, cy of the matrix (3, 3) of a pinhole camera; None where it is that of none."""
+    """Return fx, fy, cx, cy of the matrix (3, 3) of a pinhole camera; None if it is that of none."""
     fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     expected = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     known = sane((fx, fy, cx, cy)) and bool(np.abs(matrix - expected).max() <= 1e-6 * fx)  # not so of NaN

@@ -38,7 +38,7 @@ def depth_lens(calibration: Node, size: Size, intrinsics: Intrinsics | None) -> 
     """Return the depth camera for images of (width, height).
 
     Raises:
-        InputError: where the size is of no mode of the camera, or the calibration lacks something.
+        InputError: if the size is of no mode of the camera, or the calibration lacks something.
     """
     if intrinsics is not None:
         return Lens(Camera(*size, *intrinsics), ())
@@ -54,7 +54,7 @@ def colour_lens(calibration: Node, size: Size) -> Lens:
     """Return the colour camera for images of (width, height): the sensor of 4 : 3, cropped above and below for 16 : 9.
 
     Raises:
-        InputError: where the calibration lacks something.
+        InputError: if the calibration lacks something.
     """
     whole = size[0], size[0] * 3 // 4
     return _lens(calibration, COLOUR, size, whole, (0, (whole[1] - size[1]) // 2))
@@ -64,7 +64,7 @@ def colour_from_depth(calibration: Node) -> Array:
     """Return the motion (4, 4), in m, that takes points of the depth camera to the colour camera.
 
     Raises:
-        InputError: where the calibration lacks something.
+        InputError: if the calibration lacks something.
     """
     return _camera_from_device(calibration, COLOUR) @ se3.inverse(_camera_from_device(calibration, DEPTH))
 
@@ -155,7 +155,7 @@ def open_kinect(path: Path, overrides: Overrides) -> KinectSequence:
     """Open a recording.
 
     Raises:
-        InputError: where PyAV is not installed, or the file is no such recording.
+        InputError: if PyAV is not installed, or the file is no such recording.
     """
     file = Matroska(path)
     calibration = Node(file.calibration(), path)
@@ -187,7 +187,7 @@ class Matroska:
         """Return what `calibration.json`, which is attached to the recording, says.
 
         Raises:
-            InputError: where it is not attached.
+            InputError: if it is not attached.
         """
         with input_errors(self.path, "recording", _AGAIN):
             for attached in self._container.streams.attachments:
@@ -196,7 +196,7 @@ class Matroska:
         raise InputError(f"{self.path}: carries no calibration.json; it is not a recording of an Azure Kinect.")
 
     def size(self, title: str) -> tuple[int, int] | None:
-        """Return the (width, height) of a track; None where there is none."""
+        """Return the (width, height) of a track; None if there is none."""
         with input_errors(self.path, "recording", _AGAIN):
             track = self._track(title)
             return None if track is None else (int(track.width), int(track.height))
@@ -220,7 +220,7 @@ class Matroska:
         """Return one image as RGB (h, w, 3); `where` is for error messages.
 
         Raises:
-            InputError: where it cannot be decoded.
+            InputError: if it cannot be decoded.
         """
         with input_errors(self.path, "recording", _AGAIN):
             packet = self._find(title, stamp)

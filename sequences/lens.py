@@ -83,7 +83,7 @@ def lens_of_model(camera: Camera, distortion: Sequence[float], model: str, where
         where: the file, for error messages.
 
     Raises:
-        InputError: where there is distortion by an unknown model.
+        InputError: if there is distortion by an unknown model.
     """
     found = Lens(camera, coefficients(distortion))
     if found.is_distorted and model not in _NO_NAME + _BROWN:

@@ -50,7 +50,7 @@ class AbstractCamera(ABC):
         """Return time in s, raw depth (h, w), and colour (h, w, 3) of the depth camera's pixels, of the newest image.
 
         Raises:
-            InputError: where the camera gives none.
+            InputError: if the camera gives none.
         """
 
 
@@ -110,7 +110,7 @@ class LiveSequence(AbstractSequence):
         """Return a part of the sequence.
 
         Raises:
-            InputError: where nothing is left.
+            InputError: if nothing is left.
         """
         check_every(every)
         return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
@@ -181,7 +181,7 @@ def open_camera(serial: str, overrides: Overrides, context: Any = None) -> LiveS
         context: where to look for cameras; everywhere without it.
 
     Raises:
-        InputError: where the library is not installed, or no such camera gives images.
+        InputError: if the library is not installed, or no such camera gives images.
     """
     try:
         library = importlib.import_module("pyrealsense2")
@@ -231,7 +231,7 @@ class RealsenseCamera(AbstractCamera):
             context: where to look for cameras; None for everywhere.
 
         Raises:
-            InputError: where it cannot be started.
+            InputError: if it cannot be started.
         """
         where = f"{SCHEME}{serial}"
         try:

@@ -286,7 +286,7 @@ def calibrate(sequence: AbstractSequence) -> Calibration:
     """Measure the noise of the camera that took a sequence.
 
     Raises:
-        InputError: where the scene moves, or shows too little: fewer than 3 frames, no smooth surface, no border.
+        InputError: if the scene moves, or shows too little: fewer than 3 frames, no smooth surface, no border.
     """
     indices = sequence.indices[:MOST_FRAMES]
     if len(indices) < 3:

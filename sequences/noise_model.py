@@ -78,7 +78,7 @@ def read_noise(path: Path) -> NoiseModel:
     """Read a model that `modeler calibrate-sensor` has stored.
 
     Raises:
-        InputError: where it is missing or says something else.
+        InputError: if it is missing or says something else.
     """
     node = read_tree(path).need("noise")
     growth = node.need("growth").elements()

@@ -33,7 +33,7 @@ def open_sequence(path: str | Path, overrides: Overrides | None = None) -> Abstr
         overrides: values that take precedence over the files.
 
     Raises:
-        InputError: where it does not hold a readable sequence, or, on request, a link leads out of it.
+        InputError: if it does not hold a readable sequence, or, on request, a link leads out of it.
     """
     path, overrides = Path(path), overrides or Overrides()
     if not _is_text(path):

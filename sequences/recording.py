@@ -41,7 +41,7 @@ class AbstractRecording(AbstractSequence):
         return (self.path,)
 
     def sensor(self) -> SensorNoise | None:
-        """Return the noise of the camera from `sequence.json`; None where it does not say."""
+        """Return the noise of the camera from `sequence.json`; None if it does not say."""
         node = None if self._meta is None else self._meta.get("sensor")
         if node is None:
             return None
@@ -55,7 +55,7 @@ class AbstractRecording(AbstractSequence):
 
     @property
     def motion(self) -> Mapping[str, object] | None:
-        """What `sequence.json` says of the motion; None where it says nothing."""
+        """What `sequence.json` says of the motion; None if it says nothing."""
         node = None if self._meta is None else self._meta.get("motion")
         return None if node is None else _motion(node)
 
@@ -71,7 +71,7 @@ class AbstractRecording(AbstractSequence):
 
     @property
     def facts(self) -> Node | None:
-        """What `sequence.json` holds; None where there is none."""
+        """What `sequence.json` holds; None if there is none."""
         return self._meta
 
     def absent(self, index: int) -> InputError:
@@ -102,7 +102,7 @@ def _motion(node: Node) -> dict[str, object]:
     """Return the entry `motion` of `sequence.json` after a check of everything in it.
 
     Raises:
-        InputError: where a key or the kind is not known, or a value cannot be.
+        InputError: if a key or the kind is not known, or a value cannot be.
     """
     values: dict[str, object] = {}
     for key, entry in node.items().items():
@@ -123,7 +123,7 @@ def _poke(node: Node) -> dict[str, object]:
     """Return one entry of `pokes`, in camera coordinates.
 
     Raises:
-        InputError: where something is missing, not known, or cannot be.
+        InputError: if something is missing, not known, or cannot be.
     """
     known = ("point_m", "direction", "length_m")
     for key, entry in node.items().items():
@@ -152,7 +152,7 @@ class ImagePair(Generic[Stamp]):
     depth: Stamp
     """The depth image."""
     colour: Stamp | None
-    """The colour image; None where none is near enough in time."""
+    """The colour image; None if none is near enough in time."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
             stamp: which image of the stream.
 
         Raises:
-            InputError: where it cannot be read.
+            InputError: if it cannot be read.
         """
 
     @abstractmethod
@@ -188,7 +188,7 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
             depth_m: the depth image.
 
         Raises:
-            InputError: where it cannot be read.
+            InputError: if it cannot be read.
         """
 
     @property

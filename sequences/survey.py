@@ -135,7 +135,7 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
         truth: whether to read the ground truth too; estimation must not.
 
     Raises:
-        InputError: where a frame or the ground truth cannot be read, none measures anything, all masks are empty, or
+        InputError: if a frame or the ground truth cannot be read, none measures anything, all masks are empty, or
             the depth cannot be in the unit that it is said to be in.
     """
     cameras: dict[Camera, None] = {}
@@ -197,7 +197,7 @@ def _checked(sequence: AbstractSequence, camera: Camera) -> Camera:
     """Return a camera that can be one.
 
     Raises:
-        InputError: where its focal length is far too short for its images.
+        InputError: if its focal length is far too short for its images.
     """
     for name, focal_px, size_px in (("fx", camera.fx, camera.width), ("fy", camera.fy, camera.height)):
         if field_of_view_deg(size_px, focal_px) > WIDEST_FIELD_DEG:
@@ -217,7 +217,7 @@ def _check_unit(sequence: AbstractSequence, middle_m: float) -> None:
     """Refuse depth that can only be in another unit than it is said to be in.
 
     Raises:
-        InputError: where it is.
+        InputError: if it is.
     """
     if NEAREST_M <= middle_m <= FARTHEST_M:
         return

@@ -74,7 +74,7 @@ class WatchedSequence(AbstractDerived):
         """Yield each frame when it is complete, until none has come for a while.
 
         Raises:
-            InputError: where what is there when it ends cannot be read.
+            InputError: if what is there when it ends cannot be read.
         """
         wanted = -1
         for frame in arriving(self.path, self.overrides, self.patience, self.stop):
@@ -94,7 +94,7 @@ class WatchedSequence(AbstractDerived):
         """Return a part of the sequence, of what has come and of what will.
 
         Raises:
-            InputError: where `every` keeps nothing.
+            InputError: if `every` keeps nothing.
         """
         check_every(every)
         return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
@@ -113,7 +113,7 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
     """Yield frames of ascending numbers, each once it is complete, until none has come for a while.
 
     Raises:
-        InputError: where what is there when it ends cannot be read.
+        InputError: if what is there when it ends cannot be read.
     """
     last, state = -1, None
     came_s = changed_s = time.monotonic()
@@ -142,7 +142,7 @@ def watch(path: str | Path, overrides: Overrides | None = None, patience: WatchL
     """Wait for the first frames in a folder, which need not be there yet, and return the sequence that they begin.
 
     Raises:
-        InputError: where no readable frame comes in time.
+        InputError: if no readable frame comes in time.
     """
     path, overrides, patience = Path(path), overrides or Overrides(), patience or WatchLimits()
     first: list[int] = []

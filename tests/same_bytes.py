@@ -73,7 +73,7 @@ def _built(tree: Path, sequence: Path, run: Path) -> int:
 
 
 def _bytes(file: Path) -> bytes | None:
-    """Return what a file holds; None where there is none."""
+    """Return what a file holds; None if there is none."""
     return file.read_bytes() if file.exists() else None
 
 

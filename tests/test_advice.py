@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from modeler import priors, se3
-from modeler.cli.advice import ends_without, remedy, unchecked_focal_length
+from modeler.cli.advice import remedy, unchecked_focal_length, visible_frames
 from modeler.cli.build import Build
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.types import AbstractPrior, Outcome
@@ -133,5 +133,5 @@ def test_a_hand_in_half_of_the_frames_does_not_make_the_others_superfluous() -> 
         nothing = {"cause": Outcome.TOO_FEW_POINTS.label, "mask": Outcome.TOO_FEW_POINTS.label}
         return [{"id": k, **(nothing if k < 4 else {"cause": "", "mask": of_the_others.label})} for k in range(8)]
 
-    assert ends_without(told(Outcome.UNSURE_MASK)) == ""
-    assert "--frames 4:" in ends_without(told(Outcome.CONVERGED))
+    assert visible_frames(told(Outcome.UNSURE_MASK)) == ""
+    assert "--frames 4:" in visible_frames(told(Outcome.CONVERGED))

@@ -18,7 +18,7 @@ from commanded import BOX, FILES, Run
 
 from modeler import priors, se3
 from modeler.cli import compose, main
-from modeler.cli.advice import comes_back, ends_without, other_step, sense_in_doubt
+from modeler.cli.advice import comes_back, measured_step, sign_in_doubt, visible_frames
 from modeler.cli.console import Interrupt
 from modeler.cli.options import PriorOptions
 from modeler.export import RunFolder, model_upright
@@ -347,11 +347,11 @@ def test_a_turn_that_is_told_by_hand_counts_more(frames: slice, given_deg: float
 def test_a_table_that_turns_the_other_way_is_asked_about() -> None:
     lost = {"frames": [{"cause": ""}, {"cause": Outcome.NO_OVERLAP.label}], "reason_codes": ["left_out"]}
     known, unknown = (priors.TurntablePrior(-25.0, 3.0, step_sign=sign) for sign in ("known", "unknown"))
-    assert sense_in_doubt(lost, known)
-    assert sense_in_doubt({"frames": [], "reason_codes": ["little_overlap"]}, known)
-    assert not sense_in_doubt(lost, unknown)
-    assert not sense_in_doubt(lost, priors.TablePrior())
-    assert not sense_in_doubt({"frames": [], "reason_codes": ["interrupted"]}, known)
+    assert sign_in_doubt(lost, known)
+    assert sign_in_doubt({"frames": [], "reason_codes": ["little_overlap"]}, known)
+    assert not sign_in_doubt(lost, unknown)
+    assert not sign_in_doubt(lost, priors.TablePrior())
+    assert not sign_in_doubt({"frames": [], "reason_codes": ["interrupted"]}, known)
 
 
 def test_a_step_that_the_views_contradict_is_told() -> None:
@@ -361,27 +361,27 @@ def test_a_step_that_the_views_contradict_is_told() -> None:
         return [edge | {"source": gap * (k + 1), "target": gap * k} for k in range(count)]
 
     prior = priors.TurntablePrior(-30.0, 2.0)
-    said = other_step(steps(15.0), prior)
+    said = measured_step(steps(15.0), prior)
     assert [words for words in ("15.0°", "30° ± 2°", "--step-deg -15.0") if words not in said] == []
-    assert "turned by 15.0°" in other_step(steps(45.0, gap=3), prior)
+    assert "turned by 15.0°" in measured_step(steps(45.0, gap=3), prior)
     again = [edge | {"source": edge["target"], "target": edge["source"]} for edge in steps(-29.0)[:1]]
-    assert other_step(steps(29.0) + again, prior) == ""  # a frame that was tried again lies before its target
-    assert "turned by 15.0°" in other_step(steps(15.0) + again, prior)
+    assert measured_step(steps(29.0) + again, prior) == ""  # a frame that was tried again lies before its target
+    assert "turned by 15.0°" in measured_step(steps(15.0) + again, prior)
     lost = {"accepted": False, "kind": "odometry", "source": 9, "target": 8, "target_from_source": np.eye(4).tolist()}
     for edges in (steps(25.0), steps(90.0, gap=3), steps(15.0, count=2), [lost] * 5, []):
-        assert other_step(edges, prior) == ""
-    assert other_step(steps(15.0), priors.TablePrior()) == ""
-    still = other_step(steps(0.02), prior)
+        assert measured_step(edges, prior) == ""
+    assert measured_step(steps(15.0), priors.TablePrior()) == ""
+    still = measured_step(steps(0.02), prior)
     assert "turned by 0.0°" in still
     assert "--step-deg" not in still  # which refuses 0
-    assert "turned by 15.0°" in other_step(steps(15.0), priors.ProductPrior(priors.GeneralPrior(), prior))
+    assert "turned by 15.0°" in measured_step(steps(15.0), priors.ProductPrior(priors.GeneralPrior(), prior))
 
 
 def test_frames_before_the_object_came_are_told() -> None:
     few, lost = Outcome.TOO_FEW_POINTS.label, Outcome.NO_OVERLAP.label
 
     def said(*outcomes: str) -> str:
-        return ends_without([{"id": 2 * place, "cause": cause} for place, cause in enumerate(outcomes)])
+        return visible_frames([{"id": 2 * place, "cause": cause} for place, cause in enumerate(outcomes)])
 
     assert "--frames 4: " in said(few, few, ACCEPTED, lost, ACCEPTED)
     assert "--frames :7 " in said(ACCEPTED, few, lost, ACCEPTED, few)
@@ -396,7 +396,7 @@ def test_frames_without_a_hand_are_not_said_to_lack_the_object(hand: int, told: 
     few = {"cause": Outcome.TOO_FEW_POINTS.label, "mask": Outcome.TOO_FEW_POINTS.label}
     masks = [Outcome.UNSURE_MASK] * hand + [Outcome.CONVERGED] * (4 - hand)
     frames = [few, *({"cause": "", "mask": mask.label} for mask in masks)]
-    assert bool(ends_without([frame | {"id": place} for place, frame in enumerate(frames)])) is told
+    assert bool(visible_frames([frame | {"id": place} for place, frame in enumerate(frames)])) is told
 
 
 def test_ctrl_c_ends_the_frames_and_a_second_one_the_program() -> None:

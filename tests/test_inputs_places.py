@@ -159,7 +159,7 @@ def in_time() -> Iterator[None]:
 
 
 def refusal(target: Target, path: Path) -> str | None:
-    """Return what an input is refused with; None where it is read."""
+    """Return what an input is refused with; None if it is read."""
     try:
         with in_time():
             target.read(path)

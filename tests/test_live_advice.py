@@ -15,7 +15,7 @@ from rich.console import Console as Terminal
 from streamed import read
 
 from modeler.cli.console import Console
-from modeler.cli.live_advice import advising, in_short
+from modeler.cli.live_advice import advising, summary_of
 from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
 from modeler.rays import Sensor
@@ -109,11 +109,11 @@ def test_the_bar_says_the_next_turn_and_no_poke_that_the_run_is_not_told_of(
     step = steps[1]
     belief = modeler.belief(step.views, step.solution, step.edges_so_far)
     found = suggest(belief)
-    assert in_short(found).startswith("next: turn by ")
+    assert summary_of(found).startswith("next: turn by ")
     pokes = [each for each in found.ranked if each.prediction.candidate.action == "poke"]
     assert pokes
-    assert in_short(replace(found, ranked=(*pokes, *found.ranked))) == in_short(found)
-    assert in_short(found) in said_at_last(step, belief, [found])
+    assert summary_of(replace(found, ranked=(*pokes, *found.ranked))) == summary_of(found)
+    assert summary_of(found) in said_at_last(step, belief, [found])
 
 
 def test_that_nothing_is_to_be_gained_is_said_once(modeler: Modeler, steps: list[Step]) -> None:
@@ -161,5 +161,5 @@ def test_a_run_that_is_advised_has_a_tab_for_it(steps: list[Step]) -> None:
 
 def test_where_nothing_can_be_done_nothing_is_to_be_gained(modeler: Modeler, steps: list[Step]) -> None:
     belief = modeler.belief(steps[0].views, steps[0].solution, steps[0].edges_so_far)
-    assert "next: turn" in in_short(suggest(belief, [Candidate("turn", turn_deg=30.0)]))
-    assert in_short(suggest(belief, [])) == "nothing more to gain"
+    assert "next: turn" in summary_of(suggest(belief, [Candidate("turn", turn_deg=30.0)]))
+    assert summary_of(suggest(belief, [])) == "nothing more to gain"

@@ -21,7 +21,7 @@ def rod():
     """Return the exact depth (h, w) of a thin upright rod; NaN beside it."""
     columns, rows = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
     w, h = (columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy
-    a, b, c = 1.0 + w**2, -AXIS_M, AXIS_M**2 - RADIUS_M**2  # z² a + 2 z b + c = 0 where a ray meets it
+    a, b, c = 1.0 + w**2, -AXIS_M, AXIS_M**2 - RADIUS_M**2  # z² a + 2 z b + c = 0 if a ray meets it
     with np.errstate(invalid="ignore"):
         depth_m = (-b - np.sqrt(b**2 - a * c)) / a
     return np.where(np.abs(h * depth_m) < HALF_M, depth_m, np.nan)

@@ -15,7 +15,7 @@ from modeler.priors import PokePrior, TablePrior
 from modeler.rays import Sensor
 from modeler.suggestion import Belief, Candidate, Goal, Prediction, suggest
 from modeler.suggestion.candidates import poked, pokes
-from modeler.suggestion.edge_forecast import TURNS_RAD, basins
+from modeler.suggestion.edge_prediction import TURNS_RAD, basins
 from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information
 from modeler.suggestion.surface_cells import enclosing_circle
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Stated
@@ -180,9 +180,9 @@ def test_a_view_of_a_body_of_revolution_may_be_placed_at_many_turns(box: Belief,
 def test_colours_that_told_the_spin_are_expected_to_tell_it_again() -> None:
     turn = Candidate("turn", turn_deg=25.0)
     plain, printed = shown("can+plain", [0.0, 25.0], colour=True), shown("can+labelled", [0.0, 25.0], colour=True)
-    assert shown("can+labelled", [0.0]).forecast.colour is None
-    assert printed.forecast.colour is not None
-    assert (printed.forecast.colour.losses <= 0.0).all()
+    assert shown("can+labelled", [0.0]).predictor.colour is None
+    assert printed.predictor.colour is not None
+    assert (printed.predictor.colour.losses <= 0.0).all()
     assert spin_deg(printed.predict(turn)) < 0.5 * spin_deg(plain.predict(turn))
     assert mass_within(printed.predict(turn), 10.0) > mass_within(plain.predict(turn), 10.0)
 

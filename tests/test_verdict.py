@@ -49,7 +49,7 @@ from modeler.verdict.evidence import (
     other_modes,
     prior_distances,
     prior_figure,
-    spread_of_places,
+    spread_of_positions,
     spread_of_rotations,
 )
 
@@ -132,7 +132,7 @@ def test_a_part_that_one_frame_alone_shows_is_not_there() -> None:
     longer = seen(2, turned(angles_deg[2]), axes_m=AXES_M * np.array([1.0, 1.3, 1.0]))
     found = free_space(views | {2: longer}, poses)
     assert found is not None
-    assert found.bare_frame == 2
+    assert found.contradicted_frame == 2
     assert not found.absent.holds
     assert free_space(views, poses).absent.holds  # pyright: ignore[reportOptionalMemberAccess]
 
@@ -310,7 +310,7 @@ def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model
             poses,
             {frame: away[frame] @ (spread if frame == 2 else ABOUT_OBJECT) @ away[frame].T for frame in poses},
         )
-        turn, place = spread_of_rotations(solution), spread_of_places(views, solution)
+        turn, place = spread_of_rotations(solution), spread_of_positions(views, solution)
         assert turn is not None
         assert place is not None
         assert (turn.frame, turn.figure.holds) == (2, turn_holds)
@@ -322,7 +322,7 @@ def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model
     assert wider is not None
     assert 1.9 < wider.figure.value / turn.figure.value < 2.2
     assert spread_of_rotations(Solution()) is None
-    assert spread_of_places(views, Solution()) is None
+    assert spread_of_positions(views, Solution()) is None
 
 
 @pytest.mark.parametrize("sigmas_deg", [(1.5, 0.0, 0.0), (1.5, 0.6, 0.5), (1.3, 1.3, 0.1), (1.0, 1.0, 1.0)])

@@ -29,7 +29,7 @@ def draw_next(belief: Belief, found: Suggestions, done: str | None = None) -> Dr
     Args:
         belief: what is known.
         found: what to do next.
-        done: the action that led here, in words; None where nobody says.
+        done: the action that led here, in words; None if nobody says.
     """
     told = [] if done is None else [f"Done: {done}", ""]
     lines = [f"**{found.summary}**", "", *told, *(f"1. {each.words}" for each in found.ranked[:_SHOWN])]

@@ -54,7 +54,7 @@ def _row(step: Step, frame: int, placed_by: Edge | None, chain: Mapping[int, Pos
 
 
 def _solved(step: Step, frame: int) -> PoseGaussian | None:
-    """Return the pose of a frame after closure; None where its covariance is not known."""
+    """Return the pose of a frame after closure; None if its covariance is not known."""
     covariance = step.solution.covariances.get(frame)
     return None if covariance is None else PoseGaussian(step.solution.trajectory[frame], covariance)
 

@@ -139,7 +139,7 @@ def load() -> None:
     """Import what streams need, which takes half a second, ahead of `open_stream`.
 
     Raises:
-        OSError: where memory does not suffice.
+        OSError: if memory does not suffice.
     """
     if "rerun" not in sys.modules:
         check_room(_ROOM)
@@ -170,8 +170,8 @@ def open_stream(
         advised: whether it will be told what to do next.
 
     Raises:
-        InputError: where `save` cannot be written, or `connect` is not an address.
-        OSError: where memory does not suffice.
+        InputError: if `save` cannot be written, or `connect` is not an address.
+        OSError: if memory does not suffice.
     """
     load()
     import rerun as rr
@@ -232,7 +232,7 @@ def _file_sink(save: Path) -> rr.FileSink:
     """Return the sink that writes a file.
 
     Raises:
-        InputError: where it cannot be written.
+        InputError: if it cannot be written.
     """
     import rerun as rr
 

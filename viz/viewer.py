@@ -83,7 +83,7 @@ def start_window(recordings: Sequence[Path] = ()) -> Viewer:
     """Open the viewer in a window that outlives this process, showing the given recordings.
 
     Raises:
-        InputError: where there is no display, or the viewer does not start.
+        InputError: if there is no display, or the viewer does not start.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError(
@@ -99,7 +99,7 @@ def start_web(recording: Path | None = None) -> Viewer:
     """Serve the viewer in the browser on 127.0.0.1 for as long as this process lives, showing the given recording.
 
     Raises:
-        InputError: where the server does not start.
+        InputError: if the server does not start.
     """
     port, page = _free_port(), _free_port()
     arguments = ["--serve-web", "--port", str(port), "--web-viewer-port", str(page)]
@@ -120,7 +120,7 @@ def view(run: Path, *, web: bool = False) -> Viewer:
     """Show the recording of a run folder in the viewer, in a window or in the browser.
 
     Raises:
-        InputError: where the folder has no recording, or the viewer does not start.
+        InputError: if the folder has no recording, or the viewer does not start.
     """
     recording = run / "recording.rrd"
     if not os.path.lexists(recording):
@@ -133,7 +133,7 @@ def reachable(sink: str) -> bool:
     """Return whether something listens where recordings are to be sent, `rerun+http://HOST:PORT/proxy`.
 
     Raises:
-        InputError: where the address is not of that form.
+        InputError: if the address is not of that form.
     """
     scheme, _, rest = sink.partition("://")
     place, _, path = rest.partition("/")

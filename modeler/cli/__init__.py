@@ -1,7 +1,7 @@
-"""The command line: the composition root, the only module that sees everything.
+"""The command line: the composition root, the only module that imports everything.
 
-Each command is a frozen dataclass whose fields are its options; `run` returns the exit status. Heavy imports stand
-inside functions, so that help appears at once.
+Each command is a frozen dataclass whose fields are its options; `run` returns the exit status. Heavy imports are inside
+functions, so that help appears at once.
 """
 
 import contextlib
@@ -95,16 +95,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status: 0 done, 2 unusable input, 3 done but not trustworthy.
 
     Args:
-        arguments: what follows the program's name; those of the process without it.
+        arguments: those after the program's name; None: those of the process.
     """
     _open_standard_streams()
     share_one_heap()
     logging.basicConfig(level=logging.WARNING, format="modeler: %(message)s")  # to stderr
     logging.raiseExceptions = False  # stderr may be full
-    # Rerun complains in its own way of a viewer that was closed, which is nobody's error, and of a disk that is full;
-    # we tell what matters.
+    # Rerun logs a closed viewer, which is no error, and a full disk; we report what matters.
     os.environ.setdefault("RUST_LOG", "warn,re_sdk=off,re_grpc_client=off,re_log_encoding=off")
-    # Our matrices are small: to wake BLAS threads takes longer than what they would do.
+    # Our matrices are small: waking BLAS threads takes longer than their work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be text
@@ -112,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             return _run(parsed(sys.argv[1:] if arguments is None else arguments))
         finally:
-            sys.stdout.flush()  # so that a reader who has left is noticed here
+            sys.stdout.flush()  # so that a closed pipe is noticed here
     except BrokenPipeError:
         _close_stdout()
         return 1
@@ -134,10 +133,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parsed(arguments: Sequence[str]) -> Command:
-    """Return the command that the arguments (after the program's name) ask for.
+    """Return the command for arguments (after the program's name).
 
     Raises:
-        SystemExit: with status 0 after help or version, with 2 and one line on stderr for what is no command.
+        SystemExit: with status 0 after help or version, with 2 and one line on stderr for invalid arguments.
     """
     name, *others = arguments or ("",)
     if name == "help":
@@ -194,7 +193,7 @@ def _one_line(box: str) -> str:
 
 
 def _run(command: Command) -> int:
-    """Run a command and return its exit status; what cannot be used is said in one line."""
+    """Run a command and return its exit status; unusable input is reported in one line."""
     _check_environment()
     check_room(_ROOM)
     with interruptible_at_once():
@@ -210,7 +209,7 @@ def _run(command: Command) -> int:
 
 
 def _check_environment() -> None:
-    """Refuse settings of numba under which nothing can be computed.
+    """Reject settings of numba under which nothing can be computed.
 
     Raises:
         SystemExit: with status 2 and one line on stderr.
@@ -225,10 +224,10 @@ def _check_environment() -> None:
 
 
 def _check_names(options: Any) -> None:
-    """Refuse paths that cannot be names of files.
+    """Reject paths that cannot be file names.
 
     Raises:
-        InputError: where an option is one.
+        InputError: if an option is one.
     """
     from modeler.types import InputError
 
@@ -256,7 +255,7 @@ def _exhausted(error: Exception) -> bool:
 
 
 def _open_standard_streams() -> None:
-    """Let output go nowhere that goes to a closed stream, and not into the next file that is opened."""
+    """Redirect closed standard streams to the null device, so that output does not reach the next opened file."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -267,5 +266,5 @@ def _open_standard_streams() -> None:
 
 
 def _close_stdout() -> None:
-    """Say nothing more there, at exit either."""
+    """Discard further output, also at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -15,10 +15,12 @@ from modeler.verdict.evidence import MAX_UNSURE
 from sequences import AbstractSequence
 
 _SURE_STEPS: Final = 3  # pairs whose median rotation counts as the step
-_FAR_SDS: Final = 3.0  # of the stated step, beyond which the measured one contradicts it
-_ROUGH: Final = 0.25  # of a step: how unevenly an object is turned by hand (11° to 37° where 18° were intended)
+_FAR_SDS: Final = 3.0  # of the given step, beyond which the measured one contradicts it
+_ROUGH: Final = (
+    0.25  # of a step: relative deviation of steps when an object is turned by hand (11° to 37° where 18° were intended)
+)
 _NEAR_LIMIT_DEG: Final = 15.0  # from the limit: the search follows poses beyond it so far (docs/method.md)
-_FAR_DEG: Final = 100.0  # over which 1 % of a rotation is 1°, a third of what makes a pose wrong
+_FAR_DEG: Final = 100.0  # 1 % of this rotation is 1°, a third of a wrong pose
 _BY_OPTIONS: Final = {
     Outcome.TOO_FEW_POINTS: "The object covers too few pixels; check the mask, --roi and --max-depth-m.",
     Outcome.UNSURE_MASK: (
@@ -45,7 +47,7 @@ def outcome_advice(outcome: Outcome, prior: AbstractPrior | None = None, posteri
 
 
 def reason_advice(reason: Reason, prior: AbstractPrior | None = None, posteriors: Sequence[Posterior] = ()) -> str:
-    """Return what to do about a frame that was left out, in terms of options; "" where there is nothing to do.
+    """Return what to do about a frame that was left out, in terms of options; "" if there is nothing to do.
 
     Args:
         reason: why it was left out.
@@ -59,11 +61,11 @@ def reason_advice(reason: Reason, prior: AbstractPrior | None = None, posteriors
 
 
 def comes_back(frames: AbstractSequence, prior: AbstractPrior, reach_deg: float) -> bool:
-    """Return whether the stated rotations bring the object back to its first view, or nearly.
+    """Return whether the given rotations bring the object back to its first view, or nearly.
 
     Args:
-        frames: the sequence, which may state the rotation from frame to frame.
-        prior: of the run, whose turntable counts more.
+        frames: the sequence, which may have the rotation from frame to frame.
+        prior: of the run, whose turntable takes precedence.
         reach_deg: how near to a view another must look for them to be registered.
     """
     table = turntable_in(prior)
@@ -73,7 +75,7 @@ def comes_back(frames: AbstractSequence, prior: AbstractPrior, reach_deg: float)
     return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
 
 
-def sense_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
+def sign_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
     """Return whether views overlap so little that a table may turn in the other direction than its prior assumes.
 
     Args:
@@ -86,8 +88,8 @@ def sense_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
     return little and table is not None and table.step_sign == "known"
 
 
-def other_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
-    """Return in words by what step the views turned where that contradicts the prior's, else "".
+def measured_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
+    """Return in words the measured step if it contradicts the prior's, else "".
 
     Args:
         edges: of the report.
@@ -123,11 +125,11 @@ def step_angles_deg(edges: Sequence[Mapping[str, Any]]) -> list[float]:
     ]
 
 
-def told_focal_length(camera: Mapping[str, Any]) -> str:
-    """Return in words what loops told of the focal length, else "".
+def estimated_focal_length(camera: Mapping[str, Any]) -> str:
+    """Return in words the focal length estimated from loops, else "".
 
     Args:
-        camera: what report.json says of it.
+        camera: as in report.json.
     """
     fx_px, factor, sigma = camera.get("fx_px"), camera.get("factor_in_run", 1.0), camera["focal_factor_sigma"]
     if fx_px is None or not camera.get("loops"):
@@ -140,10 +142,10 @@ def told_focal_length(camera: Mapping[str, Any]) -> str:
 
 
 def unchecked_focal_length(report: Mapping[str, Any]) -> str:
-    """Return in words what an error of the focal length would do to a trusted model without a loop, else "".
+    """Return in words the effect of a focal length error on a trusted model without a loop, else "".
 
-    Of captures whose focal length was 4 to 7 % short, the sums of rotations over a turn were short by 0.7 to 1.0 times
-    as much.
+    For captures with a focal length 4 to 7 % too short, the sums of rotations over a turn were too short by 0.7 to 1.0
+    times as much.
 
     Args:
         report: of the run.
@@ -159,18 +161,18 @@ def unchecked_focal_length(report: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Remedy:
-    """What to do next, where a model is not to be trusted."""
+    """What to do next if a model is not to be trusted."""
 
     words: str
     """For people."""
     options: Mapping[str, str] = field(default_factory=dict)
-    """Of `modeler build`, by name without dashes, with their values; those given before stay. Empty: no other build."""
+    """Of `modeler build`, by name without dashes, with their values; other given options stay. Empty: no new build."""
     first: str = ""
     """A command to run first; "" = none."""
 
 
 def remedy(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
-    """Return what to do next about the first reason not to trust a model; None where there is nothing to try.
+    """Return what to do next about the first reason not to trust a model; None if there is nothing to try.
 
     Args:
         report: of the run.
@@ -199,7 +201,7 @@ def _region(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
 
 
 def _surface(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
-    """Return a look at the masks where a loop and all else confirm the poses, else a stronger prior."""
+    """Return a check of the masks if a loop and all other checks confirm the poses, else a stronger prior."""
     if report["closed"] and set(report["reason_codes"]) <= {"seen_through", "absent", "unsure_size"}:
         words = "the loop confirms the poses; check in the report whether masks or filled holes exceed the object"
         return Remedy(words, first="modeler report {run}")
@@ -207,7 +209,7 @@ def _surface(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
 
 
 def _camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
-    """Return how a focal length is estimated, where a loop determines it."""
+    """Return how to estimate the focal length, if a loop determines it."""
     if not any(edge["kind"] == "closure" for edge in report["edges"]):
         return _more_known(report, prior)
     first = "modeler calibrate-camera {run} --out camera.json"
@@ -215,7 +217,7 @@ def _camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
 
 
 def _full_turn(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
-    """Return how the focal length of a camera is learned where this run hardly tells it."""
+    """Return how to estimate the focal length of a camera that this run hardly observes."""
     if report["closed"]:
         return _camera(report, prior)
     words = "turn the object fully around, or take the focal length from another run with a full turn"
@@ -223,15 +225,15 @@ def _full_turn(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None
 
 
 def _known_camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
-    """Return how to say which of focal length and depth is right."""
+    """Return how to specify whether focal length or depth is right."""
     first = "modeler calibrate-camera {run} --known focal-length --out known.json"
     words = "if the given focal length is calibrated (if the depth is accurate instead: --known depth)"
     return Remedy(words, {"camera": "known.json"}, first)
 
 
 def _without_prior(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
-    """Return a weaker prior; None where the measured step is reported anyway."""
-    if other_step(report["edges"], prior):
+    """Return a weaker prior; None if the measured step is reported anyway."""
+    if measured_step(report["edges"], prior):
         return None
     if isinstance(prior, TurntablePrior):
         return Remedy("allow for a larger error of the step", {"step-sigma-deg": f"{3.0 * prior.step_sigma_deg:g}"})
@@ -268,7 +270,7 @@ def _twice_deg(limit_deg: float) -> str:
 
 
 def _at_limit(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
-    """Return the limit to raise at which a frame was left out; None where none was at a limit."""
+    """Return the limit to raise at which a frame was left out; None if none was at a limit."""
     lost = {frame["id"] for frame in report["frames"] if frame.get("cause") == Outcome.AT_LIMIT.label}
     edges = [edge for edge in report["edges"] if edge["source"] in lost and edge["outcome"] == Outcome.AT_LIMIT.label]
     if not edges:
@@ -279,7 +281,7 @@ def _at_limit(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
 
 
 def _wider(prior: AbstractPrior, turned_deg: float) -> Remedy | None:
-    """Return the limit to raise where a registration ended at a rotation at a limit; None where the prior has none."""
+    """Return the limit to raise where a registration ended at a rotation at a limit; None if the prior has none."""
     if isinstance(prior, GeneralPrior | TablePrior) and turned_deg >= prior.max_rotation_deg - _NEAR_LIMIT_DEG:
         return Remedy("allow for larger rotations", {"max-rotation-deg": _twice_deg(prior.max_rotation_deg)})
     if isinstance(prior, GeneralPrior):
@@ -289,10 +291,10 @@ def _wider(prior: AbstractPrior, turned_deg: float) -> Remedy | None:
     return None
 
 
-def ends_without(frames: Sequence[Mapping[str, Any]]) -> str:
-    """Return in words which frames show the object, where the first or the last ones do not, else "".
+def visible_frames(frames: Sequence[Mapping[str, Any]]) -> str:
+    """Return in words which frames show the object if the first or the last ones do not, else "".
 
-    Where the masks of most frames that show something are unsure, it may be a hand, and the others show the object.
+    If most masks are unsure, they may show a hand, and the other frames the object.
 
     Args:
         frames: of the report.

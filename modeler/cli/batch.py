@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from modeler.cli.jobs import Ended, Job
 
 _OVER = ("done", "failed")
-_TOLD = 20  # sequences without a good model that are listed one by one
+_LISTED = 20  # sequences without a good model that are listed individually
 _LOSSES = 3  # how often an engine may lose a job
-_RETURNS_S = 120.0  # within which an engine that was lost is expected back
+_RETURNS_S = 120.0  # time to wait for a lost engine
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Batch:
         """Build what is not built yet, and list everything.
 
         Raises:
-            InputError: where options, the manifest, the engine or the folder cannot be used.
+            InputError: if options, the manifest, the engine or the folder cannot be used.
             KeyboardInterrupt: after what is done has been listed.
         """
         from modeler.cli.compiling import compile_kernels
@@ -106,7 +106,7 @@ class Batch:
             if not waiting:
                 say(words)
             elif is_here(self.executor):
-                compile_kernels()  # once, and not in every build that begins
+                compile_kernels()  # once, not in every build
             try:
                 with bar() as progress:
                     task = progress.add_task("", total=len(jobs), completed=len(ends))
@@ -126,7 +126,7 @@ def _jobs(options: Batch) -> list[Job]:
     """Return a job for each sequence, in order, each with a name of its own.
 
     Raises:
-        InputError: where there is none, or the manifest cannot be used.
+        InputError: if there is none, or the manifest cannot be used.
     """
     from modeler.cli.engines import threads_of, usual_workers
     from modeler.cli.jobs import Job
@@ -164,7 +164,7 @@ def _work(options: Batch, jobs: Sequence[Job], words: str) -> Iterator[Ended]:
         words: said once it is open.
 
     Raises:
-        InputError: where it cannot be opened, or does not come back.
+        InputError: if it cannot be opened, or does not come back.
     """
     import time
 
@@ -227,13 +227,13 @@ def _until_lost(executor: object, waiting: dict[str, Job], losses: Counter[str])
 
 
 def _summarise(options: Batch, ends: Sequence[Ended]) -> int:
-    """Say what became of the sequences, and return the exit status."""
+    """Print a summary of the sequences, and return the exit status."""
     good = sum(one.status == 0 for one in ends)
     doubtful = sum(one.status == 3 for one in ends)
     others = [one for one in ends if one.status not in (0, 3)]
-    for one in others[:_TOLD]:
+    for one in others[:_LISTED]:
         say(f"{one.name} failed: {one.line}")
-    more = f" ({len(others) - _TOLD} more are listed there)" if len(others) > _TOLD else ""
+    more = f" ({len(others) - _LISTED} more are listed there)" if len(others) > _LISTED else ""
     failed = f"{len(others)} {_sequences(len(others))} failed{more}"
     say(f"{good} of {len(ends)} models can be trusted, {doubtful} cannot, {failed}: {options.out / 'models.parquet'}")
     return 0 if good == len(ends) else 3

@@ -66,10 +66,10 @@ class Build:
     where: ObjectOptions = field(default_factory=ObjectOptions)
 
     def run(self) -> int:
-        """Run the loop into a run folder; status 3 where the model is not to be trusted, as report.json then says.
+        """Run the loop into a run folder; status 3 if the model is not to be trusted, as report.json then says.
 
         Raises:
-            InputError: where the input or the folder cannot be used.
+            InputError: if the input or the folder cannot be used.
         """
         from modeler.beside import both
         from modeler.cli import compose
@@ -97,7 +97,7 @@ class Build:
             camera=estimated_camera(self.model.camera),
         )
         if self.resume and RunFolder(self.out).finished(meta):
-            RunFolder(self.out).pairs.drop()  # what a kill at the very end left of them
+            RunFolder(self.out).pairs.drop()  # left over from a kill at the very end
             say("the run is already complete; give --overwrite to build it again")
             return _summarise(RunFolder(self.out).report(), self, modeler.prior)
         compile_kernels()
@@ -120,7 +120,7 @@ class Build:
         return _summarise(report, self, modeler.prior)
 
     def settings(self) -> dict[str, object]:
-        """Return what the results depend on besides sequence, seed and the prior's name, as report.json records it."""
+        """Return the settings besides sequence, seed and the prior's name, as recorded in report.json."""
         parts = asdict(self.prior) | asdict(self.method) | asdict(self.selection) | asdict(self.where)
         parts["voxel_m"] = self.model.voxel_m
         files = {"sensor": self.model.sensor, "camera": self.model.camera}
@@ -132,14 +132,14 @@ class Build:
     def command(self, changes: Mapping[str, str]) -> str:
         """Return the command line that replaces the run by one with other options, by name without dashes."""
         given = {"prior": self.prior.prior, **self.settings(), "seed": self.method.seed}
-        given |= {name: getattr(self.model, name) for name in ("sensor", "camera")}  # named as they were
+        given |= {name: getattr(self.model, name) for name in ("sensor", "camera")}  # paths as given
         usual = {"every": 1, "frames": ":", "method": "visibility", "colour": True, "seed": 0}
         words = {
             name.replace("_", "-"): shlex.join(map(str, value if isinstance(value, tuple) else (value,)))
             for name, value in given.items()
             if value not in (None, ()) and usual.get(name) != value
         }
-        if changes.get("prior", words.get("prior")) != words.get("prior"):  # whose parameters are its own
+        if changes.get("prior", words.get("prior")) != words.get("prior"):  # parameters of another prior
             words = {name: value for name, value in words.items() if name.replace("-", "_") not in vars(self.prior)}
         if words.pop("colour", None) is not None:
             words["no-colour"] = ""  # a flag
@@ -150,10 +150,10 @@ class Build:
 
 
 def _check(options: Build) -> None:
-    """Refuse options that contradict each other or nobody can mean.
+    """Reject options that contradict each other or are out of range.
 
     Raises:
-        InputError: where they do.
+        InputError: if they do.
     """
     from modeler.types import InputError
     from viz.viewer import reachable
@@ -164,14 +164,14 @@ def _check(options: Build) -> None:
     if voxel_m is not None and not MIN_VOXEL_M <= voxel_m < 1.0:
         raise InputError(f"--voxel-m {voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
     if options.connect is not None:
-        reachable(options.connect)  # refuses what is no address; whether somebody listens is asked when there is news
+        reachable(options.connect)  # rejects invalid addresses; the connection is made with the first data
 
 
 def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
-    """Return the sequence and what was selected of it; what cannot be read is found before anything is made.
+    """Return the sequence and the selected frames; unreadable input is found before anything is created.
 
     Raises:
-        InputError: where something cannot be read.
+        InputError: if something cannot be read.
     """
     from modeler.cli.inputs import calibrated, watched
     from modeler.types import InputError
@@ -203,8 +203,8 @@ def _run(
     """Show and write every step, and return the last report.
 
     Raises:
-        InputError: where a frame cannot be read or a file cannot be written.
-        KeyboardInterrupt: where somebody asked for an end before the first frame.
+        InputError: if a frame cannot be read or a file cannot be written.
+        KeyboardInterrupt: if the user interrupted before the first frame.
     """
     from modeler.beside import behind
     from modeler.cli.inputs import while_it_lasts
@@ -241,8 +241,8 @@ def _run(
                     seconds["total"] = time.perf_counter() - began_s
                     meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
                     report = folder.write(event, meta)
-                    # Worked out here, before the next frame: when they are first asked for decides what later ones
-                    # are linearised about, and so their last digits.
+                    # Computed here, before the next frame: the time of the first request decides the linearisation
+                    # point of later ones, and so their last digits.
                     event.solution.covariances.values()
                     draw(event)
                     if followed and not event.last:
@@ -255,7 +255,7 @@ def _run(
 
 
 def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt) -> Iterator[Event]:
-    """Yield what happens in a run; Ctrl-C ends what comes after its frames."""
+    """Yield the events of a run; Ctrl-C skips the stages after its frames."""
     yield from run.track(frames)
     yield from run.revisit()
     for event in itertools.chain(run.rejoin(), run.refine()):
@@ -268,12 +268,12 @@ def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt) -> Iterator
 def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
     """Write a summary of the run to stderr, and return the exit status."""
     from modeler.cli.advice import (
-        ends_without,
-        other_step,
+        estimated_focal_length,
+        measured_step,
         remedy,
-        sense_in_doubt,
-        told_focal_length,
+        sign_in_doubt,
         unchecked_focal_length,
+        visible_frames,
     )
     from modeler.types import ACCEPTED
 
@@ -288,16 +288,22 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
             f"{1000.0 * opening['opening_m']:.1f} mm, "
             f"{opening['sigmas']:.1f} standard deviations of {opening['edges']} edges and the closure"
         )
-    if (camera := report.get("camera")) and (words := told_focal_length(camera)):
+    if (camera := report.get("camera")) and (words := estimated_focal_length(camera)):
         say(words)
     if report["reasons"]:
         coded = list(zip(report.get("reason_codes") or report["reasons"], report["reasons"], strict=False))
-        first, *others = [words for _, words in sorted(coded, key=lambda reason: reason[0] == "left_out")]  # said above
+        first, *others = [
+            words for _, words in sorted(coded, key=lambda reason: reason[0] == "left_out")
+        ]  # those were reported above
         more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
         say(f"not to be trusted: {first}{more}")
-        if sense_in_doubt(report, prior):
+        if sign_in_doubt(report, prior):
             say("the given direction of rotation is assumed; if it may be the opposite, give --step-sign unknown")
-    for remark in (other_step(report["edges"], prior), ends_without(report["frames"]), unchecked_focal_length(report)):
+    for remark in (
+        measured_step(report["edges"], prior),
+        visible_frames(report["frames"]),
+        unchecked_focal_length(report),
+    ):
         if remark:
             say(remark)
     next_step = None if report["trustworthy"] else remedy(report, prior)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from modeler.types import FocalLength
 
 
-_OPEN = 0.005  # of sizes: less is not worth a line
+_OPEN = 0.005  # of sizes: less is not reported
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class CalibrateCamera:
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:
-        """Estimate the focal length and store it; status 3 where no loop determines it.
+        """Estimate the focal length and store it; status 3 if no loop determines it.
 
         Raises:
-            InputError: where the run cannot be used or the file cannot be written.
+            InputError: if the run cannot be used or the file cannot be written.
         """
         from modeler.cli.inputs import reopened
         from modeler.cli.outputs import check_files, run_inputs
@@ -66,16 +66,16 @@ class CalibrateCamera:
         factor = found.factor * (run.report.get("camera") or {}).get("focal_factor", 1.0)
         share = {"neither": 0.5, "focal-length": 1.0, "depth": 0.0}[self.known]
         open_by = abs(math.log(factor)) if self.known == "neither" else 0.0
-        stated_px = used_px * found.factor / factor
-        stated = FocalFactor(factor, stated_px, factor**share, 0.5 * open_by, found.sigma, found.told_by)
+        given_px = used_px * found.factor / factor
+        result = FocalFactor(factor, given_px, factor**share, 0.5 * open_by, found.sigma, found.told_by)
         open_sds = {"sigmas_before": found.sigmas_before, "sigmas_after": found.sigmas_after} if found.loops else {}
         facts = {"sigmas_before": None, "sigmas_after": None, **open_sds, "loops": found.loops}
-        write_atomically(self.out, stated.text({**facts, "fx_px": found.factor * used_px, "run": str(self.run_folder)}))
+        write_atomically(self.out, result.text({**facts, "fx_px": found.factor * used_px, "run": str(self.run_folder)}))
         say(f"{_said(found, used_px)}: {self.out}")
-        if found.told_by == "loop" and stated.depth_scale_sigma >= _OPEN:
+        if found.told_by == "loop" and result.depth_scale_sigma >= _OPEN:
             say(
                 f"or the relief of the depth is wrong by {100.0 * open_by:.0f} %; sizes are known only to "
-                f"{100.0 * stated.depth_scale_sigma:.0f} %: give --known to say which of the two is accurate"
+                f"{100.0 * result.depth_scale_sigma:.0f} %: give --known to say which of the two is accurate"
             )
         return 0 if found.told_by == "loop" else 3
 

@@ -36,7 +36,7 @@ class CalibrateSensor:
         """Measure the noise, store it, and print what was measured at which distance and angle.
 
         Raises:
-            InputError: where the input cannot be used or the file cannot be written.
+            InputError: if the input cannot be used or the file cannot be written.
         """
         from modeler.cli.inputs import reading
         from modeler.cli.outputs import check_files
@@ -46,7 +46,7 @@ class CalibrateSensor:
         from sequences.noise_model import noise_text, object_distance_m
 
         check_files([self.out], [self.input], overwrite=self.overwrite)
-        sequence = open_sequence(self.input, self.given.stated())
+        sequence = open_sequence(self.input, self.given.overrides())
         with reading() as watched:
             found = calibrate(watched(sequence.recorded(), "reading"))
         distance_m = object_distance_m(sequence.frame(sequence.indices[0]))

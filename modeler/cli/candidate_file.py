@@ -100,7 +100,7 @@ def read_candidates(path: Path) -> list[Candidate]:
     """Return the actions in a file.
 
     Raises:
-        InputError: where it cannot be read or holds none.
+        InputError: if it cannot be read or holds none.
     """
     if path.suffix.lower() == ".csv":
         found = _poses(path)

@@ -67,7 +67,7 @@ def modeler(
     """Return the loop with the parts asked for, its sensor as the sequence describes it, else the first Kinect's.
 
     Raises:
-        InputError: where an option cannot be used.
+        InputError: if an option cannot be used.
     """
     check_region(where, sequence)
     noise, chosen = sequence.sensor(), registrar(method.method, colour=method.colour, device=method.device)
@@ -87,7 +87,7 @@ def check_region(where: ObjectOptions, sequence: AbstractSequence) -> None:
     """Refuse a region that is not part of the image.
 
     Raises:
-        InputError: where some of it lies outside the first frame.
+        InputError: if some of it lies outside the first frame.
     """
     if where.roi is None:
         return
@@ -120,7 +120,7 @@ def registrar(
         device: where it samples and scores poses; None = chosen for each job.
 
     Raises:
-        InputError: where it cannot be there, or is not installed.
+        InputError: if it cannot be there, or is not installed.
     """
     if device == "cuda":
         if method not in ("visibility", "paper"):
@@ -158,7 +158,7 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
         sequence: what it is for; None: several.
 
     Raises:
-        InputError: where there is no such prior, a parameter cannot be used, or the sequence lacks what it needs.
+        InputError: if there is no such prior, a parameter cannot be used, or the sequence lacks what it needs.
     """
     name = prior_name(options, sequence)
     parts = name.split("+")
@@ -218,7 +218,7 @@ def prior_name(options: PriorOptions, sequence: AbstractSequence | None) -> str:
 
 
 def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
-    """Return the name of the prior, and in words what was assumed because no option states it."""
+    """Return the name of the prior, and in words the assumptions not given by an option."""
     name, assumed = prior_name(options, sequence), []
     if options.prior is None and name != "general":
         assumed.append(f"prior {name}, from sequence.json")
@@ -258,7 +258,7 @@ def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:
         arguments: its fields, each as `name=value`.
 
     Raises:
-        InputError: where it cannot be imported or made, or is no prior.
+        InputError: if it cannot be imported or made, or is no prior.
     """
     module_name, _, class_name = name.partition(":")
     if os.getcwd() not in sys.path:
@@ -291,7 +291,7 @@ def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:
 
 
 def _guess(name: str, given: dict[str, Any], known: AbstractPrior) -> AbstractPrior:
-    """Return a prior that only proposes, within what is known."""
+    """Return a proposal within a known prior."""
     match name:
         case "velocity":
             return VelocityPrior(known, **given)
@@ -336,7 +336,7 @@ def _held(given: dict[str, Any], sequence: AbstractSequence | None) -> HeldPrior
 
 
 def _poke(given: dict[str, Any], sequence: AbstractSequence | None) -> PokePrior:
-    """Return the push that is given, or those that `sequence.json` tells."""
+    """Return the given push, or those of `sequence.json`."""
     if given:
         missing = [name for name in _GIVEN["poke"] if name not in given]
         if missing:
@@ -371,7 +371,7 @@ def _one_poke(where: str, frame: str, entry: object) -> tuple[int, Poke]:
 
 
 def _number(value: object) -> float | None:
-    """Return a finite number; None where the value is none."""
+    """Return a finite number; None if the value is none."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:

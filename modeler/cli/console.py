@@ -1,4 +1,4 @@
-"""What a command says on stderr: messages, a progress bar where somebody watches, and what Ctrl-C does."""
+"""Output of a command on stderr: messages, a progress bar on terminals, and the handling of Ctrl-C."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells have it."""
+"""Exit status after Ctrl-C, by the convention of shells."""
 TERMINATED = 128 + signal.SIGTERM
-"""Exit status after SIGTERM, as shells have it."""
+"""Exit status after SIGTERM, by the convention of shells."""
 _ONE_BY_ONE = 3  # consecutive frames left out that are reported one by one
 
 
 def say(words: str) -> None:
-    """Tell a person something in one line; names in inputs shall not steer the terminal."""
+    """Print a one-line message; unprintable characters from inputs are escaped."""
     line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(words.split()))
     with lost_without_harm():
         print("modeler:", line, file=sys.stderr)
@@ -35,7 +35,7 @@ def say(words: str) -> None:
 
 @contextlib.contextmanager
 def lost_without_harm() -> Iterator[None]:
-    """Let messages that cannot be written be lost, these and those to come: results do not depend on them."""
+    """Discard messages that cannot be written, now and later: results do not depend on them."""
     try:
         yield
     except (OSError, ValueError):  # ValueError: stderr is closed
@@ -45,14 +45,14 @@ def lost_without_harm() -> Iterator[None]:
 
 @contextlib.contextmanager
 def interruptible_at_once() -> Iterator[None]:
-    """Let Ctrl-C end the program where it stands, for imports: libraries turn it into errors of their own."""
+    """Let Ctrl-C end the program immediately during imports: libraries turn it into other errors."""
     with _handled(signal.SIGINT, _quit):
         yield
 
 
 @contextlib.contextmanager
 def _handled(number: signal.Signals, handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Handle a signal, and leave it to whoever did before; outside the main thread, where nobody may, to them alone."""
+    """Handle a signal in the block, then restore the previous handler; no effect outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -70,7 +70,7 @@ def _quit(number: int, frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def terminable() -> Iterator[None]:
-    """Let a request to terminate end the program as an error would, so that it puts in order what it leaves."""
+    """Let SIGTERM end the program like an exception, so that it cleans up."""
     with _handled(signal.SIGTERM, _leave):
         yield
 
@@ -80,7 +80,7 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 
 class Interrupt:
-    """While it is entered, the first Ctrl-C ends the iteration `until`, the second the program."""
+    """In its context, the first Ctrl-C ends the iteration `until`, the second the program."""
 
     def __init__(self) -> None:
         self.ended_early = False
@@ -89,14 +89,14 @@ class Interrupt:
         self._listening = _handled(signal.SIGINT, self._note)
 
     def __enter__(self) -> Interrupt:
-        """Listen to Ctrl-C."""
+        """Install the handler of Ctrl-C."""
         self._listening.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Hand Ctrl-C back."""
+        """Restore the handler of Ctrl-C."""
         self._listening.__exit__(kind, error, trace)
 
     @property
@@ -119,7 +119,7 @@ class Interrupt:
 
 
 def bar() -> Progress:
-    """Return a progress bar on stderr, which shows nothing where that is no terminal."""
+    """Return a progress bar on stderr, hidden if that is no terminal."""
     from rich.console import Console as Terminal
     from rich.progress import (
         BarColumn,
@@ -143,14 +143,14 @@ def bar() -> Progress:
 
 
 class Console:
-    """A sink of steps, for a terminal; where stderr is none, only frames left out are reported."""
+    """A sink of steps for a terminal; if stderr is none, only frames left out are reported."""
 
     def __init__(self, frames: int, address: str | None, prior: AbstractPrior | None = None) -> None:
         self._bar = bar()
         self._task = self._bar.add_task("", total=frames)
         self._frames, self._stage = frames, ""
         self._address, self._prior = address, prior
-        self._placed: dict[int, bool] = {}  # a lost frame that later views place comes a second time
+        self._placed: dict[int, bool] = {}  # a lost frame that is placed later occurs twice
         self._loops = 0
         self._unsure: set[int] = set()
         self._advised: set[str] = set()
@@ -168,7 +168,7 @@ class Console:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave the bar as it stands, and tell in how many frames something else may have been taken for the object."""
+        """Stop the bar, and report the number of frames with unsure masks."""
         from modeler.cli.advice import outcome_advice
         from modeler.types import Outcome
 
@@ -184,17 +184,17 @@ class Console:
         return not self._bar.disable
 
     def advise(self, step: Step, belief: Belief, found: Suggestions) -> None:
-        """Show what to do next after a step; the first time that nothing more is to be gained, it is said for good."""
-        from modeler.cli.live_advice import in_short
+        """Show the next action after a step; the first time the goal is reached, print it."""
+        from modeler.cli.live_advice import summary_of
 
         if found.reached and not self._enough:
             self._enough = True
             self._say(found.summary)
         if self._state and not self._stage:
-            self._bar.update(self._task, description=f"{self._state}; {in_short(found)}")
+            self._bar.update(self._task, description=f"{self._state}; {summary_of(found)}")
 
     def __call__(self, event: Event) -> None:
-        """Show what happens in a run."""
+        """Show an event of a run."""
         from modeler.types import Fusing, Refining, Searching, Step
 
         match event:
@@ -210,7 +210,7 @@ class Console:
                 self._show_stage("fusing the model", 0, 1)
 
     def _show_step(self, step: Step) -> None:
-        """Show what became of a frame; a lost frame that is placed later has a second step, and so has the last."""
+        """Show the result of a frame; a lost frame that is placed later has a second step, and so has the last."""
         from modeler.types import Outcome, loops_closed
 
         if step.last or any(edge.kind == "closure" for edge in step.edges):  # edges that join frames close none
@@ -223,21 +223,21 @@ class Console:
         self._state = f"{len(step.views)} joined, {loops} {'loop' if loops == 1 else 'loops'} closed"
         self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=self._state)
         if step.left_out is not None and before is None:
-            self._tell(frame, f"left out: {self._why(step.left_out, step.posteriors)}")
+            self._report_frame(frame, f"left out: {self._why(step.left_out, step.posteriors)}")
         elif accepted and before is False:
-            self._tell(frame, "placed on retry")
+            self._report_frame(frame, "placed on retry")
         elif accepted:
             self._release()
 
     def _show_stage(self, stage: str, done: int, total: int) -> None:
-        """Show how much is done of what follows the last frame."""
+        """Show the progress after the last frame."""
         if stage != self._stage:
             self._stage = stage
             self._bar.update(self._task, total=None, description=stage)  # forgets how fast the stage before went
         self._bar.update(self._task, completed=done, total=total, description=stage)
 
-    def _tell(self, frame: int, what: str) -> None:
-        """Tell what became of a frame; of those that follow each other for one reason, only the first few by one."""
+    def _report_frame(self, frame: int, what: str) -> None:
+        """Report the result of a frame; of consecutive ones with the same reason, only the first few individually."""
         if what != self._reported:
             self._release()
             self._reported = what
@@ -248,7 +248,7 @@ class Console:
             self._say(f"frame {frame} is {what}")
 
     def _release(self) -> None:
-        """Tell what was held back, together."""
+        """Report the frames held back, together."""
         if len(self._held) == 1:
             self._say(f"frame {self._held[0]} is {self._reported}")
         elif self._held:
@@ -256,7 +256,7 @@ class Console:
         self._reported, self._aloud, self._held = "", 0, []
 
     def _why(self, reason: Reason, posteriors: Sequence[Posterior]) -> str:
-        """Return why a frame was left out, with what to do about it where that has not been said yet."""
+        """Return why a frame was left out, with advice unless already given."""
         from modeler.cli.advice import reason_advice
         from modeler.types import summary
 

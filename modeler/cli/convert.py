@@ -46,7 +46,7 @@ class Convert:
         """Write the input as a BOP scene folder, or the poses of a run.
 
         Raises:
-            InputError: where the input cannot be used or the output cannot be written.
+            InputError: if the input cannot be used or the output cannot be written.
         """
         from modeler.cli.inputs import calibrated, reading, while_it_lasts
         from modeler.cli.outputs import check_files, check_folder, run_inputs
@@ -62,7 +62,7 @@ class Convert:
         if self.out.suffix in (".json", ".txt"):
             raise InputError(f"{self.input}: is not a run folder with poses for {self.out}; give a run folder")
         check_folder(self.out, [path for path in (self.input, self.sensor, self.camera) if path is not None])
-        whole = open_sequence(self.input, self.given.stated())
+        whole = open_sequence(self.input, self.given.overrides())
         whole = calibrated(whole, self.sensor, self.camera)
         kept = frame_range(self.selection.frames)
         sequence = whole.select(self.selection.every, kept)
@@ -112,7 +112,7 @@ def _poses(run: Path, out: Path) -> int:
     """Write the poses of a run as BOP's scene_gt.json, with the object frame as model frame, or as TUM lines.
 
     Raises:
-        InputError: where the report cannot be read or the file's ending says neither.
+        InputError: if the report cannot be read or the file's ending says neither.
     """
     from modeler import se3
     from modeler.export import RunFolder, poses_of, tum_text, write_atomically

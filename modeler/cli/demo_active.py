@@ -50,10 +50,10 @@ class DemoActive:
     """Watch in a Rerun viewer that is already open: rerun+http://HOST:PORT/proxy."""
 
     def run(self) -> int:
-        """Run the demonstration; status 3 where the goal was not reached or the model is not to be trusted.
+        """Run the demonstration; status 3 if the goal was not reached or the model is not to be trusted.
 
         Raises:
-            InputError: where an option cannot be used, or the folder cannot be made.
+            InputError: if an option cannot be used, or the folder cannot be made.
         """
         import numpy as np
 

@@ -1,4 +1,4 @@
-"""What runs the jobs of a batch: anything that is a `concurrent.futures.Executor`."""
+"""Engines of a batch: any `concurrent.futures.Executor`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from modeler.types import InputError
 T = TypeVar("T")
 
 JOB_BYTES = 3 << 29
-"""What one build may take, with its recording: most take half of it."""
+"""Memory of one build with its recording: most need half of it."""
 _QUEUED = 100  # jobs that a Slurm queue holds of us at a time, unless --workers says otherwise
 _PATIENCE_S = 30  # for a scheduler to answer
 
@@ -33,7 +33,7 @@ def cores() -> int:
 def free_bytes() -> int:
     """Return how much memory is left, for this machine and for the control group of this process."""
     pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    with contextlib.suppress(OSError, ValueError):  # what can be had by giving up caches counts, where Linux tells
+    with contextlib.suppress(OSError, ValueError):  # on Linux, including caches that can be freed
         lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
         pages = int(lines["MemAvailable"].split()[0]) * 1024
     with contextlib.suppress(OSError, ValueError):  # "max": no limit
@@ -48,10 +48,10 @@ def usual_workers() -> int:
 
 
 def check_engine(name: str) -> None:
-    """Refuse the name of an engine that there is not.
+    """Reject unknown names of engines.
 
     Raises:
-        InputError: where it is none.
+        InputError: if it is none.
     """
     kind, _, what = name.partition(":")
     if name != "processes" and not what:
@@ -75,14 +75,14 @@ def threads_of(name: str, workers: int) -> int:
 
 @contextlib.contextmanager
 def engine(name: str, workers: int | None) -> Iterator[Executor]:
-    """Open an engine, and with the block let go of it; jobs that it has not begun are then not begun any more.
+    """Open an engine for the block, and close it without starting its remaining jobs.
 
     Args:
         name: `processes`, `dask:ADDRESS`, `slurm:FOLDER`, or `module:callable`, called with the number of workers.
         workers: how many jobs at a time; None: as many as fit.
 
     Raises:
-        InputError: where nobody answers, or the callable makes no executor.
+        InputError: if there is no answer, or the callable returns no executor.
     """
     kind, _, what = name.partition(":")
     if name == "processes":

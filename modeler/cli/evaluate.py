@@ -71,7 +71,7 @@ class Evaluate:
         Of several runs those that cannot be judged are left out, each with a line on stderr, and the status is 2.
 
         Raises:
-            InputError: where an option, a sequence or the folder cannot be used.
+            InputError: if an option, a sequence or the folder cannot be used.
         """
         from modeler.cli.outputs import check_files, run_inputs
         from modeler.types import InputError
@@ -194,7 +194,7 @@ def _check_offsets(pairing: Pairing, recorded: Sequence[AbstractSequence]) -> No
     """Refuse frames so far apart that no sequence has two of them.
 
     Raises:
-        InputError: where they are.
+        InputError: if they are.
     """
     from modeler.types import InputError
 
@@ -224,7 +224,7 @@ def _evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> int:
         seed: of the points drawn on the surfaces.
 
     Raises:
-        InputError: where none can be judged, with the reason of the first, or the results cannot be written.
+        InputError: if none can be judged, with the reason of the first, or the results cannot be written.
     """
     from modeler.experiment import models_csv, models_json
     from modeler.export import write_atomically
@@ -256,7 +256,7 @@ def _scores(path: Path, seed: int) -> list[ModelScore]:
     """Judge the model of one run.
 
     Raises:
-        InputError: where something cannot be read, or is not known.
+        InputError: if something cannot be read, or is not known.
     """
     from modeler.cli.inputs import reopened
     from modeler.experiment import Modelled, model_scores
@@ -280,7 +280,7 @@ def _truth(run: Path, parts: Sequence[Part]) -> tuple[dict[int, Array], Mesh]:
     """Return the true camera_from_model (4, 4) by frame number, and the true surface.
 
     Raises:
-        InputError: where a part of the run does not know them, or parts that were joined know different surfaces.
+        InputError: if a part of the run does not know them, or parts that were joined know different surfaces.
     """
     from modeler.types import InputError
     from sequences import true_mesh

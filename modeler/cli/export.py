@@ -70,7 +70,7 @@ class Export:
         """Write the mesh.
 
         Raises:
-            InputError: where options exclude each other, or something cannot be read or written.
+            InputError: if options exclude each other, or something cannot be read or written.
         """
         if self.purpose is not None:
             return self._for(self.purpose)
@@ -109,17 +109,17 @@ class Export:
             say(texture_words(texture, volume))
         if self.bop:
             files.write_bop(model, self.out)
-            _tell(model, self)
+            _report(model, self)
         elif as_seen:
             files.write_mesh(model, self.out, texture, object_from_upright=files.model_upright(report))
-            _tell(model, self)
+            _report(model, self)
         else:
             place = files.placement(model, report, origin, up)
             files.write_mesh(
                 place.placed(model), self.out, texture, object_from_upright=files.AS_GIVEN, axes=place.axes
             )
             place.write(self.out)
-            _tell(model, self)
+            _report(model, self)
             say(f"{place.words}; the pose in the camera: {files.pose_file(self.out).name}")
         return 0
 
@@ -127,7 +127,7 @@ class Export:
         """Write what a program needs.
 
         Raises:
-            InputError: where options exclude each other, or something cannot be read or written.
+            InputError: if options exclude each other, or something cannot be read or written.
         """
         from modeler.cli.presets import Preset
 
@@ -136,7 +136,7 @@ class Export:
 
 
 def texture_words(texture: Texture, volume: FusionVolume) -> str:
-    """Return how fine a texture is, beside the images that it comes from."""
+    """Return the resolution of a texture, compared with that of the images."""
     side_px = len(texture.image)
     words = f"texture of {side_px} x {side_px} px, {1000.0 * texture.texel_m:.2g} mm each"
     coarse = texture.texel_m > volume.pixel_m
@@ -185,7 +185,7 @@ def _check_numbers(options: Export) -> None:
 
 
 def _volume(options: Export) -> FusionVolume | None:
-    """Return the views of the run, where the mesh has to be made anew."""
+    """Return the views of the run, if the mesh has to be fused again."""
     if not (options.watertight or options.texture or options.voxel_m is not None):
         return None
     from modeler.cli.inputs import reopened
@@ -195,7 +195,7 @@ def _volume(options: Export) -> FusionVolume | None:
     return run.volume(Fuser(voxel_m=options.voxel_m or run.report["settings"].get("voxel_m")))
 
 
-def _tell(model: ObjectModel, options: Export) -> None:
+def _report(model: ObjectModel, options: Export) -> None:
     """Say on stderr what was written, and how much of it is interpolated."""
     interpolated = ""
     if options.watertight and model.vertex_views is not None:

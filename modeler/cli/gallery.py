@@ -30,7 +30,7 @@ class Gallery:
         """Write the page.
 
         Raises:
-            InputError: where the folder holds no run, or the page cannot be written.
+            InputError: if the folder holds no run, or the page cannot be written.
         """
         import os
         from urllib.parse import quote

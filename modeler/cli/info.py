@@ -32,14 +32,14 @@ class Info:
         """Print what was found.
 
         Raises:
-            InputError: where the input cannot be used.
+            InputError: if the input cannot be used.
         """
         from json import dumps
 
         from modeler.cli.inputs import reading
         from sequences import open_sequence, survey
 
-        sequence = open_sequence(self.input, self.given.stated())
+        sequence = open_sequence(self.input, self.given.overrides())
         with reading() as watched:
             found = survey(watched(sequence.recorded(), "reading"))
         if self.json:

@@ -1,4 +1,4 @@
-"""What commands take in: sequences with a bar, sequences that are still being written, and finished runs."""
+"""Inputs of commands: sequences with a progress bar, sequences that are still being written, and finished runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from sequences import (
 from sequences.base import AbstractDerived
 
 _Options = TypeVar("_Options", PriorOptions, MethodOptions, ObjectOptions)
-_ALIKE = 0.02  # share by which the number of an object's points may change with the version of a library
+_ALIKE = 0.02  # largest relative change of an object's number of points between versions of a library
 
 
 @final
@@ -62,7 +62,7 @@ class Watched(Protocol):
 
 
 def while_it_lasts(camera: AbstractSequence) -> Iterator[Frame]:
-    """Yield the frames of a camera; one that fails ends them with a line on stderr, for they cannot be had again."""
+    """Yield the frames of a camera; a failure ends them with a line on stderr, as they cannot be read again."""
     try:
         yield from camera
     except InputError as error:
@@ -95,7 +95,7 @@ def watched(path: Path, overrides: Overrides, idle_s: float) -> AbstractSequence
         idle_s: the sequence is over after this many seconds without a new frame.
 
     Raises:
-        InputError: where nothing readable comes.
+        InputError: if nothing readable comes.
     """
     if not 0.0 < idle_s < math.inf:
         raise InputError(f"--idle-s {idle_s:g} is out of range; give a positive number of seconds")
@@ -111,11 +111,11 @@ class Part:
     run: Path
     """Its folder, or that of the run which it is a part of."""
     report: Mapping[str, Any]
-    """What it said of itself, under its own frame numbers."""
+    """Its report, with its own frame numbers."""
     sequence: AbstractSequence
     """The sequence."""
     offset: int = 0
-    """What its frame numbers are counted on from in the joined run."""
+    """Offset of its frame numbers in the joined run."""
 
     @property
     def accepted(self) -> tuple[int, ...]:
@@ -123,7 +123,7 @@ class Part:
         return tuple(record["id"] for record in self.report["frames"] if record["outcome"] == ACCEPTED)
 
     def truth(self) -> dict[int, Array] | None:
-        """Return the true camera_from_model (4, 4) by frame number of the joined run; None where it is not known."""
+        """Return the true camera_from_model (4, 4) by frame number of the joined run; None if it is not known."""
         truth = self.sequence.truth()
         return None if truth is None else {frame + self.offset: pose for frame, pose in truth.items()}
 
@@ -131,7 +131,7 @@ class Part:
         """Return the loop with the components and the prior that the run was made with.
 
         Raises:
-            InputError: where its settings cannot be used.
+            InputError: if its settings cannot be used.
         """
         said: dict[str, Any] = {**self.report["settings"], **{name: self.report[name] for name in ("prior", "seed")}}
         settings: dict[str, Any] = {
@@ -150,7 +150,7 @@ class Part:
             frames: numbers, its own, of accepted frames.
 
         Raises:
-            InputError: where the sequence shows something else than when the run was made.
+            InputError: if the sequence differs from that of the run.
         """
         (modeler, scene), views = self._looking, {}
         points = {record["id"]: record["points"] for record in self.report["frames"]}
@@ -176,7 +176,7 @@ class Part:
 
     @cached_property
     def _looking(self) -> tuple[Modeler, Scene]:
-        """What finds the object, and what that learnt from the sequence."""
+        """The components that find the object, and the scene learned from the sequence."""
         settings = self.report["settings"]
         roi = settings.get("roi")
         limits = ObjectOptions(roi=None if roi is None else tuple(roi), max_depth_m=settings.get("max_depth_m"))
@@ -187,7 +187,7 @@ class Part:
         """Look at the first and the last frame.
 
         Raises:
-            InputError: where the sequence shows something else than when the run was made.
+            InputError: if the sequence differs from that of the run.
         """
         self.views(sorted({*self.accepted[:1], *self.accepted[-1:]}))
 
@@ -200,7 +200,7 @@ def parts_of(run: Path, moved: Sequence[Path] = ()) -> tuple[Part, ...]:
         moved: where the sequences are now, in order; none: where they were.
 
     Raises:
-        InputError: where a folder holds no run, or a sequence is not to be found.
+        InputError: if a folder holds no run, or a sequence is not to be found.
     """
     places = deque(moved) if moved else None
     found = _parts(run, places, ())
@@ -231,28 +231,28 @@ def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> t
 
 
 def calibrated(sequence: AbstractSequence, sensor: Path | None, camera: Path | None) -> AbstractSequence:
-    """Return a sequence with what was measured of its camera.
+    """Return a sequence with the calibration of its camera.
 
     Args:
         sequence: as it was recorded.
-        sensor: file with the noise; None: as the sequence says.
-        camera: file with the focal length; None: as the sequence says.
+        sensor: file with the noise; None: from the sequence.
+        camera: file with the focal length; None: from the sequence.
 
     Raises:
-        InputError: where a file cannot be read.
+        InputError: if a file cannot be read.
     """
     sequence = sequence if camera is None else RefocusedSequence(sequence, read_focal_factor(camera))
     return sequence if sensor is None else CalibratedSequence(sequence, read_noise(sensor))
 
 
 def estimated_camera(file: Path | None) -> dict[str, float | str] | None:
-    """Return what the file of a camera says, as report.json has it; None without one.
+    """Return the calibration in a camera file as in report.json; None without one.
 
     Args:
         file: as `modeler calibrate-camera` wrote it.
 
     Raises:
-        InputError: where it cannot be read.
+        InputError: if it cannot be read.
     """
     return None if file is None else read_focal_factor(file).values()
 
@@ -269,17 +269,17 @@ class Reopened:
     name: str
     """Of the object or sequence."""
     report: Mapping[str, Any]
-    """What the run said of itself."""
+    """The report of the run."""
     sensor: Sensor
     """Noise of the camera."""
     views: Mapping[int, RayImage]
     """Accepted views by frame number."""
     edges: tuple[Edge, ...]
-    """Every edge, as it was judged."""
+    """Every edge, accepted or not."""
     solution: Solution
     """The poses, solved again from the edges."""
     parts: tuple[Part, ...]
-    """What it was made of: one sequence, or of joined runs all of theirs."""
+    """Its sequence, or for joined runs those of all parts."""
 
     def volume(self, fuser: Fuser) -> FusionVolume:
         """Return the views fused as `modeler build` fuses them."""
@@ -294,7 +294,7 @@ def reopened(run: Path, moved: Sequence[Path] = ()) -> Reopened:
         moved: where its sequence is now, of joined runs all of theirs in order; none: where they were.
 
     Raises:
-        InputError: where the folder holds no finished run, or a sequence is not to be found or is another.
+        InputError: if the folder holds no finished run, or a sequence is not to be found or is another.
     """
     report, parts = RunFolder(run).result(), parts_of(run, moved)
     poses = {frame: pose.mean for frame, pose in poses_of(report).items()}

@@ -1,6 +1,6 @@
-"""The jobs of a batch: one build each, in a process of its own, and what is on the disk of it.
+"""The jobs of a batch: one build each, in a separate process, and their files.
 
-Engines run `run` wherever they like; what they carry there and back is small and plain. Nothing heavy is imported here.
+Engines may execute `run` anywhere; its arguments and results are small and plain. Nothing heavy is imported here.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Any, Literal
 BUILDER = "modeler.cli.one_job"
 """Module that builds the sequence of a job, in a process of its own."""
 NOTES = ".batch"
-"""Folder in that of a batch: what is known of each sequence, and what its build said."""
+"""Subfolder of a batch with the state of each sequence and the output of its build."""
 TRIES = 2
 """How often a sequence that fails is tried."""
 ENDED = (0, 3)
@@ -59,12 +59,12 @@ class Job:
 
     @property
     def note(self) -> Path:
-        """The file with what is known of it."""
+        """The file with its state."""
         return Path(self.out) / NOTES / f"{self.name}.json"
 
     @property
     def log(self) -> Path:
-        """The file with what its builds said; who holds its lock works on the sequence."""
+        """The file with the output of its builds; the holder of its lock works on the sequence."""
         return Path(self.out) / NOTES / f"{self.name}.log"
 
 
@@ -77,7 +77,7 @@ class Ended:
     status: int
     """Exit status of the build: 0, 2, 3; 128 and more: it was killed."""
     line: str = ""
-    """What it said in a line, where it failed."""
+    """Its error line, if it failed."""
     tries: int = 0
     """How often it has failed."""
     fresh: bool = True
@@ -124,7 +124,7 @@ def fingerprint(job: Job, *, content: bool) -> str:
 
 
 def read_note(path: Path) -> dict[str, Any]:
-    """Return what is known of a sequence; nothing where there is no such file, or no sense in it."""
+    """Return the state of a sequence; empty without a valid file."""
     try:
         note = json.loads(path.read_text())
     except (OSError, ValueError):
@@ -133,7 +133,7 @@ def read_note(path: Path) -> dict[str, Any]:
 
 
 def write_note(path: Path, note: dict[str, Any]) -> None:
-    """Replace what is known of a sequence, in one go."""
+    """Replace the state of a sequence atomically."""
     part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
     try:
         part.write_text(json.dumps(note) + "\n")
@@ -143,18 +143,18 @@ def write_note(path: Path, note: dict[str, Any]) -> None:
 
 
 def standing(job: Job, note: dict[str, Any] | None = None) -> Standing:
-    """Return how far a job has got, by what is on the disk.
+    """Return the progress of a job from its files.
 
     Args:
         job: with the settings as they are now.
-        note: what is known of it; None: as its file says.
+        note: its state; None: read from its file.
     """
     note = read_note(job.note) if note is None else note
     if not note:
         return "new"
     complete = note.get("status") in ENDED
     if complete and not (job.run / "report.json").is_file():
-        return "new"  # somebody has removed the run
+        return "new"  # the run was removed
     same = note.get("sequence") == job.sequence and note.get("arguments") == list(job.arguments)
     if same and note.get("glance") != fingerprint(job, content=False):
         same = note.get("content") == fingerprint(job, content=True)  # copied or touched, perhaps
@@ -215,12 +215,12 @@ PROCESSES = Processes()
 
 
 def run(job: Job) -> Ended | None:
-    """Build a sequence unless that is done already; None where the process was ended from here.
+    """Build a sequence unless that is done already; None if the process was ended from here.
 
     Whoever else works on the same sequence is waited for. The process that builds dies with this one.
 
     Raises:
-        OSError: where no file can be written in the folder of the batch.
+        OSError: if no file can be written in the folder of the batch.
     """
     job.log.parent.mkdir(parents=True, exist_ok=True)
     with open(job.log, "ab") as log:
@@ -245,7 +245,7 @@ def write_failure(job: Job, line: str, status: int = 2) -> Ended:
     """Note that a job has failed, once more where it has before, and return how it ended.
 
     Raises:
-        OSError: where the note cannot be written.
+        OSError: if the note cannot be written.
     """
     job.note.parent.mkdir(parents=True, exist_ok=True)
     note = read_note(job.note)
@@ -256,7 +256,7 @@ def write_failure(job: Job, line: str, status: int = 2) -> Ended:
 
 
 def ended(name: str, note: dict[str, Any], *, fresh: bool = True) -> Ended:
-    """Return how a job ended, by what is known of it."""
+    """Return how a job ended, from its state."""
     return Ended(name, int(note.get("status", 2)), str(note.get("line", "")), int(note.get("tries", 0)), fresh)
 
 

@@ -43,10 +43,10 @@ class Join:
     """Same seed, same machine, same result, to the bit."""
 
     def run(self) -> int:
-        """Join the runs; status 3 where the result is not to be trusted, as report.json then says.
+        """Join the runs; status 3 if the result is not to be trusted, as report.json then says.
 
         Raises:
-            InputError: where a run cannot be read, or no pair of their views can be registered.
+            InputError: if a run cannot be read, or no pair of their views can be registered.
         """
         from modeler.cli.inputs import reopened
         from modeler.export import RunFolder, RunMeta, alone
@@ -101,7 +101,7 @@ def _check(options: Join) -> None:
     """Refuse options out of range, and a folder that holds something.
 
     Raises:
-        InputError: where they are such, or another program is writing to the folder.
+        InputError: if they are such, or another program is writing to the folder.
     """
     from modeler.cli.outputs import check_run_folder, run_inputs
     from modeler.export import alone
@@ -118,7 +118,7 @@ def _check(options: Join) -> None:
 
 
 def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
-    """Return what was estimated of the camera whose depth scale is known least; None where all are as stated."""
+    """Return what was estimated of the camera whose depth scale is known least; None if all are as stated."""
     cameras = [camera for part in parts if (camera := part.report.get("camera")) is not None]
     return max(cameras, key=lambda camera: float(camera["depth_scale_sigma"]), default=None)
 

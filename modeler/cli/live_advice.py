@@ -1,4 +1,4 @@
-"""What to do next, worked out while a run goes on, for somebody who turns the object before a camera that is live."""
+"""Suggests the next action during a live run, to a person who turns the object in front of the camera."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from modeler.suggestion import Belief, Suggestion, Suggestions
     from modeler.types import Step
 
-Tell = Callable[["Step", "Belief", "Suggestions"], None]
-"""Tells what is known after a step, and what to do next."""
+Receiver = Callable[["Step", "Belief", "Suggestions"], None]
+"""Receives the belief and the suggestions after a step."""
 
 
 @contextmanager
-def advising(modeler: Modeler, *tell: Tell) -> Iterator[Callable[[Step], None]]:
-    """Tell in a thread of its own what to do after steps; those that come meanwhile are passed over but the newest.
+def advising(modeler: Modeler, *receivers: Receiver) -> Iterator[Callable[[Step], None]]:
+    """Compute suggestions after steps in a separate thread; of steps that arrive meanwhile, only the newest is used.
 
-    What goes wrong there is raised with the next step, or at the end.
+    Exceptions are raised with the next step, or at the end.
     """
     waiting: deque[Step] = deque(maxlen=1)
 
@@ -30,11 +30,11 @@ def advising(modeler: Modeler, *tell: Tell) -> Iterator[Callable[[Step], None]]:
 
         try:
             step = waiting.pop()
-        except IndexError:  # a newer one was told instead
+        except IndexError:  # a newer one was processed instead
             return
         belief = modeler.belief(step.views, step.solution, step.edges_so_far)
         found = suggest(belief)
-        for each in tell:
+        for each in receivers:
             each(step, belief, found)
 
     with ThreadPoolExecutor(1, thread_name_prefix="advice") as thread:
@@ -53,14 +53,14 @@ def advising(modeler: Modeler, *tell: Tell) -> Iterator[Callable[[Step], None]]:
             future.result()
 
 
-def for_the_hand(found: Suggestions) -> Suggestion | None:
-    """Return the best action that a run takes without being told of it: a poke has to be said by `--prior poke`."""
+def best_manual_action(found: Suggestions) -> Suggestion | None:
+    """Return the best action that needs no input to the run: a poke would need `--prior poke`."""
     return next((each for each in found.ranked if each.prediction.candidate.action in ("turn", "lay")), None)
 
 
-def in_short(found: Suggestions) -> str:
+def summary_of(found: Suggestions) -> str:
     """Return in a few words what to do next."""
-    best = for_the_hand(found)
+    best = best_manual_action(found)
     if found.reached or best is None:
         return "nothing more to gain"
     return f"next: {best.words.split(':')[0]}"

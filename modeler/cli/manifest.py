@@ -1,4 +1,4 @@
-"""Which sequences a batch is of: their names, and the table that lists them."""
+"""The sequences of a batch: their names, and the table that lists them."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def read_manifest(path: Path, common: tuple[str, ...] = ()) -> list[Row]:
         common: options that hold for every row, where it says nothing else.
 
     Raises:
-        InputError: where it cannot be read, a column is none, or a row's options cannot be used.
+        InputError: if it cannot be read, a column is none, or a row's options cannot be used.
     """
     from sequences.input_files import read_text
 
@@ -91,7 +91,7 @@ def _arguments(options: tuple[tuple[str, str], ...], common: tuple[str, ...]) ->
     """Return the options of a row as `modeler build` takes them.
 
     Raises:
-        InputError: where it does not.
+        InputError: if it does not.
     """
     words: list[str] = []
     for column, cell in options:
@@ -106,7 +106,7 @@ def _arguments(options: tuple[tuple[str, str], ...], common: tuple[str, ...]) ->
 
 
 def _checked(words: tuple[str, ...], common: tuple[str, ...]) -> tuple[str, ...]:
-    """Return options as they are once read: files by their absolute paths, and without those that say the usual."""
+    """Return options in canonical form: files by absolute paths, defaults removed."""
     from modeler.cli import parsed
     from modeler.cli.build import Build
 
@@ -137,7 +137,7 @@ def named(rows: Sequence[Row], out: Path) -> Mapping[str, Row]:
         out: folder of the batch.
 
     Raises:
-        InputError: where a name is given that cannot be one, or is given twice.
+        InputError: if a name is given that cannot be one, or is given twice.
     """
     notes = sorted((out / NOTES).glob("*.json")) if (out / NOTES).is_dir() else []
     known = {str(read_note(note).get("sequence", "")): note.stem for note in notes}

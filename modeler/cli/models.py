@@ -1,4 +1,4 @@
-"""What is known of the models in the folder of a batch: records of single runs, and the list of them all."""
+"""The models in the folder of a batch: records of single runs, and the list of all."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ THUMBNAIL_PX = 160
 
 
 def record_of(run: Path) -> dict[str, Any]:
-    """Return what a finished run says of itself, its model measures, and the truth tells, as JSON values.
+    """Return the report, the size of the model and, if known, the errors of a finished run, as JSON values.
 
     Raises:
-        InputError: where the folder holds no run.
+        InputError: if the folder holds no run.
     """
     report = RunFolder(run).result()
     record = report_columns(report)
@@ -36,7 +36,7 @@ def record_of(run: Path) -> dict[str, Any]:
 
 
 def _errors(run: Path, report: dict[str, Any], centre_m: Array) -> dict[str, float]:
-    """Return how far the poses of an object with that centre are off where the truth is known; nothing elsewhere."""
+    """Return the pose errors of an object with that centre; empty without ground truth."""
     from modeler.cli.inputs import parts_of
     from modeler.evaluation import trajectory_errors
 
@@ -92,6 +92,6 @@ def write_models(out: Path) -> None:
     """Write the list of the models in a folder.
 
     Raises:
-        InputError: where it cannot be written.
+        InputError: if it cannot be written.
     """
     write_table(out / TABLE, models_in(out))

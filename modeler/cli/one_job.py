@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def main() -> int:
-    """Build the sequence of a job, and note what became of it; the exit status is that of the build."""
+    """Build the sequence of a job, and note the result; the exit status is that of the build."""
     began_s = time.perf_counter()
     threading.Thread(target=end_with_the_parent, daemon=True).start()
     from modeler.cli import main as command

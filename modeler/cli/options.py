@@ -189,7 +189,7 @@ class PriorOptions:
             of: those of each prior, by its name.
 
         Raises:
-            InputError: where a parameter of another prior was given, or a value that is none.
+            InputError: if a parameter of another prior was given, or a value that is none.
         """
         from modeler.priors.checks import ParameterError, check_parameter
         from modeler.types import InputError
@@ -248,11 +248,11 @@ class InputOptions:
     """Topic of the colour images in a ROS bag."""
     strict_paths: StrictPaths = False
 
-    def stated(self) -> Overrides:
-        """Return them as readers take them.
+    def overrides(self) -> Overrides:
+        """Return them for the readers of sequences.
 
         Raises:
-            InputError: where one cannot be.
+            InputError: if one cannot be.
         """
         from sequences import Overrides
 

@@ -1,4 +1,4 @@
-"""Where a command may write: never into or over what it reads, and over an earlier result only with --overwrite."""
+"""Output paths of commands: never inside or over an input, and over an earlier result only with --overwrite."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from modeler.types import InputError
 
 
 def check_folder(out: Path, inputs: Iterable[Path]) -> None:
-    """Refuse a folder that is, or lies in, something that the command reads.
+    """Reject a folder that is, or is inside, an input of the command.
 
     Args:
         out: folder that the command is about to make or fill.
         inputs: files and folders that it reads; what is not there is passed over.
 
     Raises:
-        InputError: where writing there would change an input.
+        InputError: if writing there would change an input.
     """
     found = {name: path for path in inputs for name in _identities(path)}
     place = Path(os.path.realpath(out))
@@ -30,7 +30,7 @@ def check_folder(out: Path, inputs: Iterable[Path]) -> None:
 
 
 def check_files(outs: Sequence[Path], inputs: Sequence[Path], *, overwrite: bool) -> None:
-    """Refuse files that would change what the command reads, and files that are there unless `overwrite` is set.
+    """Reject files that would change an input, and existing files unless `overwrite` is set.
 
     Args:
         outs: files that the command is about to write.
@@ -38,7 +38,7 @@ def check_files(outs: Sequence[Path], inputs: Sequence[Path], *, overwrite: bool
         overwrite: whether regular files may be replaced.
 
     Raises:
-        InputError: where a file may not be written.
+        InputError: if a file may not be written.
     """
     for out in outs:
         check_folder(out, inputs)
@@ -54,16 +54,16 @@ def check_files(outs: Sequence[Path], inputs: Sequence[Path], *, overwrite: bool
 
 
 def check_run_folder(out: Path, inputs: Iterable[Path], *, overwrite: bool, resume: bool | None = None) -> None:
-    """Refuse a run folder where something else is, or, unless asked for, where another run is.
+    """Reject a run folder with other contents or, unless requested, with another run.
 
     Args:
         out: folder of the run that the command is about to make.
         inputs: files and folders that it reads.
         overwrite: whether a run may be replaced.
-        resume: whether it may be continued; None where the command cannot.
+        resume: whether it may be continued; None if the command cannot.
 
     Raises:
-        InputError: where no run may be made there.
+        InputError: if no run may be made there.
     """
     from modeler.export import RunFolder
 
@@ -118,7 +118,7 @@ def _identities(path: Path) -> Iterator[tuple[int, int]]:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Return what is the same for all names of a file or folder; None where there is none."""
+    """Return what is the same for all names of a file or folder; None if there is none."""
     try:
         status = path.stat()
     except (OSError, ValueError):

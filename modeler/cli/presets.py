@@ -1,4 +1,4 @@
-"""`modeler export --for`: a model as a pose estimator, a simulator or a printer takes it, and checked."""
+"""`modeler export --for`: a model for a pose estimator, a simulator or a printer, with checks."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class Preset:
     """Which program it is for."""
 
     def run(self) -> int:
-        """Write the files, read them back, and say what was checked; 3 where a check fails.
+        """Write the files, read them back, and say what was checked; 3 if a check fails.
 
         Raises:
-            InputError: where options exclude each other, or something cannot be read or written.
+            InputError: if options exclude each other, or something cannot be read or written.
         """
         options = self.options
         self._refuse()
@@ -74,7 +74,7 @@ class Preset:
         """Refuse options that the preset decides.
 
         Raises:
-            InputError: where one is given.
+            InputError: if one is given.
         """
         given = [
             name for name in ("origin", "up", "watertight", "texture", "bop", "tint") if getattr(self.options, name)
@@ -114,7 +114,7 @@ class Preset:
         """Return the mesh in the object frame.
 
         Raises:
-            InputError: where the views give no surface.
+            InputError: if the views give no surface.
         """
         model = self._volume.model(watertight=watertight)
         if not len(model.triangles):
@@ -136,7 +136,7 @@ class Preset:
         place = files.placement(model, self._reopened.report, "bbox", "z")
         files.write_mesh(place.placed(model), out, texture, axes=place.axes)
         place.write(out)
-        self._tell(place)
+        self._report(place)
         checks = mesh_checks(out, most_triangles=physics.MOST_TRIANGLES)
         if texture is None:
             return checks.also(True, "no texture, as the frames have no colour")
@@ -159,7 +159,7 @@ class Preset:
         flat = solids.with_flat_bottom(place.placed(model), self._volume.grid.voxel_m if base_known else None)
         files.write_mesh(replace(flat, vertices_m=1000.0 * flat.vertices_m), out, axes=place.axes, unit="mm")
         place.write(out, unit="mm")
-        self._tell(place)
+        self._report(place)
         mesh = loaded(out)
         corners_m = np.asarray(mesh.vertices, dtype=np.float64) / 1000.0
         area_m2 = solids.bottom_area_m2(corners_m, np.asarray(mesh.faces))
@@ -211,9 +211,9 @@ class Preset:
         files.write_mesh(place.placed(model), of.visual, texture, axes=place.axes)
         place.write(of.visual)
         physics.write_parts(of, parts)
-        self._tell(place)
-        told = "as given" if self.options.mass_kg is not None else f"at {density:g} kg/m³"
-        say(f"{body.mass_kg:.3g} kg {told}; friction {physics.FRICTION[0]:g}, a default: neither is measured")
+        self._report(place)
+        source = "as given" if self.options.mass_kg is not None else f"at {density:g} kg/m³"
+        say(f"{body.mass_kg:.3g} kg {source}; friction {physics.FRICTION[0]:g}, a default: neither is measured")
         return of, body, parts
 
     def _solid_checks(self, of: physics.PhysicsFiles, body: solids.Body, parts: solids.ConvexParts) -> Checks:
@@ -248,7 +248,7 @@ class Preset:
         found = SymmetryFinder().find_in(model, model_up(run.report)[0])
         entries = _symmetry_entries(found, place.object_from_mesh)
         files.write_bop(model, self._bop_model, place, entries)
-        self._tell(place)
+        self._report(place)
         say(found.words)
         placed, count = place.placed(model), 0
         for name, views in scenes.items():
@@ -289,14 +289,14 @@ class Preset:
                 return False
         return True
 
-    def _tell(self, place: files.Placement) -> None:
+    def _report(self, place: files.Placement) -> None:
         say(f"{self.options.out}: {place.words}")
 
 
 def _symmetry_entries(found: Symmetries, object_from_mesh: Array) -> dict[str, Any]:
     """Return what `models_info.json` says of symmetries: BOP's are those that colour does not resolve.
 
-    Those of the shape alone stand beside them where colour is known, as `shape_symmetries_…`.
+    Those of the shape alone are added as `shape_symmetries_…`, if there is colour.
     """
 
     def entries(of: Symmetries) -> dict[str, Any]:
@@ -305,10 +305,10 @@ def _symmetry_entries(found: Symmetries, object_from_mesh: Array) -> dict[str, A
 
     left, of_shape = found.with_colour, entries(found)
     if left is None:
-        told = of_shape
+        found_entries = of_shape
     else:
-        told = {**entries(left), **{f"shape_{name}": values for name, values in of_shape.items()}}
-    return {**told, "symmetries_tolerance_mm": 1000.0 * found.tolerance_m}
+        found_entries = {**entries(left), **{f"shape_{name}": values for name, values in of_shape.items()}}
+    return {**found_entries, "symmetries_tolerance_mm": 1000.0 * found.tolerance_m}
 
 
 @contextlib.contextmanager

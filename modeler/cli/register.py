@@ -33,7 +33,7 @@ class Register:
     where: ObjectOptions = field(default_factory=ObjectOptions)
 
     def run(self) -> int:
-        """Register the pair; status 3 where the result would not become an edge."""
+        """Register the pair; status 3 if the result would not become an edge."""
         from modeler.cli import compose
         from modeler.cli.advice import outcome_advice
         from modeler.export import edge_record

@@ -42,7 +42,7 @@ class Report:
         out = self.run_folder / PAGE if self.out is None else self.out
         inputs = run_inputs([self.run_folder], self.moved.sequence)
         check_files([out], inputs[1:] if self.out is None else inputs, overwrite=self.overwrite)
-        RunFolder(self.run_folder).result()  # without which there is nothing to tell
+        RunFolder(self.run_folder).result()  # refuses folders without a finished run
         try:
             truth = _truth(self.run_folder, self.moved.sequence)
         except InputError:
@@ -55,10 +55,10 @@ class Report:
 
 
 def _truth(run: Path, sequences: tuple[Path, ...]) -> Mapping[int, Array] | None:
-    """Return the true camera_from_model by frame number; None where nothing tells it.
+    """Return the true camera_from_model by frame number; None if unknown.
 
     Raises:
-        InputError: where a sequence is not to be found, or is another than the run was made from.
+        InputError: if a sequence is not to be found, or is another than the run was made from.
     """
     from modeler.cli.inputs import parts_of
 

@@ -44,10 +44,10 @@ class Suggest:
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:
-        """Print the list; status 3 where a goal was given and is not reached.
+        """Print the list; status 3 if a goal was given and is not reached.
 
         Raises:
-            InputError: where the run or the candidates cannot be used.
+            InputError: if the run or the candidates cannot be used.
         """
         from modeler.cli.candidate_file import read_candidates
         from modeler.cli.inputs import reopened
@@ -80,7 +80,7 @@ class Suggest:
         """Return what is good enough, and whether the user said so.
 
         Raises:
-            InputError: where a goal is out of range.
+            InputError: if a goal is out of range.
         """
         from modeler.suggestion import Goal
         from modeler.types import InputError

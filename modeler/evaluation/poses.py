@@ -122,7 +122,7 @@ def trajectory_errors(
         centroid_m: (3,) of the object, in the camera of the first frame.
 
     Raises:
-        ValueError: where the trajectory is empty.
+        ValueError: if the trajectory is empty.
     """
     if not trajectory:
         raise ValueError("an empty trajectory has no errors; check that a frame was accepted")
@@ -147,7 +147,7 @@ def align_to_model(trajectory: Mapping[int, Array], camera_from_model: Mapping[i
         camera_from_model: (4, 4) by frame number.
 
     Raises:
-        ValueError: where no frame has both.
+        ValueError: if no frame has both.
     """
     frames = [frame for frame in sorted(trajectory) if frame in camera_from_model]
     if not frames:

@@ -78,7 +78,7 @@ class TrueSurface:
         """Return a mesh with points on it.
 
         Raises:
-            ValueError: where the mesh has no area.
+            ValueError: if the mesh has no area.
         """
         return TrueSurface(vertices_m, triangles, sample_surface(vertices_m, triangles, count, rng))
 
@@ -124,7 +124,7 @@ def surface_errors(
         rng: draws the points on the mesh.
 
     Raises:
-        ValueError: where the mesh has no area.
+        ValueError: if the mesh has no area.
     """
     import open3d as o3d
 
@@ -149,7 +149,7 @@ def sample_surface(vertices_m: Array, triangles: npt.NDArray[np.int64], count: i
         rng: source of randomness.
 
     Raises:
-        ValueError: where the mesh has no area.
+        ValueError: if the mesh has no area.
     """
     a, b, c = np.moveaxis(vertices_m[triangles], 1, 0)
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)

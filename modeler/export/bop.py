@@ -22,13 +22,13 @@ from modeler.regular_files import read_json
 from modeler.types import Array, BoolArray, Frame, InputError, ObjectModel
 
 MODELS_INFO = "models_info.json"
-"""BOP's list of models, beside them."""
+"""BOP's list of models, in their folder."""
 
 
 def write_bop(
     model: ObjectModel, out: Path, place: Placement | None = None, more: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a mesh in mm, its origin in the centre of its box, with its entry in `models_info.json` beside it.
+    """Write a mesh in mm, its origin in the centre of its box, with its entry in `models_info.json` in the same folder.
 
     The entry has the diameter and the box as BOP defines them, and `origin_m`: where in the object frame of the run the
     model's origin lies. Entries of other objects stay.
@@ -40,7 +40,7 @@ def write_bop(
         out: PLY file whose name ends in the number of the object (`obj_000001.ply`); without a number it is object 1.
 
     Raises:
-        InputError: where the name is not that of a PLY file, or a file cannot be read or written.
+        InputError: if the name is not that of a PLY file, or a file cannot be read or written.
     """
     if out.suffix.lower() != ".ply":
         raise InputError(f"{out}: BOP models are PLY files; choose a name such as obj_000001.ply")
@@ -72,7 +72,7 @@ def _entries(path: Path) -> dict[str, Any]:
     """Return the entries of other objects, by their numbers, in a `models_info.json` whose folder is made if need be.
 
     Raises:
-        InputError: where it cannot be read, or is no such file.
+        InputError: if it cannot be read, or is no such file.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

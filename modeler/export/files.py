@@ -28,7 +28,7 @@ def write_atomically(path: Path, content: str | bytes, *, lasting: bool = False,
         tidy: remove what killed processes were to write there, for which the folder is listed.
 
     Raises:
-        InputError: where the file cannot be written.
+        InputError: if the file cannot be written.
     """
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content  # names need not be text
     part = path.with_name(f".{path.name}.{os.getpid()}{PART}")
@@ -53,7 +53,7 @@ def settle(*paths: Path) -> None:
     """Wait until files, and the names in folders, are on the disk.
 
     Raises:
-        OSError: where one cannot be brought there.
+        OSError: if one cannot be brought there.
     """
     for path in paths:
         opened = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
@@ -83,7 +83,7 @@ def alone(folder: Path) -> Iterator[None]:
     """Make a folder, if it is not there, and keep other programs that ask for the same out of it.
 
     Raises:
-        InputError: where it cannot be made, or another program is in it.
+        InputError: if it cannot be made, or another program is in it.
     """
     try:
         str(folder).encode()

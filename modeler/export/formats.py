@@ -67,7 +67,7 @@ def cloud_ply(model: ObjectModel) -> bytes:
 
 
 def mesh_ply(model: ObjectModel) -> bytes:
-    """Return the mesh of a model as PLY; vertices have `views` and `sigma_m` beside the usual, where they are known."""
+    """Return the mesh of a model as PLY; vertices also have `views` and `sigma_m`, if known."""
     return ply_bytes(
         model.vertices_m,
         model.vertex_normals,

@@ -1,4 +1,4 @@
-"""The fused mesh in the formats of other programs, simplified, or coloured by what is known of it."""
+"""The fused mesh in the formats of other programs, simplified, or coloured by its uncertainty."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def format_of(out: Path) -> str:
     """Return the ending that selects the format.
 
     Raises:
-        InputError: where it is none.
+        InputError: if it is none.
     """
     suffix = out.suffix.lower()
     if suffix not in FORMATS:
@@ -71,11 +71,11 @@ def write_mesh(
 
     Coordinates stay as they are in every format. In glTF y is up, so that the node of a GLB turns a mesh that is
     given in the camera's axes: viewers show it as it stood, from the camera's side. PLY, OBJ and GLB keep normals and
-    colours, PLY alone what is known of the vertices; STL holds neither.
+    colours, only PLY has properties of the vertices; STL has neither.
 
     Args:
         model: the mesh.
-        out: file to write; folders on the way are made. A textured OBJ has an MTL and a PNG file beside it.
+        out: file to write; folders on the way are made. A textured OBJ also has an MTL and a PNG file.
         texture: for OBJ and GLB, in place of vertex colours.
         object_from_upright: (3, 3) right, down and forward of the view in which a GLB is shown; None: the camera's own;
             `AS_GIVEN`: the node of a GLB does not turn the mesh.
@@ -83,7 +83,7 @@ def write_mesh(
         unit: of the coordinates as they are given.
 
     Raises:
-        InputError: where the ending is unknown or a file cannot be written.
+        InputError: if the ending is unknown or a file cannot be written.
     """
     suffix = format_of(out)
     if texture is not None and suffix not in TEXTURED:
@@ -184,7 +184,7 @@ def simplified(model: ObjectModel, triangles: int) -> ObjectModel:
     using quadric error metrics"). Colours, views and deviations are those of the nearest old vertex.
 
     Raises:
-        InputError: where the number is too small for a solid.
+        InputError: if the number is too small for a solid.
     """
     import open3d as o3d
 
@@ -228,7 +228,7 @@ def tinted(model: ObjectModel, tint: Tint) -> ObjectModel:
             dark = 0, yellow = 2 mm and more.
 
     Raises:
-        InputError: where the model does not tell.
+        InputError: if the model does not have them.
     """
     views, sigmas_m = model.vertex_views, model.vertex_sigmas_m
     if views is None or sigmas_m is None:

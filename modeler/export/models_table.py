@@ -57,7 +57,7 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write rows as a table; what a row does not say is null.
 
     Raises:
-        InputError: where the file cannot be written.
+        InputError: if the file cannot be written.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -71,7 +71,7 @@ def read_table(path: Path) -> list[dict[str, Any]]:
     """Return the rows of a table.
 
     Raises:
-        InputError: where there is none, or it has not these columns.
+        InputError: if there is none, or it has not these columns.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -45,7 +45,7 @@ class Pairs:
     """It is made when there is something to keep."""
 
     def get(self, source: int, target: int, question: str) -> Posterior | None:
-        """Return what was found, to the bit; None where it is not there.
+        """Return what was found, to the bit; None if it is not there.
 
         Args:
             source: frame number.
@@ -78,7 +78,7 @@ class Pairs:
         """Make the folder.
 
         Raises:
-            OSError: where that cannot be.
+            OSError: if that cannot be.
         """
         self.folder.mkdir(exist_ok=True)
 
@@ -86,7 +86,7 @@ class Pairs:
         """Forget everything, or, where the program is killed at it, nothing; the folder stays.
 
         Raises:
-            OSError: where that cannot be.
+            OSError: if that cannot be.
         """
         shutil.rmtree(self._dropped, ignore_errors=True)
         if self.folder.is_dir() and not self.folder.is_symlink():
@@ -98,7 +98,7 @@ class Pairs:
         """Forget everything, or, where the program is killed at it, nothing; the folder goes.
 
         Raises:
-            OSError: where that cannot be.
+            OSError: if that cannot be.
         """
         shutil.rmtree(self._dropped, ignore_errors=True)
         if self.folder.is_dir() and not self.folder.is_symlink():
@@ -116,7 +116,7 @@ class Pairs:
 @final
 @dataclass(frozen=True, eq=False)
 class Remembered(AbstractRegistrar):
-    """Answers what is known from memory, asks another registrar for the rest, and keeps what it says at once."""
+    """Returns stored registrations, delegates the rest to another registrar, and stores its results at once."""
 
     registrar: AbstractRegistrar
     """Asked where memory ends."""

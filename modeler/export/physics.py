@@ -69,7 +69,7 @@ def write_parts(files: PhysicsFiles, parts: ConvexParts) -> None:
     """Write convex parts as OBJ files without normals.
 
     Raises:
-        InputError: where a file cannot be written.
+        InputError: if a file cannot be written.
     """
     for number, (vertices_m, triangles) in enumerate(parts.meshes):
         lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices_m]
@@ -81,7 +81,7 @@ def write_mjcf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
     """Write the object as a free body, and a scene that puts it on a plane.
 
     Raises:
-        InputError: where a file cannot be written.
+        InputError: if a file cannot be written.
     """
     name, count = files.name, len(parts.meshes)
     xx, yy, zz, xy, xz, yz = _six(body.inertia_kg_m2)
@@ -130,7 +130,7 @@ def write_urdf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
     """Write the object as a robot of one link.
 
     Raises:
-        InputError: where the file cannot be written.
+        InputError: if the file cannot be written.
     """
     xx, yy, zz, xy, xz, yz = (f"{value:.8g}" for value in _six(body.inertia_kg_m2))
     collisions = "".join(
@@ -202,7 +202,7 @@ def settled_in_mujoco(scene: Path) -> Settled:
 
     Raises:
         ImportError: where MuJoCo is not installed.
-        ValueError: where it refuses the file.
+        ValueError: if it refuses the file.
     """
     mujoco: Any = importlib.import_module("mujoco")  # its types are known only where it is installed
 
@@ -228,7 +228,7 @@ def settled_in_pybullet(urdf: Path, drop_m: float) -> Settled:
 
     Raises:
         ImportError: where PyBullet is not installed.
-        ValueError: where it refuses the file.
+        ValueError: if it refuses the file.
     """
     import pybullet  # pyright: ignore[reportMissingImports]
 

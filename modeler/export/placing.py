@@ -47,9 +47,9 @@ class Placement:
     up: Up | None
     """Which axis is up; None: the axes are the first camera's."""
     up_from: UpSource | None
-    """What tells the direction that is up; None where none is used."""
+    """Source of the up direction; None if none is used."""
     base_from: Literal["support", "lowest vertex"] | None
-    """What tells the height of the base; None where the origin is not there."""
+    """Source of the height of the base; None if the origin is not there."""
 
     @property
     def axes(self) -> str:
@@ -83,7 +83,7 @@ class Placement:
             unit: in which its coordinates are written.
 
         Raises:
-            InputError: where the file cannot be written.
+            InputError: if the file cannot be written.
         """
         content: dict[str, Any] = {
             "schema": 1,

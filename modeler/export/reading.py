@@ -44,7 +44,7 @@ def read_model(path: Path) -> ObjectModel:
         path: as `modeler build` writes it; colours, `views` and `sigma_m` where it has them.
 
     Raises:
-        InputError: where there is none, it cannot be read or has no triangles.
+        InputError: if there is none, it cannot be read or has no triangles.
     """
     import trimesh
     from trimesh.visual import ColorVisuals
@@ -80,7 +80,7 @@ def read_model(path: Path) -> ObjectModel:
 
 
 def _kind(edge: Mapping[str, Any]) -> EdgeKind:
-    """Return what an edge is for; reports count spans as odometry and joins as closures, and say so beside."""
+    """Return the kind of an edge; reports count spans as odometry and joins as closures, with a separate flag."""
     return "span" if edge.get("span") else "join" if edge.get("join") else edge["kind"]
 
 
@@ -118,7 +118,7 @@ _LATER = frozenset({"by_focal", "modes", "cause", "mask", "reason"})  # reports 
 
 
 def fault(report: Mapping[str, Any]) -> str | None:
-    """Return what is wrong with a report, in words; None where nothing is.
+    """Return what is wrong with a report, in words; None if nothing is.
 
     What other programs may leave out, or add, is not looked at.
     """

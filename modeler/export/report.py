@@ -34,7 +34,9 @@ from modeler.verdict import FrameRecord, judged
 
 _SCHEMA = 1
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
-_FREE_RAD = np.radians(8.0)  # two such are the usual step between views: the edge does not tell whether there was one
+_FREE_RAD = np.radians(
+    8.0
+)  # twice this is the usual step between views: the edge does not determine whether there was one
 _FREE_M = 0.01  # surfaces of a hand-sized object then come to lie visibly apart
 _ALIKE = np.cos(np.radians(25.0))  # nearer than this, a direction goes by the name of another
 _LONG = 1.5  # how many times longer than wide an object is said to have an axis of its own
@@ -140,22 +142,22 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
 
 
 def _camera(
-    stated: Mapping[str, float | str] | None, solution: Solution, views: Mapping[int, RayImage]
+    given: Mapping[str, float | str] | None, solution: Solution, views: Mapping[int, RayImage]
 ) -> dict[str, Any] | None:
-    """Return what is known of the camera; None where it is as the sequence says, exactly.
+    """Return the estimate of the camera; None if the given one is exact.
 
-    Loops tell the focal length and the relief of the depth together, so that the scale of one of them is as uncertain
+    Loops cannot separate focal length and relief of the depth, so that the scale of one of them is as uncertain
     as they moved the other.
 
     Args:
-        stated: by the file that the run was made with, as report.json has it.
-        solution: with what its loops tell.
+        given: by the file that the run was made with, as in report.json.
+        solution: with the estimate from its loops.
         views: by frame number.
     """
     focal = solution.focal
     if focal is None:
-        return None if stated is None else dict(stated)
-    before = {"focal_factor": 1.0, "depth_scale": 1.0, "depth_scale_sigma": 0.0} if stated is None else stated
+        return None if given is None else dict(given)
+    before = {"focal_factor": 1.0, "depth_scale": 1.0, "depth_scale_sigma": 0.0} if given is None else given
     in_run = math.exp(focal.log_factor)
     root = views.get(min(solution.trajectory, default=-1))
     return {
@@ -189,7 +191,7 @@ def _loop(
 
 
 def _support(solution: Solution, views: Mapping[int, RayImage]) -> Plane | None:
-    """Return what the object stood on in the first frame, whose camera frame is the object's; None where not seen."""
+    """Return what the object stood on in the first frame, whose camera frame is the object's; None if not seen."""
     first = views.get(min(solution.trajectory, default=-1))
     return None if first is None else first.plane
 

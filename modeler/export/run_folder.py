@@ -76,7 +76,7 @@ class RunFolder:
             resume: keep them until they are replaced, unless no report says what they are of.
 
         Raises:
-            InputError: where the folder has content that is not a run's, or is a run's and neither is given, or where
+            InputError: if the folder has content that is not a run's, or is a run's and neither is given, or where
                 it cannot be made or resumed.
         """
         folder = cls(path)
@@ -105,7 +105,7 @@ class RunFolder:
             resume: whether it may be continued.
 
         Raises:
-            InputError: where that is so.
+            InputError: if that is so.
         """
         if self.is_empty:
             return
@@ -121,7 +121,7 @@ class RunFolder:
         """Whether nothing would be lost here.
 
         Raises:
-            InputError: where one cannot look.
+            InputError: if one cannot look.
         """
         try:
             entries = list(self.path.iterdir()) if self.path.exists() else []
@@ -137,7 +137,7 @@ class RunFolder:
             return True
         try:
             self.report()
-        except InputError:  # perhaps damaged: then the files beside it tell
+        except InputError:  # perhaps damaged: then the other files decide
             return all((self.path / name).is_file() for name in (_REPORT, "trajectory.txt", "graph.g2o"))
         return True
 
@@ -150,7 +150,7 @@ class RunFolder:
         """Return the report as it stands in the folder.
 
         Raises:
-            InputError: where there is none or it cannot be read.
+            InputError: if there is none or it cannot be read.
         """
         path = self.path / _REPORT
         if not os.path.lexists(path):
@@ -164,7 +164,7 @@ class RunFolder:
         """Return the report after a look at all of it, for whoever relies on more than that it is there.
 
         Raises:
-            InputError: where there is none, it cannot be read or is not as `modeler` writes it.
+            InputError: if there is none, it cannot be read or is not as `modeler` writes it.
         """
         report = self.report()
         wrong = fault(report)
@@ -176,7 +176,7 @@ class RunFolder:
         """Return whether a run that is to be resumed had come to its end.
 
         Raises:
-            InputError: where that run was made from other input or with other settings, or its report cannot be read.
+            InputError: if that run was made from other input or with other settings, or its report cannot be read.
         """
         if not (self.path / _REPORT).exists():
             return False
@@ -199,7 +199,7 @@ class RunFolder:
         """Return the packages, each with its version, with which a run was begun that is to be resumed with others.
 
         Raises:
-            InputError: where its report cannot be read.
+            InputError: if its report cannot be read.
         """
         if not (self.path / _REPORT).exists():
             return ()
@@ -213,7 +213,7 @@ class RunFolder:
         """Bring the folder up to date and return the report that stands there then.
 
         Raises:
-            InputError: where a file cannot be written.
+            InputError: if a file cannot be written.
         """
         self.frames[step.frame.index] = frame_record(step)
         if not step.last and (len(self.frames) < self.already or self.pace.rests):
@@ -241,7 +241,7 @@ class RunFolder:
         """Bring the recording to the disk; forget the registrations, unless the run ended early and may be resumed.
 
         Raises:
-            InputError: where that cannot be.
+            InputError: if that cannot be.
         """
         recording = self.path / _OURS[-1]
         try:

@@ -47,7 +47,7 @@ def body_of(model: ObjectModel, *, density_kg_m3: float, mass_kg: float | None =
         mass_kg: mass, where it is known: the density then follows from it.
 
     Raises:
-        InputError: where the mesh encloses no volume.
+        InputError: if the mesh encloses no volume.
     """
     import trimesh
 

@@ -14,7 +14,7 @@ _LEAST_BACK = 0.3  # of the way to the camera that lies across what is up: else 
 _WIDE, _FLAT = 0.1, 0.3  # a ring is no line, and all but plane
 
 UpSource = Literal["support", "ring", "camera"]
-"""What tells which direction is up: the support, the ring of the cameras, or the first image."""
+"""Source of the up direction: the support, the ring of the cameras, or the first image."""
 
 
 def standing(up: Array) -> Array:
@@ -57,7 +57,7 @@ def model_upright(report: Mapping[str, Any]) -> Array:
 
 
 def model_up(report: Mapping[str, Any]) -> tuple[Array, UpSource]:
-    """Return which direction (3,) is up in the object frame of a run, and what tells so.
+    """Return the up direction (3,) in the object frame of a run, and its source.
 
     Args:
         report: of a run in which frames were accepted.
@@ -88,7 +88,7 @@ def level_axes(up: Array) -> Array:
 
 
 def _ring_up(centres_m: Array) -> Array | None:
-    """Return what is up (3,) on a ring of cameras at (n, 3); None where they make none."""
+    """Return what is up (3,) on a ring of cameras at (n, 3); None if they make none."""
     long, wide, high = np.pad(np.linalg.svd(centres_m - centres_m.mean(axis=0), compute_uv=False), (0, 3))[:3]
     return ring_axes(centres_m)[1] if wide > _WIDE * long and high < _FLAT * wide else None
 

@@ -44,7 +44,9 @@ def textured(model: ObjectModel, paint: Paint, side_px: int = SIDE_PX) -> tuple[
 
     corners = model.vertices_m[model.triangles]
     area_m2 = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-    texel_m = float(np.sqrt(area_m2 / _FILLED)) / side_px  # about: how much room the charts leave, packing tells
+    texel_m = (
+        float(np.sqrt(area_m2 / _FILLED)) / side_px
+    )  # approximately: packing determines how much room the charts leave
     atlas = xatlas.Atlas()
     # In texels and from the origin: the library compares lengths with constants.
     texels = ((model.vertices_m - model.vertices_m.mean(axis=0)) / texel_m).astype(np.float32)
@@ -91,7 +93,7 @@ def _pieces(centres_m: Array, most: int) -> list[npt.NDArray[np.int64]]:
 
 
 def _baked(model: ObjectModel, places_px: Array, side_px: int, paint: Paint) -> npt.NDArray[np.uint8]:
-    """Return the image (s, s, 3): every pixel in or beside a chart shows the point of the surface nearest to it.
+    """Return the image (s, s, 3): every pixel in or next to a chart shows the point of the surface nearest to it.
 
     Args:
         model: the mesh.

@@ -20,15 +20,15 @@ class Match:
     target_from_source: Array
     """(4, 4) object frame of the source to that of the target."""
     score: float
-    """At most 1: share of the surface that the other model's views confirm, less the share that they see empty."""
+    """At most 1: share of the surface that the other model's views confirm, minus the share in their free space."""
 
 
 @dataclass(frozen=True)
 class Matcher:
     """Align two models by point-to-plane ICP from many initial rotations, and rank the results by the views of both.
 
-    Surface that the views of the other model confirm counts for a match, more so in the same colour; surface that they
-    see empty counts against it.
+    Surface confirmed by the views of the other model increases the score, more so with the same colour; surface in
+    their free space decreases it.
     """
 
     rotations: int = 400
@@ -36,11 +36,11 @@ class Matcher:
     points: int = 300
     """Points of the source used by ICP."""
     scored_points: int = 1500
-    """Points of each model at which views are compared."""
+    """Number of points of each model at which views are compared."""
     steps: int = 15
     """ICP iterations; the largest distance of correspondences shrinks from a third of the object to a fiftieth."""
     scored: int = 40
-    """ICP results that are ranked by the views."""
+    """Number of ICP results ranked by the views."""
     apart_rad: float = 0.25
     """Matches closer than this in rotation are duplicates."""
     colour_level: float = 40.0

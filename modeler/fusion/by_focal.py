@@ -1,4 +1,4 @@
-"""How uncertain a focal length leaves the surface: it draws what every view measured, and moves the views."""
+"""Surface uncertainty due to the focal length, which moves the measurements and the poses of all views."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from modeler import se3
 from modeler.types import ObjectModel, Solution
 
-_MAX_VIEWS = 60  # spread over a run: more show the same sides again
-_MIN_COSINE = 0.3  # between normal and the ray to a camera: flatter surface has no say in the mesh
+_MAX_VIEWS = 60  # spread over a run: more are redundant
+_MIN_COSINE = 0.3  # between normal and the ray to a camera: more grazing surface does not contribute to the mesh
 
 
 def widened(model: ObjectModel, solution: Solution) -> ObjectModel:
-    """Return a model whose vertices are as uncertain as the focal length makes them, too (method.md, eq. F12).
+    """Return a model whose vertex uncertainty includes that of the focal length (method.md, eq. F12).
 
     Args:
         model: fused under the solution's poses.
-        solution: with what is known of the focal length; without, the model stays as it is.
+        solution: with the estimate of the focal length; without one, the model is unchanged.
     """
     focal, sigmas_m = solution.focal, model.vertex_sigmas_m
     frames = [] if focal is None else [frame for frame in solution.trajectory if frame in focal.by_focal]

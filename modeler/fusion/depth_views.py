@@ -19,7 +19,7 @@ GREY = 128  # colour of points that no view with colour sees
 SMOOTHED = 0.5  # noise of a surface point, smoothed over its neighbours, relative to that of its pixel
 STEEPEST_RAD = 1.40  # steeper steps between neighbouring pixels (80°) are depth edges; chosen by hand
 # Pixels from an edge within which colours may be those of the background: depth and colour are aligned to some pixels.
-# Measured: over six captures the colours of left-out views are predicted best with 6 to 16.
+# Measured: over six captures the colours of held-out views are predicted best with 6 to 16.
 BLEEDING_PX = 10.0
 SAMPLES = 20000  # points at which views are compared
 LOOKUPS = 10_000_000  # samples times views, at most, which bounds time
@@ -32,7 +32,7 @@ STATISTICS = 1 << 22  # points at most from which quantiles are taken, which bou
 
 @dataclass(frozen=True)
 class Cropping:
-    """Which pixels of a view count, and for how much."""
+    """Selection and weights of a view's pixels."""
 
     margin_px: int
     """A pixel carves only as far as all pixels within this distance."""
@@ -110,7 +110,7 @@ def crop(view: RayImage, where: tuple[slice, slice], cropping: Cropping) -> Crop
         step = far - near > 2.0 * depth_m / camera.fx * np.tan(STEEPEST_RAD) + 4.0 * view.sigma_r_m
     edges = step | np.logical_not(minimum_filter(mask, size=3))
     within = np.asarray(binary_fill_holes(mask), dtype=bool) & ~step  # where depth is missing, colours may be good
-    if frame.occluder is not None:  # but not where it is a hand that has them
+    if frame.occluder is not None:  # but not where they are those of a hand
         within &= ~frame.occluder[where]
     away_px = np.asarray(distance_transform_edt(np.pad(within, 1)))[1:-1, 1:-1]
     clearance = np.minimum((away_px + 0.5) / BLEEDING_PX, 1.0)
@@ -135,7 +135,7 @@ def crop(view: RayImage, where: tuple[slice, slice], cropping: Cropping) -> Crop
 
 
 def free_of(depth_m: npt.NDArray[np.float32], margin_px: int) -> npt.NDArray[np.float32]:
-    """Return the depth (h, w) up to which a pixel sees empty space: the least of all pixels around it; 0 = unknown.
+    """Return the depth (h, w) up to which a pixel sees free space: the least of all pixels around it; 0 = unknown.
 
     Args:
         depth_m: (h, w); not positive or NaN = no measurement, which carves nothing.
@@ -168,7 +168,7 @@ class DepthViews:
     index: npt.NDArray[np.int32]
     """(f, h, w) number of the surface point at a pixel, -1 = none."""
     free_m: npt.NDArray[np.float32]
-    """(f, h, w) depth up to which a pixel sees empty space, 0 = unknown."""
+    """(f, h, w) depth up to which a pixel sees free space, 0 = unknown."""
     background_m: npt.NDArray[np.float32]
     """(f, h, w) depth of background pixels with no object pixel nearby, 0 elsewhere."""
     colour: npt.NDArray[np.uint8]
@@ -213,10 +213,10 @@ class DepthViews:
         )
 
     def carving(self, tau_m: float) -> DepthViews:
-        """Return the views with empty space extended behind the background, by the band ±`tau_m`.
+        """Return the views with free space extended behind the background, by the band ±`tau_m`.
 
         Carving stops one band in front of a measured surface because its position is uncertain by as much. Where the
-        background is measured, the object is known not to be there, so this margin is added back.
+        background is measured, there is no object, so this margin is added back.
         """
         background_m = np.where(self.background_m > 0.0, self.background_m + np.float32(1.5 * tau_m), np.float32(0.0))
         return replace(self, free_m=np.maximum(self.free_m, background_m))
@@ -226,7 +226,7 @@ def posed_views(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) 
     """Return the views that have a pose with object_from_camera, by ascending frame number.
 
     Raises:
-        InputError: where no view has a pose, or none of them a surface point.
+        InputError: if no view has a pose, or none of them a surface point.
     """
     pairs = [(views[k], np.asarray(trajectory[k], dtype=np.float64)) for k in sorted(views) if k in trajectory]
     if not any(len(view.points_m) for view, _ in pairs):
@@ -235,7 +235,7 @@ def posed_views(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) 
 
 
 def one_by_one(pairs: Iterable[tuple[RayImage, Array]]) -> Iterator[tuple[RayImage, Array]]:
-    """Yield views and poses, and let go of the memory of each where it is on disk."""
+    """Yield views and poses, and free the memory of each that is on disk."""
     for view, pose in pairs:
         yield view, pose
         release(view.points_m)
@@ -321,7 +321,7 @@ def _largest(windows: Iterable[tuple[slice, slice]]) -> tuple[int, int]:
 class ViewBlocks:
     """Views in blocks, of which one at a time needs to be in memory.
 
-    Of n blocks each has every n-th view, and so sees all sides of the object that the views see.
+    Of n blocks, each has every n-th view, and so all sides of the object that the views see.
     """
 
     blocks: tuple[DepthViews, ...]
@@ -330,7 +330,7 @@ class ViewBlocks:
     """Where they are."""
 
     def __iter__(self) -> Iterator[DepthViews]:
-        """Yield the blocks, and let go of the memory of each."""
+        """Yield the blocks, and free the memory of each."""
         for block in self.blocks:
             yield block
             self.disk.release()
@@ -346,7 +346,7 @@ class ViewBlocks:
         return any(bool(block.coloured.any()) for block in self.blocks)
 
     def carving(self, tau_m: float) -> ViewBlocks:
-        """Return the views with empty space extended behind the background, see `DepthViews.carving`."""
+        """Return the views with free space extended behind the background, see `DepthViews.carving`."""
         if len(self.blocks) == 1:
             return replace(self, blocks=(self.blocks[0].carving(tau_m),))
         return replace(self, blocks=tuple(_on_disk(block.carving(tau_m), self.disk, "free_m") for block in self))
@@ -390,7 +390,7 @@ def _on_disk(block: DepthViews, disk: DiskArrays, *names: str) -> DepthViews:
 
 
 def thinning(points: int) -> int:
-    """Return of which step a share of points is for quantiles: 1 unless they are more than `STATISTICS`."""
+    """Return the stride of points used for quantiles: 1 unless they are more than `STATISTICS`."""
     return max(1, points // STATISTICS)
 
 
@@ -436,8 +436,8 @@ def _distances(blocks: ViewBlocks, samples: int, limit_m: float) -> Iterator[tup
 def conditional_covariances(solution: Solution, edges: Iterable[Edge]) -> Mapping[int, Array]:
     """Return the covariance (6, 6) of each pose conditional on its neighbours in the pose graph, by frame number.
 
-    Neighbours see the same surface. Errors that they share, such as drift since the first frame, do not decide which
-    of them is right; the error of each relative to the others does.
+    Neighbours see the same surface. Common errors, such as drift since the first frame, do not decide which of them
+    is right; errors relative to the others do.
 
     Args:
         solution: the poses.

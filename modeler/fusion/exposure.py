@@ -1,4 +1,4 @@
-"""What makes the colours of several views alike: exposure, and how lamps shade what turns before the camera."""
+"""Equalises the colours of several views: exposure, and shading by lamps of an object that turns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DARK, BRIGHT = 12.0, 243.0  # levels (of 255) beyond which a pixel may be clippe
 LOOKUPS = 100_000  # points times views at which colours are compared, which bounds time
 ROUNDS = 8  # of iteratively reweighted least squares
 GAIN_SIGMA = 0.05  # prior sd of log gains; chosen by hand
-LEAST = 1e-3  # weight of the shading itself beside that of what it explains; see method.md, λ of (F10)
+LEAST = 1e-3  # weight of the shading itself relative to that of the residuals; see method.md, λ of (F10)
 COLOUR_SIGMA = 0.1  # scale of the Cauchy weights on log colours, against highlights; chosen by hand
 LARGEST_GAIN = 2.5  # largest factor between exposures; chosen by hand
 
@@ -43,8 +43,8 @@ class Exposure:
 def exposure_of(views: ViewBlocks, *, tau_m: float, near_m: float) -> Exposure:
     """Return what equalises exposure and shading.
 
-    Each point has one colour, each view a gain, and all views the same lamps, by which surface is the brighter the
-    more it faces them; the three are fitted to the logarithms of the observed colours of common points
+    Each point has one colour, each view a gain, and all views the same lamps, which brighten the surface that faces
+    them; the three are fitted to the logarithms of the observed colours of common points
     (docs/method.md, F10). Sharper views have more weight.
 
     Args:
@@ -81,7 +81,7 @@ def exposure_of(views: ViewBlocks, *, tau_m: float, near_m: float) -> Exposure:
     logs, log_gains = np.log(np.maximum(levels, 1.0)), np.zeros((len(with_colour), 3))
     mean = np.tensordot(weights, basis, 2) / weights.sum()
     log_gains[common], shading = _fitted(logs[common], weights[common], basis[common] - mean)
-    # Of a factor common to all colours the views say nothing: it is 1 on average.
+    # A factor common to all colours is not observable: it is 1 on average.
     gains[with_colour, :3] = np.exp(log_gains - mean @ shading)
     return Exposure(gains, shading)
 
@@ -96,8 +96,8 @@ def _fitted(logs: Array, observed: Array, basis: Array) -> tuple[Array, Array]:
     """
     gains, shading = np.zeros((len(logs), 3)), np.zeros((basis.shape[2], 3))
     weights, clipped = observed, np.log(LARGEST_GAIN)
-    # What differs between points but between no views, as along the axis of a turntable, is no shading: of all that
-    # explain the colours as well, the one counts that changes them least.
+    # Differences between points that are the same in all views, as along the axis of a turntable, are not shading: of
+    # all solutions that explain the colours equally well, the one with the least shading is chosen.
     least = LEAST * np.tensordot(observed[..., None] * basis, basis, ((0, 1), (0, 1))) + LEAST * np.eye(basis.shape[2])
     for _ in range(ROUNDS):
         shares = weights / np.maximum(weights.sum(axis=0), 1e-12)

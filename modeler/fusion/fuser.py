@@ -63,7 +63,7 @@ class Fuser:
     margin_px: int = 2
     """A pixel carves only as deep as all its neighbours within this distance, which preserves silhouettes."""
     empty_weight: float = 0.3
-    """Weight of a view that sees a voxel empty, relative to 1 for a view that sees surface there head-on."""
+    """Weight of a view that sees a voxel as free space, relative to 1 for a view that sees surface there head-on."""
     min_support: float = 0.03
     """Smallest sum of view weights of a mesh vertex."""
     closing: int = 3
@@ -83,7 +83,7 @@ class Fuser:
     ) -> ObjectModel:
         """Return the cloud and the open mesh.
 
-        Space that a view saw empty is carved, unseen surface stays open, and only pixels of the object become surface.
+        Observed free space is carved, unobserved surface stays open, and only pixels of the object become surface.
 
         Args:
             views: by frame number; views without a pose are left out.

@@ -63,7 +63,7 @@ class IncrementalTsdf:
             trajectory: object_from_camera (4, 4) by frame number.
 
         Raises:
-            InputError: where no view with surface points has a pose.
+            InputError: if no view with surface points has a pose.
         """
         pairs = {view.index: (view, pose) for view, pose in posed_views(views, trajectory) if len(view.points_m)}
         voxel_m = self.voxel_m or self.fuser.preview_voxels * self.fuser.voxel_side_m(list(pairs.values()))

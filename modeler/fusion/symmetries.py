@@ -50,7 +50,7 @@ class Symmetries:
     compared: float = 1.0
     """Share of the seen surface that was compared, in the rotation for which it was least."""
     with_colour: Symmetries | None = None
-    """Those under which colours stay as well; None where the model has no colour."""
+    """Those under which colours stay as well; None if the model has no colour."""
 
     @property
     def words(self) -> str:
@@ -88,7 +88,7 @@ class SymmetryFinder:
     sigmas: float = 3.0
     """Tolerance in standard deviations of the distance between two places of the surface, each of which errs."""
     least_share: float = 0.01
-    """And at least this share of the diameter: what is smaller tells no pose estimator apart."""
+    """And at least this share of the diameter: smaller details do not help a pose estimator."""
     elsewhere: float = 0.006
     """Largest share of points farther than the tolerance from the surface, which allows for outliers."""
     unknown: float = 0.1
@@ -211,7 +211,7 @@ class _Surface:
     drawn: SurfacePoints
     scene: object
     at_border: BoolArray
-    """(t,) triangles beside which the surface is not known."""
+    """(t,) triangles next to unknown surface."""
     closed: bool
     diameter_m: float
 
@@ -298,7 +298,7 @@ class _Search:
         return axes
 
     def refined(self, direction: Array, angle_deg: float) -> Axis | None:
-        """Return the axis to which ICP of the surface with itself brings a rotation; None where it is no symmetry."""
+        """Return the axis to which ICP of the surface with itself brings a rotation; None if it is no symmetry."""
         centre = self.surface.points_m.mean(axis=0)
         points_m = self.surface.points_m[: self.finder.icp_points] - centre
         normals = self.surface.normals[: self.finder.icp_points]
@@ -413,7 +413,7 @@ def _rotation(axis: Axis, angle_rad: float) -> Array:
 
 
 def _axis_of(pose: Array, angle_rad: float) -> Axis | None:
-    """Return the axis of a motion that turns by about an angle; None where it turns by another."""
+    """Return the axis of a motion that turns by about an angle; None if it turns by another."""
     vector = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
     angle = float(np.linalg.norm(vector))
     if abs(angle - min(angle_rad, 2.0 * np.pi - angle_rad)) > np.radians(6.0):
@@ -425,7 +425,7 @@ def _axis_of(pose: Array, angle_rad: float) -> Axis | None:
 
 
 def _snapped(pose: Array) -> Array | None:
-    """Return a rotation (4, 4) by the multiple of 360°/n nearest to that of a motion; None where there is none near."""
+    """Return a rotation (4, 4) by the multiple of 360°/n nearest to that of a motion; None if there is none near."""
     angle = float(np.linalg.norm(Rotation.from_matrix(pose[:3, :3]).as_rotvec()))
     steps = [2.0 * np.pi * k / order for order in ORDERS for k in range(1, order // 2 + 1)]
     nearest = min(steps, key=lambda step: abs(step - angle))

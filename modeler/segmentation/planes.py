@@ -229,7 +229,7 @@ def choose_support(planes: Array, body: Float32Array, ground: Float32Array, nois
         noise: of the depth camera.
 
     Returns:
-        (4,) normal and offset, or None where nothing holds the object.
+        (4,) normal and offset, or None if nothing holds the object.
     """
     if len(body) == 0:
         return None
@@ -285,7 +285,7 @@ def surroundings(points: Float32Array, found: BoolArray) -> BoolArray:
 
 
 def outline(found: BoolArray) -> BoolArray:
-    """Return the pixels (h, w) within 2 px of some, and what these enclose: the floor of a dish is not its support."""
+    """Return the pixels (h, w) within 2 px of a mask, and those enclosed: the floor of a dish is not its support."""
     near = ndimage.binary_dilation(found, iterations=2)
     return np.asarray(ndimage.binary_fill_holes(near), dtype=np.bool_)
 

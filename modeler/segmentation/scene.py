@@ -1,4 +1,4 @@
-"""What several frames show of a scene: what stands still, where the object is, and its support."""
+"""Scene learned from several frames: the static background, the object's zone, and its support."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _ELSEWHERE = 0.3  # share of the moving pieces' score elsewhere from which the o
 _WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
 _IN_FRONT_SHARE = 0.9  # share of the object that is in front of a wall
 _TOUCHING_PX = 3
-_CUT_WEIGHT = 0.2  # of a moving piece that comes from the image's edge: an arm, or a person
+_CUT_WEIGHT = 0.2  # of a moving piece that extends from the image's edge: an arm, or a person
 _MOST = 0.5  # share of measured pixels; with more there is a background
 _ON_BORDER = 0.005  # share of measured pixels along the image's edge; with more the scene extends beyond it
 _ON_PLANE, _ABOVE, _BELOW = 0.1, 0.01, 0.2  # shares of the points: at least, at least, and at most for a support plane
@@ -50,7 +50,7 @@ _SPECK_SHARE = 0.003  # share of the object; smaller pieces are removed
 @final
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What several frames show of the scene. With an empty scene, each frame is segmented on its own."""
+    """Scene learned from several frames. With an empty scene, each frame is segmented separately."""
 
     plane: Plane | None = None
     """The support plane, where one was found."""
@@ -71,7 +71,7 @@ class Scene:
     noise: DepthNoise | None = None
     """Noise of the depth camera, where it exceeds what was expected."""
     range_noise: RangeNoise | None = None
-    """How the camera errs, as what surrounds the object shows; None where little is plane."""
+    """Noise statistics of the camera from planes around the object; None without enough planar surface."""
 
 
 def telling(indices: Sequence[int], *, count: int = 15) -> tuple[int, ...]:
@@ -111,7 +111,7 @@ def learn(layers: Layers, allowed: BoolArray, noise: DepthNoise, *, least_points
 
 
 def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]:
-    """Find the moving piece with the highest score (large, near, central), and what moves next to it.
+    """Find the moving piece with the highest score (large, near, central), and moving pieces next to it.
 
     Returns:
         Its pixels (h, w), and whether no other moving piece scores nearly as high.
@@ -139,7 +139,7 @@ def _standing_object(
     what stands on the one below: from floor to table to turntable, but not to the lid of a box.
 
     Returns:
-        The support (4,), or None where there is no plane; the pixels (h, w) of the object; and whether there was only
+        The support (4,), or None if there is no plane; the pixels (h, w) of the object; and whether there was only
         one candidate plane.
     """
     depth = points[..., 2]
@@ -190,8 +190,8 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
 
     A static piece above the support that lies within the image may belong to the object: the middle of a mug on a
     turntable looks static, and only its handle moves. Without a support, nothing static is the object. Nor are walls
-    behind all that moves: planes that extend beyond the image, or show more beside it than it covers. They go on behind
-    it.
+    behind all that moves: planes that extend beyond the image, or are larger next to the object than behind it. They
+    continue behind the object.
     """
     back = layers.back_m[..., 2]
     body, rim = layers.front_m[found], _rim(layers.back_m)

@@ -31,9 +31,9 @@ from modeler.types import Array, BoolArray, Camera, Float32Array, Frame, InputEr
 Window = tuple[slice, slice]
 _ZONE_MARGIN_M = 0.1  # distance from the object's zone at which it may still be
 _ZONE_MARGIN_SHARE = 0.3  # share of the zone's size, if that is more
-_MOSTLY_IN_ZONE = 0.5  # share of a piece beside the object that is in the zone, for it to be part of the object
-_LEAST_PIECE = 0.07  # of the object; what cameras fill in around a figure's limbs comes in pieces of up to 6 %
-_STRAY_WEIGHT = 0.2  # weight of what lies outside the zone, or comes from the image's edge as arms do
+_MOSTLY_IN_ZONE = 0.5  # share of a piece next to the object that must be in the zone for it to be part of the object
+_LEAST_PIECE = 0.07  # of the object; false depth filled in around a figure's limbs has pieces of up to 6 %
+_STRAY_WEIGHT = 0.2  # weight of pixels outside the zone, and of pieces that extend from the image's edge as arms do
 _FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
 _CLEARANCE_M = 0.001
 _LOW_M = 0.01  # creases of the support are at most so high, and apart from the object
@@ -64,7 +64,7 @@ class Found:
     rival: float = 0.0
     """Score of the second-best cluster relative to the best."""
     goes_on: bool = False
-    """Whether it goes on beyond where the object may be, as an arm that touches it does."""
+    """Whether it continues beyond the object's region, like an arm that touches the object."""
 
 
 def find(
@@ -78,9 +78,9 @@ def find(
 ) -> Found:
     """Find the object in a depth image, NaN where nothing was measured or no object may be.
 
-    On a downsampled image, what is above the support and in front of the background is clustered in space, and the
-    cluster with the largest area in the object's zone is chosen, with those that an occluder separates from it. Its
-    pixels are then taken at full resolution.
+    On a downsampled image, points above the support and in front of the background are clustered in space. The cluster
+    with the largest area in the object's zone is chosen, with those that an occluder separates from it. Its pixels are
+    then refined at full resolution.
     """
     if scene.zone_m is None:
         return Found(np.zeros(depth_m.shape, dtype=np.bool_))
@@ -133,7 +133,7 @@ def _choose(
 
 
 def _goes_on(depth_m: Float32Array, fore: BoolArray, inside: BoolArray, gap_m: float) -> BoolArray:
-    """Return the pixels (h, w) at which something in the foreground goes on from the inside of a box to its outside.
+    """Return the pixels (h, w) at which the foreground continues from the inside of a box to its outside.
 
     Args:
         depth_m: (h, w).
@@ -149,7 +149,7 @@ def _goes_on(depth_m: Float32Array, fore: BoolArray, inside: BoolArray, gap_m: f
 
 
 def _split(labels: Labels, chosen: BoolArray, depth_m: Float32Array, fore: BoolArray) -> Labels:
-    """Return labels (n,) with the chosen clusters split at depth jumps: an arm that touches the object is before it.
+    """Return labels (n,) with the chosen clusters split at depth jumps: an arm may touch the object.
 
     Args:
         labels: (n,) of the pixels in `fore`.
@@ -173,19 +173,19 @@ def _beside(region: BoolArray) -> Labels:
     return labels
 
 
-def _joined(best: int, labels: Labels, in_zone: BoolArray, beside: Labels) -> BoolArray:
-    """Return which clusters (k,) are the object: the best one, and what it or an occluder hides the connection to.
+def _joined(best: int, labels: Labels, in_zone: BoolArray, neighbours: Labels) -> BoolArray:
+    """Return which clusters (k,) are the object: the best one, and those whose connection it or an occluder hides.
 
-    That is beside one of the two in the image, and mostly where the object is in other frames.
+    These are next to one of the two in the image, and mostly where the object is in other frames.
 
     Args:
         best: number of a cluster.
         labels: (n,) of points.
         in_zone: (n,) whether they are where the object is in other frames.
-        beside: (n,) piece of best cluster and occluder that they are beside; 0 = none.
+        neighbours: (n,) piece of best cluster and occluder next to them; 0 = none.
     """
-    own_pieces = np.unique(beside[labels == best])
-    touching = np.bincount(labels[np.isin(beside, own_pieces)], minlength=int(labels.max()) + 1) > 0
+    own_pieces = np.unique(neighbours[labels == best])
+    touching = np.bincount(labels[np.isin(neighbours, own_pieces)], minlength=int(labels.max()) + 1) > 0
     sizes = np.bincount(labels)
     own: BoolArray = touching & (np.bincount(labels, in_zone) > _MOSTLY_IN_ZONE * sizes)
     own &= sizes > _LEAST_PIECE * sizes[best]
@@ -205,7 +205,7 @@ def _refine(
 ) -> BoolArray:
     """Return the object's pixels at full resolution, given those in the downsampled image.
 
-    What is beside these and not far behind or before them is the object's, too.
+    Pixels next to these at a similar depth belong to the object, too.
     """
     stride = planning_stride(camera)
     mask = np.zeros(depth_m.shape, dtype=np.bool_)
@@ -301,9 +301,8 @@ def _window(mask: BoolArray, *, margin: int) -> Window:
 class Segmenter:
     """Segments the object and its support plane in the frames of a depth camera.
 
-    The camera is assumed static while the object moves between frames. Where it is not, or the object does not move,
-    the object is what stands at the image's centre. Where only an island without support was measured, all of it is the
-    object.
+    The camera is assumed static while the object moves between frames. Otherwise the object
+    is what stands at the image's centre. If only an island without support was measured, all of it is the object.
     """
 
     roi: tuple[int, int, int, int] | None = None
@@ -324,14 +323,14 @@ class Segmenter:
                 f"--roi {' '.join(map(str, self.roi))} is empty; give X0 Y0 X1 Y1 with X0 < X1 and Y0 < Y1."
             )
         if self.max_depth_m is not None and not self.max_depth_m > 0.0:
-            raise InputError(f"--max-depth-m {self.max_depth_m:g} leaves nothing; give a positive depth in m.")
+            raise InputError(f"--max-depth-m {self.max_depth_m:g} is out of range; give a positive depth in m.")
 
     def scene(self, frames: Sequence[Frame]) -> Scene:
         """Learn the static background, the object's zone and its support.
 
         Args:
             frames: about a dozen, spread over the sequence; those with masks or of another size than the first are
-                ignored. Where all have masks, they tell of the camera only over how many pixels it errs alike.
+                ignored. Where all have masks, they only provide the noise correlation of the camera.
         """
         masked = [(frame, frame.mask) for frame in frames if frame.mask is not None]
         if len(masked) == len(frames):
@@ -363,8 +362,8 @@ class Segmenter:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
 
         A frame's own mask is kept, within region and largest depth; it is UNSURE_MASK if it covers much of the support,
-        or if the object's surface goes on beyond most of its rim. Where measurements are sparse, the mask holds what
-        lies between those of the object.
+        or if the object's surface continues beyond most of its rim. For sparse measurements, the mask includes the gaps
+        between those of the object.
         """
         frame = _interpolated(frame)
         if frame.mask is not None:
@@ -449,7 +448,7 @@ class Segmenter:
         return float(np.mean(np.abs(plane.height_m(points)) < self.noise.tolerance_m(points[:, 2])))
 
     def _share_beyond(self, plane: Plane | None, frame: Frame, mask: BoolArray) -> float:
-        """Return the share of the pixels around a mask where its surface goes on: no depth step, and no support."""
+        """Return the share of the pixels around a mask where its surface continues: no depth step, and no support."""
         rows, columns = _window(mask, margin=int(np.ceil(_RING_PX[1])))
         inside, depth_m = mask[rows, columns], _measured(frame)[rows, columns]
         outside = ~(inside & np.isfinite(depth_m))
@@ -482,7 +481,7 @@ class Segmenter:
 
 
 def _interpolated(frame: Frame) -> Frame:
-    """Return a frame without what occluders measure, and with depth between measurements, where they are sparse."""
+    """Return a frame without depth of occluders, and with interpolated depth if measurements are sparse."""
     known = frame.unoccluded
     return replace(known, depth_m=interpolated(known.depth_m, frame.camera)).unoccluded
 

@@ -1,9 +1,9 @@
-"""What to do next: the view, turn or poke that tells most (docs/method.md, "What to do next")."""
+"""What to do next: the most informative view, turn or poke (docs/method.md, "What to do next")."""
 
 from modeler.suggestion.belief import Belief as Belief
 from modeler.suggestion.belief import Prediction as Prediction
 from modeler.suggestion.candidates import Candidate as Candidate
-from modeler.suggestion.edge_forecast import EdgeForecast as EdgeForecast
+from modeler.suggestion.edge_prediction import EdgePredictor as EdgePredictor
 from modeler.suggestion.ranking import Goal as Goal
 from modeler.suggestion.ranking import Suggestion as Suggestion
 from modeler.suggestion.ranking import Suggestions as Suggestions

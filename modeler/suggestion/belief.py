@@ -1,4 +1,4 @@
-"""What is known of an object after some views, and how much a further view would tell."""
+"""Belief about an object after some views, and the predicted information of a further view."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from modeler.priors.mixtures import Gaussian
 from modeler.registration import VisibilityLikelihood
 from modeler.registration.visibility.likelihood import point_rows
 from modeler.suggestion.candidates import Candidate
-from modeler.suggestion.edge_forecast import TURNS_RAD, USUAL_NOISE, EdgeForecast, ForeseenEdge, ForeseenView
+from modeler.suggestion.edge_prediction import TURNS_RAD, USUAL_NOISE, EdgePredictor, PredictedEdge, PredictedView
 from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information
 from modeler.suggestion.surface_cells import IntArray, Stand, SurfaceCells
 from modeler.types import (
@@ -34,67 +34,67 @@ from modeler.types import (
     Solution,
 )
 
-_POINTS: Final = 1500  # of a view by which its surface is judged
-_BIN_RAD: Final = np.radians(15.0)  # half of what hides or shows much
-_JOINED: Final = 0.85  # of 20 recordings in which objects were turned over, 17 became one right model (README)
-_LEAST_MASS: Final = 0.03  # of a bin of turns that is looked at
-_SPAN_STEPS: Final = 4  # whose limits hold for closures too, over any number of steps
+_POINTS: Final = 1500  # of a view, used to evaluate its surface
+_BIN_RAD: Final = np.radians(15.0)  # half of a turn that changes visibility much
+_JOINED: Final = 0.85  # 17 of 20 recordings with a turned-over object gave one right model (docs/method.md)
+_LEAST_MASS: Final = 0.03  # of a bin of turns that is evaluated
+_SPAN_STEPS: Final = 4  # number of steps whose prior limits apply to closures
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What an action is expected to bring."""
+    """The predicted effect of an action."""
 
     candidate: Candidate
     """The action."""
     pose_nats: float
-    """By how much ½ log det of the poses so far should fall."""
+    """Predicted decrease of ½ log det of the covariance of the poses so far."""
     surface_nats: float
-    """By how much the entropy of the surface, given the poses, should fall: seen again, or for the first time."""
+    """Predicted decrease of the entropy of the surface given the poses, both seen and new."""
     mode_nats: float
     """Entropy of the modes of the edge that places the new view."""
     right: float
     """Probability (0..1) that the new view is placed at the true mode."""
     usable: float
-    """Probability (0..1) that registering the new view succeeds, at whichever mode."""
+    """Probability (0..1) that registering the new view succeeds, at any mode."""
     new_surface: float
-    """Share (0..1) of the surface in the view that no view has seen."""
+    """Share (0..1) of the surface in the view not observed before."""
     spin_deg: float
     """Largest standard deviation afterwards of a pose's turn about the table's normal."""
     pose_deg: float
     """Largest standard deviation afterwards of a pose's rotation about any axis."""
     new_covariance: Array
     """(6, 6) of the new pose's error in object coordinates."""
-    edges: tuple[ForeseenEdge, ...]
-    """What the view would be registered with, and what that would give."""
+    edges: tuple[PredictedEdge, ...]
+    """Predicted edges of the new view."""
 
     @property
     def gain_nats(self) -> float:
-        """The expected reduction of uncertainty: of poses and surface, if the view is placed."""
+        """Expected information gain on poses and surface."""
         return self.usable * (self.pose_nats + self.surface_nats)
 
     @property
     def worth_nats(self) -> float:
-        """What actions are ranked by: a view placed wrongly misleads by as much as one placed rightly tells."""
+        """Ranking criterion: a misplaced view misleads by as much as a correctly placed one informs."""
         return (2.0 * self.right - 1.0) * (self.pose_nats + self.surface_nats)
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What a view would show of the object."""
+    """The part of the object visible in a view."""
 
     cells: IntArray
-    """(k,) numbers of the cells that it sees."""
+    """(k,) numbers of the visible cells."""
     surface: Array
-    """(k,) how much surface, in cells, is expected there: see `SurfaceCells.looked_at`."""
+    """(k,) expected surface there, in cells: see `SurfaceCells.looked_at`."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """Poses and surface as they are known, and the components of the run that a new view would go through."""
+    """The belief about poses and surface, and the components of the run that would process a new view."""
 
     views: Mapping[int, RayImage]
     """By frame number."""
@@ -103,15 +103,15 @@ class Belief:
     edges: Sequence[Edge]
     """Every edge judged so far."""
     prior: AbstractPrior
-    """What is known of a motion."""
+    """Prior of the motion."""
     stand: Stand
-    """Where the object stands."""
+    """Pose of the object on its table."""
     closer: Closer = field(default_factory=Closer)
-    """Chooses what a view is registered with."""
-    forecast: EdgeForecast = field(default_factory=EdgeForecast)
+    """Selects the views with which a view is registered."""
+    predictor: EdgePredictor = field(default_factory=EdgePredictor)
     """Predicts edges."""
     ready: Callable[[RayImage], RayImage] = field(default=lambda view: view)
-    """Returns a view with the images that a likelihood looks up, which are ten times as large as the frame."""
+    """Returns a view with the images that a likelihood looks up (ten times the memory of the frame)."""
 
     @classmethod
     def of(
@@ -125,23 +125,23 @@ class Belief:
         likelihood: VisibilityLikelihood | None = None,
         ready: Callable[[RayImage], RayImage] = lambda view: view,
     ) -> Belief:
-        """Return what is known after some views, with noise and scale of predictions from the edges so far.
+        """Return the belief after some views, with noise and scale of predictions from the edges so far.
 
         Arguments as the fields.
 
         Raises:
-            InputError: where no view has a pose and surface points.
+            InputError: if no view has a pose and surface points.
         """
         posed = {frame: view for frame, view in views.items() if frame in solution.trajectory and len(view.points_m)}
         if not posed:
             raise InputError("no view with surface points has a pose; build the run again")
         ready = lru_cache(maxsize=None)(ready)
         noise_m = USUAL_NOISE * float(np.median([view.sigma_r_m for view in posed.values()]))
-        forecast = EdgeForecast(VisibilityLikelihood() if likelihood is None else likelihood, noise_m)
+        predictor = EdgePredictor(VisibilityLikelihood() if likelihood is None else likelihood, noise_m)
         stand = Stand.of(posed, solution)
         axis = stand.object_from_stand[:3, 3], stand.up
-        forecast = forecast.learned(edges, posed, solution, prior, ready, axis=axis)
-        return cls(posed, solution, edges, prior, stand, Closer() if closer is None else closer, forecast, ready)
+        predictor = predictor.learned(edges, posed, solution, prior, ready, axis=axis)
+        return cls(posed, solution, edges, prior, stand, Closer() if closer is None else closer, predictor, ready)
 
     @property
     def last(self) -> RayImage:
@@ -155,17 +155,17 @@ class Belief:
 
     @cached_property
     def cells(self) -> SurfaceCells:
-        """What of the surface was seen, and what may be seen yet."""
+        """Observed surface, and where unseen surface may be."""
         return SurfaceCells.of(self.views, self.solution, self.stand)
 
     @cached_property
     def can_be_seen(self) -> BoolArray:
-        """Which cells (c,) some turn on the table shows to the camera."""
+        """Which cells (c,) are visible to the camera at some turn on the table."""
         return self.cells.around(self.object_from_last) | self.cells.seen
 
     @property
     def seen(self) -> float:
-        """Share (0..1) of the surface that turns on the table can show that was seen."""
+        """Observed share (0..1) of the surface that turns on the table can show."""
         return float(np.count_nonzero(self.cells.seen) / max(np.count_nonzero(self.can_be_seen), 1))
 
     @cached_property
@@ -213,19 +213,19 @@ class Belief:
         return 1.0 / (information + 1.0 / spread_m2)
 
     def predict(self, candidate: Candidate) -> Prediction | None:
-        """Return what an action is expected to bring; None where the prior excludes it or nothing would be seen."""
+        """Return the predicted effect of an action; None if the prior excludes it or nothing would be visible."""
         new_from_last = candidate.motion(self.last, self.stand, self.object_from_last)
         object_from_new = self.object_from_last @ se3.inverse(new_from_last)
         if candidate.action == "lay":
             return self._laid(candidate, object_from_new)
         shown = self._shown(object_from_new)
-        foreseen = self._foreseen(object_from_new, shown, candidate)
-        if foreseen is None:
+        predicted = self._predicted_view(object_from_new, shown, candidate)
+        if predicted is None:
             return None
-        edges = self._edges(foreseen, object_from_new, candidate)
+        edges = self._edges(predicted, object_from_new, candidate)
         if not edges:
             return None
-        new = foreseen.image.index
+        new = predicted.image.index
         gain = self.poses.gain([(e.target, edge_information(object_from_new, e.covariance)) for e in edges], new)
         placed = [(share, self._shown(pose)) for share, pose in self._placements(edges[0], object_from_new)]
         return Prediction(
@@ -242,11 +242,11 @@ class Belief:
             edges=edges,
         )
 
-    def _placements(self, edge: ForeseenEdge, object_from_new: Array) -> list[tuple[float, Array]]:
+    def _placements(self, edge: PredictedEdge, object_from_new: Array) -> list[tuple[float, Array]]:
         """Return where a view may be placed: probabilities, which sum to 1, and poses (4, 4).
 
-        Where the images leave the turn open, a view is placed anywhere that they allow, and seems to show what would be
-        seen from there. Turns are taken together by bins of 15°, about the middle of which they are.
+        If the images do not determine the turn, the view may be placed at any likely turn, and appears to show what is
+        visible from there. Turns are grouped in bins of 15°, represented by their middle.
         """
         bins = np.round(TURNS_RAD / _BIN_RAD).astype(np.intp)
         masses = np.bincount(bins - bins.min(), edge.masses)
@@ -259,10 +259,10 @@ class Belief:
         ]
 
     def _laid(self, candidate: Candidate, object_from_new: Array) -> Prediction | None:
-        """Return what the first view of an object on its side brings.
+        """Return the predicted effect of the first view of an object on its side.
 
-        Which side it comes to lie on, and how it is turned, is open, and whole segments of views find it: so how often
-        they do stands for the modes, and the poses so far are taken to stay as they are.
+        Its resting pose is unpredictable, and whole segments of views determine it: their success rate replaces the
+        modes, and the poses so far are assumed to remain unchanged.
         """
         shown = Shown(*self.cells.looked_at(se3.inverse(object_from_new)))
         if not len(shown.cells):
@@ -307,14 +307,14 @@ class Belief:
     def _nats(self, before_m2: Array, measured_m2: Array) -> Array:
         """Return by how much the entropy (k,) of surface of known variance falls by a further measurement.
 
-        Known to the noise of a single view, surface is known well enough: looking again and again is no aim.
+        Variances below the noise of a single view are clipped: more precision is not needed.
         """
         after_m2 = 1.0 / (1.0 / before_m2 + 1.0 / measured_m2)
         enough_m2 = self._noise_m2
         return 0.5 * np.log(np.maximum(before_m2, enough_m2) / np.maximum(after_m2, enough_m2))
 
     def brought(self, view: RayImage, object_from_camera: Array, covariance: Array) -> tuple[float, float]:
-        """Return what a view that was taken brought: `surface_nats`, and the share of its surface that is new.
+        """Return the realised gain of a view: `surface_nats`, and the new share of its surface.
 
         Args:
             view: a view that is no part of the belief.
@@ -335,7 +335,7 @@ class Belief:
     def _independent_share(self) -> float:
         """Independent measurements in a cell: those of the last view, over the cells that it sees."""
         patches = max(self.last.patches, 1.0)
-        count = 1.0 / (1.0 / self.forecast.likelihood.max_independent + 1.0 / patches)
+        count = 1.0 / (1.0 / self.predictor.likelihood.max_independent + 1.0 / patches)
         cells = self.cells.visible(se3.inverse(self.object_from_last))
         return count / max(np.count_nonzero(self.cells.seen[cells]), 1)
 
@@ -346,7 +346,7 @@ class Belief:
     @cached_property
     def _noise_m2(self) -> float:
         """Variance of a point of the last view along its normal, and the noise of matching surfaces."""
-        return self._variance_m2 + self.forecast.noise_m**2
+        return self._variance_m2 + self.predictor.noise_m**2
 
     @cached_property
     def _variance_m2(self) -> float:
@@ -362,8 +362,8 @@ class Belief:
         variances_m2 = found[chosen] if source is view else np.full(len(chosen), np.median(found))
         return se3.transform(pose, view.points_m[chosen]), view.normals[chosen] @ pose[:3, :3].T, variances_m2
 
-    def _foreseen(self, object_from_new: Array, shown: Shown, candidate: Candidate) -> ForeseenView | None:
-        """Return what of the model a camera would see; None where it would see next to nothing of it."""
+    def _predicted_view(self, object_from_new: Array, shown: Shown, candidate: Candidate) -> PredictedView | None:
+        """Return the part of the model visible to a camera; None if there are too few points to register."""
         camera_from_object, visible = se3.inverse(object_from_new), shown.cells
         points_m = se3.transform(camera_from_object, self.cells.points_m[visible])
         normals = self.cells.normals[visible] @ camera_from_object[:3, :3].T
@@ -371,17 +371,17 @@ class Belief:
         if len(seen) < 20:  # as few as a registration takes
             return None
         share = 1.0 - self.new_share(shown)
-        count = int(self.forecast.likelihood.points * share)
+        count = int(self.predictor.likelihood.points * share)
         some = seen[np.linspace(0, len(seen) - 1, max(min(count, len(seen)), 1)).astype(np.intp)]
         variances_m2 = np.full(len(some), self._variance_m2)
         ahead, frame = self._frames_ahead(candidate), self.last.frame
         frame = Frame(frame.index + ahead, frame.time_s + ahead, frame.depth_m, frame.camera)
         image = replace(self.last, frame=frame, points_m=points_m[seen], normals=normals[seen], layers={})
         unseen = ~self.cells.seen[visible]
-        return ForeseenView(
+        return PredictedView(
             image=image,
             points=point_rows(points_m[some], normals[some], variances_m2, frame.camera),
-            weight=self.forecast.likelihood.points * share / len(some),
+            weight=self.predictor.likelihood.points * share / len(some),
             unseen_m=points_m[unseen],
             unseen_normals=normals[unseen],
             unseen_share=1.0 - share,
@@ -394,21 +394,23 @@ class Belief:
         table = turntable_in(self.prior)
         return 1 if table is None else max(round(abs(candidate.turn_deg / table.step_deg)), 1)
 
-    def _edges(self, foreseen: ForeseenView, object_from_new: Array, candidate: Candidate) -> tuple[ForeseenEdge, ...]:
-        """Return the edges that the view would get: to the last view, and to those that the closer would choose."""
+    def _edges(
+        self, predicted: PredictedView, object_from_new: Array, candidate: Candidate
+    ) -> tuple[PredictedEdge, ...]:
+        """Return the predicted edges of the view: to the last view, and to those that the closer would choose."""
         up = object_from_new[:3, :3].T @ self.stand.up
 
-        def edge(target: int) -> ForeseenEdge | None:
+        def edge(target: int) -> PredictedEdge | None:
             view, target_from_new = self.views[target], self._relative(target, object_from_new)
-            density = self._density(foreseen.image, view, candidate, target_from_new)
+            density = self._density(predicted.image, view, candidate, target_from_new)
             if density is None:
                 return None
-            return self.forecast.edge(foreseen, self.ready(view), target_from_new, density, up)
+            return self.predictor.edge(predicted, self.ready(view), target_from_new, density, up)
 
         first = edge(self.last.index)
         if first is None:
             return ()
-        base = _posterior(foreseen.image.index, first, self._relative(first.target, object_from_new))
+        base = _posterior(predicted.image.index, first, self._relative(first.target, object_from_new))
         others = [
             target for target in self.closer.closure_targets(base, self._map, last=True) if target != first.target
         ]
@@ -417,7 +419,7 @@ class Belief:
     def _density(
         self, source: RayImage, target: RayImage, candidate: Candidate, target_from_new: Array
     ) -> AbstractPoseDensity | None:
-        """Return what is known of the motion between a new view and another; None where nothing is."""
+        """Return the prior density of the motion between a new view and another; None if there is none."""
         if candidate.sigmas is not None:
             return Gaussian(target_from_new, np.diag(np.repeat(candidate.sigmas, 3)) ** 2, source.centroid_m)
         prior = self.prior
@@ -444,7 +446,7 @@ def displacement_m2(points_m: Array, normals: Array, covariance: Array) -> Array
     return np.maximum(np.einsum("ni,ij,nj->n", levers, covariance, levers), 0.0)
 
 
-def _posterior(source: int, edge: ForeseenEdge, mean: Array) -> Posterior:
+def _posterior(source: int, edge: PredictedEdge, mean: Array) -> Posterior:
     return Posterior(source, edge.target, PoseGaussian(mean, edge.covariance), Outcome.CONVERGED, 1.0)
 
 

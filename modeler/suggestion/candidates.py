@@ -1,4 +1,4 @@
-"""What may be done next: turns on the table, pokes, laying the object on its side, and poses that a robot can reach."""
+"""Candidate actions: turns on the table, pokes, laying the object on its side, and poses that a robot can reach."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Action = Literal["turn", "poke", "lay", "pose"]
 @final
 @dataclass(frozen=True)
 class Candidate:
-    """One action, and where it brings the object if it succeeds."""
+    """One action, and the resulting motion of the object."""
 
     action: Action
     """Its kind."""
@@ -31,15 +31,15 @@ class Candidate:
     new_from_last: tuple[tuple[float, ...], ...] | None = None
     """Of a pose: the motion (4, 4) of the object, from its camera coordinates now to those after the action."""
     name: str = ""
-    """What the user calls it."""
+    """Name given by the user."""
     cost: float = 1.0
-    """What gains are divided by: time, say."""
+    """Divisor of gains, such as time."""
     sigmas: tuple[float, float] | None = None
-    """Standard deviations in rad and m with which the pose is reached; None: as the run's prior says."""
+    """Standard deviations in rad and m with which the pose is reached; None: those of the run's prior."""
 
     @property
     def poke_prior(self) -> PokePrior:
-        """What is known of the motion by the push."""
+        """Prior of the motion given the push."""
         return PokePrior(poke=self.poke)
 
     def motion(self, last: RayImage, stand: Stand, object_from_last: Array) -> Array:
@@ -47,7 +47,7 @@ class Candidate:
 
         Args:
             last: the view before the action.
-            stand: where the object stands.
+            stand: pose of the object on its table.
             object_from_last: (4, 4) of that view.
         """
         if self.new_from_last is not None:
@@ -72,7 +72,7 @@ def pokes(last: RayImage, stand: Stand, object_from_last: Array, *, length_m: fl
 
     Args:
         last: the view before the action, with its support plane.
-        stand: where the object stands.
+        stand: pose of the object on its table.
         object_from_last: (4, 4) of that view.
         length_m: how far the finger moves.
     """
@@ -97,7 +97,7 @@ def pokes(last: RayImage, stand: Stand, object_from_last: Array, *, length_m: fl
 
 
 def poked(poke: Poke, last: RayImage, plane: Plane) -> Array:
-    """Return the motion (4, 4) of the object in the camera by a push that goes as the prior expects it to."""
+    """Return the motion (4, 4) of the object in the camera by a push, as expected by the prior."""
     axes = across_axis(plane.normal)
     seen = last.points_m @ axes.T
     way = axes @ np.array(poke.direction)
@@ -115,7 +115,7 @@ def _turn_rad(motion: Array, plane: Plane) -> float:
 
 
 def _laid(stand: Stand, object_from_last: Array) -> Array:
-    """Return the motion (4, 4) in the object frame that shows the camera what the object stood on."""
+    """Return the motion (4, 4) in the object frame that turns the object's bottom to the camera."""
     eye = se3.inverse(stand.object_from_stand) @ object_from_last[:, 3]
     towards = eye[:2] / max(float(np.linalg.norm(eye[:2])), 1e-9)
     axis = np.array([towards[1], -towards[0], 0.0])  # down becomes the direction to the camera

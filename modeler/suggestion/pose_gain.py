@@ -1,4 +1,4 @@
-"""What further edges would tell of the poses: covariances of any frames of a graph, before and after them.
+"""Information of further edges about the poses: covariances of frames of a graph, before and after.
 
 Errors are those of object coordinates, δ_k with true object_from_camera(k) = exp(δ_k) object_from_camera(k), as in
 `graph.covariance`: an edge with covariance Σ measures δ_source − δ_target with the information
@@ -34,12 +34,12 @@ def edge_information(object_from_source: Array, covariance: Array) -> Array:
 @final
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """What edges of one new frame tell of the poses before it."""
+    """Information of the edges of one new frame about the earlier poses."""
 
     nats: float
-    """By how much ½ log det of their joint covariance falls."""
+    """Decrease of ½ log det of their joint covariance."""
     covariances: Mapping[int, Array]
-    """(6, 6) of δ afterwards, by frame number, the new frame's too."""
+    """(6, 6) of δ afterwards by frame number, including the new frame."""
 
 
 @final
@@ -52,7 +52,7 @@ class PoseGraphBelief:
     places: Mapping[int, int]
     """Place of each frame in the system of equations; the root, which has no error, is not in it."""
     factorised: SuperLU | None
-    """Of their information; None where there is but one frame."""
+    """Of their information; None if there is but one frame."""
     _columns: dict[int, Array] = field(default_factory=dict)
 
     @classmethod
@@ -95,7 +95,7 @@ class PoseGraphBelief:
         return self._columns[other][row : row + 6]
 
     def gain(self, edges: Sequence[tuple[int, Array]], new: int) -> Gain:
-        """Return what edges between a new frame and others tell (docs/method.md, eq. N2).
+        """Return the information gain of edges between a new frame and others (docs/method.md, eq. N2).
 
         Args:
             edges: frame and information (6, 6) of the edge between it and the new frame, see `edge_information`.

@@ -12,11 +12,11 @@ from modeler.priors import turntable_in
 from modeler.suggestion.belief import Belief, Prediction
 from modeler.suggestion.candidates import Candidate, pokes, turns
 
-_COARSE_DEG, _FINE_DEG = 10.0, 5.0  # between turns that are compared: nobody turns by hand more exactly
+_COARSE_DEG, _FINE_DEG = 10.0, 5.0  # between compared turns: turning by hand is not more precise
 _LARGEST_DEG = 180.0
-_LYING_COST = 8.0  # a run of its own, of a full turn in steps of 45° at least
-_TENTH_DEG = 0.1  # what words resolve
-_ALIKE = 0.9  # of the better gain: two ways of one turn that a person need not tell apart
+_LYING_COST = 8.0  # a separate run: a full turn in steps of 45° at least
+_TENTH_DEG = 0.1  # resolution of the text
+_ALIKE = 0.9  # of the better gain: a turn is then equally good either way
 
 
 @final
@@ -27,7 +27,7 @@ class Goal:
     pose_deg: float = 1.0
     """Largest standard deviation of a pose's rotation."""
     seen: float = 0.95
-    """Least share (0..1) of what turns on the table can show that was seen."""
+    """Least observed share (0..1) of the surface that turns on the table can show."""
     sigma_m: float | None = None
     """Largest standard deviation of the surface in a view, by noise and pose; None: any."""
 
@@ -40,15 +40,15 @@ class Goal:
 @final
 @dataclass(frozen=True, eq=False)
 class Suggestion:
-    """One action, and what it should bring, in words."""
+    """One action and its predicted effect, in words."""
 
     prediction: Prediction
-    """What it should bring."""
+    """Its predicted effect."""
     words: str
     """For people."""
 
     def record(self) -> dict[str, Any]:
-        """Return it for programs."""
+        """Return it as JSON values."""
         found = self.prediction
         candidate = found.candidate
         record: dict[str, Any] = {
@@ -81,31 +81,31 @@ class Suggestion:
 @final
 @dataclass(frozen=True, eq=False)
 class Suggestions:
-    """Actions by what they should bring for their cost, and what is known without them."""
+    """Actions ranked by predicted gain over cost, and the current state of the model."""
 
     ranked: tuple[Suggestion, ...]
     """Best first."""
     summary: str
-    """How well the model is known, and, where that is enough, that nothing more is to be gained."""
+    """State of the model in words, and whether the goal is reached."""
     reached: bool
     """Whether the goal is reached."""
     seen: float
-    """Share (0..1) of what turns on the table can show that was seen."""
+    """Observed share (0..1) of the surface that turns on the table can show."""
     pose_deg: float
     """Largest standard deviation of a pose's rotation."""
     sigma_m: float
     """Standard deviation of the surface in the worst view."""
     excluded: int = 0
-    """How many of the candidates that were given are not ranked: the prior excludes them, or they show nothing."""
+    """Number of given candidates that are not ranked: the prior excludes them, or they show nothing."""
 
 
 def suggest(belief: Belief, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None) -> Suggestions:
     """Return what to do next.
 
     Args:
-        belief: what is known.
-        candidates: what can be done; None: turns either way, pokes where the support is seen, laying it on its side.
-        goal: what is good enough; None: every pose known to 1°, 95 % of what can be seen was seen.
+        belief: about poses and surface.
+        candidates: possible actions; None: turns either way, pokes if the support is visible, laying it on its side.
+        goal: None: every pose within 1°, 95 % of the visible surface observed.
     """
     goal = Goal() if goal is None else goal
     found = _default(belief) if candidates is None else _predicted(belief, candidates)
@@ -126,7 +126,7 @@ def _predicted(belief: Belief, candidates: Sequence[Candidate]) -> list[Predicti
 
 
 def _default(belief: Belief) -> list[Prediction]:
-    """Return predictions of what a person at a table can do; turns near the best ones are looked at more finely."""
+    """Return predictions of actions of a person at a table; turns near the best ones are sampled more finely."""
     table = turntable_in(belief.prior)
     others = _predicted(
         belief, [*pokes(belief.last, belief.stand, belief.object_from_last), Candidate("lay", cost=_LYING_COST)]
@@ -144,8 +144,8 @@ def _default(belief: Belief) -> list[Prediction]:
 
 
 def _in_words(belief: Belief, found: Sequence[Prediction]) -> list[tuple[Prediction, str]]:
-    """Return predictions with their words, a turn that is as good either way once."""
-    told, passed = [], set()
+    """Return predictions with their words; a turn that is equally good either way occurs once."""
+    worded, passed = [], set()
     for place, each in enumerate(found):
         if id(each) in passed:
             continue
@@ -153,8 +153,8 @@ def _in_words(belief: Belief, found: Sequence[Prediction]) -> list[tuple[Predict
         either = other is not None and other.worth_nats >= _ALIKE * each.worth_nats > 0.0
         if either:
             passed.add(id(other))
-        told.append((each, f"{_action(each.candidate, either=either)}: {_effect(belief, each)}"))
-    return told
+        worded.append((each, f"{_action(each.candidate, either=either)}: {_effect(belief, each)}"))
+    return worded
 
 
 def _mirrored(one: Candidate, other: Candidate) -> bool:
@@ -199,7 +199,7 @@ def _degrees(value: float) -> str:
 
 
 def _summary(belief: Belief, ranked: Sequence[Suggestion], *, reached: bool) -> str:
-    """Return in words how well the model is known, and what is left to do."""
+    """Return in words the state of the model, and what is left to do."""
     state = (
         f"every pose within {_degrees(belief.pose_deg)}, surface within {1000.0 * belief.sigma_m:.1f} mm, "
         f"{100.0 * belief.seen:.0f} % of the visible surface observed"

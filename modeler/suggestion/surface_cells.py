@@ -1,7 +1,7 @@
-"""What of an object was seen, and where unseen surface may be: cells of a grid that stands on the table.
+"""Observed surface of an object, and where unseen surface may be: cells of a grid that stands on the table.
 
-A cell that no view saw empty, nor saw surface in, may hold surface. Unknown space behind an object reaches far; surface
-is expected only within the upright cylinder about what was seen, since objects are about as deep as they are wide.
+A cell that no view observed as free space or as surface may hold surface. Unknown space behind an object extends far;
+surface is expected only in the upright cylinder about the observed surface, as objects are about as deep as wide.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from modeler.types import Array, BoolArray, Camera, RayImage, Solution
 
 IntArray = npt.NDArray[np.intp]
 CELLS = 40  # across the object: cells of 2 to 3 mm on objects of 10 cm, as wide as the balls that smooth them
-_MARGIN_PX = 1  # around a pixel: at silhouettes it mixes what lies before and behind
-_MIN_COSINE = 0.35  # between normal and ray, from which on surface gives points (`Sensor.min_cosine`)
+_MARGIN_PX = 1  # around a pixel: silhouettes mix foreground and background
+_MIN_COSINE = 0.35  # between normal and ray, above which surface gives points (`Sensor.min_cosine`)
 _NEIGHBOURS, _REACH = 50, 7.0  # cells by which normals are smoothed, and how far apart at most, in cells
-_THINNED = 2  # of so many cells one takes part in that, which halves the time
+_THINNED = 2  # every so many cells take part in smoothing, which halves the time
 _RIDGE = 1e-3  # where neighbours lie on a line
 _ALIKE = np.cos(np.radians(50.0))  # between normals of one face: edges stay
 _SURFACE_WITHIN, _SURFACE_BEYOND = 1.15, 0.24
-"""Cells of new surface that a view shows in a cell of hidden space that it looks at squarely, fitted to 48 shapes of
-the tuning half (docs/method.md). Surface of which a view shows a cell's area is itself larger, for it is slanted."""
-_STEPS = 24  # of 15°: turns from which is told what can be seen
+"""Cells of new surface that a view shows per cell of hidden space seen head-on, fitted to 48 shapes of the tuning half
+(docs/method.md). Slanted surface is larger than the area that it covers in a view."""
+_STEPS = 24  # of 15°: turns that determine the visible surface
 
 
 @dataclass(frozen=True, eq=False)
 class Stand:
-    """The table's normal through the middle of what was seen, about which an object is turned."""
+    """The table's normal through the middle of the observed surface, about which an object is turned."""
 
     object_from_stand: Array
     """(4, 4): z up, its origin on the table below the middle."""
     radius_m: float
-    """Of the upright cylinder that holds everything seen."""
+    """Of the upright cylinder that contains the observed surface."""
     height_m: float
     """Of that cylinder."""
 
@@ -94,22 +94,22 @@ def enclosing_circle(points_m: Array) -> tuple[Array, float]:
 @final
 @dataclass(frozen=True, eq=False)
 class SurfaceCells:
-    """Cells with surface that was seen, and cells that may hold unseen surface."""
+    """Cells with observed surface, and cells that may hold unseen surface."""
 
     stand: Stand
-    """Where the object stands."""
+    """Pose of the object on its table."""
     cell_m: float
     """Side of a cell."""
     points_m: Array
     """(c, 3) in the object frame: the surface in a cell, smoothed, or a cell's middle."""
     normals: Array
-    """(c, 3) unit normals: of the points in a cell, or towards what is empty."""
+    """(c, 3) unit normals: of the points in a cell, or towards free space."""
     seen: BoolArray
     """(c,) whether a view has points in the cell."""
     near: BoolArray
     """(x, y, z) whether a cell of the grid, on its table, holds seen surface or touches a cell that does."""
     under: BoolArray
-    """(c,) whether the cell is unseen surface that the object stands on."""
+    """(c,) whether the cell is unseen surface on which the object stands."""
     beyond: BoolArray
     """(c,) whether a cell may hold unseen surface, but farther from the stand's axis than any seen at that height."""
     normal_variance: float
@@ -161,15 +161,15 @@ class SurfaceCells:
         )
 
     def visible(self, camera_from_object: Array) -> IntArray:
-        """Return which cells (k,) a camera at a pose (4, 4) sees, and well enough for points."""
+        """Return which cells (k,) a camera at a pose (4, 4) sees well enough for points."""
         return self.looked_at(camera_from_object)[0]
 
     def looked_at(self, camera_from_object: Array) -> tuple[IntArray, Array]:
         """Return which cells (k,) a camera at a pose (4, 4) sees well enough for points, and the surface there (k,).
 
-        The second is how much surface, in cells, it is expected to see there: 1 of surface that was seen. Of hidden
-        space it counts how much of the view a cell covers, and whether surface is to be expected behind it: where the
-        back of seen surface is, or not farther from the axis than any was seen at that height (method.md, eq. N5).
+        The second is the expected surface there in cells, 1 for observed surface. For hidden space it depends on how
+        much of the view a cell covers, and on whether surface is expected there: in front of the back of observed
+        surface, or as near to the axis as observed surface at that height (method.md, eq. N5).
         """
         points_m = se3.transform(camera_from_object, self.points_m)
         normals = self.normals @ camera_from_object[:3, :3].T
@@ -227,12 +227,12 @@ class SurfaceCells:
 
 
 def smoothed(points_m: Array, normals: Array, cell_m: float, patch: float) -> tuple[Array, Array, float]:
-    """Return points (n, 3) and unit normals (n, 3) smoothed over neighbours that face the same way, and what is left.
+    """Return points (n, 3) and unit normals (n, 3) smoothed over neighbours that face the same way, and their noise.
 
-    The third is the variance in each tangent direction of the noise in the normals that smoothing leaves.
+    The third is the variance in each tangent direction of the noise that remains in the normals.
 
-    Predictions look points up in the images that they come from: with the images' noise in them they would match too
-    well, and a can's spin would seem to be determined by it. Normals are fitted as linear functions of the place, so
+    Predictions look points up in the images that they come from: with the images' noise they would match too well, and
+    a can's spin would appear to be determined. Normals are fitted as linear functions of the place, so
     that round surfaces stay round.
 
     Args:
@@ -302,7 +302,7 @@ def _unseen(
 ) -> tuple[BoolArray, Array]:
     """Return which cells (x, y, z) may hold unseen surface, and directions (x, y, z, 3) out of it.
 
-    Hidden cells next to empty ones; surface that was hidden there would be the first that a camera meets.
+    These are hidden cells next to free ones: hidden surface there would be the first that a camera sees.
     """
     origin_m, cell_m, shape = grid
     frames = [frame for frame in solution.trajectory if frame in views]
@@ -343,7 +343,7 @@ def _unseen(
 
 
 def _free_m(view: RayImage, where: tuple[slice, slice], margin_m: float) -> npt.NDArray[np.float32]:
-    """Return the depth (h, w) up to which a window of a view is empty; behind measured background, all of it."""
+    """Return the depth (h, w) up to which a window of a view is free space; on background, all of it."""
     depth_m = view.frame.depth_m[where]
     free_m = free_of(depth_m, _MARGIN_PX)
     if view.frame.mask is None:

@@ -1,4 +1,4 @@
-"""What speaks for and against a model, in figures: each beside the limit from which on it speaks against."""
+"""Evidence for and against a model: values with the limits beyond which it is not trusted."""
 
 from __future__ import annotations
 
@@ -25,60 +25,59 @@ from modeler.types import (
 )
 
 MAX_UNSURE: Final = 0.5
-"""Share of frames with an unsure mask: beyond, the rule and not the exception is unsure, and what moves together with
-most masks may be anything."""
+"""Share of frames with an unsure mask: beyond, unsure masks are the rule, and another object may have been modelled."""
 MIN_MOTION_SDS: Final = 3.0
-"""Displacement of the surface in standard deviations of a pixel's range: below, nothing shows that anything moved."""
+"""Displacement of the surface in standard deviations of a pixel's range: below, no motion is detectable."""
 TAIL: Final = 1e-6
-"""Probability of what contradicts a prior, a pair: of 100 runs of 100 pairs one contradicts its prior by chance."""
+"""Probability per pair of contradicting the prior by chance: one of 100 runs of 100 pairs."""
 LOOP_TAIL: Final = 1e-3
-"""Probability that the loops of a run are as far open as that by chance; that of the gate of closures."""
+"""Probability that a run has such loop closure errors by chance; that of the closure gate."""
 MAX_SEEN_THROUGH: Final = 0.1
-"""Share of a frame's surface that other frames see through by more than `WRONG_M`: a model is called wrong where less
+"""Share of a frame's surface in the free space of other frames, by more than `WRONG_M`: a model is called wrong if less
 than 90 % of its surface lies within 5 mm of the true one."""
 MAX_ABSENT: Final = 0.02
-"""Share of a frame's surface that is not there, by the frames that look: 0.005 at most in 17 right runs, five of them
-captures; 0.04 where a box with a post of 3 cm is taken to stand upside down."""
+"""Share of a frame's surface contradicted by the frames that observe it: 0.005 at most in 17 right runs, five of them
+captures; 0.04 for a box with a post of 3 cm in an upside-down pose."""
 WRONG_M: Final = 0.005
-"""Error of a surface from which on it is called wrong."""
+"""Error above which a surface is called wrong."""
 WRONG_RAD: Final = np.radians(3.0)
-"""Error of a rotation from which on it is called wrong."""
+"""Error above which a rotation is called wrong."""
 WRONG_SHARE: Final = 0.05
-"""Probability that a pose is wrong, beyond which it is not to be relied on: what regions of 95 % leave out."""
+"""Largest probability that a pose is wrong: the complement of 95 % regions."""
 MAX_OTHER_MODE: Final = 0.05
-"""Probability that some pair is at another of its modes: what confidence regions of 95 % leave out."""
+"""Largest probability that some pair is at another mode: the complement of 95 % regions."""
 
-_DRAWS: Final = 1000  # of a prior: the best of so many lies 0.2 nats below the mode of a Gaussian in six dimensions
+_DRAWS: Final = 1000  # of a prior: the best of them lies 0.2 nats below the mode of a Gaussian in six dimensions
 _MAX_VIEWS: Final = 40  # compared with each other, spread over the run: 1,600 pairs take a second
-_MAX_POINTS: Final = 400  # of each: a share of 0.1 is then known to 0.015
-_MIN_POINTS: Final = 200  # that other frames judge, of a frame: its share is then known to 0.02
-_MIN_JUDGED: Final = 100  # points of a frame at which two others look or more: a share of 0.02 is two of them
-_MARGIN_PX: Final = 2  # pixels at depth edges are mixed of what lies before and behind
+_MAX_POINTS: Final = 400  # of each: standard deviation of a share of 0.1 is then 0.015
+_MIN_POINTS: Final = 200  # per frame observed by others: standard deviation of its share is then 0.02
+_MIN_JUDGED: Final = 100  # points of a frame observed by two others or more: a share of 0.02 is two of them
+_MARGIN_PX: Final = 2  # pixels at depth edges mix foreground and background
 _MIN_COSINE: Final = 0.5  # beyond 60° range noise grows with slope
-_NODES: Final = 24  # of quadrature along an axis: shares of 5 % are then known to 0.1 %
+_NODES: Final = 24  # of quadrature along an axis: shares of 5 % are then accurate to 0.1 %
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure of the evidence."""
+    """One value of the evidence."""
 
     value: float
-    """What was found."""
+    """The measured value."""
     limit: float
-    """From which on it speaks against the model."""
+    """Beyond it, the model is not trusted."""
     at_least: bool = False
-    """Whether smaller values speak against it, not larger ones."""
+    """Whether the limit is a lower one."""
 
     @property
     def holds(self) -> bool:
-        """Whether it does not speak against the model."""
+        """Whether the value is within its limit."""
         return self.value >= self.limit if self.at_least else self.value <= self.limit
 
 
 def displacement(views: Mapping[int, RayImage], solution: Solution) -> Figure | None:
-    """Return by how much in m the surface moved most from where the first view saw it, as root mean square.
+    """Return the largest displacement in m of the first view's surface, as root mean square.
 
-    None where there are no two views.
+    None for fewer than two views.
     """
     frames = [frame for frame in solution.trajectory if frame in views]
     if len(frames) < 2 or not len(views[frames[0]].points_m):
@@ -96,7 +95,7 @@ def displacement(views: Mapping[int, RayImage], solution: Solution) -> Figure | 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """The edge whose posterior lies farthest from what its prior expects."""
+    """The edge whose posterior is farthest from its prior."""
 
     source: int
     """Frame number of the source view."""
@@ -104,7 +103,7 @@ class Contradiction:
     """Frame number of the target view."""
     figure: Figure
     """Standard deviations of a Gaussian prior in six dimensions: √(2 Δ), with Δ in nats from the prior's mode to the
-    posterior's mean. Of other densities the same, whatever their shape."""
+    posterior's mean. Defined alike for other densities."""
 
 
 def prior_distances(
@@ -112,13 +111,13 @@ def prior_distances(
 ) -> list[tuple[Edge, float]]:
     """Return edges with the distances Δ, in nats, from the prior's mode to the means of their posteriors.
 
-    Limits of a search, outside of which a density is zero, are those for several steps: motions beyond the limits of
-    one are looked for there. Edges to which the prior does not apply are left out, and those between segments.
+    Limits of a search, outside of which a density is zero, are those for several steps, because the search extends to
+    them. Edges to which the prior does not apply are left out, and those between segments.
 
     Args:
         edges: those that take part.
         views: by frame number.
-        prior: what was known of motions before the images were compared.
+        prior: of the motions.
     """
     found = []
     for edge in edges:
@@ -140,8 +139,8 @@ def prior_distances(
 def _distance_nats(density: AbstractPoseDensity, here: float) -> float:
     """Return how far from the mode of a density, in nats of a Gaussian, a pose of log evidence `here` is.
 
-    Of a Gaussian that is the difference of the logs. What has a wide part of little mass, such as a grasp that may have
-    changed, is as near as it is usual: as likely as that a pose drawn from a Gaussian lies farther out.
+    For a Gaussian it is the difference of the logs. For densities with a wide part of little mass, such as a possible
+    regrasp, it is at most the distance that a pose drawn from a Gaussian exceeds with the same probability.
     """
     drawn = density.sample(_DRAWS, np.random.default_rng(0))
     logs = density.log_evidence(drawn)
@@ -152,7 +151,7 @@ def _distance_nats(density: AbstractPoseDensity, here: float) -> float:
 
 
 def contradiction(distances: Sequence[tuple[Edge, float]]) -> Contradiction | None:
-    """Return the edge whose posterior contradicts the independent knowledge most; None where nothing can be compared.
+    """Return the edge whose posterior contradicts the prior most; None if nothing can be compared.
 
     Args:
         distances: as `prior_distances` returns them.
@@ -164,10 +163,10 @@ def contradiction(distances: Sequence[tuple[Edge, float]]) -> Contradiction | No
 
 
 def prior_figure(distances: Sequence[tuple[Edge, float]]) -> Figure | None:
-    """Return the squared distances of the odometry edges from a Gaussian prior together, a degree of freedom.
+    """Return the mean squared distance of the odometry edges from a Gaussian prior, per degree of freedom.
 
-    A step told wrongly shows in every pair a little. Under a true prior a posterior's mean is nearer to the mode than
-    the motion, whose squared distance follows χ² of six degrees of freedom. None where nothing can be compared.
+    A wrong step shows a little in every pair. Under a true prior, a posterior's mean is nearer to the mode than the
+    motion, whose squared distance follows χ² with six degrees of freedom. None if nothing can be compared.
 
     Args:
         distances: as `prior_distances` returns them.
@@ -180,10 +179,10 @@ def prior_figure(distances: Sequence[tuple[Edge, float]]) -> Figure | None:
 
 
 def loop_figure(openings: Sequence[LoopOpening]) -> tuple[LoopOpening, Figure] | None:
-    """Return the loop that is open farthest in standard deviations, with its limit; None without a loop.
+    """Return the loop with the largest closure error in standard deviations, with its limit; None without a loop.
 
-    NEES of an opening follows χ² of six degrees of freedom; of several loops the largest does with a probability that
-    is at most their number times as large (Bonferroni).
+    The NEES of a closure error follows χ² with six degrees of freedom. For the largest of several loops, the tail
+    probability is at most their number times as large (Bonferroni).
     """
     finite = [opening for opening in openings if np.isfinite(opening.sigmas)]
     if not finite:
@@ -193,7 +192,7 @@ def loop_figure(openings: Sequence[LoopOpening]) -> tuple[LoopOpening, Figure] |
 
 
 def graph_figure(edges: Sequence[Edge], solution: Solution) -> Figure | None:
-    """Return the edges' squared residuals in units of their covariances, a degree of freedom; None for a tree.
+    """Return the edges' squared residuals in units of their covariances, per degree of freedom; None for a tree.
 
     Args:
         edges: those that take part.
@@ -213,10 +212,9 @@ def graph_figure(edges: Sequence[Edge], solution: Solution) -> Figure | None:
 
 
 def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage]) -> Figure:
-    """Return the probability that some pair is at another mode than the heaviest, by the weights that the graph leaves.
+    """Return the probability that some pair is not at its heaviest mode, by the weights after the graph.
 
-    So it is where two segments may lie on each other in another way. Modes that differ by less than what is called an
-    error are one.
+    Alternative alignments of segments count likewise. Modes that differ by less than the error limits are one.
 
     Args:
         edges: those that take part.
@@ -244,18 +242,18 @@ def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, R
 
 @dataclass(frozen=True)
 class Spread:
-    """The frame of whose pose least is known."""
+    """The frame with the most uncertain pose."""
 
     frame: int
     """Frame number."""
     figure: Figure
-    """Standard deviation, see `one_axis_sd`. At the limit a Gaussian is wrong with `WRONG_SHARE`."""
+    """Standard deviation, see `one_axis_sd`. At the limit, a Gaussian is wrong with probability `WRONG_SHARE`."""
     count: int
     """Number of frames beyond the limit."""
 
 
 def misfit(edges: Sequence[Edge], solution: Solution) -> float:
-    """Return by what factor edges err by more than they state, as their residuals tell; 1 where by no more.
+    """Return the factor by which residuals of edges exceed their standard deviations, at least 1.
 
     Args:
         edges: those that take part.
@@ -266,11 +264,11 @@ def misfit(edges: Sequence[Edge], solution: Solution) -> float:
 
 
 def spread_of_rotations(solution: Solution, factor: float = 1.0) -> Spread | None:
-    """Return how uncertain the rotations of the poses are at worst, in degrees; None without a pose.
+    """Return the largest uncertainty of a pose's rotation, in degrees; None without a pose.
 
     Args:
         solution: the poses.
-        factor: of the standard deviations that are stated: `misfit`.
+        factor: on the standard deviations: `misfit`.
     """
     sigmas_deg = {
         frame: float(np.degrees(one_axis_sd(factor**2 * covariance[:3, :3], WRONG_RAD)))
@@ -279,13 +277,13 @@ def spread_of_rotations(solution: Solution, factor: float = 1.0) -> Spread | Non
     return _widest(sigmas_deg, float(np.degrees(WRONG_RAD)))
 
 
-def spread_of_places(views: Mapping[int, RayImage], solution: Solution, factor: float = 1.0) -> Spread | None:
-    """Return how uncertain the places of the surface in the poses are at worst, in m; None without a pose.
+def spread_of_positions(views: Mapping[int, RayImage], solution: Solution, factor: float = 1.0) -> Spread | None:
+    """Return the largest uncertainty of the surface's position in a pose, in m; None without a pose.
 
     Args:
-        views: by frame number; the place is that of a view's centroid.
+        views: by frame number; the position is that of a view's centroid.
         solution: the poses.
-        factor: of the standard deviations that are stated: `misfit`.
+        factor: on the standard deviations: `misfit`.
     """
     sigmas_m = {
         frame: one_axis_sd(factor**2 * se3.covariance_about(covariance, views[frame].centroid_m)[3:, 3:], WRONG_M)
@@ -296,7 +294,7 @@ def spread_of_places(views: Mapping[int, RayImage], solution: Solution, factor: 
 
 
 def spread_by_focal_length(views: Mapping[int, RayImage], solution: Solution, frame: int) -> tuple[float, float]:
-    """Return what not knowing the focal length alone makes of a pose's uncertainty: sd in degrees, and of place in m.
+    """Return a pose's uncertainty due to the focal length alone: sd of rotation in degrees, and of position in m.
 
     Args:
         views: by frame number.
@@ -315,11 +313,11 @@ def spread_by_focal_length(views: Mapping[int, RayImage], solution: Solution, fr
 def one_axis_sd(covariance: Array, wrong: float) -> float:
     """Return the standard deviation of an error along one axis that is wrong as often as a vector (3,).
 
-    Axes that are nearly as uncertain as the least certain one make a vector longer. It is no less than that one's.
+    It is at least that of the least certain axis; other uncertain axes increase it.
 
     Args:
         covariance: (3, 3) of the vector.
-        wrong: length from which on it is wrong.
+        wrong: length above which it is wrong.
     """
     small, middle, large = np.maximum(np.linalg.eigvalsh(covariance), 1e-300)
     nodes, weights = np.polynomial.hermite_e.hermegauss(_NODES)
@@ -331,7 +329,7 @@ def one_axis_sd(covariance: Array, wrong: float) -> float:
 
 
 def _widest(sigmas: Mapping[int, float], wrong: float) -> Spread | None:
-    """Return the largest standard deviation by frame number; `wrong` is the error from which on a pose is wrong."""
+    """Return the largest standard deviation by frame number; `wrong` is the error above which a pose is wrong."""
     limit = wrong / float(-ndtri(WRONG_SHARE / 2.0))
     worst = max(sigmas, key=lambda frame: sigmas[frame], default=None)
     if worst is None:
@@ -340,10 +338,10 @@ def _widest(sigmas: Mapping[int, float], wrong: float) -> Spread | None:
 
 
 def size_figure(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], depth_scale_sigma: float) -> Figure:
-    """Return by how much in m the surface may be off, because nothing tells the scale of depth so well.
+    """Return the uncertainty of the surface in m due to that of the depth scale.
 
-    A model is called wrong where less than 90 % of its surface lies within `WRONG_M`: its reach is the distance from
-    its centre within which 90 % of the points lie.
+    A model is called wrong if less than 90 % of its surface lies within `WRONG_M`: its reach is the distance from its
+    centre within which 90 % of the points lie.
 
     Args:
         views: by frame number.
@@ -362,23 +360,23 @@ def size_figure(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], 
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """What other frames say of the surface of those that they contradict most."""
+    """Free-space violations of the most contradicted frames."""
 
     frame: int
-    """Frame number of the largest share that others see through."""
+    """Number of the frame with the largest share of free-space violations."""
     seen_through: Figure
-    """That share, of all looks at its surface by others and at theirs by it."""
-    bare_frame: int
-    """Frame number of the largest share of surface that is not there."""
+    """That share of all observations of its surface by others and of theirs by it."""
+    contradicted_frame: int
+    """Number of the frame with the largest share of contradicted surface."""
     absent: Figure
-    """That share: points that two frames or more, and most of those that look there, see through."""
+    """That share: points in the free space of two frames or more, and of most of those that observe them."""
 
 
 def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> FreeSpace | None:
-    """Return how far frames see through each other's surface; None where none can be judged.
+    """Return the free-space violations between frames; None if none can be evaluated.
 
-    A surface point of one frame, carried into another, faces that camera. Where the pixel and those around it measured
-    something farther away by more than `WRONG_M`, there is no surface: one of the two poses is wrong.
+    A surface point of one frame is transformed into another, where it faces the camera. If the pixel and those around
+    it measured something farther away by more than `WRONG_M`, there is no surface: one of the two poses is wrong.
 
     Args:
         views: by frame number.
@@ -391,7 +389,7 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -
     looks, absent = np.zeros((len(frames), 2)), np.zeros((len(frames), 2))
     for row, frame in enumerate(frames):
         points_m, normals = _facing(views[frame])
-        tally = np.zeros((2, len(points_m)))  # how many frames see through each point, and see it
+        tally = np.zeros((2, len(points_m)))  # per point: frames with it in free space, frames that see it
         for column, other in enumerate(frames):
             if other != frame:
                 target_from_source = se3.inverse(trajectory[other]) @ trajectory[frame]
@@ -399,7 +397,7 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -
                 beyond_m = _beyond(views[other], reaches_m[other], carried_m, turned)
                 found = np.stack([beyond_m > WRONG_M, np.abs(beyond_m) <= WRONG_M])
                 tally += found
-                looks[[row, column]] += found.sum(axis=1)  # which of the two is wrong, is not known
+                looks[[row, column]] += found.sum(axis=1)  # which of the two is wrong is unknown
         through, judged = tally[0], tally.sum(axis=0) >= 2
         absent[row] = np.sum(judged & (through >= 2) & (through > tally[1])), judged.sum()
     known = looks.sum(axis=1) >= _MIN_POINTS
@@ -438,7 +436,7 @@ def _nearest_around(view: RayImage) -> Array:
 
 
 def _beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> Array:
-    """Return by how much in m a view measured beyond points: (n,), NaN of those that do not face its camera.
+    """Return the distances (n,) in m that a view measured beyond points; NaN for those that do not face its camera.
 
     Args:
         view: the view.

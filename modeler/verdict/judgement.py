@@ -1,4 +1,4 @@
-"""The rules by which a model is trusted: each from evidence, with its threshold and where that comes from."""
+"""The rules by which a model is trusted, each with its evidence, threshold and origin."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ from modeler.verdict.evidence import (
     prior_figure,
     size_figure,
     spread_by_focal_length,
-    spread_of_places,
+    spread_of_positions,
     spread_of_rotations,
 )
 
 _NO_SURFACE: Final = "poses are wrong, masks include more than the object, or it changed its shape"
-_LITTLE_OVERLAP: Final = 0.5  # views farther apart are registered wrongly now and then, and surely so
+_LITTLE_OVERLAP: Final = 0.5  # with less overlap, registrations are sometimes wrong with a small covariance
 
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """What became of one frame."""
+    """The result of one frame."""
 
     id: int
     """Frame number."""
@@ -63,9 +63,9 @@ class FrameRecord:
     points: int
     """Number of surface points on the object."""
     outcome: str
-    """`ACCEPTED`, or in words why the frame was left out."""
+    """`ACCEPTED`, or the reason in words why the frame was left out."""
     cause: str = ""
-    """The same for programs, as `types.code` has it; "" for frames that were accepted."""
+    """The machine-readable reason, from `types.code`; "" for accepted frames."""
     mask: str = Outcome.CONVERGED.label
     """Label of the segmentation's outcome."""
 
@@ -77,7 +77,7 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class Shortcoming:
-    """Why a model is not to be trusted."""
+    """A reason not to trust a model."""
 
     code: str
     """For programs: `doubt`, `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
@@ -93,11 +93,10 @@ class Verdict:
     """Whether a model can be trusted."""
 
     shortcomings: tuple[Shortcoming, ...] = ()
-    """Why not; empty where it can be."""
+    """Reasons not to trust it; empty if it can be trusted."""
     evidence: Mapping[str, Figure] = field(default_factory=dict)
     """Figures by name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `prior_chi2`, `loop_sigmas`,
-    `graph_chi2`, `seen_through`, `absent`, `other_modes`, `pose_sd_deg`, `pose_sd_m` and `size_m`, those that the run
-    has."""
+    `graph_chi2`, `seen_through`, `absent`, `other_modes`, `pose_sd_deg`, `pose_sd_m` and `size_m`, as available."""
 
     @property
     def trustworthy(self) -> bool:
@@ -119,12 +118,12 @@ def judged(
 
     Args:
         step: the latest.
-        frames: what became of every frame so far.
+        frames: results of all frames so far.
         doubts: further reasons in words not to trust it.
         interrupted: whether the user ended the run before its last frame.
         closure_expected: whether the object is known to come back to its start.
-        prior: what was known of motions before the images were compared; None: not known here.
-        depth_scale_sigma: standard deviation of the depth scale's logarithm; 0 = taken for known.
+        prior: of the motions; None: not known here.
+        depth_scale_sigma: standard deviation of the depth scale's logarithm; 0 = exact.
     """
     reasons = [Shortcoming("doubt", words) for words in doubts]
     if interrupted:
@@ -148,7 +147,7 @@ def judged(
 
 @dataclass(frozen=True)
 class _Finding:
-    """A figure of the evidence, and what is said where it speaks against the model."""
+    """A value of the evidence, and the reason given if it exceeds its limit."""
 
     name: str
     figure: Figure
@@ -157,7 +156,7 @@ class _Finding:
 
 
 def _against(found: Sequence[_Finding]) -> list[Shortcoming]:
-    """Return which findings speak against a model, of those with one code the first."""
+    """Return the findings that exceed their limits, the first per code."""
     against = [finding for finding in found if not finding.figure.holds]
     words = {finding.code: finding.words for finding in reversed(against)}
     return [Shortcoming(code, words[code]) for code in dict.fromkeys(finding.code for finding in against)]
@@ -170,9 +169,9 @@ def _found(
 
     Args:
         step: the last.
-        frames: what became of every frame.
+        frames: results of all frames.
         edges: those that take part.
-        prior: what was known of motions.
+        prior: of the motions.
     """
     views, solution, found = step.views, step.solution, []
     accepted = [frame for frame in frames if frame.accepted]
@@ -217,8 +216,8 @@ def _found(
         )
         found.append(_Finding("seen_through", free.seen_through, "seen_through", words))
         words = (
-            f"{100.0 * free.absent.value:.0f} % of the surface of frame {free.bare_frame} is contradicted by most "
-            f"frames that observe it: {_NO_SURFACE}"
+            f"{100.0 * free.absent.value:.0f} % of the surface of frame {free.contradicted_frame} is contradicted by "
+            f"most frames that observe it: {_NO_SURFACE}"
         )
         found.append(_Finding("absent", free.absent, "absent", words))
     others = other_modes(edges, solution, views)
@@ -228,14 +227,14 @@ def _found(
 
 
 def _spreads(step: Step, edges: Sequence[Edge]) -> list[_Finding]:
-    """Return how uncertain the poses of a whole run are."""
+    """Return the uncertainty of the poses of a whole run."""
     found, factor, focal = [], misfit(edges, step.solution), step.solution.focal
     if (turn := spread_of_rotations(step.solution, factor)) is not None:
         words = f"the rotation of frame {turn.frame} is uncertain by {turn.figure.value:.1f}° (one standard deviation)"
         words += f", {turn.count - 1} more by over {turn.figure.limit:.1f}°" if turn.count > 1 else ""
         by_focal_deg, _ = spread_by_focal_length(step.views, step.solution, turn.frame)
         found.append(_explained(_Finding("pose_sd_deg", turn.figure, "unsure_rotation", words), by_focal_deg, focal))
-    if (place := spread_of_places(step.views, step.solution, factor)) is not None:
+    if (place := spread_of_positions(step.views, step.solution, factor)) is not None:
         value_mm, limit_mm = 1000.0 * place.figure.value, 1000.0 * place.figure.limit
         words = f"the position of frame {place.frame} is uncertain by {value_mm:.1f} mm (one standard deviation)"
         words += f", {place.count - 1} more by over {limit_mm:.1f} mm" if place.count > 1 else ""
@@ -245,12 +244,12 @@ def _spreads(step: Step, edges: Sequence[Edge]) -> list[_Finding]:
 
 
 def _explained(spread: _Finding, by_focal: float, focal: FocalLength | None) -> _Finding:
-    """Return how uncertain poses are, with the reason where most of the variance is the focal length's.
+    """Return a finding on the uncertainty of poses, with the reason if the focal length causes most of the variance.
 
     Args:
         spread: the finding.
-        by_focal: standard deviation that the focal length alone makes, in the finding's unit.
-        focal: what is known of the focal length.
+        by_focal: standard deviation caused by the focal length alone, in the finding's unit.
+        focal: estimate of the focal length.
     """
     if focal is None or 2.0 * by_focal**2 < spread.figure.value**2:
         return spread
@@ -259,7 +258,7 @@ def _explained(spread: _Finding, by_focal: float, focal: FocalLength | None) -> 
 
 
 def _size(step: Step, depth_scale_sigma: float) -> list[_Finding]:
-    """Return how uncertain the size of the model is, where the scale of depth is not taken for known."""
+    """Return the uncertainty of the model's size, if the depth scale is not exact."""
     if depth_scale_sigma == 0.0:
         return []
     figure = size_figure(step.views, step.solution.trajectory, depth_scale_sigma)
@@ -271,12 +270,12 @@ def _size(step: Step, depth_scale_sigma: float) -> list[_Finding]:
 
 
 def _left_out(frames: Sequence[FrameRecord], segment_of: Mapping[int, int]) -> list[str]:
-    """Return in words which frames were left out and why, those that follow each other for one reason together.
+    """Return in words which frames were left out and why, consecutive ones with the same reason together.
 
-    Not those between two segments: what is seen there is the object in a hand that puts it down otherwise, if at all.
+    Frames between two segments are not included: they show at most the object in a hand that turns it over.
 
     Args:
-        frames: what became of each.
+        frames: results of all frames.
         segment_of: number of its segment by frame number.
     """
     words, ordered = [], sorted(frames, key=lambda frame: frame.id)
@@ -302,7 +301,7 @@ def _latest(before: int | None, now: int | None) -> int | None:
 
 
 def _open_loop(step: Step, edges: Sequence[Edge], *, closure_expected: bool) -> list[Shortcoming]:
-    """Return why no loop was closed where there should be one.
+    """Return the reason if no loop was closed although one is expected.
 
     Args:
         step: the latest.
@@ -313,9 +312,11 @@ def _open_loop(step: Step, edges: Sequence[Edge], *, closure_expected: bool) -> 
         return []
     closures = [edge for edge in step.edges_so_far if edge.kind == "closure"]
     joining = [edge for edge in closures if edge in edges]
-    refused = [edge for edge in closures if edge not in joining and (closure_expected or _tells(edge, step.solution))]
-    if refused:
-        last = refused[-1]
+    rejected = [
+        edge for edge in closures if edge not in joining and (closure_expected or _is_conclusive(edge, step.solution))
+    ]
+    if rejected:
+        last = rejected[-1]
         why = explain(OptimisationOutlier() if last in step.solution.outliers else last.reason)
         pair = f"frame {last.source} on frame {last.target}"
         words = f"none of {len(closures)} closures closed a loop; the last rejected one, {pair}: {why}"
@@ -336,14 +337,14 @@ def _open_loop(step: Step, edges: Sequence[Edge], *, closure_expected: bool) -> 
 
 
 def _unconfirmed_join(edges: Sequence[Edge]) -> list[Shortcoming]:
-    """Return that segments are joined by a single pair of views, where they are."""
+    """Return the reason if segments are joined by a single pair of views."""
     alone = [edge for edge in edges if edge.kind == "join" and not joined_without(edge, edges)]
     words = "the edge between frames {} and {}, of two segments, is not confirmed by another pair of views"
     return [Shortcoming("unconfirmed", words.format(edge.target, edge.source)) for edge in alone[:1]]
 
 
-def _tells(edge: Edge, solution: Solution) -> bool:
-    """Return whether a refused closure tells anything: far apart, views may share too little surface for one."""
+def _is_conclusive(edge: Edge, solution: Solution) -> bool:
+    """Return whether a rejected closure is conclusive: views far apart may share too little surface for one."""
     bare = isinstance(edge.reason, LowOverlap) or edge.reason == Failed(Outcome.NO_OVERLAP)
     known = edge.source in solution.trajectory and edge.target in solution.trajectory
     near = known and np.degrees(se3.rotation_angle(solution.relative(edge.target, edge.source))) <= NEAR_DEG
@@ -351,9 +352,9 @@ def _tells(edge: Edge, solution: Solution) -> bool:
 
 
 def _came_back(solution: Solution) -> tuple[int, int] | None:
-    """Return the frame that comes nearest to the first view again after the object had turned away, and the first.
+    """Return the frame nearest to the first view after the object had turned away, and the first frame.
 
-    None where no frame comes near.
+    None if no frame comes near.
     """
     first, *frames = sorted(solution.trajectory) or [0]
     angles_deg = np.array([np.degrees(se3.rotation_angle(solution.relative(first, frame))) for frame in frames])
@@ -366,7 +367,7 @@ def _came_back(solution: Solution) -> tuple[int, int] | None:
 
 
 def _little_overlap(edges: Sequence[Edge]) -> list[Shortcoming]:
-    """Return which views share little surface, and are joined by nothing else."""
+    """Return the reasons for pairs of views that share little surface and are joined by no other edge."""
     return [
         Shortcoming(
             "little_overlap",

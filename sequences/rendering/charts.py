@@ -167,7 +167,7 @@ class Unwrapped:
         """Return the charts of a mesh.
 
         Raises:
-            InputError: where the mesh has no texture coordinates.
+            InputError: if the mesh has no texture coordinates.
         """
         if mesh.uv is None:
             raise InputError("the object has no texture coordinates; give a mesh file that has, or another wrap.")

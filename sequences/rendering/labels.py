@@ -157,7 +157,7 @@ class Embedded:
         """Return what is printed on a chart (h, w, 3), in sRGB, 0 to 1.
 
         Raises:
-            InputError: where the mesh has none.
+            InputError: if the mesh has none.
         """
         if mesh.picture is None:
             raise InputError("the object's file holds no image; give a GLB file with one, or a picture.")

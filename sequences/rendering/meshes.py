@@ -86,7 +86,7 @@ class Mesh:
 
 
 def _joined_uv(meshes: list[Mesh]) -> Array | None:
-    """Return the texture coordinates (t, 3, 2) of several meshes; None where no mesh has any."""
+    """Return the texture coordinates (t, 3, 2) of several meshes; None if no mesh has any."""
     if all(mesh.uv is None for mesh in meshes):
         return None
     return np.concatenate(
@@ -116,7 +116,7 @@ def read_mesh(path: Path, scale: float, *, textured: bool = False) -> Mesh:
         textured: whether its texture coordinates and the image in it are wanted.
 
     Raises:
-        InputError: where the file is missing, cannot be read or holds no triangle.
+        InputError: if the file is missing, cannot be read or holds no triangle.
     """
     import trimesh  # slow to import, and only needed here
 
@@ -138,7 +138,7 @@ def _texture(visual: object) -> tuple[Array | None, npt.NDArray[np.uint8] | None
     """Return the texture coordinates (v, 2) and the image (h, w, 3) of what trimesh read; None for what is not there.
 
     Raises:
-        ValueError: where the image has too many pixels.
+        ValueError: if the image has too many pixels.
     """
     uv, material = getattr(visual, "uv", None), getattr(visual, "material", None)
     images = [getattr(material, name, None) for name in ("baseColorTexture", "image")]
@@ -167,7 +167,7 @@ class Hits:
     albedo: npt.NDArray[np.uint8]
     """(h, w, 3) RGB of what was met."""
     triangle: IntArray
-    """(h, w) number of the triangle that was met; 0 where nothing was."""
+    """(h, w) number of the triangle that was met; 0 if nothing was."""
     weights: Array
     """(h, w, 3) barycentric coordinates in it."""
 

@@ -29,7 +29,7 @@ def build(annotation: object, node: Node) -> typing.Any:
         node: what the file says.
 
     Raises:
-        InputError: where a value has the wrong type or a key is unknown.
+        InputError: if a value has the wrong type or a key is unknown.
     """
     origin, choices = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
@@ -258,7 +258,7 @@ def load_recipe(recipe: str | Path) -> Recipe:
     """Return a recipe from a JSON or TOML file, or a built-in one by its name.
 
     Raises:
-        InputError: where there is no such recipe or it is not understood.
+        InputError: if there is no such recipe or it is not understood.
     """
     path = Path(recipe)
     if not path.is_file() and path.name == str(recipe) and not path.suffix:

@@ -107,7 +107,7 @@ class RenderedSequence(AbstractSequence):
         return outer_surface(self._mesh)
 
     def robot_readings(self) -> Array | None:
-        """Return camera_from_hand (n, 4, 4) as the robot reads it; None where no robot holds the object."""
+        """Return camera_from_hand (n, 4, 4) as the robot reads it; None if no robot holds the object."""
         trajectory = self.recipe.trajectory
         if not isinstance(trajectory, Hand) or trajectory.robot is None:
             return None
@@ -231,7 +231,7 @@ def render(
         through: what the frames pass on their way, say something that counts them.
 
     Raises:
-        InputError: where the folder is not empty or cannot be written.
+        InputError: if the folder is not empty or cannot be written.
     """
     sequence = RenderedSequence(recipe)
     files = {"model.ply": ply_bytes(sequence.model())}

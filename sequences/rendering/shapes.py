@@ -75,7 +75,7 @@ def ear_clipped(outline: Array) -> IntArray:
     """Return triangles (p - 2, 3) of a simple polygon (p, 2), counter-clockwise.
 
     Raises:
-        ValueError: where the polygon crosses itself or runs clockwise.
+        ValueError: if the polygon crosses itself or runs clockwise.
     """
     left = list(range(len(outline)))
     triangles: list[list[int]] = []

@@ -50,7 +50,7 @@ def from_bz2(data: bytes, most: int = MAX_BYTES) -> bytes:
     """Return what was packed.
 
     Raises:
-        ValueError: where that is more than `most` bytes, or cut off.
+        ValueError: if that is more than `most` bytes, or cut off.
     """
     unpacker = bz2.BZ2Decompressor()
     return _whole(unpacker.decompress(data, most + 1), ended=unpacker.eof, most=most)
@@ -60,7 +60,7 @@ def from_lz4(data: bytes, most: int = MAX_BYTES) -> bytes:
     """Return what was packed.
 
     Raises:
-        ValueError: where that is more than `most` bytes, or cut off.
+        ValueError: if that is more than `most` bytes, or cut off.
     """
     unpacker = lz4.frame.LZ4FrameDecompressor()
     unpacked = unpacker.decompress(data, most + 1)
@@ -71,7 +71,7 @@ def from_zstd(data: bytes, most: int = MAX_BYTES) -> bytes:
     """Return what was packed.
 
     Raises:
-        ValueError: where that is more than `most` bytes, cut off, or not packed by zstd.
+        ValueError: if that is more than `most` bytes, cut off, or not packed by zstd.
     """
     unpacked, ended = b"", False
     while data:
@@ -106,7 +106,7 @@ def check_file(path: Path) -> None:
     """Refuse a file packed by zstd that would unpack to something enormous; other files are not checked.
 
     Raises:
-        ValueError: where it would.
+        ValueError: if it would.
     """
     with open_regular(path) as packed:
         if not is_zstd(packed.read(len(_ZSTD))):
@@ -186,7 +186,7 @@ class Bag:
             most: largest number of messages.
 
         Raises:
-            InputError: where the bag is broken.
+            InputError: if the bag is broken.
         """
         with input_errors(self.path, "bag", self._advice):
             stamp = Stamp(-1)
@@ -201,7 +201,7 @@ class Bag:
         """Return one message.
 
         Raises:
-            InputError: where the bag is broken.
+            InputError: if the bag is broken.
         """
         with input_errors(self.path, "bag", self._advice):
             start = stamp.received_ns
@@ -281,7 +281,7 @@ def _check_start(path: Path) -> None:
     """Refuse a file that does not start as a bag of ROS 1: the library would look for the end of its first line.
 
     Raises:
-        ValueError: where it does not.
+        ValueError: if it does not.
     """
     with open_regular(path) as file:
         if not file.read(len(_ROS1)).startswith(_ROS1):

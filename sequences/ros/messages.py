@@ -51,7 +51,7 @@ def depth_m(message: Any, unit_mm: float, where: str) -> npt.NDArray[np.float32]
         where: the bag and the topic, for error messages.
 
     Raises:
-        InputError: where the message contradicts itself.
+        InputError: if the message contradicts itself.
     """
     if not is_depth(message):
         raise InputError(f"{where}: is {_kind(message)} where images before it are depth; record it anew.")
@@ -71,7 +71,7 @@ def colour(message: Any, where: str) -> npt.NDArray[np.uint8]:
     """Return colour (h, w, 3) as RGB of an image for which `is_colour`.
 
     Raises:
-        InputError: where the message contradicts itself.
+        InputError: if the message contradicts itself.
     """
     if not is_colour(message):
         raise InputError(f"{where}: is {_kind(message)} where images before it are colour; record it anew.")
@@ -117,7 +117,7 @@ def lens(message: Any, where: str, *, ros1: bool) -> Lens:
     """Return the camera that a CameraInfo message describes.
 
     Raises:
-        InputError: where it is not calibrated, or is no pinhole camera with common distortion.
+        InputError: if it is not calibrated, or is no pinhole camera with common distortion.
     """
     matrix = np.asarray(message.K if ros1 else message.k, dtype=np.float64)
     distortion = np.asarray(message.D if ros1 else message.d, dtype=np.float64)

@@ -22,7 +22,7 @@ MOST = 1000
 
 
 def static_transform(bag: Bag, target: str, source: str) -> Array | None:
-    """Return target_from_source (4, 4), in m, between two frames; None where no fixed transforms lead there.
+    """Return target_from_source (4, 4), in m, between two frames; None if no fixed transforms lead there.
 
     Args:
         bag: with a topic `tf_static`.
@@ -74,7 +74,7 @@ _STREAM = r"(/device_\d+/sensor_\d+)/\w+"
 
 
 def realsense_unit_mm(bag: Bag, topic: str) -> tuple[float, str] | None:
-    """Return the millimetres in one unit of depth and the topic that says so; None where nothing does."""
+    """Return the millimetres in one unit of depth and the topic that says so; None if nothing does."""
     sensor = re.match(_STREAM, topic)
     if sensor is None:
         return None
@@ -91,7 +91,7 @@ def realsense_lens(bag: Bag, topic: str) -> Lens | None:
     """Return the camera of a topic from a text message, as version 2.58 writes it; None without.
 
     Raises:
-        InputError: where the text describes no camera.
+        InputError: if the text describes no camera.
     """
     stream = re.match(_STREAM, topic)
     name = None if stream is None else f"{stream[0]}/camera_info"
@@ -114,7 +114,7 @@ def realsense_colour_from_depth(bag: Bag, colour_topic: str, depth_topic: str) -
     """Return the motion (4, 4), in m, from the depth to the colour camera; None if unknown.
 
     Raises:
-        InputError: where it is not rigid.
+        InputError: if it is not rigid.
     """
     poses = [_from_reference(bag, topic) for topic in (colour_topic, depth_topic)]
     colour, depth = poses

@@ -34,7 +34,7 @@ def choose_depth_topic(bag: Bag, first: Mapping[str, Any], overrides: Overrides)
     """Return the topic of depth images.
 
     Raises:
-        InputError: where there is none, or several.
+        InputError: if there is none, or several.
     """
     found = [topic for topic, message in first.items() if messages.is_depth(message)]
     if overrides.depth_topic is not None:
@@ -58,7 +58,7 @@ def depth_lens(bag: Bag, topic: str, image: Any, overrides: Overrides) -> Lens:
     """Return the camera of a topic.
 
     Raises:
-        InputError: where it is unknown.
+        InputError: if it is unknown.
     """
     if overrides.intrinsics is not None:
         if image.__msgtype__ == messages.IMAGE:
@@ -94,7 +94,7 @@ class ColourSource:
     topic: str
     """Topic of the images."""
     alignment: Alignment | None
-    """Where their camera is; None where they have the depth camera's pixels."""
+    """Where their camera is; None if they have the depth camera's pixels."""
 
 
 def colour_source(
@@ -109,7 +109,7 @@ def colour_source(
         overrides: values that take precedence over the bag.
 
     Raises:
-        InputError: where the topic asked for holds none.
+        InputError: if the topic asked for holds none.
     """
     found = [topic for topic, message in first.items() if messages.is_colour(message)]
     if overrides.colour_topic is not None:
@@ -232,7 +232,7 @@ def open_ros(path: Path, overrides: Overrides) -> RosSequence:
     """Open a bag; topics of depth and colour are recognised from their messages.
 
     Raises:
-        InputError: where it is no bag, or lacks depth images or their camera.
+        InputError: if it is no bag, or lacks depth images or their camera.
     """
     bag = Bag(path)
     first = first_images(bag)

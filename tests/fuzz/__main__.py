@@ -39,7 +39,7 @@ MAX_BYTES = 6 << 30
 
 
 def main() -> int:
-    """Fuzz and return the exit status: 0 where nothing was found."""
+    """Fuzz and return the exit status: 0 if nothing was found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--inputs", type=int, default=100_000, help="how many in all")
     parser.add_argument("--seed", type=int, default=0)

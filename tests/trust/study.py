@@ -56,7 +56,7 @@ class Outcome:
     evidence: Mapping[str, tuple[float | None, float | None]]
     """Value and limit by name."""
     error_deg: float | None
-    """Largest rotation error of a pose against the first; None where some have no truth or none was placed."""
+    """Largest rotation error of a pose against the first; None if some have no truth or none was placed."""
     error_m: float | None
     """Largest error of the object's place, likewise."""
     f_score: float | None
@@ -89,7 +89,7 @@ def outcome(plan: Plan, look: Look = lambda plan, recorded, step: None) -> Outco
 
     Args:
         plan: of the run.
-        look: is shown the plan, what was recorded, and the last step; None where the input was refused.
+        look: is shown the plan, what was recorded, and the last step; None if the input was refused.
     """
     stage = plan.stage()
     recorded = Recorded(stage)
@@ -126,7 +126,7 @@ def _built(plan: Plan, recorded: Recorded) -> tuple[Step, dict[str, Any]]:
     """Return the last step of a run and its report.
 
     Raises:
-        InputError: where the input cannot be used.
+        InputError: if the input cannot be used.
     """
     told = recorded.stage.told
     modeler = compose.modeler(recorded, told, MethodOptions(seed=plan.seed), ObjectOptions())
@@ -153,7 +153,7 @@ def pose_errors(recorded: Recorded, step: Step) -> tuple[float | None, float | N
     The place is where the surface that a frame shows lands in the object: with depth or intrinsics stated wrongly, what
     the frame is said to show lands there, and the true surface where it truly belongs.
 
-    None where a frame in the model shows another object, or none is in it.
+    None if a frame in the model shows another object, or none is in it.
     """
     trajectory, truth = step.solution.trajectory, recorded.truth()
     if not trajectory or any(frame not in truth for frame in trajectory):

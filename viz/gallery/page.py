@@ -50,7 +50,7 @@ def write_gallery(
         links: addresses by name, relative to the page.
 
     Raises:
-        InputError: where the file cannot be written.
+        InputError: if the file cannot be written.
     """
     models = [
         {

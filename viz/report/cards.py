@@ -169,7 +169,7 @@ _DOT: Final = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])  # pixels of a point
 
 @dataclass(frozen=True)
 class Thumbnails:
-    """Small pictures of a frame as JPEG; None where there is nothing to show."""
+    """Small pictures of a frame as JPEG; None if there is nothing to show."""
 
     outlined: bytes | None
     """What the camera saw around the object, which is outlined, in colour or else its depth."""
@@ -199,7 +199,7 @@ def _of_frame(rows: Mapping[str, Row]) -> Thumbnails:
 
 
 def _picture(row: Row) -> Image.Image | None:
-    """Return the picture of a row; None where it has none."""
+    """Return the picture of a row; None if it has none."""
     blob = row.get("blob")
     return None if blob is None else Image.open(io.BytesIO(bytes(blob.values[0].values.to_numpy())))
 

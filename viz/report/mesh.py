@@ -36,7 +36,7 @@ class Mesh:
     colours: npt.NDArray[np.uint8] | None
     """(v, 3) RGB, where the input had colour."""
     certainty: npt.NDArray[np.uint8] | None
-    """(v, 3) RGB of the sd of each vertex, pink where no view saw it; None where it is unknown."""
+    """(v, 3) RGB of the sd of each vertex, pink where no view saw it; None if it is unknown."""
     total: int
     """Number of triangles before the mesh was made coarser."""
 
@@ -52,7 +52,7 @@ class Mesh:
 
 
 def read_mesh(path: Path) -> Mesh | None:
-    """Return the mesh of a PLY file; None where there is none that can be drawn."""
+    """Return the mesh of a PLY file; None if there is none that can be drawn."""
     try:
         model = read_model(path)
     except InputError:

@@ -38,7 +38,7 @@ class Result:
         """Read a run folder.
 
         Raises:
-            InputError: where there is no run, or no frame of it was accepted.
+            InputError: if there is no run, or no frame of it was accepted.
         """
         report = RunFolder(path).report()
         if not report["poses"]:
@@ -67,13 +67,13 @@ class Result:
         return next(iter(self.poses))
 
     def true_pose(self, frame: int) -> Array | None:
-        """Return the true object_from_camera (4, 4) of a frame; None where it is not known."""
+        """Return the true object_from_camera (4, 4) of a frame; None if it is not known."""
         if frame not in self.truth or self.first not in self.truth:
             return None
         return self.truth[self.first] @ se3.inverse(self.truth[frame])
 
     def true_motion(self, edge: Edge) -> Array | None:
-        """Return the true target_from_source (4, 4) of an edge; None where it is not known."""
+        """Return the true target_from_source (4, 4) of an edge; None if it is not known."""
         if edge.source not in self.truth or edge.target not in self.truth:
             return None
         return self.truth[edge.target] @ se3.inverse(self.truth[edge.source])
@@ -108,14 +108,14 @@ def recorded(recording: Path) -> dict[str, dict[int, dict[str, Any]]]:
 
 
 def registered(caption: Row) -> tuple[int, int] | None:
-    """Return the numbers of a pair's frames, the newer first, as its caption names them; None where there is none."""
+    """Return the numbers of a pair's frames, the newer first, as its caption names them; None if there is none."""
     words = " ".join(map(str, caption["labels"].as_py())) if "labels" in caption else ""
     numbers = re.findall(r"frame (\d+)", words)
     return (int(numbers[0]), int(numbers[1])) if len(numbers) == 2 else None
 
 
 def cloud(row: Row) -> tuple[Array, npt.NDArray[np.uint8]] | None:
-    """Return points (n, 3) in m and colours (n, 3) of a row; None where it has none."""
+    """Return points (n, 3) in m and colours (n, 3) of a row; None if it has none."""
     if "positions" not in row or "colors" not in row:
         return None
     points = np.array(row["positions"].as_py(), dtype=np.float64).reshape(-1, 3)

@@ -1,7 +1,7 @@
-"""The edge that registering a view not yet taken would give: Laplace's approximation of the likelihood there.
+"""Predicts the edge of a view not yet taken, by Laplace's approximation of the likelihood.
 
-The view's points are those of the model that its camera would see; they are looked up in the images of earlier views
-by the likelihood itself. What the model does not know takes part in neither.
+The view's points are those of the model that are visible to its camera; the registration's likelihood looks them up in
+the images of earlier views. Unobserved surface is not part of this.
 """
 
 from __future__ import annotations
@@ -31,46 +31,48 @@ from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, Input
 USUAL_NOISE: Final = 0.66
 """Noise b of matching surfaces before there is an edge, of the sensor's along the ray: 0.59 to 0.70 for 7 shapes."""
 USUAL_SCALE: Final = 1.7
-"""Information of an edge over what is predicted, before there is one: 1.6 to 1.9 for 6 shapes that determine a pose."""
+"""Actual over predicted information of an edge, before there is one: 1.6 to 1.9 for 6 shapes that determine a pose."""
 EVEN_ODDS_DEG, ODDS_DEG = 106.0, 21.0
-"""Rotation between views at which a registration fails or is surely wrong as often as not, and over which the odds
-change e-fold: a logistic fit to 475 steps over 48 rendered shapes of the tuning half, 42 of which failed."""
+"""Rotation between views at which half of the registrations fail or are clearly wrong, and over which the odds change
+e-fold: a logistic fit to 475 steps over 48 rendered shapes of the tuning half, 42 of which failed."""
 _PATCHES: Final = 32  # into which the registration divides a surface (`Refiner.halvings`)
 TURNS_RAD: Final = np.radians(3.0) * np.arange(-60, 60)
-"""Turns from the true pose about the table's normal at which the likelihood is asked: a posterior's width apart."""
+"""Turns from the true pose about the table's normal, a posterior's width apart, for the likelihood."""
 _TRUE: Final = 60
-_FORESEEN: Final = 0.3
-"""Share of what is predicted that a view tells between modes: so tempered, the true mode's mass is right on average.
+_MODE_TEMPER: Final = 0.3
+"""Tempering of the predicted likelihood between modes, so that the true mode's mass is right on average.
 
-Of 175 steps over 35 shapes of the tuning half the true mode is given 0.76 untempered and 0.61 tempered; views that were
-taken give it 0.63."""
-_CORE_RAD: Final = np.radians(6.0)  # two steps: turns so near the true pose are what the local Gaussian is about
+Over 175 steps of 35 shapes of the tuning half, the predicted mass of the true mode is 0.76 untempered and 0.61
+tempered; realised 0.63."""
+_CORE_RAD: Final = np.radians(6.0)  # two steps: nearer turns are described by the local Gaussian
 _DESCENT_STEPS: Final = (
-    4  # along the table: with 2 or 8, 13 of 14 shapes get the same masses to 0.03; with none, others
+    4  # along the table: with 2 or 8, the masses of 13 of 14 shapes are the same to 0.03; with none they differ
 )
-_DESCENT_NOISE: Final = 0.05  # noise of matching surfaces in them, of the object's size; as good are 0.02 and 0.1
-_LARGEST_STEP_RAD: Final = 0.1  # no step turns, which the damping forbids
-_VALLEY: Final = np.exp(-2.0)  # of a mode's peak: what separates two Gaussians two standard deviations apart each
-_MAX_EDGES: Final = 6  # newest edges by which predictions are scaled: their scatter is about a factor of two
+_DESCENT_NOISE: Final = (
+    0.05  # noise of matching surfaces in these steps, relative to the object's size; 0.02 and 0.1 are as good
+)
+_LARGEST_STEP_RAD: Final = 0.1  # steps do not rotate, because of the damping
+_VALLEY: Final = np.exp(-2.0)  # relative to a mode's peak: separates two Gaussians two standard deviations apart each
+_MAX_EDGES: Final = 6  # newest edges used to scale predictions; they scatter by about a factor of two
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class ForeseenView:
-    """A view that was not taken: what the model shows its camera."""
+class PredictedView:
+    """A view not yet taken, predicted from the model."""
 
     image: RayImage
-    """Its points, as far as they are known; it has no picture."""
+    """Its visible known points; it has no images."""
     points: Array
     """(n, 9), see `point_rows`."""
     weight: float
-    """How many points of a real view each of them stands for."""
+    """Number of points of a real view that each of them represents."""
     unseen_m: Array
     """(u, 3) places in its camera where it may see new surface."""
     unseen_normals: Array
     """(u, 3) unit normals there."""
     unseen_share: float
-    """Share (0..1) of its points that are new."""
+    """New share (0..1) of its points."""
     normal_variance: float
     """Variance in each tangent direction of the noise that its normals share with those of earlier views."""
     axis_m: Array
@@ -79,8 +81,8 @@ class ForeseenView:
 
 @final
 @dataclass(frozen=True, eq=False)
-class ForeseenEdge:
-    """What registering a foreseen view with another would give."""
+class PredictedEdge:
+    """The predicted edge between a view not yet taken and another."""
 
     target: int
     """Frame number of the other."""
@@ -89,20 +91,20 @@ class ForeseenEdge:
     masses: Array
     """(t,) probabilities, which sum to 1, that the registration places the view at each of `TURNS_RAD`."""
     right: float
-    """Probability (0..1) that it finds the true pose: by the modes' masses, and by how far the views are apart."""
+    """Probability (0..1) of finding the true pose, from the modes' masses and the rotation between the views."""
     usable: float
-    """Probability (0..1) that it finds one of the modes: by how far the views are apart."""
+    """Probability (0..1) of finding one of the modes, from the rotation between the views."""
     mode_nats: float
     """Entropy of the modes' weights."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class ColourForecast:
-    """What colours have told in the pairs so far, which they are expected to tell again."""
+class ColourInformation:
+    """Information from colour in the pairs so far, which is expected of further pairs."""
 
     matrix: Array
-    """(6, 6) sensitivity of their matches, a point of the pair, for ξ about the object's middle in the camera."""
+    """(6, 6) sensitivity of their matches per point of the pair, for ξ about the object's middle in the camera."""
     losses: Array
     """(t,) nats by which they contradict turns about the table's normal, see `TURNS_RAD`; at most 0."""
     explained: float
@@ -111,17 +113,17 @@ class ColourForecast:
 
 @final
 @dataclass(frozen=True, eq=False)
-class EdgeForecast:
-    """Predicts edges, with what the edges so far tell of the camera and the object."""
+class EdgePredictor:
+    """Predicts edges, with parameters learned from the edges so far."""
 
     likelihood: VisibilityLikelihood = field(default_factory=VisibilityLikelihood)
     """That of the registration."""
     noise_m: float = 0.0
     """Noise b of matching surfaces (method.md, eq. 8), the median of the edges so far."""
     scale: float = USUAL_SCALE
-    """Information of edges so far over what is predicted for them."""
-    colour: ColourForecast | None = None
-    """What colours tell; None where none have been compared yet."""
+    """Actual over predicted information of the edges so far."""
+    colour: ColourInformation | None = None
+    """Information from colour; None if no colours have been compared yet."""
 
     def learned(
         self,
@@ -132,15 +134,15 @@ class EdgeForecast:
         ready: Callable[[RayImage], RayImage],
         *,
         axis: tuple[Array, Array],
-    ) -> EdgeForecast:
-        """Return the forecast with noise and scale from the newest edges (method.md, eq. N4).
+    ) -> EdgePredictor:
+        """Return the predictor with noise and scale from the newest edges (method.md, eq. N4).
 
-        One edge more counts, whose information is that of usual ones: it is all that is known before the first.
+        One typical edge is added, which is the prior before the first edge.
 
         Args:
             edges: those so far.
             views: by frame number.
-            solution: tells which edges take part.
+            solution: determines which edges take part.
             prior: of the run.
             ready: returns a view with the images that a likelihood looks up.
             axis: (3,) point and (3,) direction of the axis of turns in the object frame.
@@ -170,35 +172,40 @@ class EdgeForecast:
                 camera_from_object = se3.inverse(solution.trajectory[edge.source])
                 axis_m = se3.transform(camera_from_object, axis[0][None])[0]
                 colours.append(
-                    _colour_told(
+                    _colour_information(
                         pair, pose.mean, noise, matrix[0], axis_m=axis_m, up=camera_from_object[:3, :3] @ axis[1]
                     )
                 )
             known = prior_information(prior, views[edge.source], views[edge.target], pair.centre_m)
             actual = inverted(se3.covariance_about(pose.covariance, pair.centre_m))
             scales.append(_log_scale(information, known, actual))
-        colour = ColourForecast(*(np.mean(part, axis=0) for part in zip(*colours, strict=True))) if colours else None
+        colour = ColourInformation(*(np.mean(part, axis=0) for part in zip(*colours, strict=True))) if colours else None
         return replace(self, noise_m=float(np.median(noises_m)), scale=float(np.exp(np.mean(scales))), colour=colour)
 
     def independent(self, patches: float) -> float:
         """Return the number of independent measurements in a pair's points (method.md, eq. N3).
 
-        n of the tempered likelihood (eq. 7), and those of the refinement (eq. 14) where residuals are as stated.
+        n of the tempered likelihood (eq. 7), and those of the refinement (eq. 14) with residuals as predicted.
         """
         tempered = 1.0 / (1.0 / self.likelihood.max_independent + 1.0 / patches)
         return tempered + visible_share(patches / _PATCHES) * patches
 
     def edge(
-        self, source: ForeseenView, target: RayImage, target_from_source: Array, density: AbstractPoseDensity, up: Array
-    ) -> ForeseenEdge | None:
-        """Return the edge between a foreseen view and another; None where the motion is beyond the prior.
+        self,
+        source: PredictedView,
+        target: RayImage,
+        target_from_source: Array,
+        density: AbstractPoseDensity,
+        up: Array,
+    ) -> PredictedEdge | None:
+        """Return the edge between a predicted view and another; None if the motion is beyond the prior.
 
         Args:
-            source: what would be seen.
+            source: the predicted view.
             target: an earlier view with the images that a likelihood looks up.
             target_from_source: (4, 4) expected.
             density: of target_from_source before the images are compared.
-            up: (3,) unit normal of the table in the source's camera, about which other modes are looked for.
+            up: (3,) unit normal of the table in the source's camera, about which other modes are searched.
         """
         if not np.isfinite(density.log_density(target_from_source[None])[0]):
             return None
@@ -210,36 +217,36 @@ class EdgeForecast:
             2.0 * source.weight * matched(directed, target_from_source, self.noise_m, centre_m, source.normal_variance)
         )
         patches = max(target.patches, 1.0)
-        poses, told, before, explained = self._turned(directed, source, target_from_source, density, up)
+        poses, log_likelihoods, log_priors, explained = self._turned(directed, source, target_from_source, density, up)
         if self.colour is not None:
             alike = min(explained / max(self.colour.explained, 1e-9), 1.0)
             matrix = matrix + alike * points * self.colour.matrix
-            told = told + alike * self.colour.losses
+            log_likelihoods = log_likelihoods + alike * self.colour.losses
         information = self.scale * self.independent(patches) / points * matrix
         known = density_information(density, centre_m)
         local = inverted(information + known)
         away = se3.difference(target_from_source, poses, centre_m)
-        stated = normalised(told + before) * (np.abs(TURNS_RAD) > _CORE_RAD)  # nearer ones are the local Gaussian
-        spread = local + (away.T * stated) @ away
-        share = normalised(_FORESEEN * told + before)
-        offsets_rad, masses = basins(TURNS_RAD, _FORESEEN * told + before)
+        posterior = normalised(log_likelihoods + log_priors) * (np.abs(TURNS_RAD) > _CORE_RAD)  # nearer: `local`
+        spread = local + (away.T * posterior) @ away
+        share = normalised(_MODE_TEMPER * log_likelihoods + log_priors)
+        offsets_rad, masses = basins(TURNS_RAD, _MODE_TEMPER * log_likelihoods + log_priors)
         angle_deg = float(np.degrees(se3.rotation_angle(target_from_source)))
         usable = 1.0 / (1.0 + float(np.exp((angle_deg - EVEN_ODDS_DEG) / ODDS_DEG)))
         own = usable * float(masses[np.argmin(np.abs(offsets_rad))])
         entropy = float(-np.sum(masses * np.log(np.maximum(masses, 1e-12))))
-        return ForeseenEdge(target.index, se3.covariance_about(spread, -centre_m), share, own, usable, entropy)
+        return PredictedEdge(target.index, se3.covariance_about(spread, -centre_m), share, own, usable, entropy)
 
     def _turned(
         self,
         directed: DirectedLikelihood,
-        source: ForeseenView,
+        source: PredictedView,
         target_from_source: Array,
         density: AbstractPoseDensity,
         up: Array,
     ) -> tuple[Array, Array, Array, float]:
-        """Return the poses (t, 4, 4) that match best at `TURNS_RAD`, and log masses (t,) by the images and before them.
+        """Return the poses (t, 4, 4) that match best at `TURNS_RAD`, with log-likelihoods (t,) and log priors (t,).
 
-        The last is the share of points that match at the true pose.
+        The last value is the share of matching points at the true pose.
         """
         pair = PairLikelihood(directed, replace(directed, points=directed.points[:0]), directed.size_m)
         poses = turned(pair, target_from_source, source.axis_m, up)
@@ -249,18 +256,18 @@ class EdgeForecast:
         found = scores.scores(rows(poses), projection, nothing, parameters, parameters)
         sums = source.weight * found / self.likelihood.points  # a point, in the mean of both directions
         independent = 1.0 / (1.0 / self.likelihood.max_independent + 1.0 / max(directed.image.patches, 1.0))
-        alike = sums[:, 1] + np.where(TURNS_RAD == 0.0, 0.0, self._mistaken(source, poses))
+        alike = sums[:, 1] + np.where(TURNS_RAD == 0.0, 0.0, self._confusable_share(source, poses))
         costs = [np.exp(-share / self.likelihood.overlap_scale) for share in (sums[:, 1], alike)]
         costs = [self.likelihood.no_overlap_cost * cost for cost in costs]
         looks = np.logaddexp(-costs[0], -costs[1]) - np.log(2.0)
-        told = independent * sums[:, 0] + looks  # method.md, eq. 7 and N7
-        return poses, told, density.log_density(poses), float(sums[_TRUE, 1])
+        log_likelihoods = independent * sums[:, 0] + looks  # method.md, eq. 7 and N7
+        return poses, log_likelihoods, density.log_density(poses), float(sums[_TRUE, 1])
 
-    def _mistaken(self, source: ForeseenView, poses: Array) -> Array:
-        """Return the share (n,) of a view's points, new surface, that could be taken for what the other view saw.
+    def _confusable_share(self, source: PredictedView, poses: Array) -> Array:
+        """Return the share (n,) of a view's points that are new surface and could match the other view by mistake.
 
-        New surface that faces the other camera would match if it were like what is known; at the true pose it is
-        hidden there.
+        New surface that faces the other camera would match if it resembled the known surface; at the true pose it is
+        occluded there.
         """
         if not len(source.unseen_m):
             return np.zeros(len(poses))
@@ -274,8 +281,8 @@ class EdgeForecast:
 def turned(pair: PairLikelihood, target_from_source: Array, axis_m: Array, up: Array) -> Array:
     """Return the poses (t, 4, 4) at `TURNS_RAD` from a pose (4, 4) that match best.
 
-    A body of revolution looks alike at turns about its own axis, which need not be the middle of what was seen of it:
-    matching surface moves each turned pose along the table.
+    A body of revolution looks alike at turns about its own axis, which may differ from the middle of the observed
+    surface: each turned pose is moved along the table to match.
 
     Args:
         pair: the likelihood.
@@ -294,10 +301,10 @@ def turned(pair: PairLikelihood, target_from_source: Array, axis_m: Array, up: A
     return poses
 
 
-def _colour_told(
+def _colour_information(
     pair: PairLikelihood, pose: Array, noise: MatchNoise, matrix: Array, *, axis_m: Array, up: Array
 ) -> tuple[Array, Array, float]:
-    """Return what a `ColourForecast` has, of one pair at its pose (4, 4), whose matches have a matrix (6, 6) in all."""
+    """Return the fields of a `ColourInformation` of a pair at its pose (4, 4); matrix (6, 6): of all its matches."""
     _, of_depth = pair.normal_equations(pose[None], MatchNoise(noise.surface_m), stride=1)
     found = pair.scores(turned(pair, pose, axis_m, up), noise.surface_m, stride=1)
     gains = np.minimum(found.colours - found.colours[_TRUE], 0.0)
@@ -314,7 +321,7 @@ def matched(
         target_from_source: (4, 4).
         noise_m: noise b of matching surfaces.
         centre_m: (3,).
-        normal_variance: what noise that both normals share adds to their product, in each tangent direction.
+        normal_variance: contribution of noise common to both normals to their product, per tangent direction.
     """
     found = directed.matches(rows(target_from_source), noise_m)
     used = found[found[:, point_to_plane.WEIGHT] > 0.0]
@@ -336,7 +343,7 @@ def matched(
 
 
 def prior_information(prior: AbstractPrior, source: RayImage, target: RayImage, centre_m: Array) -> Array:
-    """Return the information (6, 6) of a prior about a point of the source; 0 where it does not apply."""
+    """Return the information (6, 6) of a prior about a point of the source; 0 if it does not apply."""
     try:
         return density_information(prior.between(source, target), centre_m)
     except InputError:
