@@ -48,7 +48,7 @@ class AbstractSequence(ABC):
 
     @abstractmethod
     def sensor(self) -> SensorNoise | None:
-        """Return the noise of its camera; None if the sequence does not say."""
+        """Return the noise of its camera; None if unknown."""
 
     @property
     @abstractmethod
@@ -153,7 +153,7 @@ class AbstractDerived(AbstractSequence):
         return self.whole.truth()
 
     def sensor(self) -> SensorNoise | None:
-        """Return the noise of its camera; None if the sequence does not say."""
+        """Return the noise of its camera; None if unknown."""
         return self.whole.sensor()
 
     @property

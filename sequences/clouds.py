@@ -143,7 +143,7 @@ def organised(path: Path) -> tuple[int, int]:
     text = head.decode("latin-1")
     stop = re.search(end, text)
     if stop is None:
-        raise InputError(f"{path}: has no header of a {path.suffix[1:].upper()} file; save it anew.")
+        raise InputError(f"{path}: has no header of a {path.suffix[1:].upper()} file; save it again.")
     sizes = [re.search(pattern, text[: stop.end()]) for pattern in (width, height, count)]
     columns, rows, points = (int(found[1]) if found else 0 for found in sizes)
     if columns < 2 or rows < 2 or columns * rows != points:
@@ -155,9 +155,9 @@ def organised(path: Path) -> tuple[int, int]:
         raise InputError(f"{path}: has more than {MAX_PIXELS // 1_000_000} million points; thin it out.")
     least = points // _LZF_RATIO if "binary_compressed" in stop[0] else 2 * points
     if size < stop.end() + least:
-        raise InputError(f"{path}: is cut off, or has fewer points than its header says; save it anew.")
+        raise InputError(f"{path}: is cut off, or has fewer points than its header says; save it again.")
     if size > stop.end() + _MOST_BYTES * points:
-        raise InputError(f"{path}: is larger than the points of its header can be; save it anew.")
+        raise InputError(f"{path}: is larger than the points of its header can be; save it again.")
     return columns, rows
 
 
@@ -192,11 +192,11 @@ def fit_intrinsics(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
 def _points(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8] | None]:
     """Return the points (h, w, 3) of a cloud, NaN where there is none, and their colours (h, w, 3)."""
     width, height = organised(path)
-    with input_errors(path, "cloud", "save it anew"):
+    with input_errors(path, "cloud", "save it again"):
         with open_regular(path) as file:
             points, colours = (_read_pcd if path.suffix.lower() == ".pcd" else _read_ply)(file)
     if points.shape != (width * height, 3):
-        raise InputError(f"{path}: is cut off or broken, {len(points)} points could be read; save it anew.")
+        raise InputError(f"{path}: is cut off or broken, {len(points)} points could be read; save it again.")
     points = np.where(np.isfinite(points) & (np.abs(points) < 1e9), points, np.nan).reshape(height, width, 3)
     if colours.shape[:1] != (width * height,) or colours.ndim != 2 or colours.shape[1] < 3:
         return points, None

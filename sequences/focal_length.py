@@ -1,4 +1,4 @@
-"""Sequences with another focal length and depth scale than they say: as `modeler calibrate-camera` estimated them."""
+"""Sequences with a corrected focal length and depth scale, as estimated by `modeler calibrate-camera`."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from modeler.types import Frame, InputError, SensorNoise
 from sequences.base import AbstractDerived
 from sequences.input_files import read_tree
 
-_ALIKE = 1e-3  # relative: files round what they say
+_ALIKE = 1e-3  # relative: files have rounded values
 
 
 @final
 @dataclass(frozen=True)
 class FocalFactor:
-    """The focal length and the depth scale of a camera, relative to what its sequences say."""
+    """The focal length and the depth scale of a camera, relative to those in its sequences."""
 
     factor: float
-    """True focal length relative to the stated one, the same for fx and fy."""
+    """True focal length relative to the given one, the same for fx and fy."""
     stated_px: float
-    """fx as the sequence states it."""
+    """Given fx of the sequence."""
     depth_scale: float = 1.0
-    """True depth relative to the stated one: scales the model and the distances of its poses alike."""
+    """True depth relative to the given one: scales the model and the distances of its poses alike."""
     depth_scale_sigma: float = 0.0
     """Standard deviation of the depth scale's logarithm; 0 = known, or not asked about."""
     factor_sigma: float = 0.0
-    """Standard deviation of the factor's logarithm, as far as loops tell it; 0 = not asked about."""
+    """Standard deviation of the factor's logarithm; 0 = not estimated."""
     told_by: Literal["loop", "prior"] = "prior"
     """Whether loops determined the factor."""
 
     def values(self) -> dict[str, float | str]:
-        """Return what it says, under the names of its file and of report.json."""
+        """Return its values, under the names of its file and of report.json."""
         return {
             "focal_factor": self.factor,
             "focal_factor_sigma": self.factor_sigma,
@@ -79,7 +79,7 @@ class RefocusedSequence(AbstractDerived):
     """The focal length."""
 
     def sensor(self) -> SensorNoise | None:
-        """Return the noise of its camera, with how well loops told its focal length; None if nothing says."""
+        """Return the noise of its camera, with the uncertainty of its focal length; None if unknown."""
         noise = self.whole.sensor()
         if self.focal.told_by != "loop" or self.focal.factor_sigma == 0.0:
             return noise
@@ -105,7 +105,7 @@ class RefocusedSequence(AbstractDerived):
         camera, focal = frame.camera, self.focal
         if abs(camera.fx / focal.stated_px - 1.0) > _ALIKE:
             raise InputError(
-                f"{self.name}: frame {frame.index} has fx {camera.fx:g} px where the calibrated camera states "
+                f"{self.name}: frame {frame.index} has fx {camera.fx:g} px where the calibrated camera has "
                 f"{focal.stated_px:g}; give the calibration of this camera"
             )
         refocused = replace(camera, fx=camera.fx * focal.factor, fy=camera.fy * focal.factor)

@@ -1,4 +1,4 @@
-"""The shape of a robot's hand, drawn where its poses say it is: what it hides is marked in every frame."""
+"""The shape of a robot's hand, drawn at its poses to mask it in every frame."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _ray_distances(rays: Array, start_m: Array, end_m: Array) -> Array:
 @final
 @dataclass(frozen=True)
 class HandMarkedSequence(AbstractDerived):
-    """Another sequence, in whose frames a robot's hand is marked, beside what its masks mark."""
+    """Another sequence whose frames have a robot's hand masked, in addition to their own masks."""
 
     shape: HandShape
     """Of the hand."""
@@ -99,7 +99,7 @@ class HandMarkedSequence(AbstractDerived):
 
 
 def with_hand(sequence: AbstractSequence) -> AbstractSequence:
-    """Return a sequence with the hand marked whose shape its `sequence.json` states; without one, itself.
+    """Return a sequence with the hand of its `sequence.json` masked; without one, the sequence itself.
 
     Raises:
         InputError: if the shape cannot be read, or the hand's poses are missing.

@@ -160,7 +160,7 @@ def read_mask(path: Path) -> BoolArray:
 
 
 OCCLUDED = 128
-"""Value of a mask's pixels at which a hand or a gripper is seen, before the object or beside it."""
+"""Value of a mask's pixels that show a hand or a gripper."""
 
 
 def read_labels(path: Path) -> npt.NDArray[np.uint8]:
@@ -178,7 +178,7 @@ def read_labels(path: Path) -> npt.NDArray[np.uint8]:
 def object_and_occluder(
     labels: npt.NDArray[np.uint8], occluder: BoolArray | None
 ) -> tuple[BoolArray, BoolArray | None]:
-    """Return the masks (h, w) of an object and of what hides it, None if nobody said.
+    """Return the masks (h, w) of an object and of its occluder; None if not given.
 
     Args:
         labels: (h, w), of `read_labels`.

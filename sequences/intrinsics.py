@@ -107,7 +107,7 @@ class CameraFacts:
 
 
 def find_intrinsics(folder: Path, overrides: Overrides) -> CameraFacts | None:
-    """Return what is known of the camera of a folder of images; None without intrinsics.
+    """Return the camera of a folder of images; None without intrinsics.
 
     Args:
         folder: where to look.

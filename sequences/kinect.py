@@ -101,11 +101,11 @@ def _camera(calibration: Node, purpose: str) -> Node:
     for entry in calibration.need("CalibrationInformation").need("Cameras").elements():
         if entry.need("Purpose").value == purpose:
             return entry
-    raise InputError(f"{calibration.path}: its calibration knows no {purpose}; record it anew.")
+    raise InputError(f"{calibration.path}: its calibration knows no {purpose}; record it again.")
 
 
 ADVICE = "pip install 'modeler[kinect]'"
-_AGAIN = "record or copy it anew"
+_AGAIN = "record or copy it again"
 
 
 @final
@@ -124,7 +124,7 @@ class KinectSequence(AbstractStreams[int]):
         """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured."""
         camera, data = self.lens.camera, self.file.packet("DEPTH", stamp)
         if len(data) != 2 * camera.width * camera.height:
-            raise InputError(f"{self.path}: depth image {index} is cut off; record it anew.")
+            raise InputError(f"{self.path}: depth image {index} is cut off; record it again.")
         return metres(np.frombuffer(data, ">u2").reshape(camera.height, camera.width).astype(np.uint16), self.unit_mm)
 
     def colour_at(self, index: int, stamp: int, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
@@ -136,7 +136,7 @@ class KinectSequence(AbstractStreams[int]):
         if image.shape[:2] != (camera.height, camera.width):
             raise InputError(
                 f"{self.path}: colour image {index} is {image.shape[1]} x {image.shape[0]} pixels where the track "
-                f"says {camera.width} x {camera.height}; record it anew."
+                f"says {camera.width} x {camera.height}; record it again."
             )
         return self.alignment.align(depth_m, image)
 
@@ -165,7 +165,7 @@ def open_kinect(path: Path, overrides: Overrides) -> KinectSequence:
     lens = depth_lens(calibration, size, overrides.intrinsics)
     stamps, colours, colour_size = file.stamps("DEPTH"), [], file.size("COLOR")
     if not stamps:
-        raise InputError(f"{path}: its DEPTH track holds no image; record it anew.")
+        raise InputError(f"{path}: its DEPTH track holds no image; record it again.")
     alignment = None
     if colour_size is not None:
         colours = file.stamps("COLOR")
@@ -229,7 +229,7 @@ class Matroska:
                 return read_colour(EmbeddedImage(content, where))
             for image in packet.decode():
                 return np.asarray(image.to_ndarray(format="rgb24"), dtype=np.uint8)
-        raise InputError(f"{where}: cannot be decoded; record it anew.")
+        raise InputError(f"{where}: cannot be decoded; record it again.")
 
     def _find(self, title: str, stamp: int) -> Any:
         track = self._track(title)
@@ -238,13 +238,13 @@ class Matroska:
             for packet in self._container.demux(track):
                 if packet.pts == stamp:
                     return packet
-        raise InputError(f"{self.path}: lacks an image of {title} that it had; record it anew.")
+        raise InputError(f"{self.path}: lacks an image of {title} that it had; record it again.")
 
     def _track(self, title: str) -> Any:
         named = (track for track in self._container.streams.video if track.metadata.get("title") == title)
         track = next(named, None)
         if track is not None and not 0 < track.width * track.height <= MAX_PIXELS:
-            raise InputError(f"{self.path}: {title} has {track.width} x {track.height} pixels; record it anew.")
+            raise InputError(f"{self.path}: {title} has {track.width} x {track.height} pixels; record it again.")
         if track is not None and not track.codec_context.is_open:  # the images may claim more than their track
             track.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
         return track

@@ -120,7 +120,7 @@ class LiveSequence(AbstractSequence):
         return None
 
     def sensor(self) -> SensorNoise | None:
-        """Return None: a camera does not say."""
+        """Return None: unknown for a camera."""
         return None
 
     @property
@@ -161,7 +161,7 @@ def _next(camera: AbstractCamera, number: int, after_s: float | None) -> Frame:
             lens = camera.lens
             depth_m = lens.undistort(metres(raw, camera.unit_mm), float("nan"))
             return Frame(number, time_s, depth_m, lens.camera, None, None if colour is None else lens.undistort(colour))
-    raise InputError(f"{camera.name}: gives the same image again and again; plug it in anew.")
+    raise InputError(f"{camera.name}: gives the same image again and again; reconnect it.")
 
 
 SCHEME = "realsense:"
@@ -252,7 +252,7 @@ class RealsenseCamera(AbstractCamera):
             unit_mm = 1000.0 * device.first_depth_sensor().get_depth_scale()
             model = device.get_info(rs.camera_info.name) if device.supports(rs.camera_info.name) else "RealSense"
         except RuntimeError as error:
-            raise InputError(f"{where}: cannot be started ({' '.join(str(error).split())}); plug it in anew.") from None
+            raise InputError(f"{where}: cannot be started ({' '.join(str(error).split())}); reconnect it.") from None
         found = (intrinsics.fx, intrinsics.fy, intrinsics.ppx, intrinsics.ppy)
         camera = Camera(intrinsics.width, intrinsics.height, *(overrides.intrinsics or found))
         distortion = () if overrides.intrinsics else coefficients(intrinsics.coeffs)
@@ -285,6 +285,4 @@ class RealsenseCamera(AbstractCamera):
             image = np.array(colour.get_data(), dtype=np.uint8) if colour else None
             return float(depth.get_timestamp()) / 1000.0, raw, image
         except RuntimeError as error:
-            raise InputError(
-                f"{self.model}: gives no image ({' '.join(str(error).split())}); plug it in anew."
-            ) from None
+            raise InputError(f"{self.model}: gives no image ({' '.join(str(error).split())}); reconnect it.") from None

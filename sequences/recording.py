@@ -30,7 +30,7 @@ class AbstractRecording(AbstractSequence):
 
     @property
     def name(self) -> str:
-        """What the sequence is called: as `sequence.json` says, else as the folder or file."""
+        """Name of the sequence: from `sequence.json`, else that of the folder or file."""
         node = None if self._meta is None else self._meta.get("name")
         resolved = self.path.resolve()
         return (resolved.name if self._is_folder else resolved.stem) if node is None else node.text()
@@ -41,7 +41,7 @@ class AbstractRecording(AbstractSequence):
         return (self.path,)
 
     def sensor(self) -> SensorNoise | None:
-        """Return the noise of the camera from `sequence.json`; None if it does not say."""
+        """Return the noise of the camera from `sequence.json`; None if not given."""
         node = None if self._meta is None else self._meta.get("sensor")
         if node is None:
             return None
@@ -55,7 +55,7 @@ class AbstractRecording(AbstractSequence):
 
     @property
     def motion(self) -> Mapping[str, object] | None:
-        """What `sequence.json` says of the motion; None if it says nothing."""
+        """The motion in `sequence.json`; None if not given."""
         node = None if self._meta is None else self._meta.get("motion")
         return None if node is None else _motion(node)
 
@@ -71,7 +71,7 @@ class AbstractRecording(AbstractSequence):
 
     @property
     def facts(self) -> Node | None:
-        """What `sequence.json` holds; None if there is none."""
+        """Contents of `sequence.json`; None without one."""
         return self._meta
 
     def absent(self, index: int) -> InputError:

@@ -128,7 +128,7 @@ class Survey:
 
 
 def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
-    """Read every frame once, and refuse a sequence of which nothing could be made.
+    """Read every frame once, and reject a sequence without usable data.
 
     Args:
         sequence: what to look at.
@@ -136,7 +136,7 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
 
     Raises:
         InputError: if a frame or the ground truth cannot be read, none measures anything, all masks are empty, or
-            the depth cannot be in the unit that it is said to be in.
+            the depth cannot be in its given unit.
     """
     cameras: dict[Camera, None] = {}
     times_s, ranges, shares, joined, farthest_m = [], [], [], [], 0.0
@@ -164,7 +164,7 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
         farthest_m = max(farthest_m, float(measured.max()))
     if not ranges:
         raise InputError(
-            f"{sequence.name}: none of its {len(sequence)} frames holds any depth, all is 0 or NaN; record it anew."
+            f"{sequence.name}: none of its {len(sequence)} frames holds any depth, all is 0 or NaN; record it again."
         )
     if len(empty_masks) == len(ranges):
         raise InputError(f"{sequence.name}: its masks mark nothing that was measured; correct or remove them.")
@@ -214,7 +214,7 @@ def measured_pixels(frame: Frame) -> np.ndarray:
 
 
 def _check_unit(sequence: AbstractSequence, middle_m: float) -> None:
-    """Refuse depth that can only be in another unit than it is said to be in.
+    """Reject depth that cannot be in its given unit.
 
     Raises:
         InputError: if it is.

@@ -16,7 +16,7 @@ from sequences.opening import open_sequence
 from sequences.survey import survey
 
 END = "done"
-"""A file of this name in the folder says that no frame will follow."""
+"""A file of this name in the folder marks the end of the sequence."""
 POLL_S = 0.05
 """How often the folder is looked at."""
 

@@ -121,7 +121,7 @@ def test_a_sequence_has_no_poses_to_convert(
 ) -> None:
     write_bop(tmp_path / "scene", frames[:1], depth_scale_mm=1.0)
     assert main(["convert", str(tmp_path / "scene"), "--out", str(tmp_path / "poses.txt")]) == 2
-    assert "is no folder of a run" in capfd.readouterr().err
+    assert "is not a run folder" in capfd.readouterr().err
     assert not (tmp_path / "poses.txt").exists()
 
 

@@ -21,7 +21,7 @@ def layout(first: RayImage | None, further: Sequence[rrb.Container] = ()) -> rrb
     """Return the layout: tabs, the first of which has the poses and their uncertainty large.
 
     Args:
-        first: the first accepted view, which tells where to look from; None before there is one.
+        first: the first accepted view, which sets the viewpoint; None before there is one.
         further: tabs after the first.
     """
     tabs = rrb.Tabs(_poses(first), *further, _object(first), _pair(first), _edges(first), _words(), active_tab=0)
@@ -29,7 +29,8 @@ def layout(first: RayImage | None, further: Sequence[rrb.Container] = ()) -> rrb
 
 
 def followed(views: rrb.Container, *, fps: float) -> rrb.Blueprint:
-    """Return a layout of nothing but views, which follow the newest frame and play so many frames a second."""
+    """Return a layout of views only, which follow the newest frame and play at the given frame rate."""
+    "second."
     return rrb.Blueprint(
         views,
         rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=fps),
@@ -41,15 +42,15 @@ def followed(views: rrb.Container, *, fps: float) -> rrb.Blueprint:
 
 
 def _poses(first: RayImage | None) -> rrb.Container:
-    """Return the object among the cameras with their uncertainty, before closure and after; frame and table beside."""
+    """Return the object and the cameras with their uncertainty, before and after closure, with frame and table."""
     contents = [f"{entities.WORLD}/model/**", entities.CAMERAS, entities.CURRENT, entities.CHAIN, entities.CLOSURE]
     contents += [entities.BEFORE_POSITION_3_SIGMA, entities.POSITION_1_SIGMA, entities.POSITION_3_SIGMA]
     contents += [entities.MAGNIFICATION]
-    beside = rrb.Vertical(
+    details = rrb.Vertical(
         _frame(first), rrb.TextDocumentView(origin=entities.POSES, name="Every pose"), row_shares=[1.0, 1.7]
     )
     large = _spatial("Cameras around the object, before and after loop closure", contents, _far(first))
-    return rrb.Horizontal(large, beside, column_shares=[2.1, 1.0], name="Poses and uncertainty")
+    return rrb.Horizontal(large, details, column_shares=[2.1, 1.0], name="Poses and uncertainty")
 
 
 def _frame(first: RayImage | None) -> rrb.View:
@@ -71,7 +72,7 @@ def _depth(first: RayImage | None) -> rrb.View:
 
 
 def _object(first: RayImage | None) -> rrb.Container:
-    """Return the model alone, beside the merged points before and after closure."""
+    """Return the model, and the merged points before and after closure."""
     near = _near(first, _ABOVE_LEFT, 3.4)
     return rrb.Horizontal(
         _spatial("Object model", [f"{entities.WORLD}/model/**"], near),
@@ -110,7 +111,7 @@ def _pair(first: RayImage | None) -> rrb.Container:
 
 
 def _edges(first: RayImage | None) -> rrb.Container:
-    """Return the pose graph with the uncertainty of its edges, beside a plot for each reading."""
+    """Return the pose graph with the uncertainty of its edges, and a plot of each quantity."""
     graph = [f"{entities.WORLD}/{part}/**" for part in ("model", "poses", "edges")]
     graph += [f"- {entities.CHAIN}", entities.EDGES_1_SIGMA, entities.EDGES_MAGNIFICATION]
     return rrb.Horizontal(

@@ -102,12 +102,12 @@ LEGEND_TEXT: Final = """\
 is orange. Around each position lies an ellipsoid: the region within 3 standard deviations (sd), which holds the true
 position with 97 % probability. Violet: before loop closure, along the violet chain of consecutive pairs, where
 errors add up. Yellow: after it, solid within 1 sd. The green line is a closure: a registration to a view that the
-object had turned away from. All ellipsoids are magnified by the factor written below them. The table states the sd of
+object had turned away from. All ellipsoids are magnified by the factor written below them. The table lists the sd of
 each pose relative to the first, along its least certain axis; translation is that of the object's centre.
 
-**Object.** Pink surface was not seen by any view; it closes the mesh. After the last frame, the points of all views
-stand beside it, by the poses before loop closure and after it, coloured by frame from blue to yellow. Where the loop
-was open before closure, yellow points lie apart from blue ones.
+**Object.** Pink surface was not observed by any view; it closes the mesh. After the last frame, the points of all
+views are shown next to it, with the poses before and after loop closure, coloured by frame from blue to yellow. Before
+closure, yellow points lie apart from blue ones if the loop closure error is large.
 
 **Newest pair.** New view orange, the view it is registered to teal, in the camera frame of the latter. *Posterior*: the
 distribution over relative poses that the registration returns, its spread magnified by the factor written there; the

@@ -111,7 +111,7 @@ _CONTROL_COLOUR: Final = "#b8474a"
 @final
 @dataclass(frozen=True)
 class Curve:
-    """Squared errors in units of the covariances stated."""
+    """Squared errors in units of the estimated covariances."""
 
     label: str
     """What the legend calls them; empty for no entry."""

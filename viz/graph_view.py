@@ -167,7 +167,7 @@ class _Ellipsoids:
     def drawn(
         self, sigmas: float, rgb: entities.Rgb | npt.NDArray[np.uint8], style: rr.components.FillMode
     ) -> rr.AsComponents:
-        """Return the regions of so many standard deviations in one colour or one each (n, 3); nothing without any."""
+        """Return the regions of the given standard deviations in one colour or one each (n, 3); nothing without any."""
         if len(self.centres_m) == 0:
             return CLEAR
         return rr.Ellipsoids3D(

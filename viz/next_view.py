@@ -24,15 +24,15 @@ _SHOWN: Final = 8
 
 
 def draw_next(belief: Belief, found: Suggestions, done: str | None = None) -> Drawing:
-    """Yield what is known and what to do next.
+    """Yield drawings of the belief and the suggested actions.
 
     Args:
-        belief: what is known.
-        found: what to do next.
-        done: the action that led here, in words; None if nobody says.
+        belief: about poses and surface.
+        found: the suggested actions.
+        done: the previous action in words; None if unknown.
     """
-    told = [] if done is None else [f"Done: {done}", ""]
-    lines = [f"**{found.summary}**", "", *told, *(f"1. {each.words}" for each in found.ranked[:_SHOWN])]
+    previous = [] if done is None else [f"Done: {done}", ""]
+    lines = [f"**{found.summary}**", "", *previous, *(f"1. {each.words}" for each in found.ranked[:_SHOWN])]
     yield WORDS, rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
     cells, size_m = belief.cells, 0.5 * belief.cells.cell_m
     open_ = belief.can_be_seen & ~cells.seen & ~cells.under
@@ -46,16 +46,16 @@ def layout(first: RayImage) -> rrb.Blueprint:
     """Return the layout of a recording of nothing else.
 
     Args:
-        first: the first view, which tells where to look from.
+        first: the first view, which sets the viewpoint.
     """
     return followed(tab(first), fps=1.0)
 
 
 def tab(first: RayImage | None) -> rrb.Container:
-    """Return seen and unseen surface among the cameras, the frame, the list, and both over time.
+    """Return a layout of observed and unseen surface, the frame, the list, and the values over time.
 
     Args:
-        first: the first view, which tells where to look from; None before there is one.
+        first: the first view, which sets the viewpoint; None before there is one.
     """
     cells = rrb.Spatial3DView(
         origin=entities.WORLD,

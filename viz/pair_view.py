@@ -133,7 +133,7 @@ def draw_magnified_posterior(step: Step) -> Drawing:
 
 
 def magnified(posterior: Posterior, view: RayImage) -> Ghosts:
-    """Return samples of a posterior, magnified by a round factor that makes them easy to tell apart.
+    """Return samples of a posterior, magnified by a round factor that separates them visibly.
 
     Each sample moves away from the mean of its own mode, about the object's centre; modes stay in place.
     """

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_PATIENCE_S: Final = 5.0  # with a viewer, at the end, until it has taken what it was sent
+_PATIENCE_S: Final = 5.0  # at the end, until a viewer has received all data
 _DISK_PATIENCE_S: Final = 60.0  # with a disk that takes nothing
 _ROOM: Final = 9 * 2**29  # bytes of addresses that a run with a recording takes, most of them Rerun's and never used
-_BATCH_S: Final = 10.0  # of steps that are written in one piece where nobody watches
+_BATCH_S: Final = 10.0  # of steps that are written in one piece without a viewer
 _GRAPH_DRAWN: Final = 50  # times at most while the number of views doubles: drawing it takes time for each of them
 
 
@@ -49,7 +49,7 @@ class RerunStream:
     watched: bool = False
     """Whether it is also sent to a viewer, which may be slow or freeze."""
     advised: bool = False
-    """Whether it will be told what to do next, for which the layout has a tab."""
+    """Whether suggestions will follow, for which the layout has a tab."""
 
     @property
     def address(self) -> str | None:
@@ -89,7 +89,7 @@ class RerunStream:
             self.recording.log(path, archetype)
 
     def advise(self, step: Step, belief: Belief, found: Suggestions) -> None:
-        """Draw what is known after a step and what to do next; it may come from a thread of its own."""
+        """Draw the belief and the suggestions after a step; may be called from another thread."""
         if not self.recording.is_enabled():
             return
         from viz import next_view
@@ -100,7 +100,7 @@ class RerunStream:
             self.recording.log(path, archetype)
 
     def close(self) -> None:
-        """Complete the recording. A window stays open with what it was sent; a page in the browser ends."""
+        """Complete the recording. A window stays open with its data; a page in the browser ends."""
         if self.watched:
             try:
                 self.recording.flush(timeout_sec=_PATIENCE_S)
@@ -167,7 +167,7 @@ def open_stream(
         web: serve the viewer in the browser on 127.0.0.1; `address` names the page.
         connect: `rerun+http://HOST:PORT/proxy` of a viewer that is already open.
         facts: settings of the run, by name, which the viewer shows.
-        advised: whether it will be told what to do next.
+        advised: whether suggestions will follow.
 
     Raises:
         InputError: if `save` cannot be written, or `connect` is not an address.
@@ -207,7 +207,7 @@ def open_stream(
 
 
 def _layout(first: RayImage | None, *, advised: bool) -> rrb.Blueprint:
-    """Return the layout, with a tab for what to do next where that will be told."""
+    """Return the layout, with a tab for suggestions if they will follow."""
     from viz import blueprint, next_view
 
     return blueprint.layout(first, (next_view.tab(first),) if advised else ())

@@ -20,7 +20,7 @@ from sequences.rendering.meshes import Mesh
 Rgb = npt.NDArray[np.uint8]
 
 _FINE = 2
-"""Prints are drawn with so many pixels a texel along each side."""
+"""Number of pixels per texel along each side when prints are drawn."""
 LARGEST_PX = 4096
 """Images are at most this wide and high."""
 

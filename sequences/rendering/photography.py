@@ -59,9 +59,9 @@ class Photography:
     noise_levels: float = 1.5
     """Standard deviation of the noise of each colour of a pixel, in 8-bit levels."""
     shift_px: float = 0.0
-    """Standard deviation of the shift of a frame's colours beside its depth, along either axis, in px."""
+    """Standard deviation of the shift of a frame's colours against its depth, along either axis, in px."""
     samples: int = 3
-    """Rays a pixel along each side; their mean is what it sees."""
+    """Rays per pixel along each side, which are averaged."""
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -193,12 +193,12 @@ class Mosaic:
 @final
 @dataclass(frozen=True)
 class TurnedOver:
-    """The object is put down otherwise within the sequence."""
+    """The object is laid down differently within the sequence."""
 
     at: int
-    """Number of the first frame in which it lies so."""
+    """Number of the first frame in that pose."""
     rest_rotation_deg: tuple[float, float, float]
-    """How it lies from then on: turns about the fixed x, y and z axes, before it is set on the table."""
+    """Its resting pose from then on: turns about the fixed x, y and z axes, before it is set on the table."""
 
     def __post_init__(self) -> None:
         """Check the frame."""
@@ -218,9 +218,9 @@ class Recipe:
     seed: int = 0
     """Seed of motion and noise."""
     rest_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """How the object lies: turns about the fixed x, y and z axes, before it is set on the table."""
+    """Resting pose of the object: turns about the fixed x, y and z axes, before it is set on the table."""
     turned_over: TurnedOver | None = None
-    """Whether it is put down otherwise on the way; the trajectory goes on as it is."""
+    """Whether it is laid down differently on the way; the trajectory continues unchanged."""
     view: Viewpoint = Viewpoint()
     """The camera and its place."""
     table: Table | None = Table()

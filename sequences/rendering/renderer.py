@@ -99,7 +99,7 @@ class RenderedSequence(AbstractSequence):
 
     @property
     def motion(self) -> Mapping[str, object] | None:
-        """What the recipe says of the motion."""
+        """The motion of the recipe."""
         return self.recipe.trajectory.motion()
 
     def model(self) -> Mesh:

@@ -65,7 +65,7 @@ class Tabletop:
                 return there_m
 
     def motion(self) -> Mapping[str, object]:
-        """Return what `sequence.json` says of it."""
+        """Return its entry in `sequence.json`."""
         return {"kind": "table", "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg, "shift_m": self.shift_m}
 
 
@@ -100,7 +100,7 @@ class Turntable:
         return _wobbling(poses, self.wobble_deg, self.wobble_m, rng)
 
     def motion(self) -> Mapping[str, object]:
-        """Return what `sequence.json` says of it."""
+        """Return its entry in `sequence.json`."""
         return {"kind": "turntable", "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg}
 
 
@@ -162,7 +162,7 @@ class Hand:
         return np.array(poses)
 
     def motion(self) -> Mapping[str, object]:
-        """Return what `sequence.json` says of it."""
+        """Return its entry in `sequence.json`."""
         kind = "general" if self.robot is None else "held"
         return {"kind": kind, "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg, "shift_m": self.shift_m}
 
@@ -195,7 +195,7 @@ class Places:
         return np.array([placement(pose.offset_m, pose.rotation_deg) for pose in self.poses])
 
     def motion(self) -> Mapping[str, object] | None:
-        """Return what `sequence.json` says of it: nothing."""
+        """Return its entry in `sequence.json`: none."""
         return None
 
 

@@ -209,7 +209,7 @@ class Bag:
             for place, (connection, _, data) in enumerate(found):
                 if place == stamp.ordinal:
                     return self._message(connection, data)
-            raise InputError(f"{self.path}: lacks a message of {topic} that it had; record it anew.")
+            raise InputError(f"{self.path}: lacks a message of {topic} that it had; record it again.")
 
     def _of(self, topic: str) -> list[Connection]:
         return [connection for connection in self._reader.connections if str(connection.topic) == topic]
@@ -223,7 +223,7 @@ class Bag:
 
     @property
     def _advice(self) -> str:
-        return "reindex it (rosbag reindex), or record it anew" if self._is_bag else "record or copy it anew"
+        return "reindex it (rosbag reindex), or record it again" if self._is_bag else "record or copy it again"
 
     @property
     def _is_bag(self) -> bool:

@@ -54,7 +54,7 @@ def depth_m(message: Any, unit_mm: float, where: str) -> npt.NDArray[np.float32]
         InputError: if the message contradicts itself.
     """
     if not is_depth(message):
-        raise InputError(f"{where}: is {_kind(message)} where images before it are depth; record it anew.")
+        raise InputError(f"{where}: is {_kind(message)} where images before it are depth; record it again.")
     if _is_raw(message) and message.encoding in METRES:
         depth = _rows(message, 4, where).view(">f4" if message.is_bigendian else "<f4").astype(np.float32)
         return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(np.nan))
@@ -74,7 +74,7 @@ def colour(message: Any, where: str) -> npt.NDArray[np.uint8]:
         InputError: if the message contradicts itself.
     """
     if not is_colour(message):
-        raise InputError(f"{where}: is {_kind(message)} where images before it are colour; record it anew.")
+        raise InputError(f"{where}: is {_kind(message)} where images before it are colour; record it again.")
     packed = None if _is_raw(message) else _PACKED_YUV.fullmatch(message.format)
     if packed is not None:
         return colour(_unpacked(message, packed, where), where)
@@ -109,7 +109,7 @@ def _unpacked(message: Any, packing: re.Match[str], where: str) -> _Raw:
     try:
         data = from_zstd(bytes(message.data), min(step * height, MAX_BYTES))
     except ValueError as error:
-        raise InputError(f"{where}: cannot be unpacked ({error}); record it anew.") from None
+        raise InputError(f"{where}: cannot be unpacked ({error}); record it again.") from None
     return _Raw(packing[1], width, height, step, np.frombuffer(data, np.uint8))
 
 
@@ -152,7 +152,7 @@ def _rows(message: Any, bytes_a_pixel: int, where: str) -> npt.NDArray[np.uint8]
     height, width, step = int(message.height), int(message.width), int(message.step)
     length, needed = len(message.data), width * bytes_a_pixel
     if not 0 < height * width <= MAX_PIXELS:
-        raise InputError(f"{where}: an image has {width} x {height} pixels; record it anew.")
+        raise InputError(f"{where}: an image has {width} x {height} pixels; record it again.")
     if step < needed or step * height > length:
         raise InputError(
             f"{where}: an image of {width} x {height} pixels, {message.encoding}, has {length} bytes, {step} a row; "

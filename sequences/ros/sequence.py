@@ -242,7 +242,7 @@ def open_ros(path: Path, overrides: Overrides) -> RosSequence:
     unit_mm, unit = choose_unit(bag, depth_topic, first[depth_topic], overrides)
     times = _times(bag, depth_topic)
     if not times:
-        raise InputError(f"{path}: holds no message of {depth_topic}; record it anew.")
+        raise InputError(f"{path}: holds no message of {depth_topic}; record it again.")
     pairs, unpaired = paired(times, [] if colour is None else _times(bag, colour.topic))
     return RosSequence(path, lens, pairs, (*left, *unpaired), bag, depth_topic, colour, unit_mm, unit)
 

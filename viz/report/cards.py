@@ -57,10 +57,10 @@ def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Arr
         "The worst first: pairs of frames that were lost, then by distance from the poses in standard deviations (sd). "
         f"{note}"
     )
-    told = zip(result.edges, result.report["edges"], strict=True)
+    pairs = zip(result.edges, result.report["edges"], strict=True)
     cards = [
         _pair_card(result, edge, record, pictures.get(edge.source), centre_m)
-        for edge, record in sorted(told, key=lambda pair: _badness(result, pair[0]), reverse=True)
+        for edge, record in sorted(pairs, key=lambda pair: _badness(result, pair[0]), reverse=True)
     ]
     terms = "".join(f"<div><dt>{term}:</dt> <dd>{words}</dd></div>" for term, words in _TERMS.items())
     return [

@@ -10,12 +10,12 @@ from typing import Any, Final
 
 @dataclass(frozen=True)
 class Check:
-    """How a figure of the evidence is worded."""
+    """Description of a value of the evidence."""
 
     words: str
     """What it is."""
     why: str
-    """What a large value, or else a small one, means."""
+    """Meaning of a value beyond its limit."""
     factor: float = 1.0
     """To its unit."""
     unit: str = ""
@@ -97,10 +97,10 @@ CHECKS: Final = {
 
 
 def evidence_table(evidence: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the figures beside their limits as HTML; "" for runs of earlier versions.
+    """Return the values with their limits as HTML; "" for runs of earlier versions.
 
     Args:
-        evidence: as `report.json` has it.
+        evidence: as in `report.json`.
     """
     rows = [_row(CHECKS.get(name, Check(name.replace("_", " "), "")), figure) for name, figure in evidence.items()]
     if not rows:

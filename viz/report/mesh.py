@@ -25,7 +25,7 @@ _STEPS: Final = 32767  # of a coordinate from the centre to the farthest vertex:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles with what is known of their corners."""
+    """Triangles with properties of their corners."""
 
     vertices_m: Array
     """(v, 3) in the object frame."""
@@ -114,7 +114,7 @@ def shade(
     field_of_view_deg: float = 30.0,
     samples: int = 2,
 ) -> npt.NDArray[np.uint8]:
-    """Return a picture (h, w, 3) of a mesh under a light beside the camera, on white; back sides are drawn red.
+    """Return a picture (h, w, 3) of a mesh under a light next to the camera, on white; back sides are drawn red.
 
     Args:
         vertices_m: (v, 3).

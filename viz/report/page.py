@@ -64,7 +64,7 @@ def _opening(loop: Mapping[str, float] | None) -> list[tuple[str, str, str]]:
 
 
 def _focal_length(camera: Mapping[str, Any] | None) -> list[tuple[str, str, str]]:
-    """Return what is known of the focal length, as a key figure; nothing where it is taken for known."""
+    """Return the estimate of the focal length as a key value; nothing if it is exact."""
     if camera is None or not (fx_px := camera.get("fx_px")):
         return []
     value = f"{fx_px:.1f} ± {fx_px * camera['focal_factor_sigma']:.1f} px"
@@ -156,8 +156,8 @@ def _trajectory(result: Result, mesh: Mesh | None, centre_m: Array) -> Sequence[
         "<h2>Uncertainty</h2>",
         figure(
             plots.uncertainty(result, centre_m),
-            "Standard deviation (sd) along the least certain axis: of each edge (the relative pose of two frames that "
-            "a registration states), and of each pose relative to the first frame, before loop closure (edges of "
+            "Standard deviation (sd) along the least certain axis: of each edge (the relative pose of two frames by "
+            "registration), and of each pose relative to the first frame, before loop closure (edges of "
             "consecutive frames, one after another, so that their errors add up) and after the pose graph of all edges "
             "was optimised. The gap between the two lines is the effect of loop closure.",
         ),
@@ -201,8 +201,8 @@ def _accuracy(result: Result, centre_m: Array) -> Sequence[str]:
         "<h2>Calibration of the covariances</h2>",
         figure(
             plots.coverage(result),
-            "A covariance states regions that hold the true pose with a given probability; the curves are the shares "
-            "of true poses inside. On the diagonal: calibrated; below: "
+            "A covariance defines regions that contain the true pose with a given probability; the curves are the "
+            "shares of true poses inside. On the diagonal: calibrated; below: "
             "overconfident; above: conservative; grey: expected scatter. The 95 % regions of "
             f"{100.0 * inside:.0f} % of the {len(nees)} edges contain the truth.",
             style="half",

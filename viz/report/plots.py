@@ -113,7 +113,7 @@ def uncertainty(result: Result, centre_m: Array) -> bytes:
 
 
 def errors(result: Result, centre_m: Array) -> bytes:
-    """Draw how far every pose is from the truth, before closure and after, over the sd it states.
+    """Draw the error of every pose, before and after closure, with its estimated sd.
 
     Args:
         result: with the truth of at least its first frame.
@@ -124,18 +124,22 @@ def errors(result: Result, centre_m: Array) -> bytes:
     for label, poses, colour in (("before closure", result.chain, BEFORE), ("after optimisation", result.poses, AFTER)):
         known = {k: pose for k, pose in poses.items() if result.true_pose(k) is not None}
         off = evaluation.trajectory_errors({k: pose.mean for k, pose in known.items()}, result.truth, centre_m)
-        stated = _sds(known, centre_m)
+        estimated = _sds(known, centre_m)
         for axis, values, sd in (
-            (of_rotation, list(off.rotation_deg.values()), [one.rotation_deg for one in stated]),
-            (of_translation, [1000.0 * v for v in off.translation_m.values()], [one.translation_mm for one in stated]),
+            (of_rotation, list(off.rotation_deg.values()), [one.rotation_deg for one in estimated]),
+            (
+                of_translation,
+                [1000.0 * v for v in off.translation_m.values()],
+                [one.translation_mm for one in estimated],
+            ),
         ):
             axis.plot(sorted(known), values, ".-", color=colour, linewidth=1.4, label=f"error, {label}")
-            axis.fill_between(list(known), sd, color=colour, alpha=0.14, linewidth=0, label=f"stated sd, {label}")
+            axis.fill_between(list(known), sd, color=colour, alpha=0.14, linewidth=0, label=f"estimated sd, {label}")
     return _by_frame(figure, of_rotation, of_translation)
 
 
 def coverage(result: Result) -> bytes:
-    """Draw the share of truths inside the stated regions against their probability, for edges and for poses, as PNG."""
+    """Draw the share of truths inside confidence regions against their probability, for edges and for poses, as PNG."""
     panels = []
     for title, estimates in (("edges", edge_estimates(result)), ("poses, relative to the first", _poses(result))):
         parts = (("all six", slice(0, 6), 6), ("rotation", slice(0, 3), 3), ("translation", slice(3, 6), 3))

@@ -87,10 +87,10 @@ _MAX_BYTES = 4 << 30  # Rerun reads the whole file into memory; 5,000 frames of 
 
 
 def recorded(recording: Path) -> dict[str, dict[int, dict[str, Any]]]:
-    """Return the rows of `READ` by frame; no frames where nothing can be read.
+    """Return the rows of `READ` by frame; empty if nothing can be read.
 
-    A frame is what a pair's caption calls the newer view, else what the timeline says: a frame that was tried again
-    later stands there beside the latest. Of a frame that was tried more than once the last attempt counts.
+    The frame is the newer view of a pair's caption, else that of the timeline, where a frame that was retried later
+    appears at a later time. Of repeated attempts, the last one counts.
     """
     rows: dict[str, dict[int, dict[str, Any]]] = {path: {} for path in READ}
     if not os.path.lexists(recording):
