@@ -1,4 +1,4 @@
-"""The moving picture of the README: a model that grows, and what is known of its poses.
+"""The animation of the README: a growing model, and the uncertainty of its poses.
 
 `PYTHONPATH=tests python -m growing SEQUENCE --out docs/growing.webp` builds a sequence with the table prior (that of
 the README: `modeler render figurine`). For each frame it draws what the camera sees with the object outlined, the model

@@ -76,7 +76,7 @@ def test_every_other_run_is_sound_and_every_fault_occurs() -> None:
 def test_a_plan_draws_the_same_stage_again(number: int) -> None:
     first, second = (Plan("tuning", number).stage() for _ in range(2))
     assert first.recipe == second.recipe
-    assert first.told == second.told
+    assert first.options == second.options
     assert Plan("held-out", number).stage().recipe != first.recipe
 
 
@@ -110,9 +110,9 @@ def test_an_object_that_stands_still_keeps_the_order_of_its_poses(stage: Stage) 
 def test_depth_stated_wrongly_moves_what_lands_by_the_size_of_the_object_alone() -> None:
     """The camera is 10 % nearer than stated: poses scaled alike place the surface wrongly by a tenth of its size."""
     rng = np.random.default_rng(2)
-    told = sound(viewed(load_specimen("wedge"), rng, 2), rng)
-    told = replace(told.moving(told.places[:3]), masks=True)
-    recorded = Recorded(replace(told, spoil=lambda frames: [replace(f, depth_m=1.1 * f.depth_m) for f in frames]))
+    observed = sound(viewed(load_specimen("wedge"), rng, 2), rng)
+    observed = replace(observed.moving(observed.places[:3]), masks=True)
+    recorded = Recorded(replace(observed, spoil=lambda frames: [replace(f, depth_m=1.1 * f.depth_m) for f in frames]))
     truth = recorded.truth()
     first_from = {k: truth[0] @ se3.inverse(pose) for k, pose in truth.items()}
     for pose in first_from.values():
@@ -125,7 +125,7 @@ def test_depth_stated_wrongly_moves_what_lands_by_the_size_of_the_object_alone()
     assert error_deg < 1e-4
     assert error_m < 0.005
     exact = pose_errors(
-        Recorded(told), replace(step, solution=Solution({k: truth[0] @ se3.inverse(truth[k]) for k in truth}))
+        Recorded(observed), replace(step, solution=Solution({k: truth[0] @ se3.inverse(truth[k]) for k in truth}))
     )
     assert exact == pytest.approx((0.0, 0.0), abs=1e-5)
 
@@ -149,7 +149,7 @@ def test_the_table_counts_by_fault_and_status() -> None:
     wrong = replace(RIGHT, fault="masks late", error_deg=20.0)
     outcomes = [RIGHT, replace(RIGHT, status=3), wrong, replace(wrong, status=3), replace(wrong, status=2)]
     lines = {line[:26].strip(): line[26:].split() for line in text(outcomes).splitlines()[1:]}
-    assert lines["sound"] == ["2", "0", "0", "1", "1"]
+    assert lines["no fault"] == ["2", "0", "0", "1", "1"]
     assert lines["masks late"] == ["3", "1", "2", "0", "0"]
     assert lines["all"] == ["5", "1", "2", "1", "1"]
 

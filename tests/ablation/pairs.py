@@ -60,7 +60,7 @@ class Case:
 
 
 def cases(block: str) -> Iterator[Case]:
-    """Yield the cases of a block whose true motion the prior allows; recordings where they are present."""
+    """Yield the cases of a block whose true motion the prior allows; recordings if available."""
     return (case for case in _cases(block) if np.isfinite(case.density.log_density(case.truth[None])[0]))
 
 
@@ -118,7 +118,7 @@ def _rendered(name: str, condition: Condition, seed: int) -> tuple[RayImage, Ray
 
 
 def _far(first: int, offsets: Sequence[int], *, every: int) -> Iterator[Case]:
-    """Yield pairs of the dragon's scans that lie so many steps of 24° apart, under a wide prior."""
+    """Yield pairs of the dragon's scans the given number of steps of 24° apart, under a wide prior."""
     views, poses = recorded_views("dragon"), open_sequence(SHARED / "dragon").truth()
     assert poses is not None
     numbers = sorted(views)

@@ -130,7 +130,7 @@ def _changed(own: Sequence[Record], defaults: Sequence[Sequence[Record]]) -> str
 
 
 def _time(own: Sequence[Record], defaults: Sequence[Sequence[Record]]) -> str:
-    """Return the processor time relative to the default's: that measured beside it, where there is one."""
+    """Return the processor time relative to the default's: that measured together with it, if any."""
     timed = [one for one in own if "default_seconds" in one]
     if timed:
         return f"{sum(one['seconds'] for one in timed) / sum(one['default_seconds'] for one in timed):.2f}"

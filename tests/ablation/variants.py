@@ -48,7 +48,7 @@ class _Other(VisibilityLikelihood):
 
 
 class _StatedMisfit(PairLikelihood):
-    """With the misfit of a typical match that stated noise implies: half a nat."""
+    """With the misfit of a typical match implied by the nominal noise: half a nat."""
 
     def typical_misfit(self, pose: Array, blur_m: float) -> float:
         return 0.5

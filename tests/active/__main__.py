@@ -1,9 +1,9 @@
 """Runs trials and prints what they show.
 
     PYTHONPATH=tests .venv/bin/python -m active --shapes 12 --out runs/active.jsonl
-    PYTHONPATH=tests .venv/bin/python -m active --out runs/active.jsonl --shapes 0    # the tables of what is there
+    PYTHONPATH=tests .venv/bin/python -m active --out runs/active.jsonl --shapes 0    # the tables of existing trials
 
-A trial that the file holds already is not run again.
+Trials already in the file are not run again.
 """
 
 from __future__ import annotations

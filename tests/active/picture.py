@@ -1,4 +1,4 @@
-"""The picture of the README: what a robot that does what is suggested has seen, action by action.
+"""The picture of the README: surface observed by a robot that follows the suggestions, action by action.
 
 PYTHONPATH=tests .venv/bin/python -m active.picture figurine --out docs/next.png
 """

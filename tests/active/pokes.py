@@ -1,4 +1,4 @@
-"""Where a poke tells more than a turn: what both say of the spin between two views, predicted and as it came.
+"""Pokes that are more informative than turns: spin between two views, predicted and realised.
 
 PYTHONPATH=tests .venv/bin/python -m active.pokes --shapes 6
 """
@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def row(name: str) -> str:
-    """Return the first poke at a shape beside a turn by as much, whose angle nobody tells."""
+    """Return the first poke at a shape, and a turn by the same unmeasured angle."""
     robot, rng = SimulatedRobot.before(small(load_specimen(name), 0, 320)), np.random.default_rng(0)
     table = Modeler(sensor=Sensor(*robot.stage.sequence.sensor()), prior=TablePrior(max_rotation_deg=REACH_DEG))
     scene = table.segmenter.scene([robot.stage.frame()])

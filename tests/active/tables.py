@@ -19,7 +19,7 @@ MEASURES = {
 
 
 def steps(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return all actions with their gains: none where the view was left out, or its pose is wrong by the truth."""
+    """Return all actions with their gains: zero if the view was left out or its pose is wrong."""
     found = []
     for record in records:
         for one in record["outcomes"]:
@@ -90,6 +90,6 @@ def printed(records: Sequence[dict[str, Any]]) -> None:
 
 
 def needed(record: dict[str, Any]) -> int | None:
-    """Return the actions until every pose was within 1° of the truth and 95 % of what can be seen was; None: never."""
+    """Return the actions until every pose was within 1° and 95 % of the visible surface observed; None: never."""
     pairs = zip(record["seen"], record["worst_error_deg"], strict=True)
     return next((count for count, (seen, error_deg) in enumerate(pairs) if done(seen, error_deg)), None)

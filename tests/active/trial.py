@@ -1,4 +1,4 @@
-"""One object modelled by a simulated robot under a policy, each step's prediction beside what came of it."""
+"""One object modelled by a simulated robot under a policy, with predicted and realised gains per step."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Outcome:
     error_deg: float = float("nan")
     """True error of the rotation from the last view to the new one."""
     edge_sigma_deg: float = float("nan")
-    """Standard deviation that the edge between them states."""
+    """Standard deviation of the edge between them."""
 
 
 @final
@@ -181,7 +181,7 @@ class Trial:
 
 
 def done(seen: float, worst_error_deg: float) -> bool:
-    """Return whether every pose is within 1° of the truth and 95 % of what can be seen was."""
+    """Return whether every pose is within 1° of the truth and 95 % of the visible surface was observed."""
     return seen >= 0.95 and worst_error_deg <= 1.0
 
 

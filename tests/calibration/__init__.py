@@ -1,1 +1,1 @@
-"""The study of calibration: whether posteriors know how far off they are. `make calibrate` runs it."""
+"""The study of calibration: whether covariances match the errors. `make calibrate` runs it."""

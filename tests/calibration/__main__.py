@@ -1,15 +1,14 @@
-"""Render pairs, register them, and report how true the posteriors' covariances are: `make calibrate`.
+"""Render pairs, register them, and report how well the posteriors' covariances are calibrated: `make calibrate`.
 
-Shapes have no colour, unless printed ones are asked for (`--colour`): bodies of revolution and n-fold shapes with a
-strong print, with a faint one and with none, under lamps that stay with the camera. With `--blind` as well, the same
-pairs are registered without their colour; with `--shifted`, colours are not aligned to depth, by as much as a camera's.
+Shapes have no colour unless `--colour` is given: bodies of revolution and n-fold shapes with a
+strong print, with a faint one and with none, under lamps fixed to the camera. With `--blind` as well, the same
+pairs are registered without their colour; with `--shifted`, colours are misaligned with depth by as much as a camera's.
 
-The shapes are split: methods may be tuned on one half; the other is there to be looked at once, at the end, and only
-where it is asked for (`--half held-out`). The tables go to stdout, progress to stderr, and calibration.json,
+The shapes are split: methods may be tuned on one half; the other (`--half held-out`) is for a single evaluation
+at the end. The tables go to stdout, progress to stderr, and calibration.json,
 calibration.csv and coverage.png into a folder.
 
-The status is 1 where the negative control, whose covariance is known to be far too small, is not shown to be: then the
-study is broken.
+The status is 1 if the study does not detect the far too small covariance of the negative control: then it is broken.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from modeler.registration import ColouredIcpRegistrar
 from modeler.types import InputError
 from viz.figures import Curve, Panel, coverage_curves
 
-_ORDERS_OF_MAGNITUDE = 100.0  # by which the control's mean squared error must exceed what it states
+_ORDERS_OF_MAGNITUDE = 100.0  # by which the control's mean squared error must exceed its covariance
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,8 +1,8 @@
-"""Whether stated uncertainties are true with other cameras than the renderer's: `python -m calibration.by_camera`.
+"""Calibration of covariances for cameras other than the renderer's: `python -m calibration.by_camera`.
 
-Shapes of the study are seen by depth cameras of several kinds (`calibration.depth_cameras`), each once with its true
-focal length and once with one that is stated wrongly, by errors of 2 % standard deviation as nominal ones have. Pairs
-are registered with both priors, beside ICP, and judged camera by camera. Shapes are split as in the study itself.
+Depth cameras of several kinds (`calibration.depth_cameras`) observe shapes of the study, each once with its true focal
+length and once with a nominal one, which has errors of 2 % standard deviation. Pairs are registered with both priors
+and with ICP, and evaluated camera by camera. Shapes are split as in the study itself.
 
 Tables go to stdout, progress to stderr, trials as CSV into a folder.
 """
@@ -125,7 +125,7 @@ def shown(sequence: RenderedSequence, camera: DepthCamera | None, rng: np.random
 
 
 def viewed(frames: Sequence[Frame], stated: str) -> list[RayImage]:
-    """Return the views of a sequence; nothing is told of the camera's noise."""
+    """Return the views of a sequence; the camera's noise is not given."""
     segmenter = Segmenter()
     scene = segmenter.scene([frames[k] for k in telling(range(len(frames)))])
     sensor = Sensor().measured(scene.range_noise)
@@ -153,7 +153,7 @@ def _pair(blank: Trial, source: RayImage, target: RayImage, truth: Array, seed: 
 
 
 def judged(trial: Trial, posterior: Posterior, truth: Array, source: RayImage, target: RayImage) -> Trial:
-    """Return a trial with its errors; of a nominal focal length it is told how uncertain it is."""
+    """Return a trial with its errors; the uncertainty of a nominal focal length is given."""
     there = truth @ se3.translation(source.centroid_m)
     pose = posterior.pose.widened(NOMINAL if trial.stated == "nominal" else 0.0)
     estimate = about_point(pose, source.centroid_m)
@@ -266,7 +266,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def chosen(half: Half, per_class: int) -> tuple[Specimen, ...]:
-    """Return so many shapes of each class, always the same."""
+    """Return the given number of shapes of each class, always the same."""
     rng = np.random.default_rng(0)
     found = []
     for name in _CLASSES:

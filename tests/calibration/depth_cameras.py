@@ -1,8 +1,8 @@
-"""Depth cameras of several kinds, drawn from how they measure, by a program that shares nothing with the renderer.
+"""Depth cameras of several kinds, modelled on their measurement principle, independent of the renderer.
 
-Each camera looks at triangles through rays of its own and makes of them what its principle makes of them: window
-matching with a fixed pattern (Kinect 1, D415, D435), independent pixels, phases that surroundings light as well (time
-of flight), a stripe that falls off edges (laser). Numbers stand beside their source; "assumed" marks those without.
+Each camera intersects triangles with its own rays and measures them by its principle: window matching with a fixed
+pattern (Kinect 1, D415, D435), independent pixels, phases with multipath (time of flight), a stripe that falls off
+edges (laser). Numbers have their source next to them; "assumed" marks those without.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class DepthCamera(ABC):
         """Return measured depth (h, w) in m, 0 where there is none.
 
         Args:
-            world: what is there.
+            world: the scene.
             rng: of noise that changes from frame to frame.
             seed: of what does not.
         """

@@ -37,7 +37,7 @@ class Specimen:
     recipe: str
     """Name of its recipe, of this folder or built in; `can+faint` is the can with a faint print."""
     symmetry: Symmetry
-    """Its class; a near-symmetric shape is a body of revolution but for something small."""
+    """Its class; a near-symmetric shape is a body of revolution except for something small."""
     half: Half
     """Whether methods may be tuned on it."""
 
@@ -87,7 +87,7 @@ def printed(recipe: Recipe, contrast: float) -> Recipe:
 FRAMES: Final = 2
 """Frames of each shape under each condition, one more than pairs."""
 
-# A half that has been looked at may be tuned on from then on: its shapes move over, and new ones take their place.
+# After an evaluation, held-out shapes may be used for tuning: they move over, and new ones replace them.
 _RECIPES: Final[Mapping[Half, Mapping[Symmetry, tuple[str, ...]]]] = {
     "tuning": {
         "asymmetric": (

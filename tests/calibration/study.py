@@ -44,7 +44,7 @@ class Condition:
     step_deg: float = 25.0
     """Mean turn from frame to frame."""
     shift_px: float = 0.0
-    """Standard deviation of the shift of a frame's colours beside its depth."""
+    """Standard deviation of the shift of a frame's colours against its depth."""
 
     def __str__(self) -> str:
         """Return it in words."""

@@ -1,13 +1,12 @@
-"""Register views one to four steps apart from scratch, and count what is right and what is stood by.
+"""Register views one to four steps apart without initial guess, and count right and usable results.
 
     PYTHONPATH=tests python -m far_apart                                  # tuning shapes and recordings, three minutes
-    PYTHONPATH=tests python -m far_apart --half held-out --limits none    # to be looked at once, at the end
+    PYTHONPATH=tests python -m far_apart --half held-out --limits none    # a single evaluation, at the end
 
-Limits are told that hold the motion, none are told (180° and 20 cm), or nothing is. An answer is right where its
-rotation is off by less than 5° (16.2° for the dragon and the dog, as in literature). Beside it are FPFH with RANSAC,
-and KISS-Matcher where it is installed, both followed by ICP. Of the wrong ones, missed are
-those where the images are better explained, by 3 nats, by the truth than by the answer; the others are the fault of
-the evidence. The status is 1 where no pair is right: then the study is broken.
+The given limits contain the motion, are wide (180° and 20 cm), or are the defaults. A result is right if its rotation
+error is below 5° (16.2° for the dragon and the dog, as in the literature). Baselines are FPFH with RANSAC, and
+KISS-Matcher if installed, both followed by ICP. A wrong result is missed if the images fit the truth better by 3 nats;
+otherwise the evidence is at fault. The status is 1 if no pair is right: then the study is broken.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="far_apart", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--half", choices=("tuning", "held-out"), default="tuning", help="which shapes")
-    parser.add_argument("--limits", nargs="+", choices=get_args(Limits), default=get_args(Limits), help="what is told")
+    parser.add_argument("--limits", nargs="+", choices=get_args(Limits), default=get_args(Limits), help="given limits")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="every N-th target of recordings")
     parser.add_argument("--no-colour", action="store_true", help="by depth alone")
     parser.add_argument("--seed", type=int, default=0, help="of the registration")
@@ -75,8 +74,8 @@ def _trials(pair: Pair, limits: Iterable[Limits], seed: tuple[int, int], *, colo
     """Yield what is made of a pair."""
     ours = VisibilityRegistrar(VisibilityLikelihood(colour=colour))
 
-    def by(registrar: AbstractRegistrar, told: Limits) -> Posterior:
-        return registrar.register(pair.source, pair.target, pair.density(told), rng=np.random.default_rng(seed))
+    def by(registrar: AbstractRegistrar, limit: Limits) -> Posterior:
+        return registrar.register(pair.source, pair.target, pair.density(limit), rng=np.random.default_rng(seed))
 
     untold = Modeler(
         registrar=ours, prior=GeneralPrior(limits_assumed=True), seed=seed[0]

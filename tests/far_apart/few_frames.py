@@ -1,13 +1,12 @@
 """Build models from few frames far apart: six views 60° apart of a full turn, and four views 90° apart.
 
     PYTHONPATH=tests python -m far_apart.few_frames                              # 16 shapes of the tuning half
-    PYTHONPATH=tests python -m far_apart.few_frames --half held-out              # to be looked at once, at the end
+    PYTHONPATH=tests python -m far_apart.few_frames --half held-out              # a single evaluation, at the end
     PYTHONPATH=tests python -m far_apart.few_frames --views 4
 
-Shapes that look different from every side stand on a table, 0.6 m from a camera of 640 × 480 px; nothing is told
-but masks. A frame that is in the model is right where its pose is off by less than 3° and the place of the
-surface by less than 5 mm; a model is wrong where a frame in it is not right. The status is 1 where a wrong model ends
-with 0.
+Shapes that look different from every side stand on a table, 0.6 m from a camera of 640 × 480 px; only masks
+are given. A frame in the model is right if its rotation error is below 3° and the position error of its surface below
+5 mm; a model is wrong if a frame in it is not right. The status is 1 if a wrong model ends with 0.
 """
 
 from __future__ import annotations
@@ -88,14 +87,14 @@ def shapes(half: Half, count: int) -> list[str]:
 
 
 def built(name: str, views: int, prior: str) -> Built:
-    """Build the model of a shape as `modeler build` does, but for the recording, and compare it with the truth."""
+    """Build the model of a shape as `modeler build` does, without recording, and compare it with the truth."""
     recipe = load_specimen(name)
     seed = int(np.random.SeedSequence([60, recipe.seed, views]).generate_state(1)[0])
     condition = Condition(distance_m=0.6, step_deg=360.0 / views)
     sequence = RenderedSequence(staged(recipe, condition, frames=views, seed=seed))
-    told = PriorOptions(prior=prior)  # pyright: ignore[reportArgumentType]
+    options = PriorOptions(prior=prior)  # pyright: ignore[reportArgumentType]
     began = time.process_time()
-    modeler = compose.modeler(sequence, told, MethodOptions(seed=0), ObjectOptions())
+    modeler = compose.modeler(sequence, options, MethodOptions(seed=0), ObjectOptions())
     records, centres_m, last = {}, {}, None
     for event in modeler.run(sequence, compose.scene(modeler, sequence)):
         if isinstance(event, Step):

@@ -18,7 +18,7 @@ from sequences import open_sequence
 from sequences.rendering.renderer import RenderedSequence
 
 Limits = Literal["told", "none", "default"]
-"""What is said of the motion: limits that hold it, none, or nothing."""
+"""Prior of the motion: limits that contain it, wide limits, or the defaults."""
 
 STEPS: Final = 4
 STEP_DEG: Final = 25.0
@@ -64,7 +64,7 @@ class Pair:
         return _RIGHT_DEG.get(self.group, 5.0)
 
     def density(self, limits: Limits) -> AbstractPoseDensity:
-        """Return what is known of the motion where limits are told, or that there are none."""
+        """Return the prior of the motion for given or wide limits."""
         if limits == "told":
             reach_deg = 50.0 if self.turn_deg < 40.0 else min(self.turn_deg + 20.0, 180.0)
             return GeneralPrior(reach_deg, 0.09).between(self.source, self.target)
@@ -72,7 +72,7 @@ class Pair:
 
 
 def pairs(half: Half, *, every: int = 1) -> Iterator[Pair]:
-    """Yield pairs of the shapes of a half and, to tune on, of recordings; every so many of the targets."""
+    """Yield pairs of the shapes of a half and, to tune on, of recordings; every n-th of the targets."""
     for name in SHAPES[half]:
         yield from _of("shapes", name, _rendered(name), range(1, STEPS + 1), ())
     if half == "tuning" and SHARED.exists():
@@ -84,7 +84,7 @@ Views = tuple[dict[int, RayImage], dict[int, Array]]
 
 
 def _of(group: str, name: str, views: Views, offsets: Sequence[int], targets: Sequence[int]) -> Iterator[Pair]:
-    """Yield pairs of views so many steps apart, of the first target where none are given."""
+    """Yield pairs of views the given number of steps apart, of the first target where none are given."""
     images, poses = views
     numbers = [number for number in sorted(images) if number in poses]
     for place in targets or (0,):

@@ -1,1 +1,1 @@
-"""The study of objects that a hand holds and turns before the camera: a robot's, which takes it anew, or a person's."""
+"""The study of objects that a hand turns in front of the camera: a robot's, with a regrasp, or a person's."""

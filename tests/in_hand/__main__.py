@@ -1,8 +1,8 @@
 """Build models of objects in a hand: `PYTHONPATH=tests python -m in_hand`.
 
-A robot's gripper carries eight shapes, its poses read with errors of 2° and 5 mm, and takes each anew halfway
-(`robot`) or not (`steady`); a person's hand turns them before the camera at 60° a second, seen 15 times a second.
-Results are kept in the folder, and a study that was stopped goes on where it was.
+A robot's gripper, whose poses have errors of 2° and 5 mm, carries eight shapes and regrasps each halfway (`robot`) or
+not (`steady`); a person's hand turns them in front of the camera at 60° a second, at 15 frames a second. Results are
+kept in the folder, and an interrupted study continues.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="in_hand", description=__doc__)
     parser.add_argument("--holder", nargs="+", choices=HOLDERS, default=HOLDERS, help="whose hand")
     parser.add_argument("--shape", nargs="+", choices=SHAPES, default=SHAPES, help="which shapes")
-    parser.add_argument("--told", choices=TOLD, default="masks", help="what is handed over of the images")
+    parser.add_argument("--told", choices=TOLD, default="masks", help="given masks or shape of the hand")
     parser.add_argument("--out", type=Path, default=Path("runs/in_hand"), help="folder of the results")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Objects in a hand: a robot's, that takes them anew on the way, or a person's, seen at the rate of a camera."""
+"""Objects in a hand: a robot's, with a regrasp on the way, or a person's, at the frame rate of a camera."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from sequences.rendering.stage import matrix_of, place_of
 from sequences.rendering.trajectory import Hand, Place, Places
 
 Holder = Literal["robot", "steady", "person"]
-"""A robot that takes the object anew halfway, one that does not, or a person."""
+"""A robot that regrasps the object halfway, one that does not, or a person."""
 HOLDERS: Final[tuple[Holder, ...]] = ("robot", "steady", "person")
 Told = Literal["masks", "nothing", "shape"]
 """What is handed over of the images: masks of object and hand, nothing, or the shape of the robot's hand."""
 TOLD: Final[tuple[Told, ...]] = ("masks", "nothing", "shape")
 SHAPES: Final = ("drill", "teapot", "figurine", "l_bracket", "rubber_duck", "toy_car", "stapler", "telephone")
 ROBOT_FRAMES, REGRASPED, ROBOT_STEP_DEG = 24, 12, 18.0
-"""Of the robot: frames, the first one in its second grasp, and the turn from frame to frame."""
+"""Of the robot: number of frames, first frame of the second grasp, and the turn from frame to frame."""
 PERSON_FRAMES, PERSON_STEP_DEG = 96, 4.0
 """Of the person: a full turn and a little more at 60° a second, 15 frames a second."""
 SIGMA_DEG, SIGMA_M = 2.0, 0.005
@@ -110,7 +110,7 @@ def stage(shape: str, holder: Holder, told: Told = "masks") -> Stage:
 
 
 def hand_poses(recorded: Recorded, regrasped: int) -> Array:
-    """Return camera_from_hand (n, 4, 4) as a robot reads it that takes the object anew at a frame."""
+    """Return camera_from_hand (n, 4, 4) as measured by a robot that regrasps the object at a frame."""
     rng = np.random.default_rng([recorded.stage.recipe.seed, 24])
     sigma = np.repeat([np.radians(SIGMA_DEG), SIGMA_M], 3)
     regrasp = se3.exp(np.array([np.pi, 0.0, 0.0, 0.0, 0.0, 0.1]))
@@ -144,7 +144,7 @@ def hand_shape(recorded: Recorded) -> HandShape:
 def outcome(shape: str, holder: Holder, told: Told = "masks") -> Outcome:
     """Build the model of one run and compare it with the truth."""
     recorded = Recorded(stage(shape, holder, told))
-    modeler = compose.modeler(recorded, recorded.stage.told, MethodOptions(seed=0), ObjectOptions())
+    modeler = compose.modeler(recorded, recorded.stage.options, MethodOptions(seed=0), ObjectOptions())
     given: AbstractSequence = recorded
     if holder != "person":
         times_s = np.array([recorded.frame(index).time_s for index in recorded.indices])

@@ -1,8 +1,8 @@
 """Build whole sequences and report the error before and after loop closure: `PYTHONPATH=tests python -m loops`.
 
-The table goes to stdout, progress to stderr, and loops.json into a folder, for a long sequence beside costs.png. Errors
-of one run are largely chance: with several seeds the last lines are means by case. The status is 1 where, on a rendered
-case, the mean error after is above 1°, or more than 0.6 of that before where a loop leads over all frames.
+The table goes to stdout, progress to stderr, and loops.json into a folder, for a long sequence also costs.png. Errors
+of one run are largely chance: with several seeds the last lines are means by case. The status is 1 if, on a rendered
+case, the mean error after is above 1°, or more than 0.6 of that before if a loop spans all frames.
 """
 
 from __future__ import annotations

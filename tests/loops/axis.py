@@ -1,7 +1,7 @@
-"""Turntables whose axis nobody tells: what solving for it with all poses takes off their errors, over many seeds.
+"""Turntables with an unknown axis: how much estimating it with all poses reduces errors, over many seeds.
 
 `PYTHONPATH=tests python -m loops.axis --shape figurine --seeds 10`. The views show no table, so that each pair's edge
-holds how far it turned, but not about what. The table goes to stdout.
+determines the rotation angle, but not the axis. The table goes to stdout.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ BUNDLED = Path(sequences.__file__).parent / "bundled"
 
 @dataclass(frozen=True)
 class Case:
-    """One sequence, and what is known of its motion."""
+    """One sequence and its motion prior."""
 
     name: str
     """What it is called."""
@@ -101,7 +101,7 @@ def bundled() -> list[Case]:
 
 
 def real() -> list[Case]:
-    """Return the real captures that are there."""
+    """Return the available real captures."""
     priors = {"cap": "table", "kleenex": "table", "castard": "general", "dragon": "general", "dog_upright": "general"}
     return [
         Case(name, sequences.open_sequence(SHARED / name), prior)

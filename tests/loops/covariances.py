@@ -1,9 +1,9 @@
 """Covariances of whole runs against the truth, by shape and by class: `PYTHONPATH=tests python -m loops.covariances`.
 
-A hand pushes each shape about a table that wobbles as the prior says, 14 frames at about 25°, so that the end meets the
-beginning. Judged are poses relative to the first frame, motions between neighbours, and motions over five frames: NEES,
-an average a degree of freedom, 1 where covariances are true, and how often the 95 % region holds the truth. Poses of
-one run err together: few runs tell little. The table goes to stdout, covariances.json into a folder.
+A hand pushes each shape about a table that wobbles as the prior assumes, 14 frames at about 25°, a closed turn.
+Evaluated are poses relative to the first frame, motions between neighbours, and motions over five frames: NEES,
+an average per degree of freedom, 1 for calibrated covariances, and the coverage of the 95 % region. Errors within one
+run are correlated: few runs are not conclusive. The table goes to stdout, covariances.json into a folder.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Focal lengths that loops tell, against the truth: `PYTHONPATH=tests python -m loops.focal_lengths`.
+"""Focal lengths estimated from loops, against the truth: `PYTHONPATH=tests python -m loops.focal_lengths`.
 
-Each shape is pushed about a table for a full turn, and its intrinsics are stated with an error of 2 to 8 %. The table
-says which focal length the run found relative to the true one, by how much it states to err, how far its loops were
-open before and after in standard deviations, and what `modeler calibrate-camera` finds from the run (again).
+Each shape is pushed about a table for a full turn; its given intrinsics have an error of 2 to 8 %. The table has the
+estimate of the run relative to the true focal length, its standard deviation, the loop closure errors before and after
+in standard deviations, and the estimate of `modeler calibrate-camera` from the run (again).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _GOAL = 0.01
 
 
 def row(shape: str, error: float, options: argparse.Namespace) -> dict[str, Any]:
-    """Build one sequence and return what it tells."""
+    """Build one sequence and return its estimates."""
     true = pushed(shape, options.seed, options.frames, options.step_deg)
     true_px = true.frame(true.indices[0]).camera.fx
     stated = RefocusedSequence(true, FocalFactor(1.0 + error, true_px))

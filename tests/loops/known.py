@@ -1,4 +1,4 @@
-"""A registrar that is told the truth, to see what everything else costs."""
+"""A registrar that returns ground truth, to measure the cost of everything else."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Outcome
 @final
 @dataclass(frozen=True)
 class Known(AbstractRegistrar):
-    """The true motion, but for an error as large as it says."""
+    """The true motion with an error drawn from the reported covariance."""
 
     camera_from_model: Mapping[int, Array] = field(repr=False)
     """(4, 4) by frame number."""

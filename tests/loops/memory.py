@@ -1,9 +1,9 @@
-"""How much memory and time `modeler build` takes over thousands of frames.
+"""Memory and time of `modeler build` over thousands of frames.
 
 `PYTHONPATH=tests python -m loops.memory --frames 5000 --out runs/memory` renders an object that turns by 3° a frame, a
-folder of pictures that is kept for the next time, and builds it as the command does: with pairs kept, recording and
-report. With --told-truth pairs are registered by the truth, to see what everything else takes. Ctrl-C ends it with the
-frames so far. stdout has a line for every --every steps: resident memory as the system counts it (what the program
+folder of images that is reused, and builds it as the command does: with stored pairs, recording and report. With
+--told-truth, ground truth replaces registration, to measure the cost of everything else. Ctrl-C ends it with the frames
+so far. stdout has a line for every --every steps: resident memory as the system counts it (what the program
 allocated, and what it read of mapped files), and the most so far.
 """
 
@@ -75,7 +75,7 @@ class Meter(Console):
 
 
 def _row(costs: list[dict[str, Any]], every: int) -> str:
-    """Return a line on the newest step, with the time a frame since so many before."""
+    """Return a line on the newest step, with the time per frame since an earlier step."""
     new, old = costs[-1], costs[max(len(costs) - 1 - every, 0)]
     count = max(min(every, len(costs) - 1), 1)
     spent = ((new[name] - old[name]) / count for name in ("s", "cpu_s"))

@@ -69,7 +69,7 @@ class Result:
 
 
 def modeler(case: Case, closer: Closer, seed: int, *, told_truth: bool = False, lies: float = 0.0) -> Modeler:
-    """Return the loop for a case; its model is coarse, for nobody looks at it."""
+    """Return the loop for a case; its model is coarse, as it is not used."""
     noise = case.sequence.sensor()
     truth = case.truth() if told_truth else None
     registrar = VisibilityRegistrar() if truth is None else Known(truth)
@@ -86,7 +86,7 @@ def modeler(case: Case, closer: Closer, seed: int, *, told_truth: bool = False, 
 
 
 def run(maker: Modeler, case: Case, told: Callable[[Step, float, float], None]) -> Result:
-    """Build a case and return its figures; `told` hears of each step, its processor time and memory."""
+    """Build a case and return its figures; `told` receives each step, its processor time and memory."""
     indices = case.sequence.indices
     scene = maker.segmenter.scene([case.sequence.frame(index) for index in telling(indices)])
     began = time.process_time()

@@ -1,1 +1,1 @@
-"""What a batch costs: per sequence, beside single builds, and per task of an engine."""
+"""Cost of a batch: per sequence, compared with single builds, and per task of an engine."""

@@ -1,8 +1,8 @@
 """Find objects in rendered scenes without masks, or build models behind hands and grippers: `python -m scenes`.
 
-`masks` segments scenes of all kinds and compares the masks with the truth; the held-out half is there to be looked at
-once. `occluded` builds models of objects that a hand or a gripper hides in part. Renderings and runs are kept in the
-folder, and a study that was stopped goes on where it was. The table goes to stdout, progress to stderr.
+`masks` segments scenes of all kinds and compares the masks with the truth; the held-out half is for a single
+evaluation. `occluded` builds models of objects partly occluded by a hand or a gripper. Renderings and runs are kept in
+the folder, and an interrupted study continues. The table goes to stdout, progress to stderr.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--half", choices=HALVES, default="tuning", help="of masks: which shapes and draws")
     parser.add_argument("--scenes", type=int, default=masks.SCENES, metavar="N", help="of masks: how many of the half")
     parser.add_argument(
-        "--told", nargs="+", choices=occluded.TOLD, default=occluded.TOLD, help="of occluded: what is handed over"
+        "--told", nargs="+", choices=occluded.TOLD, default=occluded.TOLD, help="of occluded: given masks"
     )
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)

@@ -116,4 +116,4 @@ def table(results: Sequence[Found]) -> str:
 
 SCENES: Final = 3 * len(KINDS)
 """Of a half, of `FRAMES` each."""
-assert FRAMES <= 15  # so that all are looked at
+assert FRAMES <= 15  # so that all are evaluated

@@ -1,4 +1,4 @@
-"""Objects behind a hand or a gripper: what poses and models come to, by what is told of it."""
+"""Objects behind a hand or a gripper: accuracy of poses and models by the given masks."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from sequences.rendering.trajectory import Place, Places, Tabletop
 
 Holder = Literal["arm", "gripper"]
 HOLDERS: Final[tuple[Holder, ...]] = ("arm", "gripper")
-"""An arm before the object, elsewhere in every frame; a gripper that holds it and turns with it."""
+"""An arm in front of the object, at a different place in every frame; a gripper that holds it and turns with it."""
 SHAPES: Final = ("drill", "teapot", "figurine", "l_bracket", "box")
 Told = Literal["no hand", "masks with hand", "masks", "masks and hand", "nothing", "hand"]
 TOLD: Final[tuple[Told, ...]] = ("no hand", "masks with hand", "masks", "masks and hand", "nothing", "hand")
-"""What is handed over: nothing hides the object; masks that hold the hand too, as if it were object; masks of the
-object; masks of object and hand; no masks; masks of the hand alone."""
+"""Given masks: no occlusion; joint masks of object and hand; masks of the object; separate masks of object and hand; no
+masks; masks of the hand alone."""
 FRAMES, STEP_DEG = 12, 30.0
 
 
 @final
 @dataclass(frozen=True)
 class Outcome:
-    """What one run came to."""
+    """Result of one run."""
 
     shape: str
     """Name of the object's recipe."""
     holder: Holder
     """What hides it."""
     told: Told
-    """What was handed over."""
+    """The given masks."""
     hidden: float
     """Median share of the object's pixels that are hidden."""
     placed: int
@@ -83,7 +83,7 @@ def stage(shape: str, holder: Holder, told: Told) -> Stage:
 def outcome(shape: str, holder: Holder, told: Told) -> Outcome:
     """Build the model of one run and compare it with the truth."""
     recorded = Recorded(stage(shape, holder, told))
-    modeler = compose.modeler(recorded, recorded.stage.told, MethodOptions(seed=0), ObjectOptions())
+    modeler = compose.modeler(recorded, recorded.stage.options, MethodOptions(seed=0), ObjectOptions())
     hidden = _hidden(recorded)
     began = time.perf_counter()
     last = None
@@ -128,7 +128,7 @@ def gripper(recipe: Recipe, places: Sequence[Place], width_m: float = 0.03) -> R
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Return a line for each holder and what was told: medians over the shapes, and the worst."""
+    """Return a line for each holder and given masks: medians over the shapes, and the worst."""
     lines = [f"{'':26}{'hidden':>8}{'placed':>10}{'rotation, median':>18}{'worst':>8}{'F, median':>11}{'worst':>8}"]
     for holder in HOLDERS:
         for told in TOLD:

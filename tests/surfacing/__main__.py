@@ -31,7 +31,7 @@ from surfacing.methods import METHODS, Surface
 
 SHAPES = ("box", "flashlight", "tube", "bottle", "figurine", "l_bracket", "mug", "teapot")
 TURNED = ("--prior", "turntable", "--step-deg", "25", "--step-sigma-deg", "3", "--max-shift-m", "0.05")
-"""For shapes whose turn the images do not tell, or not all the way round."""
+"""For shapes whose rotation the images do not determine, or only in part."""
 BLIND = ("bottle", "mug")
 _RECIPES = Path(sequences.__file__).parent / "recipes"
 

@@ -1,12 +1,11 @@
-"""What left-out views say of surfaces and colours: `PYTHONPATH=tests python -m surfacing.captures RUN...`.
+"""Surfaces and colours of held-out views: `PYTHONPATH=tests python -m surfacing.captures RUN...`.
 
-Every view of a run is left out once, with every FOLDS-th other; the rest is fused with the run's poses, and what the
-view's camera would see of the mesh is compared with what it saw. Prints a Markdown table, a row for each run and
-method: which share of the object's pixels the view sees through surface, which share of what other views see as well is
-missing, how far surfaces are apart, how far colours are (of our textures, of 255, one gain for the view; as they are,
-and with the shading of the view's lamps put back), how far their gradients are a pixel (seams that are not in the
-images, print that is blurred); and of the mesh of all views the length of its boundaries, and the surface that lies on
-the support like a part of it.
+Cross-validation over the views of a run: each fold leaves out every FOLDS-th view, fuses the rest with the run's poses,
+and compares the mesh with each left-out view. Prints a Markdown table, a row for each run and method: the share of the
+object's pixels that violate free space, the share of surface observed by other views too that is missing, the distance
+of surfaces, colour differences (of our textures, of 255, one gain for the view; as they are, and with the shading of
+the view's lamps put back), gradient differences per pixel (seams that are not in the images, blurred print); and for
+the mesh of all views the length of its boundaries, and false surface on the support.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ from surfacing.drawing import Scene
 from surfacing.methods import Surface, open3d_poisson, open3d_tsdf
 
 FOLDS = 5
-MARGIN_PX = 2  # a pixel sees as far as all around it do: along outlines depth is a mixture
-BLUR_PX = 1.0  # of colours before gradients: a pixel's noise is no seam
+MARGIN_PX = 2  # free space of a pixel ends at the least depth around it: depth is mixed along outlines
+BLUR_PX = 1.0  # of colours before gradients, against pixel noise
 FLAT_RAD = 0.5  # of the support's normal: what lies so flat and low is its surface
 
 
@@ -48,7 +47,7 @@ def ours(volume: FusionVolume, views: Mapping[int, RayImage], poses: Mapping[int
 
 
 def tsdf(volume: FusionVolume, views: Mapping[int, RayImage], poses: Mapping[int, Array]) -> Surface:
-    """Integrate with Open3D, on our voxels and band; as with us, what a single view saw is surface."""
+    """Integrate with Open3D, on our voxels and band; as in ours, a single view suffices for surface."""
     return open3d_tsdf(views, poses, volume.grid.voxel_m, volume.tau_m, above=0.5)
 
 
@@ -78,7 +77,7 @@ def figures_of(run: Reopened, method: str, folds: int) -> dict[str, float]:
 def compared(
     mesh: Surface, volume: FusionVolume, view: RayImage, object_from_camera: Array, near_m: float
 ) -> dict[str, float]:
-    """Return how a mesh differs from what a view saw that had no part in it, nor in a volume."""
+    """Return the differences between a mesh and a view that was not part of it or its volume."""
     frame, scene = view.frame, Scene(*mesh)
     drawn = scene.seen(frame.camera, object_from_camera)
     mask = np.isfinite(frame.depth_m) & (frame.depth_m > 0.0)
@@ -159,7 +158,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _table(rows: Sequence[Mapping[str, object]]) -> str:
-    heads = ("seen through", "missing", "apart", "colour", "same, lit", "gradient", "boundaries", "on the support")
+    heads = (
+        "free-space violations",
+        "missing",
+        "distance",
+        "colour",
+        "same, lit",
+        "gradient",
+        "boundaries",
+        "on the support",
+    )
     lines = ["| | | " + " | ".join(heads) + " |", "|---" * (2 + len(heads)) + "|"]
     forms = {
         "through": "{:.2%}",

@@ -30,7 +30,7 @@ def measured(make: Callable[..., Any], arguments: tuple[Any, ...], warm: tuple[A
 
 def _measure(make: Callable[..., Any], arguments: tuple[Any, ...], warm: tuple[Any, ...], answer: Connection) -> None:
     make(*warm)
-    Path("/proc/self/clear_refs").write_text("5")  # begin the peak anew
+    Path("/proc/self/clear_refs").write_text("5")  # reset the peak
     before = _status("VmRSS")
     began = time.process_time()
     result = make(*arguments)

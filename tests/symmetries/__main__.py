@@ -1,9 +1,9 @@
 """Find symmetries of shapes of known class: `PYTHONPATH=tests python -m symmetries`.
 
 Takes shapes of the calibration study, as many of each class, as true meshes with noise or, with --built, as models that
-are built from rendered images of a full turn on a turntable. Prints a table of what was found, and a line of JSON a
-shape to stderr. The status is 1 where more than one shape in twelve is put into a wrong class, or where a symmetry is
-claimed of a shape that has none.
+are built from rendered images of a full turn on a turntable. Prints a table of the results, and a line of JSON per
+shape to stderr. The status is 1 if more than one shape in twelve is misclassified, or if a symmetry is claimed of a
+shape that has none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Build sound sequences and sequences with one fault each, and count wrong models that end with 0: `make trust`.
+"""Build sequences without a fault and with one fault each, and count wrong models that end with 0: `make trust`.
 
-Shapes and draws are split into two halves: limits may be settled on the tuning half; the other is there to be looked at
-once, at the end. Every run is written as it ends (HALF.jsonl), and a study that was stopped goes on where it was. The
+Shapes and draws are split into two halves: limits may be tuned on the tuning half; the other is for a single evaluation
+at the end. Every run is written as it ends (HALF.jsonl), and an interrupted study continues. The
 table goes to stdout, progress to stderr.
 """
 

@@ -1,4 +1,4 @@
-"""What goes wrong in a recording or in what is told of it: one fault each."""
+"""Faults of a recording or of its metadata: one each."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def late_mask(stage: Stage, other: Recipe, rng: Rng) -> Stage:
 
 
 def other_mask(stage: Stage, other: Recipe, rng: Rng) -> Stage:
-    """Masks are those of a box that stands beside, in all frames or in some."""
+    """Masks are those of a neighbouring box, in all frames or in some."""
     count, reach_m = len(stage.places), _half_width_m(stage.recipe)
     size_m = rng.uniform(0.05, 0.12, 3)
     beside = Place((float(rng.choice([-1.0, 1.0])) * (reach_m + 0.13), 0.0, float(size_m[2]) / 2.0))
@@ -129,7 +129,7 @@ def replaced(stage: Stage, other: Recipe, rng: Rng) -> Stage:
 
 
 def two_objects(stage: Stage, other: Recipe, rng: Rng) -> Stage:
-    """Another object moves beside it, in masks too where these are handed over."""
+    """Another object moves next to it, in masks too if these are given."""
     apart_m = _half_width_m(stage.recipe) + _half_width_m(other) + 0.02
     side = float(rng.choice([-1.0, 1.0]))
     own = [Place((p.offset_m[0] - side * apart_m / 2.0, *p.offset_m[1:]), p.rotation_deg) for p in stage.places]
@@ -163,7 +163,7 @@ def object_still(stage: Stage, other: Recipe, rng: Rng) -> Stage:
 
 
 def wrong_intrinsics(stage: Stage, other: Recipe, rng: Rng) -> Stage:
-    """The focal length is stated 2 to 10 % too long or too short."""
+    """The given focal length is 2 to 10 % too long or too short."""
     factor = 1.0 + _signed(rng, 0.02, 0.1)
 
     def off(frames: Sequence[Frame]) -> Sequence[Frame]:
@@ -176,7 +176,7 @@ def wrong_intrinsics(stage: Stage, other: Recipe, rng: Rng) -> Stage:
 
 
 def wrong_scale(stage: Stage, other: Recipe, rng: Rng) -> Stage:
-    """Depth is stated 2 to 10 % too large or too small."""
+    """The given depth scale is 2 to 10 % too large or too small."""
     factor = np.float32(1.0 + _signed(rng, 0.02, 0.1))
     return replace(stage, spoil=lambda frames: [replace(frame, depth_m=factor * frame.depth_m) for frame in frames])
 
@@ -189,16 +189,16 @@ def _turntable(stage: Stage, rng: Rng) -> tuple[Stage, float]:
 
 
 def wrong_step(stage: Stage, other: Recipe, rng: Rng) -> Stage:
-    """The turntable's step is told 10 to 60 % too large, or as much too small."""
+    """The given step of the turntable is 10 to 60 % too large, or as much too small."""
     stage, step_deg = _turntable(stage, rng)
     factor = float(rng.uniform(1.1, 1.6)) ** float(rng.choice([-1.0, 1.0]))
-    return replace(stage, told=PriorOptions(prior="turntable", step_deg=step_deg * factor, step_sigma_deg=1.0))
+    return replace(stage, options=PriorOptions(prior="turntable", step_deg=step_deg * factor, step_sigma_deg=1.0))
 
 
 def wrong_sense(stage: Stage, other: Recipe, rng: Rng) -> Stage:
-    """The turntable is told to turn the other way round."""
+    """The given sign of the turntable's step is wrong."""
     stage, step_deg = _turntable(stage, rng)
-    return replace(stage, told=PriorOptions(prior="turntable", step_deg=-step_deg, step_sigma_deg=1.0))
+    return replace(stage, options=PriorOptions(prior="turntable", step_deg=-step_deg, step_sigma_deg=1.0))
 
 
 def symmetric(stage: Stage, other: Recipe, rng: Rng) -> Stage:
@@ -208,9 +208,9 @@ def symmetric(stage: Stage, other: Recipe, rng: Rng) -> Stage:
 
 def large_steps(stage: Stage, other: Recipe, rng: Rng) -> Stage:
     """The object turns by 55° to 180° from frame to frame."""
-    step_deg, turntable = float(rng.uniform(55.0, 180.0)), stage.told.prior == "turntable"
+    step_deg, turntable = float(rng.uniform(55.0, 180.0)), stage.options.prior == "turntable"
     places = posed(Tabletop(10, step_deg, 3.0, 0.02), int(rng.integers(2**31)))
-    return replace(stage.moving(places), told=PriorOptions(prior="table") if turntable else stage.told)
+    return replace(stage.moving(places), options=PriorOptions(prior="table") if turntable else stage.options)
 
 
 def few_frames(stage: Stage, other: Recipe, rng: Rng) -> Stage:
@@ -249,14 +249,14 @@ FAULTS: Final = (
     Fault("masks thin", thin_mask),
     Fault("box behind", box_behind),
     Fault("depth scale", wrong_scale),
-    Fault("step told wrongly", wrong_step),
+    Fault("wrong step", wrong_step),
     Fault("deformed", deformed),
     Fault("masks late", late_mask),
     Fault("person behind", person_behind),
     Fault("camera bumped", camera_bumped),
-    Fault("sense told wrongly", wrong_sense),
+    Fault("wrong sign of the step", wrong_sense),
     Fault("two objects", two_objects),
-    Fault("masks of another thing", other_mask),
+    Fault("masks of another object", other_mask),
     Fault("hand in view", hand_in_view),
     Fault("object still", object_still),
     Fault("symmetric", symmetric, ("near-symmetric", "revolution")),

@@ -1,4 +1,4 @@
-"""The runs of the study: which shape, which motion, what is told, and which fault, drawn from half and number alone."""
+"""The runs of the study: shape, motion, given metadata and fault, drawn from half and number alone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from trust.stage import WIDTH_PX, Stage, posed
 
 Half = Literal["tuning", "held-out"]
 HALVES: Final[tuple[Half, ...]] = ("tuning", "held-out")
-SOUND: Final = "sound"
+SOUND: Final = "no fault"
 """Of a run without a fault."""
 SHIFT_M: Final = 0.02
 """Mean shift of an object that is pushed: half of the least limit of a prior."""
@@ -42,7 +42,7 @@ class Plan:
     half: Half
     """Whether limits may be settled on it."""
     number: int
-    """Within its half: even numbers are sound."""
+    """Within its half: even numbers have no fault."""
 
     @property
     def fault(self) -> str:
@@ -59,7 +59,7 @@ class Plan:
         return int(np.random.SeedSequence([HALVES.index(self.half), self.number]).generate_state(1)[0])
 
     def stage(self) -> Stage:
-        """Return what is recorded and told."""
+        """Return the recording and its metadata."""
         rng, fault = np.random.default_rng(self.seed), self._fault
         symmetries = ("asymmetric", "n-fold") if fault is None else fault.symmetries
         name, other = rng.choice(shapes(self.half, *symmetries), 2, replace=False)
@@ -115,9 +115,9 @@ def sound(recipe: Recipe, rng: np.random.Generator) -> Stage:
         trajectory = Turntable(
             frames, step_deg, 0.5, (offset_m[0], offset_m[1]), wobble_deg=WOBBLE_DEG, wobble_m=WOBBLE_M
         )
-        told = PriorOptions(prior=prior, step_deg=step_deg, step_sigma_deg=1.0)
+        options = PriorOptions(prior=prior, step_deg=step_deg, step_sigma_deg=1.0)
     else:
         trajectory = Tabletop(frames, step_deg, shift_m=SHIFT_M, wobble_deg=WOBBLE_DEG, wobble_m=WOBBLE_M)
-        told = PriorOptions(prior=prior)
+        options = PriorOptions(prior=prior)
     places = posed(trajectory, int(rng.integers(2**31)))
-    return Stage(replace(recipe, trajectory=Places(tuple(places))), told, masks)
+    return Stage(replace(recipe, trajectory=Places(tuple(places))), options, masks)

@@ -1,4 +1,4 @@
-"""A rendered scene before it is recorded: the object, what else is in view, and what the user hands over and tells."""
+"""A rendered scene before it is recorded: the object, its surroundings, and the user's metadata."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Stage:
 
     recipe: Recipe
     """The object and how it moves, pose by pose."""
-    told: PriorOptions
+    options: PriorOptions
     """What the user says of the motion."""
     masks: bool = False
     """Whether masks are handed over."""
@@ -101,11 +101,11 @@ class Recorded(AbstractSequence):
         }
 
     def sensor(self) -> None:
-        """Return None: of most cameras nothing is told."""
+        """Return None: unknown for most cameras."""
 
     @property
     def motion(self) -> Mapping[str, object] | None:
-        """Return None: what is known is told by options."""
+        """Return None: it is given by options."""
         return None
 
     def model(self) -> Mesh:

@@ -38,11 +38,11 @@ class Outcome:
     number: int
     """Within the half."""
     fault: str
-    """Put into it, or "sound"."""
+    """Name of its fault, or "no fault"."""
     shape: str
     """Name of the object's recipe."""
     prior: str
-    """As told."""
+    """As given."""
     masks: bool
     """Whether there were any."""
     frames: int
@@ -85,15 +85,15 @@ Look = Callable[[Plan, Recorded, Step | None], None]
 
 
 def outcome(plan: Plan, look: Look = lambda plan, recorded, step: None) -> Outcome:
-    """Build the model of a plan as `modeler build` does, but for the recording, and judge it.
+    """Build the model of a plan as `modeler build` does, without recording, and evaluate it.
 
     Args:
         plan: of the run.
-        look: is shown the plan, what was recorded, and the last step; None if the input was refused.
+        look: receives the plan, the recording, and the last step; None if the input was refused.
     """
     stage = plan.stage()
     recorded = Recorded(stage)
-    count, told = len(recorded.indices), stage.told
+    count, options = len(recorded.indices), stage.options
     began = time.perf_counter()
     step, report = None, {}
     try:
@@ -108,7 +108,7 @@ def outcome(plan: Plan, look: Look = lambda plan, recorded, step: None) -> Outco
         number=plan.number,
         fault=plan.fault,
         shape=recorded.name,
-        prior=str(told.prior),
+        prior=str(options.prior),
         masks=stage.masks,
         frames=count,
         placed=0 if step is None else len(step.solution.trajectory),
@@ -128,8 +128,8 @@ def _built(plan: Plan, recorded: Recorded) -> tuple[Step, dict[str, Any]]:
     Raises:
         InputError: if the input cannot be used.
     """
-    told = recorded.stage.told
-    modeler = compose.modeler(recorded, told, MethodOptions(seed=plan.seed), ObjectOptions())
+    options = recorded.stage.options
+    modeler = compose.modeler(recorded, options, MethodOptions(seed=plan.seed), ObjectOptions())
     scene = compose.scene(modeler, recorded)
     records, last = {}, None
     for event in modeler.run(recorded, scene):
@@ -140,7 +140,7 @@ def _built(plan: Plan, recorded: Recorded) -> tuple[Step, dict[str, Any]]:
     meta = RunMeta(
         sequence=recorded.name,
         seed=plan.seed,
-        prior=str(told.prior),
+        prior=str(options.prior),
         known=modeler.prior,
         closure_expected=comes_back(recorded, modeler.prior, modeler.closer.max_angle_deg),
     )
@@ -148,10 +148,10 @@ def _built(plan: Plan, recorded: Recorded) -> tuple[Step, dict[str, Any]]:
 
 
 def pose_errors(recorded: Recorded, step: Step) -> tuple[float | None, float | None]:
-    """Return the largest errors of a run's poses against its first: rotation in degrees, place in m.
+    """Return the largest errors of a run's poses relative to the first: rotation in degrees, position in m.
 
-    The place is where the surface that a frame shows lands in the object: with depth or intrinsics stated wrongly, what
-    the frame is said to show lands there, and the true surface where it truly belongs.
+    The position is that of a frame's surface in the object: measured with the given depth scale and intrinsics,
+    compared with the true surface.
 
     None if a frame in the model shows another object, or none is in it.
     """

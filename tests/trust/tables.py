@@ -11,16 +11,16 @@ _HEADS = ("", "runs", "wrong with 0", "wrong with 3", "right with 0", "right wit
 
 
 def text(outcomes: Sequence[Outcome]) -> str:
-    """Return the table of one half or both: a line for sound runs, one for every fault, one for all faults."""
-    names = sorted(dict.fromkeys(one.fault for one in outcomes), key=lambda name: (name != "sound", name))
+    """Return the table of one half or both: a line for runs without fault, one for every fault, one for all faults."""
+    names = sorted(dict.fromkeys(one.fault for one in outcomes), key=lambda name: (name != "no fault", name))
     lines = [_row(_HEADS), *(_line(name, [one for one in outcomes if one.fault == name]) for name in names)]
-    faulty = [one for one in outcomes if one.fault != "sound"]
+    faulty = [one for one in outcomes if one.fault != "no fault"]
     lines += [_line("all faults", faulty), _line("all", outcomes)]
     return "\n".join(lines)
 
 
 def _line(name: str, outcomes: Sequence[Outcome]) -> str:
-    """Return one line; an input that was refused counts as not trusted."""
+    """Return one line; a rejected input counts as not trusted."""
     counts = [
         sum(one.wrong is wrong and (one.status == 0) is trusted for one in outcomes)
         for wrong, trusted in ((True, True), (True, False), (False, True), (False, False))

@@ -1,11 +1,11 @@
 """Build models of objects that are turned over within one recording: `python -m turned_over`.
 
     PYTHONPATH=tests python -m turned_over                          # ten recordings of five shapes
-    PYTHONPATH=tests python -m turned_over --half held-out          # ten of five others, to be looked at once
+    PYTHONPATH=tests python -m turned_over --half held-out          # ten of five others, for a single evaluation
 
-A recording is a full turn of an object as it stands and another as it lies. It is joined right where the frames of both
-postures are in one model, no pose of which is off by more than 3° or 5 mm. The results are a line of JSON each in a
-file of the folder, and a study that was stopped goes on where it was.
+A recording is a full turn of an object as it stands and another as it lies. It is joined correctly if the frames of
+both postures are in one model without a pose error above 3° or 5 mm. Results are lines of JSON in a file of the folder,
+and an interrupted study continues.
 """
 
 from __future__ import annotations

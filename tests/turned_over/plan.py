@@ -1,4 +1,4 @@
-"""The recordings of the study: which shape, how it is put down again, and what the camera sees meanwhile."""
+"""The recordings of the study: shape, second resting pose, and what the camera sees in between."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Plan:
         return range(FRAMES, FRAMES if self.gap == "jump" else FRAMES + _GAP_FRAMES)
 
     def stage(self) -> Stage:
-        """Return what is recorded and told."""
+        """Return the recording and its metadata."""
         return turned_over(viewed(load_specimen(self.shape), np.random.default_rng(self.seed), self.seed), self)
 
 
@@ -89,10 +89,10 @@ def turned_over(recipe: Recipe, plan: Plan) -> Stage:
         trajectory=Places((*before, *between, *after)),
         turned_over=TurnedOver(at, lying_deg(recipe, rng)),
     )
-    told = PriorOptions(prior=prior)
+    options = PriorOptions(prior=prior)
     if prior == "turntable":
-        told = replace(told, step_deg=30.0, step_sigma_deg=1.0)
-    stage = Stage(recipe, told, masks=bool(rng.integers(2)))
+        options = replace(options, step_deg=30.0, step_sigma_deg=1.0)
+    stage = Stage(recipe, options, masks=bool(rng.integers(2)))
     return arm(stage, rng, shown=plan.gap_frames) if plan.gap == "hand" else stage
 
 
@@ -110,7 +110,7 @@ def _held_up(rng: np.random.Generator) -> Place:
 
 
 def lying_deg(recipe: Recipe, rng: np.random.Generator) -> tuple[float, float, float]:
-    """Return how an object lies that is put down otherwise: at rest, and turned about the vertical at random."""
+    """Return a different resting pose of an object, turned about the vertical at random."""
     standing = Rotation.from_euler("xyz", recipe.rest_rotation_deg, degrees=True).as_matrix()
     down, areas_m2 = _rests(RenderedSequence(recipe).model().vertices_m)
     away = np.degrees(np.arccos(np.clip(-down @ standing[2], -1.0, 1.0))) >= _LEAST_TURN_DEG

@@ -34,7 +34,7 @@ class Outcome:
     gap: str
     """What was seen between the postures."""
     prior: str
-    """As told."""
+    """As given."""
     masks: bool
     """Whether there were any."""
     placed: tuple[int, int]
@@ -79,17 +79,17 @@ class Outcome:
 
 
 def outcome(plan: Plan, folder: Path) -> Outcome:
-    """Build the model of a plan as `modeler build` does, but for the recording, and compare it with the truth.
+    """Build the model of a plan as `modeler build` does, without recording, and compare it with the truth.
 
     Args:
         plan: of the recording.
         folder: where its mesh is written.
     """
     recorded = Recorded(plan.stage())
-    told = recorded.stage.told
+    options = recorded.stage.options
     len(recorded.indices)  # rendered before the clock starts
     began = time.perf_counter()
-    modeler = compose.modeler(recorded, told, MethodOptions(seed=plan.seed % 1000), ObjectOptions())
+    modeler = compose.modeler(recorded, options, MethodOptions(seed=plan.seed % 1000), ObjectOptions())
     records, last = {}, None
     for event in modeler.run(recorded, compose.scene(modeler, recorded)):
         if isinstance(event, Step):
@@ -100,7 +100,7 @@ def outcome(plan: Plan, folder: Path) -> Outcome:
     meta = RunMeta(
         sequence=recorded.name,
         seed=0,
-        prior=str(told.prior),
+        prior=str(options.prior),
         known=modeler.prior,
         closure_expected=comes_back(recorded, modeler.prior, modeler.closer.max_angle_deg),
     )
@@ -112,7 +112,7 @@ def outcome(plan: Plan, folder: Path) -> Outcome:
         number=plan.number,
         shape=plan.shape,
         gap=plan.gap,
-        prior=str(told.prior),
+        prior=str(options.prior),
         masks=recorded.stage.masks,
         placed=(
             sum(frame < FRAMES for frame in trajectory),
