@@ -1,9 +1,9 @@
-"""Models of objects from depth-camera sequences, with registration uncertainty that is tested to be true.
+"""Models of objects from depth-camera sequences, with calibrated registration uncertainty.
 
 A fixed depth camera watches a rigid object that is turned or moved. Pairs of depth images are registered by a
 probabilistic method, whose posteriors become the factors of a pose graph; its optimised poses fuse the images into a
 mesh. The method is that of M. Wüthrich et al., "Probabilistic Depth Image Registration incorporating Nonvisual
-Information", ICRA 2012, and its extensions; `docs/method.md` states it.
+Information", ICRA 2012, and its extensions; see `docs/method.md`.
 
 Two depth images to a relative pose and its covariance:
 
@@ -12,7 +12,7 @@ Two depth images to a relative pose and its covariance:
     posterior = modeler.register(source_depth_m, target_depth_m, (fx, fy, cx, cy))
     posterior.outcome, posterior.pose.mean, posterior.pose.covariance
 
-A sequence to a model, in a run folder as `modeler build` makes it:
+A sequence to a model, in a run folder as `modeler build` writes it:
 
     result = modeler.build("sequences/bundled/box", "runs/box", prior="table")
     result.trustworthy, result.model.vertices_m, result.solution.trajectory
@@ -20,8 +20,8 @@ A sequence to a model, in a run folder as `modeler build` makes it:
 Frames and units
     Lengths are in m, angles in rad unless a name ends with `_deg`; depth is the distance along the optical axis, with 0
     or NaN where nothing was measured. Camera frames have x right, y down, z forward. `target_from_source` is the (4, 4)
-    transform that carries points of the source's camera frame to the target's. The object frame is the camera frame of
-    the first accepted view; a trajectory holds `object_from_camera` by frame number. A covariance (6, 6) is that of
+    transform that maps points from the source's camera frame to the target's. The object frame is the camera frame of
+    the first accepted view; a trajectory holds `object_from_camera` by frame number. A covariance (6, 6) is of
     the tangent vector (rotation, translation) of `mean @ exp(xi)`, in the frame on the right.
 
 Components are frozen dataclasses, whose fields are their parameters: a `Modeler` is made of a segmenter, a sensor, a

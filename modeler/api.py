@@ -1,4 +1,4 @@
-"""What a script needs most: two depth images to a posterior, a sequence to a model."""
+"""The main functions for scripts: two depth images to a posterior, a sequence to a model."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ Intrinsics = Camera | npt.ArrayLike
 @final
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a run came to."""
+    """Result of a run."""
 
     model: ObjectModel | None
-    """The fused object; None where no frame shows it."""
+    """The fused object; None if no frame shows it."""
     solution: Solution
     """object_from_camera (4, 4) by frame number, with covariances."""
     report: Mapping[str, Any]
@@ -66,15 +66,15 @@ def register(
         source_depth_m: (h, w) depth in m; 0 or NaN where nothing was measured.
         target_depth_m: (h, w), of the same camera.
         intrinsics: a `Camera`, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix.
-        prior: what is known of the motion; None: rotations up to 50° and shifts of up to 4 cm, as `GeneralPrior`,
-            and any motion where none of these matches or the images contradict the one that does.
+        prior: of the motion; None: `GeneralPrior` with rotations up to 50° and shifts of up to 4 cm, then any motion
+            if none of these matches or the images contradict the match.
         masks: (h, w) of source and target, true on the object; None: the object is segmented.
         colours: (h, w, 3) 8-bit RGB of source and target, aligned to depth; None: only depth is compared.
         sensor: noise of the camera; None: the first Kinect's.
         seed: of the samples; the same seed gives the same posterior.
 
     Raises:
-        InputError: where an image cannot be used, shows no object, or lacks what the prior needs.
+        InputError: if an image cannot be used, shows no object, or lacks what the prior needs.
     """
     pictures = [np.array(depth, dtype=np.float32) for depth in (source_depth_m, target_depth_m)]
     if pictures[0].ndim != 2 or pictures[0].shape != pictures[1].shape:
@@ -119,14 +119,13 @@ def build(
 
     Args:
         sequence: a path in any format that `modeler build` reads, or an open sequence, with frames selected or not.
-        out: the run folder to make: mesh, cloud, trajectory, graph, report and recording.
-        prior: what is known of the motion between frames, or the name of such a prior as of `--prior`; None: what the
-            sequence says of itself, else that of `general`.
+        out: the run folder to create: mesh, cloud, trajectory, graph, report and recording.
+        prior: of the motion between frames, or its name as in `--prior`; None: that of the sequence, else `general`.
         seed: of every random number; the same seed gives the same model.
         overwrite: replace the results of an earlier run in the folder.
 
     Raises:
-        InputError: where the sequence cannot be read, or the folder cannot be used.
+        InputError: if the sequence cannot be read, or the folder cannot be used.
     """
     began_s = time.perf_counter()
     frames = sequence if isinstance(sequence, AbstractSequence) else opened(Path(sequence))
@@ -161,7 +160,7 @@ def build(
             stream.close()
         folder.finish()
     if last is None:
-        raise InputError(f"{frames.name}: holds no frame; select others")
+        raise InputError(f"{frames.name}: has no selected frame; select others")
     return Result(last.model, last.solution, report, folder.path)
 
 
@@ -169,7 +168,7 @@ def _camera(intrinsics: Intrinsics, shape: tuple[int, ...]) -> Camera:
     """Return the camera of images of a shape (h, w).
 
     Raises:
-        InputError: where the intrinsics are none.
+        InputError: if the intrinsics are invalid.
     """
     height, width = shape
     if isinstance(intrinsics, Camera):
@@ -178,5 +177,5 @@ def _camera(intrinsics: Intrinsics, shape: tuple[int, ...]) -> Camera:
     if numbers.shape == (3, 3):
         numbers = numbers[[0, 1, 0, 1], [0, 1, 2, 2]]
     if numbers.shape != (4,) or not np.isfinite(numbers).all() or not (numbers[:2] > 0.0).all():
-        raise InputError("the intrinsics are no camera; give (fx, fy, cx, cy) in px, or the (3, 3) camera matrix")
+        raise InputError("the intrinsics are invalid; give (fx, fy, cx, cy) in px, or the (3, 3) camera matrix")
     return Camera(width, height, *(float(number) for number in numbers))

@@ -18,7 +18,7 @@ from modeler.pipeline import Modeler, Prepared
 from modeler.pipeline.state import State
 from modeler.priors.mixtures import DefensiveMixture, KernelMixture
 from modeler.rays import Sensor
-from modeler.segmentation import Scene, Segmenter, telling
+from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
@@ -503,7 +503,7 @@ def test_one_frame_or_two_are_a_sequence(count: int) -> None:
 @pytest.mark.parametrize(("frames", "told"), [(1, 1), (3, 3), (15, 15), (16, 15), (1000, 15)])
 def test_a_scene_is_told_by_few_frames_spread_over_the_sequence(frames: int, told: int) -> None:
     indices = range(7, 7 + 2 * frames, 2)
-    chosen = telling(indices)
+    chosen = scene_frames(indices)
     assert len(chosen) == len(set(chosen)) == told
     assert set(chosen) <= set(indices)
     assert chosen[0] == indices[0]

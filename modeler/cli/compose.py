@@ -33,7 +33,7 @@ from modeler.priors import (
 from modeler.priors.checks import ParameterError
 from modeler.rays import Sensor
 from modeler.registration.baselines import kiss
-from modeler.segmentation import Scene, Segmenter, telling
+from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.types import NOMINAL_FOCAL, AbstractPrior, AbstractRegistrar, InputError
 from sequences import AbstractSequence
 from sequences.hand_shapes import hand_poses
@@ -106,7 +106,7 @@ def segmenter(options: ObjectOptions) -> Segmenter:
 
 def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
     """Return what frames spread over the whole sequence teach the segmenter."""
-    return modeler.segmenter.scene([sequence.frame(index) for index in telling(sequence.indices)])
+    return modeler.segmenter.scene([sequence.frame(index) for index in scene_frames(sequence.indices)])
 
 
 def registrar(

@@ -1,4 +1,4 @@
-"""Methods and models compared with what is known to be true: which pairs, which errors, which tables."""
+"""Evaluation of methods and models against ground truth: pairs, errors, tables."""
 
 from modeler.experiment.experiment import Experiment as Experiment
 from modeler.experiment.experiment import Pairing as Pairing

@@ -1,4 +1,4 @@
-"""The same pairs of frames registered by several methods, with the same prior, beside the truth."""
+"""The same pairs of frames registered by several methods, with the same prior, against ground truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.experiment.trials import Trial
 from modeler.pipeline import anywhere, prepare, register
 from modeler.rays import Sensor
-from modeler.segmentation import Scene, Segmenter, telling
+from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
@@ -35,7 +35,7 @@ _SPARSE_STREAM = 1  # the random stream that thins frame k is [seed, k, this]; p
 
 
 class Recorded(Protocol):
-    """Frames, and what is known of them; the readers of sequences have it."""
+    """Frames with metadata and ground truth, as provided by the readers of sequences."""
 
     @property
     def name(self) -> str:
@@ -172,9 +172,9 @@ class Experiment:
         return tuple(index for index in recorded.indices if index in truth)
 
     def _viewing(self, recorded: Recorded, indices: Sequence[int]) -> Callable[[int], RayImage | Outcome]:
-        """Return what makes the view of a frame, or tells why there is none."""
+        """Return a function that prepares the view of a frame, or the reason if there is none."""
         noise = recorded.sensor()
-        scene = self.segmenter.scene([recorded.frame(index) for index in telling(indices)])
+        scene = self.segmenter.scene([recorded.frame(index) for index in scene_frames(indices)])
         sensor = (Sensor() if noise is None else Sensor(*noise)).measured(scene.range_noise)
         return lambda index: self._view(recorded.frame(index), scene, sensor)
 

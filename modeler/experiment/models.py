@@ -1,4 +1,4 @@
-"""Models of runs against true surfaces, beside models of the same frames fused with their true poses."""
+"""Models of runs against true surfaces, compared with models of the same frames fused with their true poses."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ class Trial:
     translation_error_mm: float = math.nan
     """Distance at the object's centroid between estimate and truth."""
     nees: float = math.nan
-    """Squared error in units of the covariance stated; 6 on average where that is true."""
+    """Squared error in units of the estimated covariance; 6 on average if that is calibrated."""
     sigma_deg: float = math.nan
     """Root mean square rotation error that the covariance predicts."""
     overlap: float = math.nan

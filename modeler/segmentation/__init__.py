@@ -2,7 +2,7 @@
 
 from modeler.segmentation.depth_images import DepthNoise
 from modeler.segmentation.planes import fit_plane
-from modeler.segmentation.scene import Scene, telling
+from modeler.segmentation.scene import Scene, scene_frames
 from modeler.segmentation.segmenter import Segmenter
 
-__all__ = ["DepthNoise", "Scene", "Segmenter", "fit_plane", "telling"]
+__all__ = ["DepthNoise", "Scene", "Segmenter", "fit_plane", "scene_frames"]

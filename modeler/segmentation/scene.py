@@ -74,7 +74,7 @@ class Scene:
     """Noise statistics of the camera from planes around the object; None without enough planar surface."""
 
 
-def telling(indices: Sequence[int], *, count: int = 15) -> tuple[int, ...]:
+def scene_frames(indices: Sequence[int], *, count: int = 15) -> tuple[int, ...]:
     """Return the numbers of at most `count` frames, spread evenly over a sequence, from which to learn its scene."""
     places = np.linspace(0, len(indices) - 1, min(count, len(indices))).round()
     return tuple(indices[place] for place in places.astype(np.int64).tolist())

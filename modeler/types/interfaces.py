@@ -52,7 +52,7 @@ class SharedAxis:
 
 
 class AbstractPrior(ABC):
-    """Nonvisual information: a frozen dataclass whose fields are its parameters, which states a density for each pair.
+    """Nonvisual information: a frozen dataclass whose fields are its parameters, with a density for each pair.
 
     To write one, subclass and implement `between`; the other methods have defaults. Ten lines suffice, since densities
     may be composed of those in `modeler.priors`:
@@ -66,9 +66,9 @@ class AbstractPrior(ABC):
                 covariance = np.diag([0.02, 0.02, 0.02, 0.003, 0.003, 0.003]) ** 2
                 return Gaussian(shift, covariance, source.centroid_m)
 
-    Frames: target_from_source (4, 4) takes a point of the object from its camera coordinates in the source frame to
+    Frames: target_from_source (4, 4) maps a point of the object from its camera coordinates in the source frame to
     those in the target frame; x right, y down, z forward. Units: metres and radians; fields carry units in their names
-    (`_deg`, `_m`), for the command line makes options of them. Source and target are `RayImage`: `index` is the frame
+    (`_deg`, `_m`), because they become command-line options. Source and target are `RayImage`: `index` is the frame
     number, `frame.time_s` its time, `points_m` (n, 3) and `normals` the surface, `centroid_m` (3,) its mean, `plane`
     the support plane or None. The source may come before or after the target, and several frames from it.
 
@@ -77,7 +77,7 @@ class AbstractPrior(ABC):
     would be counted twice: `defensive_mixture(known, [guess])` lets it guide the search only. Uncertainties should be
     honest: a pose outside the support is never found.
 
-    Raise `InputError` in `__post_init__` for parameters out of range (`modeler.priors.checks`), and in `between` where
+    Raise `InputError` in `__post_init__` for parameters out of range (`modeler.priors.checks`), and in `between` if
     the views lack what the prior needs: the pair is skipped, with the message as its reason.
     """
 

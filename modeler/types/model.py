@@ -42,7 +42,7 @@ class ObjectModel:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What one frame brought, and what is known after it.
+    """The result of one frame, and the state of the run after it.
 
     The final step of a run repeats the last frame with the pairs of the refinement and the final model.
     """

@@ -23,8 +23,8 @@ class PoseGaussian:
     covariance: Array
     """(6, 6) of ξ: rotation in rad first, then translation in m."""
     by_focal: Array = field(default_factory=lambda: np.zeros(6))
-    """(6,) derivative of ξ by the logarithm of the camera's focal length, which no image tells by itself and all share
-    (method.md, eq. 25); 0 where it is not stated. The covariance is that under a known focal length."""
+    """(6,) derivative of ξ by the logarithm of the camera's focal length, common to all images and not observable from
+    one (method.md, eq. 25); 0 if unknown. The covariance is conditional on the focal length."""
 
     def inverse(self) -> PoseGaussian:
         """Return the Gaussian of the inverse motion."""
@@ -72,13 +72,13 @@ class Posterior:
     least_overlap: float = field(default=0.0, kw_only=True)
     """Overlap below which the method considers the surfaces not to match, whatever the outcome."""
     contradicted: bool = field(default=False, kw_only=True)
-    """Whether the images contradict the mean more than 99 of 100 right ones, where the method can tell."""
+    """Whether the images contradict the mean more than 99 of 100 right ones, if the method can test this."""
     samples: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """(n, 4, 4) samples of target_from_source; empty where the method draws none."""
     weights: Array = field(default_factory=lambda: np.zeros(0))
     """(n,) weights of the samples, summing to 1."""
     modes: tuple[Mode, ...] = ()
-    """The separate modes, heaviest first, with weights that sum to 1; empty where there is one, or none are stated."""
+    """The separate modes, heaviest first, with weights that sum to 1; empty for a single mode, or if unknown."""
     effective_samples: float = float("nan")
     """Effective sample size."""
     pareto_k: float = float("nan")

@@ -20,8 +20,8 @@ from modeler.types.reasons import Reason
 
 EdgeKind = Literal["odometry", "closure", "span", "join"]
 """What an edge is for: to place a frame, to close a loop with a view that the object had turned away from, to span
-several steps between frames that others placed, or to join two segments, between which nothing is known of the motion:
-the object was put down otherwise, or a hand took it anew."""
+several steps between frames that others placed, or to join two segments, between which there is no motion
+prior: the object was laid down differently, or regrasped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ NEAR_DEG: Final = 45.0
 
 @dataclass(frozen=True, eq=False)
 class FocalLength:
-    """What the edges of a graph tell of the logarithm of the true focal length over that of their views."""
+    """Estimate of the logarithm of the true focal length over that of the views, from the edges of a graph."""
 
     log_factor: float
     """Its mean."""
@@ -65,7 +65,7 @@ class FocalLength:
     prior_sigma: float
     """The same before the edges are asked."""
     loops: int
-    """Number of loops that tell it."""
+    """Number of loops used."""
     sigmas_before: float
     """Root mean square of the loops' normalised residuals with the one given: 1 where all is true; 0 without a loop."""
     sigmas_after: float
@@ -80,7 +80,7 @@ class FocalLength:
 
     @property
     def told_by(self) -> Literal["loop", "prior"]:
-        """Whether loops tell it, more than what was known before."""
+        """Source of most of the information: loops or the prior."""
         return "loop" if self.sigma < 0.5 * self.prior_sigma else "prior"
 
 
@@ -108,7 +108,7 @@ class Solution:
     mode_weights: Mapping[tuple[int, int], Array] = field(default_factory=dict)
     """Weights (m,) of the modes of a multimodal edge, given all edges together, by (source, target)."""
     focal: FocalLength | None = None
-    """What is known of the focal length, and covariances hold; None: it is taken for known."""
+    """Estimate of the focal length, whose uncertainty is part of the covariances; None: exact."""
     camera_from_axis: Array | None = None
     """(4, 4), whose third direction is the axis of all steps; None where none was estimated, or it does not fit."""
 
@@ -198,7 +198,7 @@ class LoopOpening:
     translation_m: float
     """Distance between where they put the object."""
     sigmas: float
-    """Root of NEES/6 under the stated covariances of chain and closure: about 1 where these are true."""
+    """Root of NEES/6 under the covariances of chain and closure: about 1 if these are calibrated."""
 
     @property
     def words(self) -> str:
@@ -213,12 +213,12 @@ class LoopOpening:
 def loop_openings(edges: Sequence[Edge], solution: Solution, centroids_m: Mapping[int, Array]) -> list[LoopOpening]:
     """Compare each accepted closure whose ends a chain of odometry edges joins with that chain.
 
-    Needs no ground truth: an opening of many standard deviations shows errors that the covariances do not hold, as
-    those of intrinsics, or a wrong edge. The noise that consecutive edges share is not taken into account.
+    Needs no ground truth: a closure error of many standard deviations shows errors that are not part of the
+    covariances, such as those of intrinsics, or a wrong edge. Noise common to consecutive edges is not modelled.
 
     Args:
         edges: of the graph.
-        solution: tells which of them take part, and with which pose.
+        solution: determines which of them take part, and with which pose.
         centroids_m: (3,) of the object in camera coordinates by frame number, for the translation; 0 where unknown.
     """
     used = [edge for edge in edges if solution.takes_part(edge)]

@@ -1,4 +1,4 @@
-"""What the camera saw: frames, and what is known of them before two are compared."""
+"""Frames, and the views prepared from them for registration."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Segmentation:
 
 
 COLOUR_SHIFT_PX = 0.5
-"""How far colours shift beside depth from one image to the next, where a camera does not say (standard deviation).
+"""Default standard deviation of the shift of colours against depth from one image to the next.
 
 Fitted with the pose to the pairs of three captures: 0.44 by column and 0.26 px by row (`cap`), 0.38 and 0.21
 (`kleenex`, both a first Kinect), 0.5 and 0.4 (`bear`, a D435).
@@ -107,21 +107,21 @@ Fitted with the pose to the pairs of three captures: 0.44 by column and 0.26 px 
 
 
 NOMINAL_FOCAL = 0.02
-"""Standard deviation of the logarithm of a focal length of which nobody says how well it is known.
+"""Default standard deviation of the logarithm of a focal length.
 
-What manufacturers allow for. Focal lengths fitted to boards are good to some 0.002.
+Typical manufacturing tolerance. Focal lengths fitted to boards are good to some 0.002.
 """
 
 
 class SensorNoise(NamedTuple):
-    """Noise of a depth camera, as a sequence states it."""
+    """Noise of a depth camera, given by a sequence."""
 
     sigma_wh: float = 0.002
     """Lateral noise in ray coordinates (w, h); the paper's value for the first Kinect."""
     sigma_r_m: float = 0.002
     """Noise along the ray in m, for a surface that faces the camera."""
     sigma_colour_px: float = COLOUR_SHIFT_PX
-    """Standard deviation in px of the shift of colours beside depth from one image to the next."""
+    """Standard deviation in px of the shift of colours against depth from one image to the next."""
     sigma_focal: float = NOMINAL_FOCAL
     """Standard deviation of the logarithm of the focal length; 0 = it is exact."""
 
@@ -150,7 +150,7 @@ class RayImage:
     layers: Mapping[str, npt.NDArray[np.float64] | npt.NDArray[np.float32]] = field(default_factory=dict)
     """Images a likelihood looks up, made by `rays`."""
     sigma_colour_px: float = COLOUR_SHIFT_PX
-    """Standard deviation in px of the shift of colours beside depth from one image to the next."""
+    """Standard deviation in px of the shift of colours against depth from one image to the next."""
     sharing: float = 1.0
     """Number of surface points that share the noise of a pixel, in the sensor and by smoothing."""
     error_area_px: float = 1.0

@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         type=int,
         default=(0, len(VARIANTS)),
         metavar=("FIRST", "END"),
-        help="which, by number, the most telling first (all)",
+        help="which, by number, the most informative first (all)",
     )
     parser.add_argument("--out", type=Path, default=Path("runs/ablation.jsonl"), help="one line a registration")
     parser.add_argument("--table", action="store_true", help="print the table of what has been registered")

@@ -15,7 +15,7 @@ from calibration.study import CONDITIONS, Condition, rendered_views, staged
 from modeler.evaluation import true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
-from modeler.segmentation import Segmenter, telling
+from modeler.segmentation import Segmenter, scene_frames
 from modeler.types import AbstractPoseDensity, Array, Outcome, RayImage
 from sequences import open_sequence
 from sequences.rendering.renderer import RenderedSequence
@@ -144,7 +144,7 @@ def recorded_views(name: str) -> dict[int, RayImage]:
     """Return the views of a recording, by frame number; without those in which no object was found."""
     sequence, segmenter, views = open_sequence(SHARED / name), Segmenter(), {}
     noise = sequence.sensor()
-    scene = segmenter.scene([sequence.frame(index) for index in telling(sequence.indices)])
+    scene = segmenter.scene([sequence.frame(index) for index in scene_frames(sequence.indices)])
     sensor = (Sensor() if noise is None else Sensor(*noise)).measured(scene.range_noise)
     for index in sequence.indices:
         found = segmenter.segment(sequence.frame(index), scene)

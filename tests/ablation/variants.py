@@ -130,7 +130,7 @@ REMOVED: Final = (
 
 
 def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
-    """Return registrations with groups of constants times a factor, the most telling first."""
+    """Return registrations with groups of constants times a factor, the most informative first."""
     hidden = 0.25 if factor < 1.0 else 0.75
     silhouette = _module(likelihood, _SILHOUETTE_NOISE=0.5 * factor)
     cosines = _module(likelihood, _COSINES=(factor * np.array([0.1, 0.35, 0.35, 0.6])).astype(np.float32))
@@ -183,4 +183,4 @@ VARIANTS: Final = (
     *REMOVED,
     *_groups(),
 )
-"""All of them, the most telling first."""
+"""All of them, the most informative first."""

@@ -17,7 +17,7 @@ from modeler.kernels.point_likelihood import Projection
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
-from modeler.segmentation import Segmenter, telling
+from modeler.segmentation import Segmenter, scene_frames
 from modeler.types import AbstractPrior, Array, Frame, Plane, RayImage
 from sequences import AbstractSequence, bundled, open_sequence
 
@@ -154,7 +154,7 @@ def segmented(sequence: AbstractSequence, most: int | None = None) -> list[tuple
     """Return all or the first frames with masks, and the support plane in each: neither is part of what is timed."""
     segmenter = Segmenter()
     frames = [sequence.frame(index) for index in sequence.indices[:most]]
-    scene = segmenter.scene([sequence.frame(index) for index in telling(sequence.indices)])
+    scene = segmenter.scene([sequence.frame(index) for index in scene_frames(sequence.indices)])
     found = [segmenter.segment(frame, scene) for frame in frames]
     return [(replace(frame, mask=look.mask), look.plane) for frame, look in zip(frames, found, strict=True)]
 

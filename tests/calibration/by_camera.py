@@ -32,7 +32,7 @@ from modeler.export import write_atomically
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
-from modeler.segmentation import Segmenter, telling
+from modeler.segmentation import Segmenter, scene_frames
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Camera, Frame, Posterior, RayImage
 from sequences.rendering.renderer import RenderedSequence, surroundings
 
@@ -127,7 +127,7 @@ def shown(sequence: RenderedSequence, camera: DepthCamera | None, rng: np.random
 def viewed(frames: Sequence[Frame], stated: str) -> list[RayImage]:
     """Return the views of a sequence; the camera's noise is not given."""
     segmenter = Segmenter()
-    scene = segmenter.scene([frames[k] for k in telling(range(len(frames)))])
+    scene = segmenter.scene([frames[k] for k in scene_frames(range(len(frames)))])
     sensor = Sensor().measured(scene.range_noise)
     return [sensor.ray_image(frame, segmenter.segment(frame, scene).plane) for frame in frames]
 

@@ -15,7 +15,7 @@ from modeler.priors import GeneralPrior, TablePrior
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityLikelihood, VisibilityRegistrar
-from modeler.segmentation import Segmenter, telling
+from modeler.segmentation import Segmenter, scene_frames
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Posterior, RayImage
 from sequences.rendering.recipe import Recipe
 from sequences.rendering.renderer import RenderedSequence
@@ -198,7 +198,7 @@ def rendered_views(sequence: RenderedSequence) -> dict[int, RayImage]:
     """Return the views of a sequence, masked by the truth, by frame number."""
     segmenter = Segmenter()
     frames = {index: sequence.frame(index) for index in sequence.indices}
-    scene = segmenter.scene([frames[index] for index in telling(sequence.indices)])
+    scene = segmenter.scene([frames[index] for index in scene_frames(sequence.indices)])
     # By two frames, so that what is made of a pair does not depend on how many there are.
     sensor = Sensor(*sequence.sensor()).measured(segmenter.scene([frames[k] for k in sequence.indices[:2]]).range_noise)
     return {index: sensor.ray_image(frame, segmenter.segment(frame, scene).plane) for index, frame in frames.items()}

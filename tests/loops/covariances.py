@@ -26,7 +26,7 @@ from modeler.closure import Closer
 from modeler.evaluation import nees, true_motion
 from modeler.export import write_atomically
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
-from modeler.segmentation import telling
+from modeler.segmentation import scene_frames
 from modeler.types import Array, Solution, Step
 from sequences import AbstractSequence
 from sequences.rendering.renderer import RenderedSequence
@@ -71,7 +71,7 @@ def run(shape: str, seed: int, frames: int, step_deg: float, prior: str) -> dict
     case = Case(shape, pushed(shape, seed, frames, step_deg), prior)
     maker, truth, indices = modeler(case, Closer(), seed), case.truth(), case.sequence.indices
     assert truth is not None
-    scene = maker.segmenter.scene([case.sequence.frame(index) for index in telling(indices)])
+    scene = maker.segmenter.scene([case.sequence.frame(index) for index in scene_frames(indices)])
     *_, last = maker.run(case.frames(), scene)
     assert isinstance(last, Step)
     return judged(last.solution, truth)

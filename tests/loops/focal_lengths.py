@@ -23,7 +23,7 @@ from loops.covariances import pushed
 from loops.study import modeler
 from modeler.closure import Closer
 from modeler.export import write_atomically
-from modeler.segmentation import telling
+from modeler.segmentation import scene_frames
 from modeler.self_calibration import FocalCalibrator
 from modeler.types import Step
 from sequences import FocalFactor, RefocusedSequence
@@ -42,7 +42,7 @@ def row(shape: str, error: float, options: argparse.Namespace) -> dict[str, Any]
     case = Case(shape, stated, "table")
     maker = modeler(case, Closer(), options.seed)
     maker = replace(maker, sensor=replace(maker.sensor, sigma_focal=options.sigma))
-    scene = maker.segmenter.scene([stated.frame(index) for index in telling(stated.indices)])
+    scene = maker.segmenter.scene([stated.frame(index) for index in scene_frames(stated.indices)])
     *_, last = maker.run(case.frames(), scene)
     assert isinstance(last, Step)
     found, calibrator = last.solution.focal, FocalCalibrator()

@@ -22,7 +22,7 @@ from modeler.pipeline import Modeler, glancing
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
-from modeler.segmentation import Segmenter, telling
+from modeler.segmentation import Segmenter, scene_frames
 from modeler.types import Array, Edge, PoseGaussian, Solution, Step
 
 _PAGE_BYTES = 4096
@@ -88,7 +88,7 @@ def modeler(case: Case, closer: Closer, seed: int, *, told_truth: bool = False, 
 def run(maker: Modeler, case: Case, told: Callable[[Step, float, float], None]) -> Result:
     """Build a case and return its figures; `told` receives each step, its processor time and memory."""
     indices = case.sequence.indices
-    scene = maker.segmenter.scene([case.sequence.frame(index) for index in telling(indices)])
+    scene = maker.segmenter.scene([case.sequence.frame(index) for index in scene_frames(indices)])
     began = time.process_time()
     before, peak_mib, registrations, step = began, 0.0, 0, None
     for event in maker.run(case.frames(), scene):

@@ -11,7 +11,7 @@ from typing import Final, final
 import numpy as np
 from trust.stage import Recorded
 
-from modeler.segmentation import Segmenter, telling
+from modeler.segmentation import Segmenter, scene_frames
 from modeler.types import BoolArray, Camera, Frame, Outcome, Segmentation
 from scenes.plan import FRAMES, KINDS, Plan
 
@@ -70,7 +70,7 @@ def find(plan: Plan, folder: Path) -> tuple[Found, Shots, list[Segmentation]]:
     """Segment the frames of a scene as a build does, and compare the masks with the truth."""
     shown, segmenter = shots(plan, folder), Segmenter()
     began = time.perf_counter()
-    scene = segmenter.scene([shown.frames[index] for index in telling(range(len(shown.frames)))])
+    scene = segmenter.scene([shown.frames[index] for index in scene_frames(range(len(shown.frames)))])
     found = [segmenter.segment(frame, scene) for frame in shown.frames]
     seconds = (time.perf_counter() - began) / len(found)
     ious = tuple(iou(one.mask, mask) for one, mask in zip(found, shown.masks, strict=True))
