@@ -1,15 +1,15 @@
-# make setup      prepare .venv (quick when it is there)
+# make setup      prepare .venv (quick if it exists)
 # make demo       model the bundled box sequence into runs/demo
 # make test       the whole gate: format, lint, types, layers, tests
-# make test-slow  the tests that take long, which make test leaves out
-# make calibrate  whether stated uncertainties are true, on rendered pairs and other cameras (many minutes)
-# make trust      whether status 0 can be trusted: 150 rendered runs, half with a fault (some 20 minutes a core)
-# make ablation   what each stage and each constant of the default registration is worth (many hours)
+# make test-slow  the slow tests, which make test leaves out
+# make calibrate  calibration of covariances, on rendered pairs and other cameras (many minutes)
+# make trust      reliability of status 0: 150 rendered runs, half with a fault (some 20 minutes a core)
+# make ablation   contribution of each stage and constant of the default registration (many hours)
 # make bench      speed, against Open3D and the committed baseline
 # make bench-gpu  speed on an NVIDIA GPU, against the CPU of the same machine
-# make scale      200 small sequences by a batch of two workers, beside single builds (some 15 minutes)
-# make same       COMMIT=…: whether the results are those of another commit, byte by byte
-# make audit      locked packages against published advisories, where these can be reached
+# make scale      200 small sequences by a batch of two workers, against single builds (some 15 minutes)
+# make same       COMMIT=…: compare results with those of another commit, byte by byte
+# make audit      locked packages against published advisories, if reachable
 
 BIN := .venv/bin
 TWO := -n 2 --dist loadfile  # processes; kernels have threads of their own
