@@ -14,7 +14,7 @@ from modeler.types import AbstractPrior, Failed, Outcome, Posterior, Reason, adv
 from modeler.verdict.evidence import MAX_UNSURE
 from sequences import AbstractSequence
 
-_SURE_STEPS: Final = 3  # pairs whose median rotation counts as the step
+_SURE_STEPS: Final = 3  # least number of pairs for a measured step
 _FAR_SDS: Final = 3.0  # of the given step, beyond which the measured one contradicts it
 _ROUGH: Final = (
     0.25  # of a step: relative deviation of steps when an object is turned by hand (11° to 37° where 18° were intended)
@@ -35,7 +35,7 @@ def outcome_advice(outcome: Outcome, prior: AbstractPrior | None = None, posteri
     Args:
         outcome: of a frame or a registration.
         prior: of the registration.
-        posterior: its result; with it and the prior, the limit that was hit is named.
+        posterior: its result; with it and the prior, the exceeded limit is named.
     """
     if outcome is Outcome.AT_LIMIT and prior is not None and posterior is not None:
         wanted = posterior.beyond[0] if len(posterior.beyond) else posterior.pose.mean
@@ -66,7 +66,7 @@ def comes_back(frames: AbstractSequence, prior: AbstractPrior, reach_deg: float)
     Args:
         frames: the sequence, which may have the rotation from frame to frame.
         prior: of the run, whose turntable takes precedence.
-        reach_deg: how near to a view another must look for them to be registered.
+        reach_deg: largest rotation across which views are registered.
     """
     table = turntable_in(prior)
     step_deg = (frames.motion or {}).get("step_deg") if table is None else table.step_deg

@@ -70,11 +70,11 @@ class Batch:
     where: ObjectOptions = field(default_factory=ObjectOptions)
 
     def run(self) -> int:
-        """Build what is not built yet, and list everything.
+        """Build the remaining sequences, and list all.
 
         Raises:
             InputError: if options, the manifest, the engine or the folder cannot be used.
-            KeyboardInterrupt: after what is done has been listed.
+            KeyboardInterrupt: after the finished sequences have been listed.
         """
         from modeler.cli.compiling import compile_kernels
         from modeler.cli.engines import check_engine, is_here
@@ -156,12 +156,12 @@ def _jobs(options: Batch) -> list[Job]:
 
 
 def _work(options: Batch, jobs: Sequence[Job], words: str) -> Iterator[Ended]:
-    """Yield how each job ended, as soon as it has; an engine that is lost is waited for.
+    """Yield the end of each job as it occurs; a lost engine is awaited.
 
     Args:
-        options: which engine.
-        jobs: what it does.
-        words: said once it is open.
+        options: with the engine.
+        jobs: to run.
+        words: message once the engine is open.
 
     Raises:
         InputError: if it cannot be opened, or does not come back.

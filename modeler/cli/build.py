@@ -66,7 +66,7 @@ class Build:
     where: ObjectOptions = field(default_factory=ObjectOptions)
 
     def run(self) -> int:
-        """Run the loop into a run folder; status 3 if the model is not to be trusted, as report.json then says.
+        """Run the loop into a run folder; status 3 if the model cannot be trusted; report.json has the reasons.
 
         Raises:
             InputError: if the input or the folder cannot be used.

@@ -33,7 +33,7 @@ class CalibrateSensor:
     given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
-        """Measure the noise, store it, and print what was measured at which distance and angle.
+        """Measure the noise, store it, and print it by distance and angle.
 
         Raises:
             InputError: if the input cannot be used or the file cannot be written.
@@ -62,7 +62,7 @@ class CalibrateSensor:
 
 
 def _facts(name: str, found: Calibration, sensor: dict[str, float]) -> dict[str, object]:
-    """Return what the file says besides the model."""
+    """Return the other contents of the file."""
     return {
         "schema": 1,
         "sequence": name,

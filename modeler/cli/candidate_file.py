@@ -1,4 +1,4 @@
-"""What can be done next, from a file: turns, pokes and poses with their costs."""
+"""Candidate actions from a file: turns, pokes and poses with their costs."""
 
 from __future__ import annotations
 

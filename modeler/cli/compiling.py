@@ -28,9 +28,9 @@ _USED_TO_FUSE = ("tsdf", "shading", "marching_cubes", "point_clouds")
 
 
 def compile_kernels() -> None:
-    """Compile kernels that are missing, and say how far that is; they are kept for later commands.
+    """Compile missing kernels with a progress message; they are cached for later commands.
 
-    Does nothing where they are compiled. What cannot be compiled here is compiled, or reported, where it is used.
+    Does nothing if they are compiled. Failures here are ignored: kernels are then compiled, or reported, at first use.
     """
     from modeler import kernels
 
@@ -90,7 +90,7 @@ def _fusion() -> None:
 
 
 def _prepared() -> tuple[Modeler, list[RayImage], dict[int, Array]]:
-    """Return what registers and fuses, two views of a bundled sequence, and its true object_from_camera (4, 4)."""
+    """Return a modeler, two views of a bundled sequence, and its true object_from_camera (4, 4)."""
     from modeler import se3
     from modeler.pipeline import Modeler
     from sequences import bundled, open_sequence

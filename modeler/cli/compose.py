@@ -1,4 +1,4 @@
-"""From options, and what a sequence says of itself, to components."""
+"""From options and the metadata of a sequence to components."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def segmenter(options: ObjectOptions) -> Segmenter:
 
 
 def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
-    """Return what frames spread over the whole sequence teach the segmenter."""
+    """Return the scene that the segmenter learns from frames spread over the sequence."""
     return modeler.segmenter.scene([sequence.frame(index) for index in scene_frames(sequence.indices)])
 
 
@@ -151,11 +151,11 @@ def registrar(
 
 
 def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> AbstractPrior:
-    """Return the prior asked for.
+    """Return the requested prior.
 
     Args:
         options: as given.
-        sequence: what it is for; None: several.
+        sequence: to which it applies; None: several.
 
     Raises:
         InputError: if there is no such prior, a parameter cannot be used, or the sequence lacks what it needs.
@@ -201,7 +201,7 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
 
 
 def prior_name(options: PriorOptions, sequence: AbstractSequence | None) -> str:
-    """Return the name of the prior asked for; without one, what the sequence says if that is enough, else `general`."""
+    """Return the name of the requested prior; without one, that of the sequence if it is complete, else `general`."""
     if options.prior is not None:
         return options.prior
     motion = {} if sequence is None else sequence.motion or {}
@@ -302,9 +302,9 @@ def _guess(name: str, given: dict[str, Any], known: AbstractPrior) -> AbstractPr
 
 
 def _turntable(given: dict[str, Any], motion: Mapping[str, object]) -> TurntablePrior:
-    """Return a turntable, its step as given, else as `sequence.json` says.
+    """Return a turntable, its step as given, else from `sequence.json`.
 
-    A step given without an axis leaves the sense of rotation open, unless it is negative or agrees with the file.
+    A step given without an axis leaves its sign unknown, unless it is negative or agrees with the file.
     """
     step_deg, sigma_deg = _number(motion.get("step_deg")), _number(motion.get("sigma_deg"))
     given = dict(given)

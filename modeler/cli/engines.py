@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 JOB_BYTES = 3 << 29
 """Memory of one build with its recording: most need half of it."""
-_QUEUED = 100  # jobs that a Slurm queue holds of us at a time, unless --workers says otherwise
+_QUEUED = 100  # jobs in a Slurm queue at a time, unless --workers is given
 _PATIENCE_S = 30  # for a scheduler to answer
 
 
@@ -69,7 +69,7 @@ def is_here(name: str) -> bool:
 
 
 def threads_of(name: str, workers: int) -> int:
-    """Return how many threads each build gets: the machine's cores are shared out; elsewhere one is what a slot has."""
+    """Return the number of threads of each build: the local cores are shared; elsewhere a slot has one."""
     return max(1, cores() // workers) if is_here(name) else 1
 
 
@@ -106,7 +106,7 @@ def _dask(address: str) -> Iterator[Executor]:
     """Open an existing cluster through its executor interface."""
     distributed = importlib.import_module("distributed")
     for name in logging.root.manager.loggerDict:
-        if name.startswith("distributed"):  # each has a level of its own; what matters is said by us
+        if name.startswith("distributed"):  # each has its own level; we report errors
             logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         distributed.comm.get_address_host(address)  # a client that was begun with nonsense would linger
@@ -148,7 +148,7 @@ class SubmititExecutor(Executor):
         return self._waiting.submit(self._result, fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Queue nothing more; take what is queued out of the queue where `cancel_futures` is set."""
+        """Accept no more jobs; remove queued ones if `cancel_futures` is set."""
         self._waiting.shutdown(wait=False, cancel_futures=cancel_futures)
         for job in [*self._begun] if cancel_futures else ():
             job.cancel(check=False)

@@ -68,7 +68,7 @@ class Evaluate:
     def run(self) -> int:
         """Run the experiment, write its results and print a table.
 
-        Of several runs those that cannot be judged are left out, each with a line on stderr, and the status is 2.
+        Runs that cannot be evaluated are left out, each with a line on stderr, and the status is 2.
 
         Raises:
             InputError: if an option, a sequence or the folder cannot be used.
@@ -134,7 +134,7 @@ def _evaluate_pairs(options: Evaluate) -> int:
 
 
 def table(rows: Sequence[Summary]) -> str:
-    """Return summaries as text in columns; what nothing is known of is left out."""
+    """Return summaries as text in columns; unknown values are left out."""
     measured = tuple(f"{what} {share}" for what in ("deg", "mm") for share in ("50 %", "90 %", "max"))
     heading = ("sequence", "method", "apart", "pairs", "usable", "right", *measured)
     cells = [
@@ -216,15 +216,15 @@ def _offsets(text: str) -> tuple[int, ...]:
 
 
 def _evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> int:
-    """Judge the models of runs, write `models.json` and `models.csv`, print a table and return the exit status.
+    """Evaluate the models of runs, write `models.json` and `models.csv`, print a table and return the exit status.
 
     Args:
         runs: run folders of sequences whose poses and surface are known.
-        out: folder, made where there is none.
+        out: folder, created if missing.
         seed: of the points drawn on the surfaces.
 
     Raises:
-        InputError: if none can be judged, with the reason of the first, or the results cannot be written.
+        InputError: if none can be evaluated, with the reason of the first, or the results cannot be written.
     """
     from modeler.experiment import models_csv, models_json
     from modeler.export import write_atomically

@@ -196,7 +196,7 @@ def _volume(options: Export) -> FusionVolume | None:
 
 
 def _report(model: ObjectModel, options: Export) -> None:
-    """Say on stderr what was written, and how much of it is interpolated."""
+    """Report on stderr the file and the interpolated share."""
     interpolated = ""
     if options.watertight and model.vertex_views is not None:
         interpolated = f", {100.0 * float((model.vertex_views == 0).mean()):.0f} % of the vertices interpolated"

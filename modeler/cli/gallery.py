@@ -69,5 +69,5 @@ class Gallery:
 
 
 def _newer(picture: Path, model: Path) -> bool:
-    """Return whether there is a picture of a model as it is now, or no model any more."""
+    """Return whether the picture of a model is up to date, or the model was removed."""
     return picture.exists() and (not model.exists() or picture.stat().st_mtime_ns >= model.stat().st_mtime_ns)

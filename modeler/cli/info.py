@@ -50,7 +50,7 @@ class Info:
 
 
 def record(sequence: AbstractSequence, found: Survey) -> dict[str, object]:
-    """Return what was found as JSON has it."""
+    """Return the results as JSON values."""
     camera, sensor, motion = found.cameras[0], sequence.sensor(), sequence.motion
     return {
         "name": sequence.name,
@@ -74,7 +74,7 @@ def record(sequence: AbstractSequence, found: Survey) -> dict[str, object]:
 
 
 def rows(sequence: AbstractSequence, found: Survey) -> list[tuple[str, str]]:
-    """Return what was found as (what, in words)."""
+    """Return the results as (name, words)."""
     from sequences.base import span
 
     total = len(found.indices)

@@ -57,7 +57,7 @@ class Watched(Protocol):
     """From a sequence to the same sequence, watched."""
 
     def __call__(self, sequence: AbstractSequence, what: str = "", /) -> AbstractSequence:
-        """Add a bar for a sequence, with what is done with its frames in a word."""
+        """Add a bar for a sequence, labelled with the operation on its frames."""
         ...
 
 
@@ -71,9 +71,9 @@ def while_it_lasts(camera: AbstractSequence) -> Iterator[Frame]:
 
 @contextmanager
 def reading() -> Iterator[Watched]:
-    """Show a bar on stderr for each sequence handed in, as its frames are taken; nothing where that is no terminal.
+    """Show a progress bar on stderr for each sequence as its frames are read; hidden if that is no terminal.
 
-    A sequence that is still being written is left alone.
+    A sequence that is still being written is unchanged.
     """
     with bar() as progress:
 
@@ -106,7 +106,7 @@ def watched(path: Path, overrides: Overrides, idle_s: float) -> AbstractSequence
 @final
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A run as it was built, and the sequence that it was made from."""
+    """A run and its sequence."""
 
     run: Path
     """Its folder, or that of the run which it is a part of."""
@@ -193,14 +193,14 @@ class Part:
 
 
 def parts_of(run: Path, moved: Sequence[Path] = ()) -> tuple[Part, ...]:
-    """Return what a run was made of: itself, or the runs that it joins.
+    """Return the parts of a run: itself, or the runs that it joins.
 
     Args:
         run: run folder.
         moved: where the sequences are now, in order; none: where they were.
 
     Raises:
-        InputError: if a folder holds no run, or a sequence is not to be found.
+        InputError: if a folder holds no run, or a sequence cannot be found.
     """
     places = deque(moved) if moved else None
     found = _parts(run, places, ())
@@ -212,7 +212,7 @@ def parts_of(run: Path, moved: Sequence[Path] = ()) -> tuple[Part, ...]:
 
 
 def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> tuple[Part, ...]:
-    """Return what a run was made of; `within` are the runs that it was joined to, from the outermost."""
+    """Return the parts of a run; `within` are the joined runs that contain it, from the outermost."""
     if run.resolve() in within:
         raise InputError(f"{run}: is part of itself; join its parts again")
     report = RunFolder(run).result()

@@ -27,7 +27,7 @@ NOTES = ".batch"
 TRIES = 2
 """How often a sequence that fails is tried."""
 ENDED = (0, 3)
-"""Statuses of builds that came to their end."""
+"""Statuses of completed builds."""
 Standing = Literal["new", "interrupted", "done", "changed", "failed"]
 _CHUNK_BYTES = 1 << 20
 _LINE = "modeler: "
@@ -103,7 +103,7 @@ def files_of(sequence: Path) -> list[Path]:
 def fingerprint(job: Job, *, content: bool) -> str:
     """Return a digest of the input of a job: of names and bytes, or, at a glance, of names, sizes and times of change.
 
-    The files that options name count, too. What cannot be read counts by its name: the build will say what is wrong.
+    Files named by options are included. Unreadable files are represented by their name: the build will report them.
     """
     digest = hashlib.blake2b(digest_size=16)
     named = [Path(value) for option, value in pairwise(job.arguments) if option in ("--sensor", "--camera")]
@@ -197,7 +197,7 @@ class Processes:
 
     @contextmanager
     def ended(self) -> Iterator[None]:
-        """End, with the block, what is still running then."""
+        """Kill the processes that still run at the end of the block."""
         self._open = True
         try:
             yield
@@ -242,7 +242,7 @@ def run(job: Job) -> Ended | None:
 
 
 def write_failure(job: Job, line: str, status: int = 2) -> Ended:
-    """Note that a job has failed, once more where it has before, and return how it ended.
+    """Record a (further) failure of a job, and return how it ended.
 
     Raises:
         OSError: if the note cannot be written.
@@ -261,7 +261,7 @@ def ended(name: str, note: dict[str, Any], *, fresh: bool = True) -> Ended:
 
 
 def last_line(log: Path, status: int) -> str:
-    """Return the last line that a build said; where it was killed, by what."""
+    """Return the last message of a build, or the signal that killed it."""
     if status < 0:
         return f"was killed by signal {-status}; is memory exhausted? See {log}"
     lines = log.read_text(errors="replace").splitlines()

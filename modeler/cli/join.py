@@ -43,7 +43,7 @@ class Join:
     """Same seed, same machine, same result, to the bit."""
 
     def run(self) -> int:
-        """Join the runs; status 3 if the result is not to be trusted, as report.json then says.
+        """Join the runs; status 3 if the result cannot be trusted; report.json has the reasons.
 
         Raises:
             InputError: if a run cannot be read, or no pair of their views can be registered.
@@ -118,7 +118,7 @@ def _check(options: Join) -> None:
 
 
 def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
-    """Return what was estimated of the camera whose depth scale is known least; None if all are as stated."""
+    """Return the estimate of the camera with the most uncertain depth scale; None if all are as given."""
     cameras = [camera for part in parts if (camera := part.report.get("camera")) is not None]
     return max(cameras, key=lambda camera: float(camera["depth_scale_sigma"]), default=None)
 

@@ -59,7 +59,7 @@ def best_manual_action(found: Suggestions) -> Suggestion | None:
 
 
 def summary_of(found: Suggestions) -> str:
-    """Return in a few words what to do next."""
+    """Return the next action in a few words."""
     best = best_manual_action(found)
     if found.reached or best is None:
         return "nothing more to gain"

@@ -48,10 +48,10 @@ def read_manifest(path: Path, common: tuple[str, ...] = ()) -> list[Row]:
 
     Args:
         path: the file; paths in it are taken as on the command line.
-        common: options that hold for every row, where it says nothing else.
+        common: default options for every row.
 
     Raises:
-        InputError: if it cannot be read, a column is none, or a row's options cannot be used.
+        InputError: if it cannot be read, a column is unknown, or a row's options cannot be used.
     """
     from sequences.input_files import read_text
 
@@ -171,6 +171,6 @@ def _free(sequence: Path, path: str, taken: set[str]) -> str:
 
 
 def _clean(name: str) -> str:
-    """Return what is left of a name that any file system takes, and no file of ours has."""
+    """Return the name reduced to portable characters, and different from our files."""
     kept = re.sub(r"[^\w.+-]+", "_", name)[:_LONGEST].strip(".")
     return f"{kept}_" if kept.casefold() in ("models.parquet", "gallery.html") else kept

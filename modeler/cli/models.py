@@ -28,7 +28,7 @@ def record_of(run: Path) -> dict[str, Any]:
     record = report_columns(report)
     record["settings"] = json.dumps(report["settings"])
     record["versions"] = json.dumps(report.get("versions") or {})
-    with contextlib.suppress(InputError):  # a run without surface, or whose sequence is elsewhere now
+    with contextlib.suppress(InputError):  # a run without surface, or whose sequence has moved
         model = read_model(mesh_of(run))
         record |= model_columns(model, report)
         record |= _errors(run, report, model.vertices_m.mean(axis=0))
@@ -51,7 +51,7 @@ def _errors(run: Path, report: dict[str, Any], centre_m: Array) -> dict[str, flo
 
 
 def thumbnail_of(run: Path, out: Path) -> None:
-    """Write a small picture of the model of a run; nothing where it has none."""
+    """Write a small picture of the model of a run, if it has one."""
     from modeler.export import model_upright
     from viz.report.mesh import portrait, read_mesh
 

@@ -1,6 +1,6 @@
 """One job of a batch in a process of its own: `python -m modeler.cli.one_job JOB`, JOB in JSON.
 
-It ends when its standard input does, that is with the process that started it, however that ends.
+It ends with its standard input, that is, with the process that started it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def main() -> int:
 
 
 def begin(words: str) -> tuple[Job, dict[str, Any]]:
-    """Return a job, and the note with which it begins, which is written; what others have built there is deleted.
+    """Return a job and its initial note, which is written; results of other builds are deleted.
 
     Args:
         words: the job in JSON.
@@ -68,7 +68,7 @@ def end_with_the_parent() -> None:
     """End this process at the end of its standard input."""
     while os.read(0, 1):
         pass
-    os.kill(os.getpid(), signal.SIGKILL)  # as if both had been killed: what is on the disk is whole
+    os.kill(os.getpid(), signal.SIGKILL)  # as if both had been killed: files on disk are complete
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ def check_folder(out: Path, inputs: Iterable[Path]) -> None:
     """Reject a folder that is, or is inside, an input of the command.
 
     Args:
-        out: folder that the command is about to make or fill.
-        inputs: files and folders that it reads; what is not there is passed over.
+        out: folder that the command will create or fill.
+        inputs: files and folders that it reads; missing ones are skipped.
 
     Raises:
         InputError: if writing there would change an input.
@@ -34,7 +34,7 @@ def check_files(outs: Sequence[Path], inputs: Sequence[Path], *, overwrite: bool
 
     Args:
         outs: files that the command is about to write.
-        inputs: files and folders that it reads; what is not there is passed over.
+        inputs: files and folders that it reads; missing ones are skipped.
         overwrite: whether regular files may be replaced.
 
     Raises:
@@ -76,10 +76,10 @@ def check_run_folder(out: Path, inputs: Iterable[Path], *, overwrite: bool, resu
 
 
 def run_inputs(runs: Iterable[Path], moved: Iterable[Path] = ()) -> tuple[Path, ...]:
-    """Return run folders with all that they were made from: sequences, calibrations, and the runs that they join.
+    """Return run folders with all their inputs: sequences, calibrations, and joined runs.
 
     Args:
-        runs: run folders; what is none is returned as it is.
+        runs: run folders; other paths are returned unchanged.
         moved: where sequences are now.
     """
     from modeler.export import RunFolder
@@ -106,7 +106,7 @@ def run_inputs(runs: Iterable[Path], moved: Iterable[Path] = ()) -> tuple[Path, 
 
 
 def _identities(path: Path) -> Iterator[tuple[int, int]]:
-    """Yield what identifies a file or folder, and what the links in it lead to: parts of it may lie elsewhere."""
+    """Yield identifiers of a file or folder and of the targets of links in it."""
     try:
         places = [path, *(entry for entry in (path.iterdir() if path.is_dir() else ()) if entry.is_symlink())]
     except (OSError, ValueError):  # ValueError: a NUL in the name
@@ -118,7 +118,7 @@ def _identities(path: Path) -> Iterator[tuple[int, int]]:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Return what is the same for all names of a file or folder; None if there is none."""
+    """Return an identifier common to all names of a file or folder; None if it does not exist."""
     try:
         status = path.stat()
     except (OSError, ValueError):

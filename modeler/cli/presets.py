@@ -32,7 +32,7 @@ from sequences import write_bop
 _FILES: Final = {"foundationpose": ".obj", "print": ".stl"}
 _PLAIN_TRIANGLES: Final = 50_000  # of a mesh without texture, whose vertices carry the colours
 _DENSITY_KG_M3: Final = 1000.0  # of water; plastics have 900 to 1400, wood 400 to 800, most boxes are hollow
-_LEAST_FOOTPRINT: Final = 0.02  # of the box: what stands on less is not flat at the bottom
+_LEAST_FOOTPRINT: Final = 0.02  # of the box: a smaller footprint is not a flat bottom
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class Preset:
     """One export for one program."""
 
     options: Export
-    """What was asked for."""
+    """The given options."""
     purpose: Purpose
     """Which program it is for."""
 
     def run(self) -> int:
-        """Write the files, read them back, and say what was checked; 3 if a check fails.
+        """Write the files, read them back, and report the checks; 3 if one fails.
 
         Raises:
             InputError: if options exclude each other, or something cannot be read or written.
@@ -71,7 +71,7 @@ class Preset:
         return 3 if made.failed else 0
 
     def _refuse(self) -> None:
-        """Refuse options that the preset decides.
+        """Reject options that the preset decides.
 
         Raises:
             InputError: if one is given.
@@ -90,7 +90,7 @@ class Preset:
             raise InputError(f"--{of_bodies[0]} goes with --for mujoco and --for urdf alone")
 
     def _outs(self, *, textured: bool) -> tuple[Path, ...]:
-        """Return the files that are written, but for convex parts and scenes, whose number is not known before."""
+        """Return the files to write, except convex parts and scenes, whose number is unknown before."""
         out = self.options.out
         if self.purpose == "bop":
             return (self._bop_model, self._bop_model.with_name(bop.MODELS_INFO))
@@ -294,7 +294,7 @@ class Preset:
 
 
 def _symmetry_entries(found: Symmetries, object_from_mesh: Array) -> dict[str, Any]:
-    """Return what `models_info.json` says of symmetries: BOP's are those that colour does not resolve.
+    """Return the symmetries for `models_info.json`: BOP's are those that colour does not resolve.
 
     Those of the shape alone are added as `shape_symmetries_…`, if there is colour.
     """
@@ -313,14 +313,14 @@ def _symmetry_entries(found: Symmetries, object_from_mesh: Array) -> dict[str, A
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what compiled code writes to stdout away from it."""
+    """Suppress output of compiled code to stdout."""
     sys.stdout.flush()
     kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 1)
         yield
     finally:
-        ctypes.CDLL(None).fflush(None)  # what C has not written yet
+        ctypes.CDLL(None).fflush(None)  # buffered output of C
         os.dup2(kept, 1)
         os.close(kept)
         os.close(nowhere)

@@ -1,4 +1,4 @@
-"""A robot before the renderer: it does what is suggested, with errors, and shows what comes of it."""
+"""A simulated robot in front of the renderer: executes suggested actions with errors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHIFT_SIGMA_M: Final = 0.004
 @final
 @dataclass(frozen=True)
 class SimulatedRobot:
-    """What the robot has done so far. A value: `after` makes the next."""
+    """State of the robot. Immutable: `after` returns the next one."""
 
     stage: Stage
     """The object before the camera."""
@@ -31,11 +31,11 @@ class SimulatedRobot:
         return cls(Stage(recipe))
 
     def after(self, candidate: Candidate, belief: Belief, rng: np.random.Generator) -> SimulatedRobot:
-        """Return the robot after an action; a poke goes as its own prior says, with the prior's spread.
+        """Return the robot after an action; the motion of a poke is drawn from its prior.
 
         Args:
             candidate: the action.
-            belief: what was known before it.
+            belief: before the action.
             rng: source of the errors.
         """
         if candidate.poke is not None:

@@ -77,7 +77,7 @@ class Suggest:
         return 0 if found.reached and trusted else 3
 
     def _goal(self) -> tuple[Goal, bool]:
-        """Return what is good enough, and whether the user said so.
+        """Return the goal, and whether the user gave it.
 
         Raises:
             InputError: if a goal is out of range.

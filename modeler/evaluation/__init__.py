@@ -1,4 +1,4 @@
-"""Pure metrics: how far estimates and models are from the truth, and whether they knew."""
+"""Pure metrics: errors of estimates and models, and calibration of their covariances."""
 
 from modeler.evaluation.poses import LEVELS as LEVELS
 from modeler.evaluation.poses import about_point as about_point

@@ -1,8 +1,8 @@
-"""How far motions and trajectories are from the truth, and whether they knew.
+"""Errors of motions and trajectories, and calibration of their covariances.
 
 Truth is `camera_from_model(k)`: the pose (4, 4) of the object's model in the camera at frame k. Motions are compared in
-the source camera, translations at the object's centroid: what a rotation about a distant camera moves there is counted,
-what the same error would move at the camera, where nothing is, is not.
+the source camera, translations at the object's centroid: displacements of the object due to a rotation error about the
+camera are included.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def rotation_error_deg(estimate: Array, truth: Array) -> float:
 
 
 def translation_error_m(estimate: Array, truth: Array, centroid_m: Array) -> float:
-    """Return how far apart in m two motions (4, 4) put the object's centroid.
+    """Return the distance in m between the object's centroid under two motions (4, 4).
 
     Args:
         estimate: target_from_source.
@@ -51,7 +51,7 @@ def translation_error_m(estimate: Array, truth: Array, centroid_m: Array) -> flo
 def nees(estimate: PoseGaussian, truth: Array, components: slice = slice(0, 6)) -> float:
     """Return the normalised estimation error squared ξᵀ Σ⁻¹ ξ with truth = mean · Exp(ξ).
 
-    Over many estimates that are what they say it is χ² distributed with as many degrees of freedom as components.
+    For calibrated estimates it is χ² distributed with as many degrees of freedom as components.
 
     Args:
         estimate: mean and covariance.
@@ -98,7 +98,7 @@ class TrajectoryErrors:
     rotation_deg: Mapping[int, float]
     """By frame number; the first frame's is zero."""
     translation_m: Mapping[int, float]
-    """By frame number: how far the object's centroid, as that frame saw it, lands from where it belongs."""
+    """By frame number: position error of the object's centroid in that frame."""
 
     @property
     def max_rotation_deg(self) -> float:

@@ -1,4 +1,4 @@
-"""How far a reconstructed surface is from the true one: accuracy, completeness, F-score."""
+"""Errors of a reconstructed surface: accuracy, completeness, F-score."""
 
 from __future__ import annotations
 

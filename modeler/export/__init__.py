@@ -1,4 +1,4 @@
-"""A sink: what a run leaves on disk, whole at any moment."""
+"""A sink: the files of a run, complete at any moment."""
 
 from modeler.export.bop import scene_gt_info as scene_gt_info
 from modeler.export.bop import write_bop as write_bop

@@ -1,4 +1,4 @@
-"""BOP models: meshes in mm with their entry in `models_info.json`, and what a scene shows of them."""
+"""BOP models: meshes in mm with their entry in `models_info.json`, and their visibility in scenes."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def write_bop(
 
     Args:
         model: the mesh, in the object frame.
-        place: another frame; its `object_from_mesh` (16, row by row, m) then stands in the entry.
-        more: what else the entry is to hold.
+        place: another frame; its `object_from_mesh` (16, row by row, m) is then in the entry.
+        more: further values of the entry.
         out: PLY file whose name ends in the number of the object (`obj_000001.ply`); without a number it is object 1.
 
     Raises:
@@ -69,7 +69,7 @@ def write_bop(
 
 
 def _entries(path: Path) -> dict[str, Any]:
-    """Return the entries of other objects, by their numbers, in a `models_info.json` whose folder is made if need be.
+    """Return the entries of other objects, by their numbers, in `models_info.json`; its folder is created if missing.
 
     Raises:
         InputError: if it cannot be read, or is no such file.

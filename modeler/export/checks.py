@@ -1,4 +1,4 @@
-"""What can be said of an exported file by reading it back, as the program that it is for would."""
+"""Checks of an exported file after reading it back like its target program."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Checks:
     """Statements about a file, and which of them do not hold."""
 
     held: tuple[str, ...] = ()
-    """What holds, in words."""
+    """Passed checks, in words."""
     failed: tuple[str, ...] = ()
-    """What does not, in words."""
+    """Failed checks, in words."""
 
     def also(self, holds: bool, words: str, otherwise: str = "") -> Checks:
         """Return the checks with one more: `words` where it holds, else `otherwise`, or `not` and the words."""
@@ -32,11 +32,11 @@ class Checks:
         return Checks(self.held, (*self.failed, otherwise or f"not {words}"))
 
     def attempt(self, what: Callable[[], tuple[bool, str]], absent: str) -> Checks:
-        """Return the checks with what a program says, where it is installed.
+        """Return the checks with that of a program, if installed.
 
         Args:
-            what: whether it holds, and words; ValueError where the program refuses the file.
-            absent: what to say where the program is not installed.
+            what: returns whether it passes, and words; ValueError if the program rejects the file.
+            absent: words if the program is not installed.
         """
         try:
             return self.also(*what())

@@ -17,15 +17,15 @@ PART = ".part"  # ending of a file that is still being written
 
 
 def write_atomically(path: Path, content: str | bytes, *, lasting: bool = False, tidy: bool = True) -> None:
-    """Write a file so that whoever looks at any moment, also after a kill, finds the old one or the new one whole.
+    """Write a file atomically: at any moment, also after a kill, the old or the new one is complete.
 
-    A folder that is not there is made.
+    A missing folder is created.
 
     Args:
         path: the file.
         content: all of it.
-        lasting: wait until it is on the disk, so that the same holds after a power cut.
-        tidy: remove what killed processes were to write there, for which the folder is listed.
+        lasting: wait until it is on the disk, for safety against power cuts.
+        tidy: remove partial files of killed processes, by listing the folder.
 
     Raises:
         InputError: if the file cannot be written.
@@ -67,7 +67,7 @@ def settle(*paths: Path) -> None:
 
 
 def settle_soon(*paths: Path) -> threading.Thread:
-    """Do so without waiting; what is gone by then need not last."""
+    """Do so without waiting; files removed by then are ignored."""
 
     def settled() -> None:
         with contextlib.suppress(OSError):

@@ -33,10 +33,10 @@ def tum_text(trajectory: Mapping[int, Array], times_s: Mapping[int, float]) -> s
 def g2o_text(edges: Sequence[Edge], solution: Solution) -> str:
     """Return the solved graph as VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines, numbers written in full.
 
-    Vertices are object_from_camera, edges `target source target_from_source` as they took part: of an edge with several
-    modes, the one that the loops chose. Information matrices are of translation first, then rotation in rad, as g2o
-    orders them and GTSAM reads and writes them. (g2o itself measures rotation by the vector part of a quaternion, half
-    the angle: it takes such files, GTSAM's too, for twice as vague in rotation.)
+    Vertices are object_from_camera, edges `target source target_from_source` as used: of an edge with several modes,
+    the selected one. Information matrices are of translation first, then rotation in rad, as g2o orders them and GTSAM
+    reads and writes them. (g2o itself measures rotation by the vector part of a quaternion, half the angle: it reads
+    such files, GTSAM's too, with twice the rotation uncertainty.)
 
     Args:
         edges: those that take part are written: accepted, no outliers, both ends solved.

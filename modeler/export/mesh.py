@@ -19,7 +19,7 @@ from modeler.types import Array, InputError, ObjectModel
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 TEXTURED = (".obj", ".glb")
 AS_GIVEN: Final = np.diag([1.0, -1.0, -1.0])
-"""Of a mesh whose y axis is up already: what turns glTF's axes back."""
+"""For a mesh whose y axis is already up: reverses the rotation to glTF's axes."""
 
 Tint = Literal["views", "sigma"]
 MADE_UP_RGB: Final = (230, 90, 200)
@@ -67,23 +67,23 @@ def write_mesh(
     axes: str = CAMERA_AXES,
     unit: Literal["m", "mm"] = "m",
 ) -> None:
-    """Write a mesh; the ending of `out` selects the format.
+    """Write a mesh; the suffix of `out` selects the format.
 
     Coordinates stay as they are in every format. In glTF y is up, so that the node of a GLB turns a mesh that is
-    given in the camera's axes: viewers show it as it stood, from the camera's side. PLY, OBJ and GLB keep normals and
+    given in the camera's axes: viewers show it upright, from the camera's side. PLY, OBJ and GLB keep normals and
     colours, only PLY has properties of the vertices; STL has neither.
 
     Args:
         model: the mesh.
-        out: file to write; folders on the way are made. A textured OBJ also has an MTL and a PNG file.
+        out: file to write; missing folders are created. A textured OBJ also has an MTL and a PNG file.
         texture: for OBJ and GLB, in place of vertex colours.
         object_from_upright: (3, 3) right, down and forward of the view in which a GLB is shown; None: the camera's own;
             `AS_GIVEN`: the node of a GLB does not turn the mesh.
-        axes: what the axes are, in words, for formats that have room for them.
+        axes: description of the axes, for formats with comments.
         unit: of the coordinates as they are given.
 
     Raises:
-        InputError: if the ending is unknown or a file cannot be written.
+        InputError: if the suffix is unknown or a file cannot be written.
     """
     suffix = format_of(out)
     if texture is not None and suffix not in TEXTURED:
@@ -220,12 +220,12 @@ def simplified(model: ObjectModel, triangles: int) -> ObjectModel:
 
 
 def tinted(model: ObjectModel, tint: Tint) -> ObjectModel:
-    """Return the model with vertices coloured by how well they are known; interpolated surface is pink.
+    """Return the model with vertices coloured by their uncertainty; interpolated surface is pink.
 
     Args:
         model: with `vertex_views` and `vertex_sigmas_m`.
-        tint: "views": how many views saw a vertex, dark = 1, yellow = 12 and more. "sigma": its standard deviation,
-            dark = 0, yellow = 2 mm and more.
+        tint: "views": number of views that observed a vertex, dark = 1, yellow = 12 and more. "sigma": its standard
+            deviation, dark = 0, yellow = 2 mm and more.
 
     Raises:
         InputError: if the model does not have them.

@@ -25,7 +25,7 @@ _COLUMNS = {
     "status": "int64",  # 0 trustworthy, 3 not; 2 and above: no model; null: not ended
     "trustworthy": "bool",
     "reasons": "list",  # why not
-    "failure": "string",  # what the build said, where there is no model
+    "failure": "string",  # message of the build, if there is no model
     "tries": "int64",  # how often it has failed
     "frames": "int64",
     "accepted": "int64",
@@ -54,7 +54,7 @@ _COLUMNS = {
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows as a table; what a row does not say is null.
+    """Write rows as a table; missing values are null.
 
     Raises:
         InputError: if the file cannot be written.
@@ -92,12 +92,12 @@ def _schema() -> pa.Schema:
 
 
 def blank() -> dict[str, Any]:
-    """Return a row that says nothing."""
+    """Return an empty row."""
     return dict.fromkeys(_COLUMNS)
 
 
 def report_columns(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a report says in the columns of the table."""
+    """Return the values of a report in the columns of the table."""
     loop, evidence = report.get("loop") or {}, report.get("evidence") or {}
     return {
         "sequence": report["sequence"],
@@ -117,7 +117,7 @@ def report_columns(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def model_columns(model: ObjectModel, report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a model measures in the columns of the table."""
+    """Return the measures of a model in the columns of the table."""
     upright_m = model.vertices_m @ model_upright(report)  # right, down, forward
     width_m, height_m, depth_m = (upright_m.max(axis=0) - upright_m.min(axis=0)).tolist()
     sigmas_m = model.vertex_sigmas_m

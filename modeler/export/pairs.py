@@ -1,4 +1,4 @@
-"""Registrations of a run that has not ended, each kept as soon as it is made."""
+"""Registrations of an unfinished run, each stored as soon as it is made."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ _digests: WeakKeyDictionary[RayImage, bytes] = WeakKeyDictionary()  # of views, 
 @final
 @dataclass(frozen=True)
 class Pairs:
-    """A folder with one file a registration, so that a run that was killed need not make them again.
+    """A folder with one file per registration, so that a killed run need not repeat them.
 
-    A file is named by the two frames and by what was asked of them: another question has another answer.
+    A file is named by the two frames and a digest of all other inputs.
     """
 
     folder: Path
     """It is made when there is something to keep."""
 
     def get(self, source: int, target: int, question: str) -> Posterior | None:
-        """Return what was found, to the bit; None if it is not there.
+        """Return the stored result, to the bit; None if there is none.
 
         Args:
             source: frame number.
             target: frame number.
-            question: a digest of all that the answer depends on.
+            question: a digest of all inputs of the result.
         """
         try:
             packed = io.BytesIO(read_regular(self._path(source, target, question)))
@@ -60,7 +60,7 @@ class Pairs:
             return None
 
     def keep(self, posterior: Posterior, question: str) -> None:
-        """Keep what was found. Where that cannot be, say for want of space, it will have to be found again."""
+        """Store the result. If this fails, as on a full disk, it will be computed again."""
         packed = io.BytesIO()
         np.savez(packed, allow_pickle=False, **_arrays(posterior))
         with contextlib.suppress(OSError, InputError):
@@ -71,7 +71,7 @@ class Pairs:
 
     @property
     def marked(self) -> bool:
-        """Whether the folder is there, or what a killed program left of it: the sign of a run that has not ended."""
+        """Whether the folder exists, or remains of it after a kill: the sign of an unfinished run."""
         return any(folder.is_dir() and not folder.is_symlink() for folder in (self.folder, self._dropped))
 
     def mark(self) -> None:

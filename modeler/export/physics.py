@@ -201,8 +201,8 @@ def settled_in_mujoco(scene: Path) -> Settled:
     """Load a scene in MuJoCo and let the object come to rest.
 
     Raises:
-        ImportError: where MuJoCo is not installed.
-        ValueError: if it refuses the file.
+        ImportError: if MuJoCo is not installed.
+        ValueError: if it rejects the file.
     """
     mujoco: Any = importlib.import_module("mujoco")  # its types are known only where it is installed
 
@@ -227,8 +227,8 @@ def settled_in_pybullet(urdf: Path, drop_m: float) -> Settled:
         drop_m: height of the link's origin at which it starts.
 
     Raises:
-        ImportError: where PyBullet is not installed.
-        ValueError: if it refuses the file.
+        ImportError: if PyBullet is not installed.
+        ValueError: if it rejects the file.
     """
     import pybullet  # pyright: ignore[reportMissingImports]
 

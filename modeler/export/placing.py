@@ -58,7 +58,7 @@ class Placement:
 
     @property
     def words(self) -> str:
-        """Origin and axes in a sentence, with what they rest on."""
+        """Origin and axes in a sentence, with their sources."""
         base = " at its lowest vertex" if self.base_from == "lowest vertex" else ""
         up = "" if self.up is None or self.up_from is None else f"; up is {_UP_WORDS[self.up_from]}"
         return f"origin at {_ORIGINS[self.origin]}{base}, {self.axes}{up}"
@@ -111,10 +111,10 @@ def default_up(suffix: str, origin: Origin) -> Up | None:
 
 
 def placement(model: ObjectModel, report: Mapping[str, Any], origin: Origin, up: Up | None) -> Placement:
-    """Return the frame in which the model of a run has its origin and its axes where they are asked for.
+    """Return the frame of the model of a run with the requested origin and axes.
 
-    The horizontal axes are the first camera's: x is its right. The base lies on the support; where none was seen, at
-    the height of the lowest vertex. Its centre is that of the box around the model.
+    The horizontal axes are the first camera's: x is its right. The base is on the support; without one, at the
+    height of the lowest vertex. Its centre is that of the box around the model.
 
     Args:
         model: with a mesh, in the object frame.

@@ -22,7 +22,7 @@ _ROUND = 1e-6
 
 
 def edges_of(report: Mapping[str, Any]) -> tuple[Edge, ...]:
-    """Return the edges in a report, in order, as they were judged; their posteriors are without samples."""
+    """Return the edges in a report, in order, with their acceptance; their posteriors are without samples."""
     return tuple(
         Edge(_posterior(record), _kind(record), record["accepted"], Stated(record.get("reason", "")))
         for record in report["edges"]
@@ -110,7 +110,7 @@ def _matrix(numbers: Sequence[float | None], size: int) -> Array:
 
 
 def _number(value: float | None) -> float:
-    """Return a number, NaN for what was not finite."""
+    """Return a number, NaN if it was not finite."""
     return math.nan if value is None else float(value)
 
 
@@ -118,9 +118,9 @@ _LATER = frozenset({"by_focal", "modes", "cause", "mask", "reason"})  # reports 
 
 
 def fault(report: Mapping[str, Any]) -> str | None:
-    """Return what is wrong with a report, in words; None if nothing is.
+    """Return the first defect of a report, in words; None if it is valid.
 
-    What other programs may leave out, or add, is not looked at.
+    Optional and additional fields are not checked.
     """
     for name, test in _WHOLE.items():
         if not test(report.get(name)):

@@ -1,4 +1,4 @@
-"""`report.json`: what a run did, what it found and how far that is to be trusted."""
+"""`report.json`: inputs, results and trustworthiness of a run."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
 _FREE_RAD = np.radians(
     8.0
 )  # twice this is the usual step between views: the edge does not determine whether there was one
-_FREE_M = 0.01  # surfaces of a hand-sized object then come to lie visibly apart
+_FREE_M = 0.01  # surfaces of a hand-sized object are then visibly apart
 _ALIKE = np.cos(np.radians(25.0))  # nearer than this, a direction goes by the name of another
-_LONG = 1.5  # how many times longer than wide an object is said to have an axis of its own
+_LONG = 1.5  # ratio of length to width above which an object has its own axis
 
 
 def _versions() -> dict[str, str]:
@@ -48,7 +48,7 @@ def _versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class RunMeta:
-    """What a report says about the run besides its results."""
+    """Contents of a report besides the results."""
 
     sequence: str
     """Name or path of the sequence."""
@@ -65,8 +65,8 @@ class RunMeta:
     doubts: Sequence[str] = ()
     """Further reasons in words not to trust the model."""
     camera: Mapping[str, float | str] | None = None
-    """What was estimated of the camera, as report.json has it: `focal_factor`, `focal_factor_sigma`, `depth_scale`,
-    `depth_scale_sigma` and `told_by`; None: it is as the sequence says."""
+    """Estimate of the camera, as in report.json: `focal_factor`, `focal_factor_sigma`, `depth_scale`,
+    `depth_scale_sigma` and `told_by`; None: the given one is exact."""
     interrupted: bool = False
     """Whether the user ended the run before its last frame."""
     seconds: Mapping[str, float] = field(default_factory=dict)
@@ -76,7 +76,7 @@ class RunMeta:
 
 
 def frame_record(step: Step) -> FrameRecord:
-    """Return what became of the frame of a step."""
+    """Return the result of the frame of a step."""
     points = 0 if step.view is None else len(step.view.points_m)
     reason, mask = step.left_out, step.segmentation.outcome.label
     outcome, cause = (ACCEPTED, "") if reason is None else (explain(reason), code(reason))
@@ -88,7 +88,7 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
 
     Args:
         step: the latest.
-        frames: what became of every frame so far.
+        frames: results of all frames so far.
         meta: everything else.
     """
     solution, views, covariances = step.solution, dict(step.views), dict(step.solution.covariances.items())
@@ -191,7 +191,7 @@ def _loop(
 
 
 def _support(solution: Solution, views: Mapping[int, RayImage]) -> Plane | None:
-    """Return what the object stood on in the first frame, whose camera frame is the object's; None if not seen."""
+    """Return the support plane in the first frame, whose camera frame is the object's; None if not seen."""
     first = views.get(min(solution.trajectory, default=-1))
     return None if first is None else first.plane
 
@@ -201,12 +201,12 @@ def _taking_part(step: Step) -> list[Edge]:
 
 
 def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) -> dict[str, Any]:
-    """Return an edge as the report has it, in values that JSON holds.
+    """Return an edge as JSON values of the report.
 
     Args:
-        edge: as it was judged.
+        edge: with its acceptance.
         solution: the poses, which may contradict it.
-        view: the edge's source, by which directions that are not determined are named; None: by the camera alone.
+        view: the edge's source, used to name undetermined directions; None: only by the camera.
     """
     posterior = edge.posterior
     outlier = edge in solution.outliers
@@ -247,7 +247,7 @@ def _mode_record(mode: Mode, left: float | None) -> dict[str, Any]:
 
 
 def _json(value: Any) -> Any:
-    """Return a value as JSON holds it: matrices row by row, what is not finite as None."""
+    """Return a JSON value: matrices row by row, None for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {key: _json(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray):
@@ -321,7 +321,7 @@ def _principal(covariance: Array) -> tuple[Array, Array]:
 
 
 def _name(direction: Array, view: RayImage | None) -> str:
-    """Return what a person would call a unit direction (3,) of the source camera frame, whichever way it points."""
+    """Return the name of a unit direction (3,) of the source camera frame, of either sign."""
     for name, known in _directions(view):
         if abs(float(direction @ known)) >= _ALIKE:
             return name

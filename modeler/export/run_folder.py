@@ -22,13 +22,13 @@ _REPORT = "report.json"
 _OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd")
 """The report, without which nothing is resumed, goes first."""
 PAGE = "report.html"
-"""What `modeler report` makes of a run; it goes with it."""
+"""Page of `modeler report`; removed together with the run."""
 _NO_TIME_S = 0.01
 
 
 @dataclass
 class Pace:
-    """Sees to it that what is done again and again, and takes ever longer, takes a tenth of the time at most."""
+    """Limits repeated work of growing cost to a tenth of the time."""
 
     resting_until_s: float = 0.0
     """By `time.monotonic`."""
@@ -39,7 +39,7 @@ class Pace:
         return time.monotonic() < self.resting_until_s
 
     def took(self, seconds: float) -> None:
-        """Note that it was done and how long that took; what takes no time may always be done."""
+        """Record that it was done and its duration; fast work is always allowed."""
         if seconds > _NO_TIME_S:
             self.resting_until_s = time.monotonic() + 9.0 * seconds
 
@@ -48,19 +48,19 @@ class Pace:
 class RunFolder:
     """A sink for steps. Poses, graph and report are written after every step, clouds and mesh after the last.
 
-    Where that takes long, as of a thousand frames, some steps are passed over: it gets a tenth of the time at most.
-    Each file is replaced in one go, the report after what it reports on: a run killed at any moment leaves no half
-    file. After the last step all of it is on the disk; before, it is brought there in the background. Until the run
-    has ended each registration is kept as well. `RunFolder(path)` is for reading; `RunFolder.open` makes one to write
+    If this takes long, as for a thousand frames, some steps are skipped to limit it to a tenth of the time. Each file
+    is replaced atomically, the report last: a run killed at any moment leaves no partial file. After the last step all
+    files are on the disk; before, they are flushed in the background. Until the run has ended, each registration is
+    stored as well. `RunFolder(path)` is for reading; `RunFolder.open` makes one to write
     to.
     """
 
     path: Path
     """The folder."""
     already: int = 0
-    """Number of frames that a resumed run had got to: until it is there again its files stay as they are."""
+    """Number of frames of a resumed run: its files are kept until that is reached again."""
     frames: dict[int, FrameRecord] = field(default_factory=dict, init=False, repr=False)
-    """What became of the frames so far; a step knows only its own."""
+    """Results of the frames so far; a step has only its own."""
     newest: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
     """The report that was written last."""
     pace: Pace = field(default_factory=Pace, init=False, repr=False)
@@ -68,16 +68,16 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path, *, overwrite: bool = False, resume: bool = False) -> RunFolder:
-        """Make a folder to write to, or prepare the one that is there. Files that are not of a run are never touched.
+        """Create a folder to write to, or prepare an existing one. Files that do not belong to a run are never touched.
 
         Args:
             path: where.
             overwrite: delete the files of an earlier run first.
-            resume: keep them until they are replaced, unless no report says what they are of.
+            resume: keep them until they are replaced, unless there is no report.
 
         Raises:
-            InputError: if the folder has content that is not a run's, or is a run's and neither is given, or where
-                it cannot be made or resumed.
+            InputError: if the folder has content that is not a run's, or is a run's and neither is given, or if
+                it cannot be created or resumed.
         """
         folder = cls(path)
         folder.check(overwrite=overwrite, resume=resume)
@@ -88,7 +88,7 @@ class RunFolder:
             folder.pairs.mark()  # from here on the folder is that of a run, also after a kill
             resumes = resume and (path / _REPORT).exists()
             leftovers = [part for name in _OURS for part in path.glob(f".{name}.*{PART}")]
-            # The recording is written in place: whatever else its name leads to stays as it is.
+            # The recording is written in place: a link target stays unchanged.
             for file in [*leftovers, *(path / name for name in (_OURS[-1:] if resumes else (*_OURS, PAGE)))]:
                 file.unlink(missing_ok=True)
             if not resumes:
@@ -132,7 +132,7 @@ class RunFolder:
 
     @property
     def is_run(self) -> bool:
-        """Whether a run was made here, though it may not have come to its end."""
+        """Whether a run was made here, possibly unfinished."""
         if self.pairs.marked:
             return True
         try:
@@ -147,7 +147,7 @@ class RunFolder:
         return Pairs(self.path / ".pairs")
 
     def report(self) -> dict[str, Any]:
-        """Return the report as it stands in the folder.
+        """Return the report in the folder.
 
         Raises:
             InputError: if there is none or it cannot be read.
@@ -173,7 +173,7 @@ class RunFolder:
         return report
 
     def finished(self, meta: RunMeta) -> bool:
-        """Return whether a run that is to be resumed had come to its end.
+        """Return whether a run to be resumed was complete.
 
         Raises:
             InputError: if that run was made from other input or with other settings, or its report cannot be read.

@@ -21,12 +21,12 @@ PART_TRIANGLES = 1_500
 """Triangles of the mesh from which convex parts are found."""
 _CONCAVITY = 0.08
 _SEARCH: Mapping[str, Any] = {"resolution": 800, "mcts_nodes": 10, "mcts_iterations": 30}
-_LEAST_AREA_M2 = 1e-12  # of a triangle: (1 µm)², below what a 32-bit file resolves at a distance of 10 m
+_LEAST_AREA_M2 = 1e-12  # of a triangle: (1 µm)², below the resolution of a 32-bit file at a distance of 10 m
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What a simulator needs to know of a rigid body of even density."""
+    """Physical properties of a rigid body of uniform density."""
 
     mass_kg: float
     """Mass."""
@@ -129,8 +129,8 @@ def with_flat_bottom(model: ObjectModel, laid_m: float | None) -> ObjectModel:
 
     Args:
         model: closed, with its base about z = 0.
-        laid_m: what lies less than this above a support at z = 0, or below it, is laid onto it; a voxel, within which
-            closed bottoms keep to the support. None: no support was seen, and the object is cut 2 % of its height above
+        laid_m: vertices less than this above a support at z = 0, or below it, are moved onto it; a voxel, within which
+            closed bottoms follow the support. None: no support was seen, and the object is cut 2 % of its height above
             its lowest vertex.
     """
     height_m = model.vertices_m[:, 2]

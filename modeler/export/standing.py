@@ -1,4 +1,4 @@
-"""Upright views of what stands on a support that the camera looks down on, or turned in front of it."""
+"""Upright views of an object on a support seen from above, or turned in front of the camera."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from modeler.export.reading import poses_of
 from modeler.types import Array, RayImage
 
-_LEAST_BACK = 0.3  # of the way to the camera that lies across what is up: else it looks down from right above
+_LEAST_BACK = 0.3  # least horizontal part of the direction to the camera: else it looks straight down
 _WIDE, _FLAT = 0.1, 0.3  # a ring is no line, and all but plane
 
 UpSource = Literal["support", "ring", "camera"]
@@ -24,7 +24,7 @@ def standing(up: Array) -> Array:
         up: (3,) unit, in camera coordinates.
 
     Returns:
-        The identity, which is the camera's own view, where the camera looks along `up`.
+        The identity, which is the camera's own view, if the camera looks along `up`.
     """
     back = np.array([0.0, 0.0, -1.0])
     back = back - up * (up @ back)
@@ -36,9 +36,9 @@ def standing(up: Array) -> Array:
 
 
 def upright(view: RayImage) -> Array:
-    """Return right, down and forward (3, 3), as columns, of a view in which the support of an object lies level.
+    """Return right, down and forward (3, 3), as columns, of a view in which the support of an object is level.
 
-    The identity, which is the camera's own view, where no support is seen.
+    The identity, which is the camera's own view, if no support is seen.
     """
     return np.eye(3) if view.plane is None else standing(view.plane.normal)
 
@@ -46,8 +46,8 @@ def upright(view: RayImage) -> Array:
 def model_upright(report: Mapping[str, Any]) -> Array:
     """Return right, down and forward (3, 3), as columns, of a view in which the model of a run stands upright.
 
-    What it stood on lies level in it; where none was seen, the ring that the cameras make around it; where they make
-    none, it is the view of the first frame's camera.
+    The support is level in it; without one, the ring of cameras around it; without a ring, it is the view of the first
+    frame's camera.
 
     Args:
         report: of a run in which frames were accepted.
@@ -88,13 +88,13 @@ def level_axes(up: Array) -> Array:
 
 
 def _ring_up(centres_m: Array) -> Array | None:
-    """Return what is up (3,) on a ring of cameras at (n, 3); None if they make none."""
+    """Return the up direction (3,) of a ring of cameras at (n, 3); None if there is no ring."""
     long, wide, high = np.pad(np.linalg.svd(centres_m - centres_m.mean(axis=0), compute_uv=False), (0, 3))[:3]
     return ring_axes(centres_m)[1] if wide > _WIDE * long and high < _FLAT * wide else None
 
 
 def ring_axes(centres_m: Array) -> tuple[Array, Array]:
-    """Return what is across (3,) and what is up (3,) in pictures of a ring of cameras.
+    """Return the right (3,) and up (3,) directions for pictures of a ring of cameras.
 
     From above the first camera's left is on the left; from the side, its up is up.
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from modeler.types import Array, ObjectModel
 
-SIDE_PX = 2048  # of the image: what programs that read textures are made for
+SIDE_PX = 2048  # of the image: common in programs that read textures
 PADDING_PX = 4  # charts keep this distance, so that colours do not bleed when the image is shrunk
 TRIANGLES = 8_000  # of a mesh whose detail is in the image
 _FILLED = 0.6  # share of the image that charts fill

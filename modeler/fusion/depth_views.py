@@ -421,7 +421,7 @@ def disagreement(views: ViewBlocks, limit_m: float) -> tuple[float, float] | Non
 
 
 def _distances(blocks: ViewBlocks, samples: int, limit_m: float) -> Iterator[tuple[Array, Array]]:
-    """Yield distances between views at sampled points of each block, and these in units of what the weights imply."""
+    """Yield distances between views at sampled points of each block, and the same in units given by the weights."""
     for views in blocks:
         chosen = np.arange(0, len(views.points_m), max(1, len(views.points_m) // samples))
         lookup = views.index, views.poses, views.intrinsics, views.points_m, views.normals
