@@ -183,14 +183,20 @@ class Run:
         """Begin without a model."""
         self._preview = Preview(self.modeler.fuser)
 
-    def track(self, frames: Iterable[Frame]) -> Iterator[Step | Searching]:
+    def track(self, frames: Iterable[Frame], *, live: bool = False) -> Iterator[Step | Searching]:
         """Place each frame among the views before it. A frame that cannot be placed is reported and left out.
+
+        Args:
+            frames: in order of time.
+            live: each frame is placed before the next is read, which may take as long as somebody needs to turn the
+                object. Otherwise the next is prepared meanwhile, and the last one is always compared with the first.
 
         Raises:
             InputError: where two frames have the same number.
         """
         with ahead(partial(self.modeler.prepare, scene=self.scene)) as preparing:
-            for prepared, last in _with_last(map(preparing, frames)):  # the next one, while this one is registered
+            coming = map(preparing, frames)
+            for prepared, last in ((one, False) for one in coming) if live else _with_last(coming):
                 found = prepared()
                 self.state = self.state.read(found)
                 yield from self._place(found, self.state.latest, last=last)
