@@ -254,6 +254,10 @@ class KeptSequence(AbstractDerived):
                 self.kept[index] = found
         return found
 
+    def until(self, stop: Callable[[], bool]) -> AbstractSequence:
+        """Return itself, with the frames that stay in memory: it is never live."""
+        return self
+
 
 def _size_bytes(frame: Frame) -> int:
     """Return the memory that a frame's images take."""

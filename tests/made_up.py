@@ -71,7 +71,7 @@ def made_up_steps(count: int = 4, *, closure: bool = True) -> list[Step]:
                 edges=tuple(edges),
                 left_out=None,
                 solution=solve(graph, {}),
-                model=ball(),
+                make_model=ball,
                 edges_so_far=graph.edges,
                 views=views,
                 last=last,

@@ -60,7 +60,7 @@ def told(outcomes: Iterable[tuple[int, Reason | None]], capfd: pytest.CaptureFix
     """Return the lines that are said of frames, by number, that end so."""
     frame = next(iter(open_sequence(bundled("tube"))))
     nothing = Segmentation(np.zeros_like(frame.depth_m, dtype=bool), None, FEW)
-    lost = Step(frame, nothing, None, (), (), None, Solution(), None)
+    lost = Step(frame, nothing, None, (), (), None, Solution())
     with Console(99, None) as console:
         for number, outcome in outcomes:
             console(replace(lost, frame=replace(frame, index=number), left_out=outcome))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +80,7 @@ def true_run(sequence: RenderedSequence, scene: Path, path: Path) -> None:
             edges=(),
             left_out=None,
             solution=solution,
-            model=Fuser().fuse(views, solution.trajectory) if last else None,
+            make_model=partial(Fuser().fuse, views, solution.trajectory),
             edges_so_far=tuple(edges),
             views=views,
             last=last,

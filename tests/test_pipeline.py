@@ -156,6 +156,20 @@ def test_each_frame_gives_one_step_with_a_preview_and_the_end_one_more_with_the_
     assert all(len(model.points_m) > 0 for model in models)
 
 
+def test_each_frame_of_a_live_camera_is_placed_before_the_next_is_read() -> None:
+    read: list[int] = []
+
+    def frames() -> Iterator[Frame]:
+        for frame in FRAMES:
+            read.append(frame.index)
+            yield frame
+
+    for event in modeler().start(Scene()).track(frames(), live=True):
+        assert isinstance(event, Step)
+        assert event.frame.index == read[-1]
+    assert len(read) == len(FRAMES)
+
+
 def test_a_full_turn_is_closed_on_the_first_view() -> None:
     *_, closing, last = run()
     assert [(edge.target, edge.kind, edge.accepted) for edge in closing.edges] == [

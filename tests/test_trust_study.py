@@ -118,7 +118,7 @@ def test_depth_stated_wrongly_moves_what_lands_by_the_size_of_the_object_alone()
     for pose in first_from.values():
         pose[:3, 3] *= 1.1
     frame = recorded.frame(2)
-    step = Step(frame, None, None, (), (), None, Solution(first_from), None)  # pyright: ignore[reportArgumentType]
+    step = Step(frame, None, None, (), (), None, Solution(first_from))  # pyright: ignore[reportArgumentType]
     error_deg, error_m = pose_errors(recorded, step)
     assert error_deg is not None
     assert error_m is not None

@@ -216,11 +216,11 @@ def odd_steps(run: list[Step]) -> list[Step]:
     unknown = Solution(step.solution.trajectory, {1: np.full((6, 6), np.nan)}, {})
     posterior = step.posteriors[0]
     lost = replace(posterior, pose=PoseGaussian(posterior.pose.mean, np.full((6, 6), np.inf)))
-    bare = Step(blind, nothing, None, (), (), Failed(Outcome.TOO_FEW_POINTS), Solution(), None)
+    bare = Step(blind, nothing, None, (), (), Failed(Outcome.TOO_FEW_POINTS), Solution())
     return [
         bare,
         replace(bare, last=True),
-        replace(step, model=empty, last=True),
+        replace(step, make_model=lambda: empty, last=True),
         replace(step, solution=unknown),
         replace(step, posteriors=(lost,), edges=(replace(step.edges[0], posterior=lost),)),
         replace(run[1], views={}),

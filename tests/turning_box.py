@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -67,7 +68,7 @@ def steps(count: int = 5, *, width: int = 96, lost: int | None = None, colour: b
             edges=tuple(judged),
             left_out=None if found else Failed(Outcome.NO_OVERLAP),
             solution=Solution(trajectory, dict(covariances), dict(chain)),
-            model=_model(views, trajectory, colour=colour),
+            make_model=partial(_model, dict(views), trajectory, colour=colour),
             edges_so_far=tuple(edges),
             views=dict(views),
             last=last,

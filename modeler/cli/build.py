@@ -234,7 +234,7 @@ def _run(
             followed = frames.live and (console.watched or stream.watched)
             wanted = frames.until(lambda: interrupt.asked)
             coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
-            for event in _events(modeler.start(scene), coming, interrupt):
+            for event in _events(modeler.start(scene), coming, interrupt, live=frames.live):
                 console(event)
                 if isinstance(event, Step):
                     seconds["registration"] += sum(posterior.seconds for posterior in event.posteriors)
@@ -254,9 +254,9 @@ def _run(
     return report
 
 
-def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt) -> Iterator[Event]:
+def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt, *, live: bool) -> Iterator[Event]:
     """Yield the events of a run; Ctrl-C skips the stages after its frames."""
-    yield from run.track(frames)
+    yield from run.track(frames, live=live)
     yield from run.revisit()
     for event in itertools.chain(run.rejoin(), run.refine()):
         yield event

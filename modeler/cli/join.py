@@ -181,7 +181,7 @@ def _written(
         _step(views[best.source], solution=solution, views=views),
         posteriors=(best,),
         edges=joining,
-        model=model,
+        make_model=lambda: model,
         edges_so_far=graph.edges,
         last=True,
     )
@@ -211,6 +211,5 @@ def _step(view: RayImage, *, solution: Solution, views: Mapping[int, RayImage]) 
         edges=(),
         left_out=None,
         solution=solution,
-        model=None,
         views=views,
     )

@@ -4,7 +4,7 @@ from modeler.fusion.alignment import Match, Matcher
 from modeler.fusion.by_focal import widened
 from modeler.fusion.depth_views import conditional_covariances
 from modeler.fusion.fuser import Fuser, FusionVolume
-from modeler.fusion.incremental_tsdf import IncrementalTsdf
+from modeler.fusion.incremental_tsdf import IncrementalTsdf, Preview
 from modeler.fusion.symmetries import Symmetries, SymmetryFinder
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "IncrementalTsdf",
     "Match",
     "Matcher",
+    "Preview",
     "Symmetries",
     "SymmetryFinder",
     "conditional_covariances",

@@ -1,7 +1,8 @@
-"""An incremental TSDF: views are added one by one, and integrated again where their poses have changed."""
+"""The growing model: a TSDF to which views are added one by one, and again where their poses have changed."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -34,6 +35,8 @@ class _Integrated:
     """The box at that time, in voxels: the view is missing from what was added to it since."""
     corners_m: Array
     """(8, 3) of a box in camera coordinates around what the view sees of the object."""
+    view: RayImage
+    """The view, for when it is removed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +59,10 @@ class IncrementalTsdf:
     """By frame number."""
 
     def updated(self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> IncrementalTsdf:
-        """Return the model with new views added, and those integrated again whose poses have moved most.
+        """Return the model with new views added, those without a pose removed, and those that moved most moved.
 
         Args:
-            views: by frame number; those without a pose are left out.
+            views: by frame number.
             trajectory: object_from_camera (4, 4) by frame number.
 
         Raises:
@@ -72,7 +75,7 @@ class IncrementalTsdf:
         moved_m = _shifts_m(pairs, self.integrated)
         moved = sorted((frame for frame in moved_m if moved_m[frame] > 0.5 * voxel_m), key=lambda k: -moved_m[k])
         moved = moved[: self.fuser.preview_moves]
-        gone = [frame for frame in self.integrated if frame not in pairs and frame in views]
+        gone = [frame for frame in self.integrated if frame not in pairs]
         if not (new or moved or gone):
             return self
         low, high = after._box([pairs[frame] for frame in (*new, *moved)])
@@ -80,10 +83,11 @@ class IncrementalTsdf:
             return IncrementalTsdf(self.fuser, 1.5 * voxel_m).updated(views, trajectory)
         after, integrated = after._enlarged(low, high), dict(self.integrated)
         for frame in (*gone, *moved):
-            after._integrate(views[frame], integrated.pop(frame), -1.0)
+            after._integrate(integrated.pop(frame), -1.0)
         for frame in (*new, *moved):
-            integrated[frame] = _Integrated(pairs[frame][1], low, high, _corners_m(pairs[frame][0]))
-            after._integrate(pairs[frame][0], integrated[frame], 1.0)
+            view, object_from_camera = pairs[frame]
+            integrated[frame] = _Integrated(object_from_camera, low, high, _corners_m(view), view)
+            after._integrate(integrated[frame], 1.0)
         return replace(after, integrated=integrated)
 
     @property
@@ -145,8 +149,9 @@ class IncrementalTsdf:
             sums[x : x + nx, y : y + ny, z : z + nz] = self.sums
         return replace(self, low=low, sums=sums)
 
-    def _integrate(self, view: RayImage, at: _Integrated, sign: float) -> None:
+    def _integrate(self, at: _Integrated, sign: float) -> None:
         """Add a view to the sums in place (sign 1), or remove it (sign -1)."""
+        view = at.view
         index, free_m, intrinsics = _images(view, self.fuser.margin_px)
         cosine = -np.sum(view.points_m * view.normals, axis=1) / np.linalg.norm(view.points_m, axis=1)
         colours = np.ones((len(view.points_m), 4))
@@ -169,6 +174,36 @@ class IncrementalTsdf:
             np.where(cosine >= self.fuser.min_cosine, cosine, 0.0),
             colours,
         )
+
+
+@dataclass(eq=False)
+class Preview:
+    """The model of a run in progress, made on request, also from several threads."""
+
+    fuser: Fuser
+    """Parameters."""
+
+    def __post_init__(self) -> None:
+        """Start without views."""
+        self._tsdf, self._model, self._lock = IncrementalTsdf(self.fuser), None, threading.Lock()
+
+    def model(self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> ObjectModel | None:
+        """Return the model of views, incrementally from the last request; None without views.
+
+        Args:
+            views: by frame number.
+            trajectory: object_from_camera (4, 4) by frame number; views without a pose are left out.
+
+        Raises:
+            InputError: if no view with surface points has a pose.
+        """
+        if not views:
+            return None
+        with self._lock:
+            before, self._tsdf = self._tsdf, self._tsdf.updated(views, trajectory)
+            if self._model is None or self._tsdf is not before:
+                self._model = self._tsdf.model()
+            return self._model
 
 
 def _corner(numbers: npt.NDArray[np.int64]) -> Corner:

@@ -11,7 +11,7 @@ import numpy as np
 
 from modeler.beside import ahead
 from modeler.closure import Closer
-from modeler.fusion import Fuser, IncrementalTsdf, conditional_covariances, widened
+from modeler.fusion import Fuser, Preview, conditional_covariances, widened
 from modeler.graph import CommonAxis, MovingGraph, located, shared_noise
 from modeler.pipeline.joining import LEAST_JOINS, Joiner, Segment
 from modeler.pipeline.pairs import Prepared, anywhere, prepare, register
@@ -179,14 +179,24 @@ class Run:
     state: State = field(default_factory=State)
     """What is known so far."""
 
-    def track(self, frames: Iterable[Frame]) -> Iterator[Step | Searching]:
+    def __post_init__(self) -> None:
+        """Begin without a model."""
+        self._preview = Preview(self.modeler.fuser)
+
+    def track(self, frames: Iterable[Frame], *, live: bool = False) -> Iterator[Step | Searching]:
         """Place each frame among the views before it. A frame that cannot be placed is reported and left out.
+
+        Args:
+            frames: in order of time.
+            live: each frame is placed before the next is read, which may take as long as somebody needs to turn the
+                object. Otherwise the next is prepared meanwhile, and the last one is always compared with the first.
 
         Raises:
             InputError: where two frames have the same number.
         """
         with ahead(partial(self.modeler.prepare, scene=self.scene)) as preparing:
-            for prepared, last in _with_last(map(preparing, frames)):  # the next one, while this one is registered
+            coming = map(preparing, frames)
+            for prepared, last in ((one, False) for one in coming) if live else _with_last(coming):
                 found = prepared()
                 self.state = self.state.read(found)
                 yield from self._place(found, self.state.latest, last=last)
@@ -235,18 +245,18 @@ class Run:
 
     def finish(self) -> Iterator[Step | Fusing]:
         """Solve the graph with the noise that its edges share, make the final model and yield the last step."""
-        newest = self.state.newest
+        newest, model = self.state.newest, None
         if newest is None:
             return
         self._solve()
         if self.state.views:
             yield Fusing()
-            self.state = replace(self.state, growing=None)  # so that its memory serves the fusion
             sure = conditional_covariances(self.state.solution, self.state.graph.edges)
             model = self.modeler.fuser.fuse(self.state.views, self.state.solution.trajectory, sure)
-            self.state = replace(self.state, model=widened(model, self.state.solution))
+            model = widened(model, self.state.solution)
         spans = self.state.spans
-        yield self._step(newest, [edge.posterior for edge in spans], spans, last=True)
+        last = self._step(newest, [edge.posterior for edge in spans], spans)
+        yield replace(last, last=True, make_model=lambda: model)
 
     def _segment(self, frames: Sequence[int]) -> Generator[Searching, None, State]:
         """Place lost frames among each other, and return what comes of it; it begins where two of them fit."""
@@ -277,7 +287,6 @@ class Run:
             left_out = NotJoined(len(segment.views))
         else:
             self.state = united
-            self._preview()
         if (newest := self.state.newest) is not None and newest.frame.index in segment.views:
             self.state = replace(self.state, newest=replace(newest, left_out=left_out))
         for frame in sorted(segment.views, key=lambda frame: self.state.places[frame]):
@@ -308,15 +317,8 @@ class Run:
             number = prepared.frame.index
             if self.modeler.closer.is_keyframe(number, self.state.map_view):
                 self.state = replace(self.state, keyframes=(*self.state.keyframes, number))
-            self._preview()
         if prepared.accepted or not again:
             yield self._step(prepared, posteriors, edges)
-
-    def _preview(self) -> None:
-        """Bring the growing model up to date."""
-        growing = self.state.growing or IncrementalTsdf(self.modeler.fuser)
-        growing = growing.updated(self.state.views, self.state.solution.trajectory)
-        self.state = replace(self.state, growing=growing, model=growing.model())
 
     def _solve(self) -> None:
         """Solve the graph with what its edges share: an axis about which all steps turn, or noise, and a focal length.
@@ -357,10 +359,9 @@ class Run:
         focal = located(told_at, rounds=3, enough=1.0, reach=_FOCAL_REACH * sigma)
         return (state if focal.log_factor == at else state.under(focal.log_factor - at, sensor)), focal
 
-    def _step(
-        self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge], *, last: bool = False
-    ) -> Step:
+    def _step(self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge]) -> Step:
         """Return what a frame brought, and what is known after it."""
+        views, solution = self.state.views, self.state.solution
         return Step(
             frame=prepared.frame,
             segmentation=prepared.segmentation,
@@ -368,11 +369,10 @@ class Run:
             posteriors=tuple(posteriors),
             edges=tuple(edges),
             left_out=prepared.left_out,
-            solution=self.state.solution,
-            model=self.state.model,
+            solution=solution,
+            make_model=partial(self._preview.model, views, solution.trajectory),
             edges_so_far=self.state.graph.edges,
-            views=self.state.views,
-            last=last,
+            views=views,
         )
 
 

@@ -11,11 +11,10 @@ import numpy as np
 from modeler import se3
 from modeler.closure import MapView, PathNetwork
 from modeler.disk_arrays import ViewStore
-from modeler.fusion import IncrementalTsdf
 from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.pipeline.pairs import Prepared
 from modeler.rays import Sensor
-from modeler.types import Edge, FocalLength, InputError, ObjectModel, PoseGaussian, Posterior, RayImage, Solution
+from modeler.types import Edge, FocalLength, InputError, PoseGaussian, Posterior, RayImage, Solution
 
 _READY_BYTES, _LEAST_READY = 128 * 2**20, 8  # of views kept ready, 13 of 640 × 480; however large, so many are
 _REVISITED = 3  # frames at most between a lost one and a view that followed it, to which it is registered again
@@ -49,10 +48,6 @@ class State:
     """Edges of the refinement, which the graph does not hold yet."""
     store: ViewStore = field(default_factory=ViewStore)
     """What keeps the views and the lost frames."""
-    model: ObjectModel | None = None
-    """The newest model."""
-    growing: IncrementalTsdf | None = None
-    """What it grows from while frames still come."""
 
     @property
     def solution(self) -> Solution:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.range_noise import RangeNoise
+from modeler.segmentation.background_colour import BackgroundColour
 from modeler.segmentation.depth_images import (
     DepthNoise,
     Labels,
@@ -70,6 +71,8 @@ class Scene:
     """Whether the frames show nothing but the object."""
     noise: DepthNoise | None = None
     """Noise of the depth camera, where it exceeds what was expected."""
+    background: BackgroundColour | None = None
+    """Colours of what stands still behind the object; None where frames have no colour, or are few."""
     range_noise: RangeNoise | None = None
     """Noise statistics of the camera from planes around the object; None without enough planar surface."""
 

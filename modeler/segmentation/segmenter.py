@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from modeler.range_noise import range_noise
+from modeler.segmentation.background_colour import BackgroundColour, without_background
 from modeler.segmentation.depth_images import (
     DepthNoise,
     Labels,
@@ -355,8 +356,15 @@ class Segmenter:
         areas, rivals = [look.area_m2 for _, look in looks], [look.rival for _, look in looks]
         zone = np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
         sure = scene.sure and float(np.median(rivals)) < _RIVAL
-        noise = range_noise([(frame, look.mask) for frame, look in looks])
-        return replace(scene, zone_m=zone, areas_m2=(min(areas), max(areas)), sure=sure, range_noise=noise)
+        frames, masks = [frame for frame, _ in looks], [look.mask for _, look in looks]
+        return replace(
+            scene,
+            zone_m=zone,
+            areas_m2=(min(areas), max(areas)),
+            sure=sure,
+            background=BackgroundColour.learned(frames, masks),
+            range_noise=range_noise([*zip(frames, masks, strict=True)]),
+        )
 
     def segment(self, frame: Frame, scene: Scene) -> Segmentation:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
@@ -383,14 +391,15 @@ class Segmenter:
         if not (scene.still and self._holds(frame, scene)):
             scene = self._learn([frame])
         found = self._find(frame, scene)
-        count = np.count_nonzero(found.mask)
+        mask = without_background(found.mask, frame, scene.background)
+        count = np.count_nonzero(mask)
         if count < self.min_points:
-            return Segmentation(found.mask, scene.plane, Outcome.TOO_FEW_POINTS)
+            return Segmentation(mask, scene.plane, Outcome.TOO_FEW_POINTS)
         sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < _RIVAL and not found.goes_on
         if scene.areas_m2 is not None:
             sure &= scene.areas_m2[0] / _AREA_FACTOR < found.area_m2 < scene.areas_m2[1] * _AREA_FACTOR
-        sure &= np.count_nonzero(found.mask & edge_of(frame.depth_m > 0.0)) < _CUT_SHARE * np.sqrt(count)
-        return Segmentation(found.mask, scene.plane, Outcome.CONVERGED if sure else Outcome.UNSURE_MASK)
+        sure &= np.count_nonzero(mask & edge_of(frame.depth_m > 0.0)) < _CUT_SHARE * np.sqrt(count)
+        return Segmentation(mask, scene.plane, Outcome.CONVERGED if sure else Outcome.UNSURE_MASK)
 
     def _learn(self, frames: Sequence[Frame]) -> Scene:
         """Return the scene that frames without masks show, if their camera is static."""

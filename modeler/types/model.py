@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +41,11 @@ class ObjectModel:
     up. None: not known."""
 
 
+def no_model() -> ObjectModel | None:
+    """Return the model of a step that has none."""
+    return None
+
+
 @dataclass(frozen=True, eq=False)
 class Step:
     """The result of one frame, and the state of the run after it.
@@ -61,14 +67,19 @@ class Step:
     """Why the frame is no part of the model; None: it is."""
     solution: Solution
     """All poses so far."""
-    model: ObjectModel | None
-    """The model so far; None until the first view."""
+    make_model: Callable[[], ObjectModel | None] = no_model
+    """Makes `model`."""
     edges_so_far: tuple[Edge, ...] = ()
     """Every edge judged so far, in order."""
     views: Mapping[int, RayImage] = field(default_factory=dict)
     """Every accepted view by frame number."""
     last: bool = False
     """True for the final step."""
+
+    @cached_property
+    def model(self) -> ObjectModel | None:
+        """The model so far, made on first request: a preview except in the final step; None until the first view."""
+        return self.make_model()
 
     @property
     def accepted(self) -> bool:

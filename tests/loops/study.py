@@ -24,6 +24,7 @@ from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.types import Array, Edge, PoseGaussian, Solution, Step
+from modeler.types.model import no_model
 
 _PAGE_BYTES = 4096
 
@@ -100,7 +101,7 @@ def run(maker: Modeler, case: Case, told: Callable[[Step, float, float], None]) 
         told(step, now - before, memory_mib())
         before = now
     assert step is not None
-    return _figures(case, replace(step, model=None), registrations, time.process_time() - began, peak_mib)
+    return _figures(case, replace(step, make_model=no_model), registrations, time.process_time() - began, peak_mib)
 
 
 def _figures(case: Case, step: Step, registrations: int, seconds: float, peak_mib: float) -> Result:
