@@ -111,7 +111,7 @@ def with_hand(sequence: AbstractSequence) -> AbstractSequence:
     if sequence.robot_path is None:
         raise InputError(
             f"{node.path}: describes a hand, but there is no robot.txt; write lines `time tx ty tz qx qy qz qw` of "
-            "camera_from_hand beside it, or take out the hand."
+            "camera_from_hand into the same folder, or remove the hand."
         )
     return HandMarkedSequence(sequence, shape, hand_poses(sequence.robot_path))
 

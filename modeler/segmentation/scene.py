@@ -162,8 +162,8 @@ def _standing_object(
         labels = pieces(depth, free & (heights(points, level) > tolerance))
         merit = _central(labels, depth, np.ones_like(depth))
         piece = labels == int(merit.argmax())
-        beside = np.count_nonzero(found & (np.abs(heights(points, level)) > tolerance))
-        if merit.max() > 0.0 and np.count_nonzero(piece) > _CARRIED_SHARE * beside:
+        off_plane = np.count_nonzero(found & (np.abs(heights(points, level)) > tolerance))
+        if merit.max() > 0.0 and np.count_nonzero(piece) > _CARRIED_SHARE * off_plane:
             support, found, levels_used = level, piece, levels_used + 1
     return support, found, levels_used == 1
 
@@ -199,11 +199,11 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
     back = layers.back_m[..., 2]
     body, rim = layers.front_m[found], _rim(layers.back_m)
     tolerance_m, body_tolerance_m = noise.tolerance_m(back), noise.tolerance_m(body[:, 2])
-    above, beside = layers.still & ~found, layers.still & ~outline(found)
+    above, around = layers.still & ~found, layers.still & ~outline(found)
     if support is not None:
         over_m = heights(layers.back_m, support)
         above &= over_m > tolerance_m
-        beside &= np.abs(over_m) > tolerance_m
+        around &= np.abs(over_m) > tolerance_m
         rim[np.abs(heights(rim, support)) < noise.tolerance_m(rim[:, 2])] = np.nan
     labels = pieces(back, above)
     touching = np.bincount(labels[edge_of(np.isfinite(back))], minlength=int(labels.max()) + 1)
@@ -216,7 +216,7 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
         if is_support or np.mean(heights(body, plane) > -body_tolerance_m) < _IN_FRONT_SHARE:
             continue
         in_front_m = heights(layers.back_m, plane)
-        on = beside & (np.abs(in_front_m) < tolerance_m)
+        on = around & (np.abs(in_front_m) < tolerance_m)
         if np.count_nonzero(on) < np.count_nonzero(found) and not _beyond_image(plane, rim, noise):
             continue
         facing = layers.rays @ plane[:3].astype(np.float32)
