@@ -21,7 +21,7 @@ class AbstractSequence(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """What the sequence is called."""
+        """Name of the sequence."""
 
     @property
     @abstractmethod
@@ -57,7 +57,7 @@ class AbstractSequence(ABC):
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """Files and folders that are read, which nothing may be written into; none where it lies in memory."""
+        """Input files and folders, which are never written to; none for sequences in memory."""
         return ()
 
     @property
@@ -82,7 +82,7 @@ class AbstractSequence(ABC):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the reader assumed or left out, a sentence each."""
+        """Assumptions and omissions of the reader, a sentence each."""
         return ()
 
     @property
@@ -129,14 +129,14 @@ class AbstractSequence(ABC):
 
 @dataclass(frozen=True)
 class AbstractDerived(AbstractSequence):
-    """A view of another sequence; subclasses override what differs."""
+    """A view of another sequence; subclasses override the differences."""
 
     whole: AbstractSequence
     """The underlying sequence."""
 
     @property
     def name(self) -> str:
-        """What the sequence is called."""
+        """Name of the sequence."""
         return self.whole.name
 
     @property
@@ -178,17 +178,17 @@ class AbstractDerived(AbstractSequence):
 
     @property
     def layout(self) -> str:
-        """What the sequence is stored as."""
+        """Format of the sequence."""
         return self.whole.layout
 
     @property
     def depth_unit(self) -> str:
-        """What one unit of stored depth is."""
+        """Unit of stored depth."""
         return self.whole.depth_unit
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the reader assumed, or left out."""
+        """Assumptions and omissions of the reader."""
         return self.whole.notes
 
     @property

@@ -96,7 +96,7 @@ def pose_entry(pose: Array) -> dict[str, object]:
 MASKS = "mask_visib"
 """Folder of the masks."""
 OCCLUDERS = "mask_hand"
-"""Folder of the masks of what hides the object: a hand, a gripper."""
+"""Folder of the masks of occluders: a hand, a gripper."""
 
 
 @final
@@ -160,19 +160,19 @@ class BopSequence(AbstractRecording):
 
     @property
     def layout(self) -> str:
-        """What the sequence is stored as."""
+        """Format of the sequence."""
         return "BOP scene folder"
 
     @property
     def depth_unit(self) -> str:
-        """What one unit of stored depth is."""
+        """Unit of stored depth."""
         scales = sorted({scale for _, scale in self._intrinsics.values()})
         source = "scene_camera.json" if self.overrides.depth_scale_mm is None else "--depth-scale-mm"
         return f"{' or '.join(f'{scale:g}' for scale in scales[:3])} mm ({source})"
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the reader left out, or took as it stands although it is unusual."""
+        """Omissions of the reader, and unusual values that it accepted."""
         notes = []
         left = [index for index in self._colour_paths if index not in self._depth_paths]
         if left:

@@ -88,13 +88,13 @@ class CloudSequence(AbstractRecording):
 
     @property
     def layout(self) -> str:
-        """What the sequence is stored as."""
+        """Format of the sequence."""
         kinds = sorted({path.suffix.lower()[1:].upper() for path in self.clouds.values()})
         return f"organised clouds ({', '.join(kinds)})"
 
     @property
     def depth_unit(self) -> str:
-        """What one unit of the coordinates is."""
+        """Unit of the coordinates."""
         return "m (the coordinates)" if self.unit_mm == 1000.0 else f"{self.unit_mm:g} mm (--depth-scale-mm)"
 
     @property

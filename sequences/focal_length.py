@@ -47,7 +47,7 @@ class FocalFactor:
         }
 
     def text(self, facts: Mapping[str, object]) -> str:
-        """Return the file of the factor, with what else is known; null for numbers that are not."""
+        """Return the file of the factor, with further values; null for unknown numbers."""
         said = {"schema": 1, "stated_fx_px": self.stated_px, **self.values()}
         known = {name: None if isinstance(fact, float) and not isfinite(fact) else fact for name, fact in facts.items()}
         return json.dumps(said | known, indent=1, allow_nan=False) + "\n"

@@ -29,7 +29,7 @@ class HandShape:
     radii_m: Array
     """(k,) of the capsules."""
     margin_m: float
-    """By how much capsules are widened, for errors of the poses and of the shape."""
+    """Widening of the capsules, for errors of the poses and of the shape."""
 
     def __post_init__(self) -> None:
         """Check the shapes."""
@@ -38,7 +38,7 @@ class HandShape:
     def marked(self, frame: Frame, camera_from_hand: Array) -> BoolArray:
         """Return where a frame shows the hand (h, w): points within it, and rays through it that measured nothing.
 
-        What was measured before or behind it is not the hand.
+        Measurements in front of or behind it are not part of the hand.
 
         Args:
             frame: as read.

@@ -204,7 +204,7 @@ def read_colour(path: Path | EmbeddedImage) -> npt.NDArray[np.uint8]:
 
 
 def write_image(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
-    """Write pixels as the suffix says: PNG as small as it gets, or JPEG at quality 85."""
+    """Write pixels in the format of the suffix: PNG with best compression, or JPEG at quality 85."""
     image = Image.fromarray(np.ascontiguousarray(pixels))
     if path.suffix == ".jpg":
         image.save(path, quality=85, optimize=True)
@@ -255,7 +255,7 @@ def check_same_size(path: Path, size: tuple[int, ...], alike: Path, said: str) -
         path: the depth image.
         size: its (h, w).
         alike: the other.
-        said: what says that the intrinsics are the same, and what to do.
+        said: source of the common intrinsics, and advice.
 
     Raises:
         InputError: if it is.

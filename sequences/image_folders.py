@@ -68,7 +68,7 @@ class ImageFolderSequence(AbstractRecording):
     read_truth: Callable[[], dict[int, Array] | None] = lambda: None
     """Reads the true camera_from_model (4, 4) in m by frame number, when it is asked for."""
     remarks: tuple[str, ...] = ()
-    """What the reader assumed or left out."""
+    """Assumptions and omissions of the reader."""
 
     def __post_init__(self) -> None:
         """Check `sequence.json`.
@@ -109,17 +109,17 @@ class ImageFolderSequence(AbstractRecording):
 
     @property
     def layout(self) -> str:
-        """What the sequence is stored as."""
+        """Format of the sequence."""
         return self.what
 
     @property
     def depth_unit(self) -> str:
-        """What one unit of stored depth is."""
+        """Unit of stored depth."""
         return f"{self.depth_scale_mm:g} mm ({self.unit_source})"
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the reader assumed, or left out."""
+        """Assumptions and omissions of the reader."""
         coloured = next((files for files in self.files.values() if files.colour is not None), None)
         if coloured is None or coloured.colour is None:
             return self.remarks
@@ -133,7 +133,7 @@ class ImageFolderSequence(AbstractRecording):
 UNIT_MM = 0.2
 """The benchmark stores 5000 units per metre."""
 CALIBRATION = (525.0, 525.0, 319.5, 239.5)
-"""What the benchmark recommends for its images of 640 x 480, which come without intrinsics."""
+"""Intrinsics recommended by the benchmark for its images of 640 x 480, which come without intrinsics."""
 FARTHEST_M = 1e6
 """Largest plausible coordinate of a camera in m."""
 MAX_GAP_S = 0.2

@@ -22,7 +22,7 @@ from modeler.types import Array, InputError
 
 @contextmanager
 def input_errors(path: Path, what: str, advice: str) -> Iterator[None]:
-    """Turn whatever a library raises at a file into one line.
+    """Turn exceptions of a library on a file into one line.
 
     Args:
         path: the file.
@@ -46,13 +46,13 @@ def input_errors(path: Path, what: str, advice: str) -> Iterator[None]:
 
 
 def short_message(error: Exception, path: Path) -> str:
-    """Return what an error says, short and without the file's name."""
+    """Return the message of an error, short and without the file's name."""
     words = " ".join(str(error).split()).replace(str(path), "the file") or type(error).__name__
     return words if len(words) <= 120 else words[:117] + "..."
 
 
 def entries(folder: Path) -> list[Path]:
-    """Return what lies in a folder by name; nothing where there is no such folder.
+    """Return the contents of a folder by name; nothing without such a folder.
 
     Raises:
         InputError: if it may not be read.
@@ -138,9 +138,9 @@ _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 @final
 @dataclass(frozen=True)
 class Node:
-    """One value of a file, and where it stands there.
+    """One value of a file, and its place in the file.
 
-    Methods return it as what it should be, and raise an InputError that names the place where it is not.
+    Methods return it with the expected type, or raise an InputError that names the place.
     """
 
     value: object
@@ -151,7 +151,7 @@ class Node:
     """The keys that lead to it."""
 
     def fault(self, expected: str) -> InputError:
-        """Return the error that says what should stand here."""
+        """Return the error that states the expected value."""
         try:
             shown = json.dumps(self.value, default=str)
         except RecursionError:
@@ -254,7 +254,7 @@ def read_tree(path: Path) -> Node:
 
 
 def read_text(path: Path, kind: str = "text") -> str:
-    """Return what a file of at most 64 MB says.
+    """Return the text of a file of at most 64 MB.
 
     Args:
         path: the file.

@@ -20,7 +20,7 @@ RANGE = "fx and fy from 1 to 1e6, cx and cy from -1e6 to 1e6"
 
 @dataclass(frozen=True)
 class Overrides:
-    """Values that take precedence over what the files say or the reader assumes."""
+    """Values that take precedence over the files and the defaults of the reader."""
 
     intrinsics: Intrinsics | None = None
     """fx, fy, cx, cy of the depth camera in px."""
@@ -74,7 +74,7 @@ NAMES = (
 @final
 @dataclass(frozen=True)
 class CameraFacts:
-    """What is known of the camera of a folder of images."""
+    """The camera of a folder of images."""
 
     intrinsics: Intrinsics
     """fx, fy, cx, cy in px."""

@@ -142,12 +142,12 @@ class KinectSequence(AbstractStreams[int]):
 
     @property
     def layout(self) -> str:
-        """What the sequence is stored as."""
+        """Format of the sequence."""
         return "Azure Kinect recording (MKV)"
 
     @property
     def depth_unit(self) -> str:
-        """What one unit of stored depth is."""
+        """Unit of stored depth."""
         return f"{self.unit_mm:g} mm ({'of the format' if self.unit_mm == 1.0 else '--depth-scale-mm'})"
 
 
@@ -184,7 +184,7 @@ class Matroska:
     """The file."""
 
     def calibration(self) -> Any:
-        """Return what `calibration.json`, which is attached to the recording, says.
+        """Return the contents of `calibration.json`, attached to the recording.
 
         Raises:
             InputError: if it is not attached.

@@ -50,7 +50,7 @@ class Lens:
 
         Args:
             image: as the camera took it.
-            outside: what pixels get that the camera did not see.
+            outside: value of pixels that the camera did not see.
         """
         if not self.is_distorted:
             return image
@@ -79,7 +79,7 @@ def lens_of_model(camera: Camera, distortion: Sequence[float], model: str, where
     Args:
         camera: the camera.
         distortion: coefficients in the model's order.
-        model: what the file calls the model of distortion.
+        model: name of the distortion model in the file.
         where: the file, for error messages.
 
     Raises:
@@ -123,7 +123,7 @@ class Alignment:
     def align(self, depth_m: npt.NDArray[np.float32], image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
         """Return the colour (h, w, 3) of each depth pixel; black where there is no depth.
 
-        What the colour camera does not see takes the colour of the nearest surface that it sees, if that is near.
+        Surface that the colour camera does not see takes the colour of the nearest visible surface, if that is near.
 
         Args:
             depth_m: (h, w) of the depth camera, NaN where nothing was measured.

@@ -33,7 +33,7 @@ class AbstractCamera(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """What it is called."""
+        """Name of the camera."""
 
     @property
     @abstractmethod
@@ -62,7 +62,7 @@ class LiveSequence(AbstractSequence):
     camera: AbstractCamera
     """The running camera."""
     seen: tuple[Frame, ...]
-    """What it saw first."""
+    """Its first frame."""
     every: int = 1
     """Stride over the images."""
     kept: slice = field(default_factory=lambda: slice(None, None))
@@ -72,7 +72,7 @@ class LiveSequence(AbstractSequence):
 
     @property
     def name(self) -> str:
-        """What the camera is called."""
+        """Name of the camera."""
         return self.camera.name
 
     @property
@@ -97,7 +97,7 @@ class LiveSequence(AbstractSequence):
         raise InputError(f"{self.name}: frame {index} is not kept; the first ones are {span(self.indices)}.")
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the first frames and then what the camera sees whenever the next is asked for."""
+        """Yield the first frames and then the current image on each request."""
         low, high = self.kept.start or 0, self.kept.stop
         frames = itertools.chain(self.seen, self._coming())
         yield from itertools.islice(frames, low, high, self.every)
@@ -130,12 +130,12 @@ class LiveSequence(AbstractSequence):
 
     @property
     def layout(self) -> str:
-        """What the sequence comes from."""
+        """Source of the sequence."""
         return "live camera"
 
     @property
     def depth_unit(self) -> str:
-        """What one unit of depth is."""
+        """Unit of depth."""
         return f"{self.camera.unit_mm:g} mm (the camera)"
 
     def _coming(self) -> Iterator[Frame]:
@@ -146,7 +146,7 @@ class LiveSequence(AbstractSequence):
 
 
 def begin(camera: AbstractCamera, first: int | None = None) -> LiveSequence:
-    """Return what a camera sees from now on."""
+    """Return the images of a camera from now on."""
     seen: list[Frame] = []
     for number in range(FIRST if first is None else first):
         seen.append(_next(camera, number, seen[-1].time_s if seen else None))
@@ -165,7 +165,7 @@ def _next(camera: AbstractCamera, number: int, after_s: float | None) -> Frame:
 
 
 SCHEME = "realsense:"
-"""What a path begins with that means a camera; its serial number may follow."""
+"""Prefix of a path that selects a camera; its serial number may follow."""
 ADVICE = "a RealSense camera is read by its maker's library; pip install 'modeler[realsense]'"
 WARM_UP = 30
 """Images after which exposure has settled."""
@@ -214,7 +214,7 @@ class RealsenseCamera(AbstractCamera):
     align: Any
     """Brings colour to the depth camera's pixels."""
     model: str
-    """What the camera is."""
+    """Model of the camera."""
     depth: Lens
     """The depth camera."""
     scale_mm: float
@@ -263,7 +263,7 @@ class RealsenseCamera(AbstractCamera):
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Name of the camera."""
         return self.model
 
     @property

@@ -84,7 +84,7 @@ def _positions(depth_m: Array, middle_m: Array) -> Array:
         for step in range(1, REACH + 1):
             beyond = middle_m[:, REACH - 1 + step :][:, :width]
             good &= np.isnan(beyond) | (beyond > near + jump)
-        # A camera with a projector sees nothing in the shadow of the near thing; what follows must be farther.
+        # A camera with a projector has no depth in the shadow of the near object; the next measurement must be farther.
         good &= _following(middle_m)[:, REACH:][:, :width] > near + jump
     rows, starts = np.nonzero(good)
     columns = starts + REACH - 1
@@ -125,7 +125,7 @@ def _chains(positions: Array, rows: int) -> list[Array]:
 
 
 def _measured(chain: Array, frames: int) -> list[DepthEdge]:
-    """Return what a chain says, unless it runs too nearly along the rows."""
+    """Return the measurement of a chain, unless it is nearly parallel to the rows."""
     smooth, slope = savgol_coeffs(WINDOW, 2), savgol_coeffs(WINDOW, 2, deriv=1)
     where = chain[:, 1]
     half = WINDOW // 2
@@ -174,7 +174,7 @@ def noise_bins(depth_m: Array, middle_m: Array, camera: Camera, lateral_px: floa
     """Measure noise along the ray by distance and angle.
 
     Over time, and about a quadric through the neighbours of the mean image in inverse depth, in which planes are
-    linear. What slopes make of noise across the ray is taken off: it is counted there.
+    linear. The effect of lateral noise on slopes is subtracted: it is counted there.
 
     Args:
         depth_m: (n, h, w), NaN where nothing was measured.
@@ -233,7 +233,7 @@ def _rough(middle_m: Array) -> BoolArray:
 
 
 def _quadric() -> tuple[Array, Array, Array, float]:
-    """Return weights (7, 7) for value and slopes of a quadric fit, and what it leaves of a pixel's own variance."""
+    """Return weights (7, 7) for value and slopes of a quadric fit, and the rest of a pixel's own variance."""
     y, x = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].astype(np.float64)
     design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).reshape(-1, 6)
     solver = np.linalg.pinv(design).reshape(6, *x.shape)
@@ -318,7 +318,7 @@ def calibrate(sequence: AbstractSequence) -> Calibration:
     if not bins:
         raise InputError(f"{sequence.name}: shows no smooth surface; put flat things at several distances and angles.")
     floor_m, growth = fit_growth(bins)
-    # A border that never wavers still lies somewhere within its pixel.
+    # A constant border is still uncertain within its pixel.
     lateral_px = max(lateral_px, float(np.sqrt(1.0 / 12.0)))
     model = NoiseModel(lateral_px, 0.5 * (camera.fx + camera.fy), floor_m, growth)
     return Calibration(model, tuple(bins), tuple(found), len(frames))

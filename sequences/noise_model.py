@@ -16,7 +16,7 @@ from sequences.base import AbstractDerived
 from sequences.input_files import Node, read_tree
 
 MAX_ANGLE_RAD = np.radians(85.0)
-"""Beyond, where the model's noise would grow without bounds, it stays as it is here."""
+"""Beyond, the model's noise would grow without bounds and is kept constant."""
 
 
 @final
@@ -67,7 +67,7 @@ class NoiseModel:
 
 
 def slope_terms(distance_m: Array, angle_rad: Array) -> Array:
-    """Return what the variance along the ray is linear in (..., 4): 1, z⁴, z⁴ q, z⁴ q²."""
+    """Return the regressors (..., 4) of the variance along the ray: 1, z⁴, z⁴ q, z⁴ q²."""
     angle = np.minimum(np.abs(angle_rad), MAX_ANGLE_RAD)
     slope = (angle / (0.5 * np.pi - angle)) ** 2
     fourth, slope = np.broadcast_arrays(np.asarray(distance_m) ** 4, slope)
@@ -97,12 +97,12 @@ def _share(node: Node) -> float:
 
 
 def noise_text(model: NoiseModel, facts: Mapping[str, object]) -> str:
-    """Return the file of a model: with the noise at the distance where it was measured, and what it was measured on."""
+    """Return the file of a model: with the noise at the distance where it was measured, and further facts."""
     return json.dumps({**facts, "noise": model.record()}, indent=1, allow_nan=False) + "\n"
 
 
 def object_distance_m(frame: Frame) -> float:
-    """Return about how far away the object is: half way into its mask, or where the nearest quarter of a scene ends."""
+    """Return the approximate distance of the object: the median in its mask, or the nearest quartile of a scene."""
     measured = np.isfinite(frame.depth_m) & (frame.depth_m > 0.0)
     inside = measured if frame.mask is None else measured & frame.mask
     share = 25.0 if frame.mask is None else 50.0

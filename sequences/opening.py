@@ -1,4 +1,4 @@
-"""The reader of a path, chosen by what lies there."""
+"""Selects the reader of a path by its contents."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _scenes(path: Path, names: list[str]) -> list[str]:
 
 
 def _advice(path: Path) -> str:
-    """Return what is wrong with a folder that holds no depth."""
+    """Return the error for a folder without depth."""
     inner = _folders(path)
     scenes = _scenes(path, inner) or _scenes(
         path, [f"{name}/{deeper}" for name in inner for deeper in _folders(path / name)]

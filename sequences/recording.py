@@ -164,7 +164,7 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
     pairs: Mapping[int, ImagePair[Stamp]]
     """By frame number: places in order of time."""
     remarks: tuple[str, ...]
-    """What the reader assumed or left out."""
+    """Assumptions and omissions of the reader."""
 
     @abstractmethod
     def seen_m(self, index: int, stamp: Stamp) -> npt.NDArray[np.float32]:
@@ -211,7 +211,7 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the reader assumed, or left out."""
+        """Assumptions and omissions of the reader."""
         return self.remarks
 
 

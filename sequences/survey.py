@@ -1,4 +1,4 @@
-"""Inspection of all frames: what a sequence holds, what is missing, and what is implausible."""
+"""Inspection of all frames: contents, missing data, and implausible values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FARTHEST_M = 100.0
 
 
 LIKELY_M = (0.25, 5.0)
-"""Half of what a camera that watches an object sees lies within these limits; elsewhere the unit may be wrong."""
+"""Half of a camera's depth lies within these limits when it watches an object; elsewhere the unit may be wrong."""
 OFF_MIDDLE = 0.1
 """Principal points lie within such a share of an image's longer side of its middle; farther off, cx and cy may be
 exchanged."""
@@ -35,7 +35,7 @@ LEAST_JOINED = 0.3
 @final
 @dataclass(frozen=True)
 class Survey:
-    """What the frames of a sequence hold."""
+    """Contents of the frames of a sequence."""
 
     indices: tuple[int, ...]
     """Frame numbers."""
@@ -66,7 +66,7 @@ class Survey:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What is missing and the consequences, for people."""
+        """Missing data and the consequences, in words."""
         total, lacks = len(self.indices), []
         if self.masks < total:
             what = "no masks" if self.masks == 0 else f"no mask in {total - self.masks} frames"
@@ -84,7 +84,7 @@ class Survey:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What is likely to be wrong, for people."""
+        """Likely errors, in words."""
         middle_m, doubts = self.range_m[1], []
         if not LIKELY_M[0] <= middle_m <= LIKELY_M[1]:
             what = "near" if middle_m < LIKELY_M[0] else "far"
@@ -131,7 +131,7 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
     """Read every frame once, and reject a sequence without usable data.
 
     Args:
-        sequence: what to look at.
+        sequence: to inspect.
         truth: whether to read the ground truth too; estimation must not.
 
     Raises:

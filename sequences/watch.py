@@ -18,7 +18,7 @@ from sequences.survey import survey
 END = "done"
 """A file of this name in the folder marks the end of the sequence."""
 POLL_S = 0.05
-"""How often the folder is looked at."""
+"""Polling interval of the folder."""
 
 
 @final
@@ -67,14 +67,14 @@ class WatchedSequence(AbstractDerived):
         return True
 
     def recorded(self) -> AbstractSequence:
-        """Return what was there when it was opened."""
+        """Return the frames that existed when it was opened."""
         return self.whole
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield each frame when it is complete, until none has come for a while.
 
         Raises:
-            InputError: if what is there when it ends cannot be read.
+            InputError: if the data at the end cannot be read.
         """
         wanted = -1
         for frame in arriving(self.path, self.overrides, self.patience, self.stop):
@@ -91,7 +91,7 @@ class WatchedSequence(AbstractDerived):
         return replace(self, stop=stop)
 
     def select(self, every: int = 1, frames: slice | None = None) -> WatchedSequence:
-        """Return a part of the sequence, of what has come and of what will.
+        """Return a part of the sequence, of present and future frames.
 
         Raises:
             InputError: if `every` keeps nothing.
@@ -113,7 +113,7 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
     """Yield frames of ascending numbers, each once it is complete, until none has come for a while.
 
     Raises:
-        InputError: if what is there when it ends cannot be read.
+        InputError: if the data at the end cannot be read.
     """
     last, state = -1, None
     came_s = changed_s = time.monotonic()

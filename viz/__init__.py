@@ -1,1 +1,1 @@
-"""Rerun's only home: what a run shows while it runs."""
+"""Visualisation of runs: the only package that imports Rerun."""

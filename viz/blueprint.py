@@ -86,7 +86,7 @@ def _object(first: RayImage | None) -> rrb.Container:
 
 
 def _pair(first: RayImage | None) -> rrb.Container:
-    """Return the newest pair: depth and what the target saw, before and after alignment, posterior and words."""
+    """Return the newest pair: depth, projection into the target view, both alignments, posterior and text."""
     eye = _near(first, FROM_THE_SIDE, 4.2)
     before = [entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_CAPTION]
     after = [entities.PAIR_TARGET, entities.PAIR_AFTER, entities.PAIR_AXES, entities.PAIR_DRAWS]
@@ -170,7 +170,7 @@ def _spatial(
 
 
 def _eye(first: RayImage, distance_m: float, direction: Array) -> rrb.EyeControls3D:
-    """Return an eye that looks at the object from a distance in a direction (3,); its support, if seen, lies level."""
+    """Return an eye that looks at the object from a distance in a direction (3,); its support, if seen, is level."""
     object_from_upright = upright(first)
     away = object_from_upright @ direction / np.linalg.norm(direction)
     return rrb.EyeControls3D(

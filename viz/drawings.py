@@ -1,4 +1,4 @@
-"""What the drawings share: archetypes by the path of their entity, and helpers for clouds, captions and ellipsoids."""
+"""Shared parts of the drawings: archetypes by entity path, and helpers for clouds, captions and ellipsoids."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Drawing = Iterator[tuple[str, rr.AsComponents]]
 """Entities in the order in which they are logged."""
 
 CLEAR: Final = rr.Clear(recursive=False)
-"""Removes what an entity showed."""
+"""Clears an entity."""
 
 
 POINT_SIZE: Final = rr.Radius.ui_points(1.75)

@@ -114,13 +114,13 @@ class Curve:
     """Squared errors in units of the estimated covariances."""
 
     label: str
-    """What the legend calls them; empty for no entry."""
+    """Name in the legend; empty for no entry."""
     nees: Sequence[float]
     """One an estimate."""
     degrees: int
     """Degrees of freedom of each."""
     role: Literal["whole", "axis", "control"] = "whole"
-    """How it is drawn: in a colour of its own, as a thin line behind, or dashed."""
+    """Style: its own colour, a thin line behind, or dashed."""
 
 
 @final
@@ -135,8 +135,8 @@ class Panel:
 def coverage_curves(panels: Sequence[Sequence[Panel]]) -> bytes:
     """Return rows of panels as a PNG: the share of truths inside a region against the region's probability.
 
-    A curve on the diagonal is calibrated, one below is too sure, one above too modest. The band holds 95 % of what
-    chance makes of as many independent estimates as the panel's first curve has.
+    A curve on the diagonal is calibrated, one below overconfident, one above conservative. The band is the 95 %
+    sampling interval for as many independent estimates as the panel's first curve has.
     """
     from matplotlib.figure import Figure  # slow to load
 

@@ -91,7 +91,7 @@ def _edges(step: Step) -> Drawing:
 
 
 def _lines(strips: Sequence[Array | list[Array]], rgb: entities.Rgb, points: float) -> rr.AsComponents:
-    """Return line strips `points` wide on the screen, or nothing where there are none."""
+    """Return line strips `points` wide on the screen, or nothing if there are none."""
     return rr.LineStrips3D(strips, colors=rgb, radii=rr.Radius.ui_points(points)) if strips else CLEAR
 
 

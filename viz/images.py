@@ -1,4 +1,4 @@
-"""What the camera saw, and the points of the new view projected into the image it is registered to."""
+"""Camera images, and the points of the new view projected into the image it is registered to."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def stride_px(frame: Frame) -> int:
 
 
 def depth_stride_px(frame: Frame) -> int:
-    """Return the stride of images made of depth: larger, for they compress slowly and show no more when finer."""
+    """Return the stride of depth images: larger, as they compress slowly and finer ones show no more."""
     return math.ceil(math.sqrt(frame.depth_m.size / _DEPTH_PIXELS))
 
 
@@ -179,7 +179,7 @@ def caption_of(shown: ProjectedPoints) -> str:
 
 
 def areas(view: RayImage) -> npt.NDArray[np.uint8]:
-    """Return what each pixel (h, w) saw."""
+    """Return the class of each pixel (h, w)."""
     measured = np.isfinite(view.frame.depth_m) & (view.frame.depth_m > 0)
     picture = np.where(measured, BACKGROUND, MISSING).astype(np.uint8)
     picture[measured if view.frame.mask is None else view.frame.mask] = OBJECT

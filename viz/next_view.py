@@ -1,4 +1,4 @@
-"""What to do next, in the viewer: the ranked list, what was seen and what may be seen yet, and how both develop."""
+"""Suggestions in the viewer: the ranked list, observed and unseen surface, and both over time."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def pose_table(step: Step, chain: Mapping[int, PoseGaussian], frames: Sequence[i
 
 
 def _row(step: Step, frame: int, placed_by: Edge | None, chain: Mapping[int, PoseGaussian]) -> tuple[str, str, str]:
-    """Return by how much a frame turned since the one it was registered to, and its standard deviations."""
+    """Return the rotation of a frame relative to the one it was registered to, and its standard deviations."""
     if placed_by is None:
         return ("first" if chain and frame == next(iter(chain)) else ""), "", ""
     turned_rad = se3.rotation_angle(placed_by.posterior.pose.mean)

@@ -1,4 +1,4 @@
-"""Reads what a recording shows, in a process of its own."""
+"""Reads a recording in a separate process."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _READER: Final = ("-m", "viz.reader")
 
 @dataclass
 class LoggedStep:
-    """What was logged at once."""
+    """Data logged together."""
 
     frame: int
     """On the timeline."""

@@ -59,7 +59,7 @@ def certainty_words(posterior: Posterior, centre_m: Array) -> list[str]:
 
 
 def _short(value: float) -> str:
-    """Return a number of two digits, none of which lie beyond what anybody measures."""
+    """Return a number with two significant digits, at least 0.01."""
     return "<0.01" if 0.0 < value < 0.01 else f"{value:.2g}"
 
 
@@ -72,7 +72,7 @@ _SERIES_RGB = {"odometry": entities.ODOMETRY_RGB, "closure": entities.CLOSURE_RG
 
 
 def draw_legend(name: str, facts: Mapping[str, object]) -> Drawing:
-    """Yield what does not change: the style of each series, the legend, and the settings of the run."""
+    """Yield the static parts: the style of each series, the legend, and the settings of the run."""
     for reading in entities.READINGS:
         for series in entities.SERIES:
             if series != "pose" or reading in entities.POSE_READINGS:
@@ -117,7 +117,7 @@ def draw_readings(step: Step) -> Drawing:
 
 
 def draw_text(step: Step) -> Drawing:
-    """Yield what happened to the frame in words, and a log line for each pair."""
+    """Yield the result of the frame in words, and a log line for each pair."""
     level = rr.TextLogLevel.INFO if step.accepted else rr.TextLogLevel.WARN
     if not step.edges and not step.last:
         yield entities.LOG, rr.TextLog(f"frame {step.frame.index}: {_outcome(step)}", level=level)
@@ -171,7 +171,7 @@ def now_words(step: Step) -> str:
 
 
 def loop_words(step: Step) -> list[str]:
-    """Return in words by how much the loop was open before the optimisation; nothing without a loop."""
+    """Return in words the loop closure error before the optimisation; nothing without a loop."""
     centroids_m = {frame: view.centroid_m for frame, view in step.views.items()}
     opening = loop_opening(step.edges_so_far, step.solution, centroids_m)
     return [] if opening is None or not math.isfinite(opening.sigmas) else [opening.words]

@@ -45,7 +45,7 @@ class RerunStream:
     started_s: float
     """When the stream was opened, by `time.monotonic`."""
     file: Path | None = None
-    """What it is recorded to."""
+    """File of the recording."""
     watched: bool = False
     """Whether it is also sent to a viewer, which may be slow or freeze."""
     advised: bool = False
@@ -64,7 +64,7 @@ class RerunStream:
         from viz import graph_view, images, model_view, pair_view, readings
         from viz.drawings import shown_posterior
 
-        # A frame that was lost is tried again when later ones are known: what that brings stands at the latest frame.
+        # A lost frame is retried after later ones: the result is logged at the latest frame.
         self.recording.set_time(entities.FRAME, sequence=max([step.frame.index, *step.views]))
         self.recording.set_time(entities.ELAPSED, duration=time.monotonic() - self.started_s)
         if step.view is not None and set(step.views) == {step.frame.index}:
@@ -125,7 +125,7 @@ class RerunStream:
             leave.join(_PATIENCE_S if self.watched else _DISK_PATIENCE_S)
 
     def _size(self) -> int:
-        """Return the size of the file in bytes; 0 where there is none."""
+        """Return the size of the file in bytes; 0 without one."""
         return self.file.stat().st_size if self.file is not None and self.file.exists() else 0
 
 

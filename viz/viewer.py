@@ -1,4 +1,4 @@
-"""The Rerun viewer as a process of its own, and `modeler view`."""
+"""The Rerun viewer as a separate process, and `modeler view`."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Viewer:
     sink: str
     """Where recordings are sent to."""
     address: str
-    """What a person opens: the page of the viewer in the browser; the sink for a window."""
+    """Address for the user: the page of the viewer in the browser; the sink for a window."""
     lasting: bool
     """Whether it outlives this process: a window does, a page in the browser does not."""
     files: ThreadingHTTPServer | None = None

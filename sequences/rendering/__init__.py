@@ -1,1 +1,1 @@
-"""Synthetic sequences: shapes on a table, how they move, what a depth camera makes of them."""
+"""Synthetic sequences: shapes on a table, their motion, and a depth camera."""

@@ -11,13 +11,13 @@ from modeler.types import Array, InputError
 from sequences.rendering.meshes import IntArray, Mesh
 
 STEEP = np.sqrt(0.5)
-"""What is tilted from upright by more than 45 degrees counts as facing up or down."""
+"""Surface tilted from upright by more than 45 degrees counts as facing up or down."""
 
 
 @final
 @dataclass(frozen=True)
 class Chart:
-    """A flat image's size on the body: u runs to the right and v down, as they are seen from outside, each 0 to 1."""
+    """A flat image's size on the body: u runs to the right and v down, as seen from outside, each 0 to 1."""
 
     width_m: float
     """Length of the row that is the longest."""
@@ -64,7 +64,7 @@ class Places:
 @final
 @dataclass(frozen=True)
 class Cylindrical:
-    """One image around the z axis, over what faces the side."""
+    """One image around the z axis, over side-facing surface."""
 
     bottom_m: float | None = None
     """Height in the model frame at which it begins in m; null for that of the lowest point."""
@@ -129,10 +129,10 @@ _OUT = np.array([[1, 0, 0], [0, -1, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0,
 @final
 @dataclass(frozen=True)
 class Faces:
-    """An image on each face of the body's bounding box: what faces +x, -y, -x, +y and, if wanted, up and down."""
+    """An image on each face of the body's bounding box: facing +x, -y, -x, +y and, if wanted, up and down."""
 
     lids: bool = False
-    """Whether what faces up and down has images too."""
+    """Whether surface facing up and down has images too."""
 
     @property
     def count(self) -> int:
@@ -156,7 +156,7 @@ class Faces:
 @final
 @dataclass(frozen=True)
 class Unwrapped:
-    """One image laid as the texture coordinates of the mesh file say."""
+    """One image mapped by the texture coordinates of the mesh file."""
 
     @property
     def count(self) -> int:

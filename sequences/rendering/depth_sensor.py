@@ -172,7 +172,7 @@ class Exposure:
     depth_m: Array
     """(h, w) distance along the optical axis; NaN where they met nothing."""
     incidence_rad: Array
-    """(h, w) angle between the ray and the normal of what it met."""
+    """(h, w) angle between the ray and the normal of the hit surface."""
     shadowed: BoolArray
     """(h, w) True where the projector's light does not reach."""
 
@@ -189,7 +189,7 @@ class DepthSensor:
     max_range_m: float = 3.5
     """Farther surfaces are not measured."""
     shadow: bool = True
-    """Whether what the projector does not light is lost."""
+    """Whether surface not lit by the projector is lost."""
     jitter: LateralJitter | None = field(default_factory=LateralJitter)
     """Lateral jitter."""
     mixed: MixedPixels | None = field(default_factory=MixedPixels)
@@ -211,7 +211,7 @@ class DepthSensor:
     def measure(self, exposure: Exposure, focal_px: float, rng: np.random.Generator) -> npt.NDArray[np.float32]:
         """Draw the measured depth (h, w) in m; NaN = no measurement.
 
-        Every effect draws from a generator of its own, so that leaving one out does not change the others.
+        Every effect has its own random generator, so that leaving one out does not change the others.
         """
         mixed_rng, disparity_rng, grazing_rng, loss_rng = rng.spawn(4)
         depth_m, incidence_rad = exposure.depth_m, exposure.incidence_rad

@@ -1,4 +1,4 @@
-"""What is printed on objects: made-up prints and image files, laid around the body."""
+"""Prints on objects: synthetic prints and image files, wrapped around the body."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ class Print:
     """A made-up label: patches, bands, bar codes and lines of letter-like blocks, from the large to the small."""
 
     seed: int = 0
-    """Decides what is printed; faces of one body differ."""
+    """Seed of the print; faces of one body differ."""
     contrast: float = 1.0
-    """How far colours are from the paper's: 1 for strong, 0.1 for faint, 0 for plain."""
+    """Contrast of colours to the paper: 1 strong, 0.1 faint, 0 plain."""
     rgb: tuple[int, int, int] = (206, 200, 186)
     """Colour of the paper."""
     items: int = 60
@@ -57,7 +57,7 @@ class Print:
             raise ValueError("rgb must hold numbers from 0 to 255")
 
     def image(self, mesh: Mesh, chart: Chart, number: int, texel_m: float) -> Float32Array:
-        """Return what is printed on a chart (h, w, 3), in sRGB, 0 to 1."""
+        """Return the print of a chart (h, w, 3), in sRGB, 0 to 1."""
         rng = np.random.default_rng((self.seed, number))
         paper = np.array(self.rgb) / 255.0
         inks = rng.uniform(0.0, 1.0, (5, 3)) * np.linspace(0.15, 1.0, 5)[:, None]
@@ -144,7 +144,7 @@ class Picture:
     """PNG, JPEG or TIFF, relative to the recipe: one for every face, or one for all."""
 
     def image(self, mesh: Mesh, chart: Chart, number: int, texel_m: float) -> Float32Array:
-        """Return what is printed on a chart (h, w, 3), in sRGB, 0 to 1."""
+        """Return the print of a chart (h, w, 3), in sRGB, 0 to 1."""
         return _fitted(read_colour(self.paths[number % len(self.paths)]), chart, texel_m)
 
 
@@ -154,7 +154,7 @@ class Embedded:
     """The image in the object's own mesh file."""
 
     def image(self, mesh: Mesh, chart: Chart, number: int, texel_m: float) -> Float32Array:
-        """Return what is printed on a chart (h, w, 3), in sRGB, 0 to 1.
+        """Return the print of a chart (h, w, 3), in sRGB, 0 to 1.
 
         Raises:
             InputError: if the mesh has none.
@@ -167,10 +167,10 @@ class Embedded:
 @final
 @dataclass(frozen=True)
 class Label:
-    """An image, or one for every face, laid around the object; it replaces the shape's colour where it lies."""
+    """An image, or one for every face, wrapped around the object; it replaces the shape's colour there."""
 
     image: Print | Picture | Embedded = Print()
-    """What is printed."""
+    """The print."""
     wrap: AnyWrap = field(default_factory=Cylindrical)
     """How it is laid around the object."""
 
@@ -189,7 +189,7 @@ class LabelledMesh:
     mesh: Mesh
     """In its model frame."""
     texel_m: float
-    """Side of an image's pixel on the body: what one sample of the camera sees, so that nothing finer aliases."""
+    """Side of an image's pixel on the body: the footprint of a camera sample, to avoid aliasing."""
 
     @cached_property
     def _textures(self) -> tuple[Texture, ...]:

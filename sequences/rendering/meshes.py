@@ -135,7 +135,7 @@ def read_mesh(path: Path, scale: float, *, textured: bool = False) -> Mesh:
 
 
 def _texture(visual: object) -> tuple[Array | None, npt.NDArray[np.uint8] | None]:
-    """Return the texture coordinates (v, 2) and the image (h, w, 3) of what trimesh read; None for what is not there.
+    """Return the texture coordinates (v, 2) and the image (h, w, 3) of a trimesh; None if missing.
 
     Raises:
         ValueError: if the image has too many pixels.
@@ -156,16 +156,16 @@ _SHORT = 1.0 - 2e-3
 @final
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What a bundle of rays met first."""
+    """First hits of a bundle of rays."""
 
     depth_m: Array
     """(h, w) distance along the optical axis; NaN where nothing was met."""
     incidence_rad: Array
     """(h, w) angle between ray and normal; NaN where nothing was met."""
     points_m: Array
-    """(h, w, 3) camera coordinates of what was met; NaN where nothing was."""
+    """(h, w, 3) camera coordinates of the hits; NaN without a hit."""
     albedo: npt.NDArray[np.uint8]
-    """(h, w, 3) RGB of what was met."""
+    """(h, w, 3) RGB of the hits."""
     triangle: IntArray
     """(h, w) number of the triangle that was met; 0 if nothing was."""
     weights: Array
@@ -190,7 +190,7 @@ class Caster:
     """A mesh made ready for rays; one without triangles is met by no ray."""
 
     mesh: Mesh
-    """What the rays are to meet."""
+    """The scene to intersect."""
 
     @cached_property
     def _scene(self) -> o3d.t.geometry.RaycastingScene:
@@ -253,7 +253,7 @@ _SKIN_M = 1e-5
 
 
 def outer_surface(mesh: Mesh) -> Mesh:
-    """Return the mesh without what lies inside other parts; where parts meet, the cut is right to a millimetre.
+    """Return the mesh without surface inside other parts; cuts between parts are accurate to a millimetre.
 
     Triangles that two parts cut are halved until they are small; the pieces inside another part are left out.
     """
@@ -293,7 +293,7 @@ def _hidden(corners: Array, part: IntArray, others: list[Mesh]) -> BoolArray:
 
 
 def _box_gap(corners: Array, others: list[Mesh]) -> Array:
-    """Return how far (t, parts) triangles are from the bounding box of each part; 0 where they touch it."""
+    """Return the distances (t, parts) of triangles from the bounding box of each part; 0 if they touch it."""
     low, high = corners.min(axis=1), corners.max(axis=1)
     gaps = [np.maximum(low - o.vertices_m.max(axis=0), o.vertices_m.min(axis=0) - high) for o in others]
     return np.maximum(np.stack(gaps, axis=1).max(axis=2), 0.0)

@@ -28,7 +28,7 @@ class Lamp:
     direction: tuple[float, float, float]
     """Where it comes from, in the camera frame (x right, y down, z forward); of any length."""
     strength: float
-    """What a white surface that faces it sends to the camera; 1 is as bright as an image can be."""
+    """Radiance of a white surface that faces it; 1 is the maximum of an image."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -45,7 +45,7 @@ class Photography:
     """
 
     ambient: float = 0.3
-    """Light from all sides: what a white surface sends to the camera by it."""
+    """Ambient light: radiance of a white surface."""
     lamps: tuple[Lamp, ...] = (Lamp((-0.7, -0.8, -0.5), 0.45), Lamp((0.6, 0.5, -0.8), 0.3))
     """Lamps, fixed to the camera."""
     highlight: float = 0.2
@@ -101,7 +101,7 @@ class Photography:
         return albedo * diffuse[:, None] + glare[:, None]
 
     def image(self, light: Array, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
-        """Return the image (h, w, 3) that a frame makes of light (h, w, 3)."""
+        """Return the image (h, w, 3) of a frame from radiance (h, w, 3)."""
         exposure_rng, balance_rng, noise_rng = rng.spawn(3)
         balance = self.white_balance_sigma * balance_rng.normal(size=3)
         gain = np.exp(self.exposure_sigma * exposure_rng.normal() + balance - balance.mean())

@@ -26,7 +26,7 @@ def build(annotation: object, node: Node) -> typing.Any:
     Args:
         annotation: a dataclass, a union of dataclasses, None, bool, int, float, str, Path, a Literal of texts, or
             tuples of these. Paths are taken relative to the file.
-        node: what the file says.
+        node: of the file.
 
     Raises:
         InputError: if a value has the wrong type or a key is unknown.
@@ -56,7 +56,7 @@ def build(annotation: object, node: Node) -> typing.Any:
 
 
 def kind_of(cls: type) -> str:
-    """Return what a file calls a dataclass: `MeshFile` is "mesh_file"."""
+    """Return the name of a dataclass in files: `MeshFile` is "mesh_file"."""
     return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
 
@@ -102,7 +102,7 @@ def _dataclass(cls: type, node: Node) -> object:
 @final
 @dataclass(frozen=True)
 class Viewpoint:
-    """The camera, and from where it looks at the middle of the table."""
+    """The camera, and its position relative to the middle of the table."""
 
     width: int = 640
     """Image width in px."""
@@ -214,7 +214,7 @@ class Recipe:
     object: AnyShape
     """Shape of the object in its model frame, z up."""
     name: str = "rendered"
-    """What the sequence is called."""
+    """Name of the sequence."""
     seed: int = 0
     """Seed of motion and noise."""
     rest_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -224,9 +224,9 @@ class Recipe:
     view: Viewpoint = Viewpoint()
     """The camera and its place."""
     table: Table | None = Table()
-    """What the object stands on; null for nothing."""
+    """Support of the object; null for none."""
     wall: Wall | None = None
-    """What is behind; null for nothing."""
+    """Background; null for none."""
     trajectory: AnyTrajectory = field(default_factory=Tabletop)
     """How the object moves."""
     sensor: DepthSensor | None = field(default_factory=DepthSensor)
@@ -234,9 +234,9 @@ class Recipe:
     colour: Literal["none", "png", "jpg"] = "none"
     """Whether and how colour images are written."""
     pattern: Mosaic | None = None
-    """What is painted on the object."""
+    """Pattern on the object."""
     label: Label | None = None
-    """What is printed around the object; needs photography."""
+    """Label around the object; needs photography."""
     photography: Photography | None = None
     """Lamps and the colour camera; null for light from the camera itself, without noise."""
     masks: bool = True

@@ -51,7 +51,7 @@ def mosaic_shade(points_m: Array, mosaic: Mosaic) -> Array:
 
 
 _MOTION, _READINGS, _FRAMES, _PHOTOGRAPHS, _SHIFTS = range(5)  # keys of the seed's branches
-_ALIGNED_PX = 0.1  # what interpolation leaves of colours that are taken along the rays of depth, by hand
+_ALIGNED_PX = 0.1  # misalignment by interpolation of colours along the rays of depth, by hand
 
 
 @final
@@ -60,11 +60,11 @@ class RenderedSequence(AbstractSequence):
     """A sequence that is rendered as it is read; the same recipe gives the same frames."""
 
     recipe: Recipe
-    """What to render."""
+    """The recipe."""
 
     @property
     def name(self) -> str:
-        """What the sequence is called."""
+        """Name of the sequence."""
         return self.recipe.name
 
     @property
@@ -126,12 +126,12 @@ class RenderedSequence(AbstractSequence):
 
     @cached_property
     def _casters(self) -> tuple[Caster, Caster]:
-        """Return the object in its model frame, and what surrounds it in the camera frame."""
+        """Return the object in its model frame, and its surroundings in the camera frame."""
         return Caster(self._mesh), Caster(surroundings(self.recipe).moved(self.recipe.view.camera_from_table()))
 
     @cached_property
     def _lit(self) -> tuple[LitMesh, LitMesh]:
-        """Return the object in its model frame, and what surrounds it in the camera frame."""
+        """Return the object in its model frame, and its surroundings in the camera frame."""
         thing, around = self._casters
         label = self.recipe.label
         if label is None:
@@ -152,7 +152,7 @@ class RenderedSequence(AbstractSequence):
         return recipe.view.camera_from_table() @ table_from_object @ rests
 
     def _resting(self, rotation_deg: tuple[float, float, float]) -> tuple[Array, Array]:
-        """Return object_from_model (4, 4) of the object as it is set on the table, and its centre (3,) there."""
+        """Return object_from_model (4, 4) of the object set on the table, and its centre (3,) there."""
         vertices_m = self._mesh.moved(placement((0.0, 0.0, 0.0), rotation_deg)).vertices_m
         low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)
         middle = 0.5 * (low + high)
@@ -166,12 +166,12 @@ class RenderedSequence(AbstractSequence):
         return rays + np.stack([along_w / camera.fx, along_h / camera.fy, np.zeros_like(along_w)], axis=-1)
 
     def _look(self, index: int, rays: Array) -> tuple[Hits, npt.NDArray[np.bool_]]:
-        """Return what rays (h, w, 3) from the camera meet first, and where that is the object."""
+        """Return the first hits of camera rays (h, w, 3), and where they are on the object."""
         on_thing, behind, first = self._met(index, rays)
         return on_thing.over(behind, first), first
 
     def _met(self, index: int, rays: Array) -> tuple[Hits, Hits, npt.NDArray[np.bool_]]:
-        """Return what rays (h, w, 3) meet of the object and of what surrounds it, and where the object is first."""
+        """Return the hits of rays (h, w, 3) on the object and its surroundings, and where the object is first."""
         thing, around = self._casters
         on_thing, behind = thing.cast(rays, self._camera_from_model[index]), around.cast(rays, np.eye(4))
         first = on_thing.depth_m < np.where(np.isnan(behind.depth_m), np.inf, behind.depth_m)
@@ -226,9 +226,9 @@ def render(
     """Write the sequence of a recipe as a BOP scene folder, with the true surface as `model.ply`.
 
     Args:
-        recipe: what to render.
+        recipe: to render.
         folder: where to write; it may exist if it is empty.
-        through: what the frames pass on their way, say something that counts them.
+        through: wrapper of the frames, such as a progress counter.
 
     Raises:
         InputError: if the folder is not empty or cannot be written.

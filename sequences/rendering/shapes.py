@@ -115,7 +115,7 @@ def _welded(vertices: Array, triangles: IntArray) -> Mesh:
 
 
 ROUNDNESS_M = 15e-6
-"""How far facets of round shapes may lie inside the true surface in m."""
+"""Largest distance of facets of round shapes from the true surface in m."""
 
 _UNIT_CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _CUBE_FACES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
@@ -232,7 +232,7 @@ class Torus:
     tube_radius_m: float
     """Radius of the bar in m."""
     arc_deg: float = 360.0
-    """How far it is bent; 360° closes the ring."""
+    """Bending angle; 360° closes the ring."""
 
     def __post_init__(self) -> None:
         """Check the sizes."""

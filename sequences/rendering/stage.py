@@ -1,4 +1,4 @@
-"""A rendered object that is moved step by step, as what is seen asks for: the renderer as a robot's eye."""
+"""A rendered object that is moved step by step: the renderer as a robot's camera."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Stage:
         return RenderedSequence(replace(self.recipe, trajectory=Places(self.poses)))
 
     def frame(self) -> Frame:
-        """Return what the camera sees now."""
+        """Return the current frame."""
         return self.sequence.frame(len(self.poses) - 1)
 
     def truth(self) -> dict[int, Array]:

@@ -1,9 +1,9 @@
-"""How the object moves from frame to frame, as poses table_from_object.
+"""Motion of the object, as poses table_from_object.
 
 The table frame has its origin in the middle of the table's surface, z up, y away from the camera. The object frame is
-the object as it rests: standing on z = 0, its bounding box centred over the origin.
+that of the resting object: standing on z = 0, its bounding box centred over the origin.
 
-Real tables are not plane and real turntables not true: what moves on them may wobble, tilted and lifted in each frame.
+Real tables are not plane and real turntables not exact: objects on them may wobble, tilted and lifted in each frame.
 """
 
 from __future__ import annotations
@@ -205,8 +205,8 @@ AnyTrajectory = Tabletop | Turntable | Hand | Places
 def _wobbling(table_from_object: Array, wobble_deg: float, wobble_m: float, rng: np.random.Generator) -> Array:
     """Return upright poses (n, 4, 4), each tilted about where the object stands and lifted at random.
 
-    A motion takes the wobble of two frames, hence the root of two. It is drawn from streams of its own: turns and
-    shifts are those on a true table, and a sequence begins as a shorter one does.
+    A motion takes the wobble of two frames, hence the root of two. It has its own random streams: turns and
+    shifts are those on an exact table, and a sequence begins like a shorter one.
     """
     count = len(table_from_object)
     tilt_rng, lift_rng = rng.spawn(2)

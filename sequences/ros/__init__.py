@@ -1,1 +1,1 @@
-"""Bags of ROS 1 and ROS 2, MCAP files, and what RealSense records into bags."""
+"""Bags of ROS 1 and ROS 2, MCAP files, and RealSense bags."""

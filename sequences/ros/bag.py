@@ -43,11 +43,11 @@ MAX_BYTES = 1 << 30
 MAX_RATIO = 100
 """Largest compression ratio of larger files: depth images never reach it."""
 _PIECE = 1 << 20
-_ZSTD = b"\x28\xb5\x2f\xfd"  # what its files begin with
+_ZSTD = b"\x28\xb5\x2f\xfd"  # magic bytes of its files
 
 
 def from_bz2(data: bytes, most: int = MAX_BYTES) -> bytes:
-    """Return what was packed.
+    """Return the unpacked bytes.
 
     Raises:
         ValueError: if that is more than `most` bytes, or cut off.
@@ -57,7 +57,7 @@ def from_bz2(data: bytes, most: int = MAX_BYTES) -> bytes:
 
 
 def from_lz4(data: bytes, most: int = MAX_BYTES) -> bytes:
-    """Return what was packed.
+    """Return the unpacked bytes.
 
     Raises:
         ValueError: if that is more than `most` bytes, or cut off.
@@ -68,7 +68,7 @@ def from_lz4(data: bytes, most: int = MAX_BYTES) -> bytes:
 
 
 def from_zstd(data: bytes, most: int = MAX_BYTES) -> bytes:
-    """Return what was packed.
+    """Return the unpacked bytes.
 
     Raises:
         ValueError: if that is more than `most` bytes, cut off, or not packed by zstd.
@@ -129,9 +129,9 @@ def _whole(unpacked: bytes, *, ended: bool, most: int) -> bytes:
 
 
 _ROS1 = b"#ROSBAG V"
-_MCAP = b"\x89MCAP0\r\n\x01"  # what its files begin with: the format, and that a header follows
+_MCAP = b"\x89MCAP0\r\n\x01"  # magic bytes: the format, and the start of a header
 _PROFILE_AT = 21  # behind the header's length and that of the profile's name
-_ROS1_SCHEMA = "ros1msg"  # what MCAP calls definitions of ROS 1's messages
+_ROS1_SCHEMA = "ros1msg"  # name of ROS 1 message definitions in MCAP
 
 
 def _definition(
@@ -278,7 +278,7 @@ def _bounded(chunk: Chunk) -> Chunk:
 
 
 def _check_start(path: Path) -> None:
-    """Refuse a file that does not start as a bag of ROS 1: the library would look for the end of its first line.
+    """Refuse a file that does not start as a bag of ROS 1: the library would search for the end of its first line.
 
     Raises:
         ValueError: if it does not.
@@ -346,12 +346,12 @@ def _profile(path: Path) -> str | None:
 def _check_profile(path: Path) -> None:
     """Refuse an MCAP file of messages that are not ROS's, as far as its header says so."""
     profile = _profile(path)
-    if profile not in ("ros1", "ros2", None):  # the library refuses what is no MCAP file
+    if profile not in ("ros1", "ros2", None):  # the library rejects other files
         raise InputError(
             f"{path}: holds messages of profile {profile!r} where those of ROS are read from MCAP; record it with ROS."
         )
 
 
 def _in_address(path: Path) -> Path:
-    """Return a path as it stands in an address, which is what the library makes of it without further ado."""
+    """Return a path quoted for an address, as the library expects it."""
     return Path(quote(str(path)))

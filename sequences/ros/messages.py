@@ -19,7 +19,7 @@ IMAGE, PACKED, CAMERA = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImag
 MILLIMETRES = ("16UC1", "mono16")
 METRES = ("32FC1",)
 COLOURS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4, "mono8": 1, "8UC1": 1}
-"""Bytes a pixel; what OpenCV calls 8UC3 is BGR."""
+"""Bytes per pixel; OpenCV's 8UC3 is BGR."""
 YUV = {"yuv422": (1, 0, 2), "UYVY": (1, 0, 2), "yuv422_yuy2": (0, 1, 3), "YUYV": (0, 1, 3)}
 """Where Y, U and V stand in the four bytes of two pixels."""
 _PACKED_YUV = re.compile(r"(YUYV|UYVY); zstd; (\d{1,5})x(\d{1,5}) step=(\d{1,6})")  # RealSense's recorder, since 2.59
@@ -27,7 +27,7 @@ _PACKED_DEPTH_HEADER = 12  # bytes of image_transport's compressedDepth before t
 
 
 def is_depth(message: Any) -> bool:
-    """Return whether an image message holds what may be depth."""
+    """Return whether an image message may be depth."""
     if _is_raw(message):
         return message.encoding in MILLIMETRES + METRES
     return "compressedDepth" in message.format
@@ -47,7 +47,7 @@ def depth_m(message: Any, unit_mm: float, where: str) -> npt.NDArray[np.float32]
 
     Args:
         message: an image for which `is_depth`.
-        unit_mm: what one unit of 16-bit depth is.
+        unit_mm: unit of 16-bit depth.
         where: the bag and the topic, for error messages.
 
     Raises:
@@ -148,7 +148,7 @@ def _is_raw(message: Any) -> bool:
 
 
 def _rows(message: Any, bytes_a_pixel: int, where: str) -> npt.NDArray[np.uint8]:
-    """Return the bytes (h, w · bytes) of an image without what pads its rows."""
+    """Return the bytes (h, w · bytes) of an image without row padding."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     length, needed = len(message.data), width * bytes_a_pixel
     if not 0 < height * width <= MAX_PIXELS:

@@ -1,4 +1,4 @@
-"""Metadata of bags: static transforms, and what the RealSense recorder writes besides images."""
+"""Metadata of bags: static transforms, and further data of the RealSense recorder."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _pose(message: Any, where: str) -> Array:
 
 
 def _entries(message: Any) -> dict[str, str]:
-    """Return what a text message `key=value;key=value` says."""
+    """Return the values of a text message `key=value;key=value`."""
     return dict(part.split("=", 1) for part in str(getattr(message, "data", "")).split(";") if "=" in part)
 
 

@@ -100,7 +100,7 @@ class ColourSource:
 def colour_source(
     bag: Bag, first: Mapping[str, Any], depth: tuple[str, Lens], overrides: Overrides
 ) -> tuple[ColourSource | None, list[str]]:
-    """Return where colour comes from that is or can be aligned to depth, and what is said of other colour.
+    """Return the source of colour that is or can be aligned to depth, and a note on other colour.
 
     Args:
         bag: the bag.
@@ -209,14 +209,14 @@ class RosSequence(AbstractStreams[Stamp]):
 
     @property
     def layout(self) -> str:
-        """What the sequence is stored as."""
+        """Format of the sequence."""
         kinds = {".bag": "ROS 1 bag", ".mcap": "MCAP file", ".db3": "ROS 2 bag"}
         realsense = ", by RealSense" if self.depth_topic.startswith("/device_") else ""
         return f"{kinds.get(self.path.suffix.lower(), 'ROS 2 bag')}{realsense}, topic {self.depth_topic}"
 
     @property
     def depth_unit(self) -> str:
-        """What one unit of stored depth is."""
+        """Unit of stored depth."""
         return self.unit
 
     def _check_size(self, where: str, found: tuple[int, ...], lens: Lens) -> None:

@@ -70,7 +70,7 @@ def write_gallery(
 
 
 def _rounded(value: Any, factor: float) -> Any:
-    """Return a number in its unit, to four digits; anything else as it is."""
+    """Return a number in its unit, to four digits; other values unchanged."""
     return float(f"{factor * value:.4g}") if isinstance(value, float) else value
 
 

@@ -95,7 +95,7 @@ def mask_cards(result: Result, pictures: Mapping[int, Thumbnails]) -> Sequence[s
 
 
 def _apart_sds(result: Result, edge: Edge) -> float | None:
-    """Return how far an edge is from the poses, as root mean square in its standard deviations; None if not known."""
+    """Return the distance of an edge from the poses, root mean square in its standard deviations; None if unknown."""
     pose = edge.posterior.pose
     if edge.source not in result.poses or edge.target not in result.poses or not np.isfinite(pose.covariance).all():
         return None
@@ -104,7 +104,7 @@ def _apart_sds(result: Result, edge: Edge) -> float | None:
 
 
 def _badness(result: Result, edge: Edge) -> tuple[bool, float, float]:
-    """Return what pairs are sorted by: whether a frame of it was lost, its distance from the poses, little overlap."""
+    """Return the sort key of a pair: lost frames first, then distance from the poses, then little overlap."""
     apart_sds = _apart_sds(result, edge)
     distance = 0.0 if apart_sds is None or not math.isfinite(apart_sds) else round(apart_sds, 1)
     overlap = edge.posterior.overlap
@@ -172,7 +172,7 @@ class Thumbnails:
     """Small pictures of a frame as JPEG; None if there is nothing to show."""
 
     outlined: bytes | None
-    """What the camera saw around the object, which is outlined, in colour or else its depth."""
+    """Image around the outlined object, in colour or else depth."""
     before: bytes | None
     """The frame's surface and that of the view it was registered to, both in their own camera's coordinates."""
     after: bytes | None
@@ -183,7 +183,7 @@ def thumbnails(rows: Mapping[str, Mapping[int, Row]]) -> dict[int, Thumbnails]:
     """Return the pictures by frame number.
 
     Args:
-        rows: what the recording holds, as `recorded` returns it.
+        rows: of the recording, as `recorded` returns them.
     """
     frames = sorted({frame for entity in rows.values() for frame in entity})
     return {frame: _of_frame({path: rows[path].get(frame, {}) for path in FRAME_PATHS}) for frame in frames}
@@ -222,7 +222,7 @@ def _outlined(picture: Image.Image | None, mask: Image.Image | None) -> bytes | 
 
 
 def _around(on: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:
-    """Return the box (left, top, right, bottom) around what is set in a mask (h, w), with room around it."""
+    """Return the box (left, top, right, bottom) around the set pixels of a mask (h, w), with a margin."""
     height, width = on.shape
     if not on.any():
         return 0, 0, width, height

@@ -13,7 +13,7 @@ class Check:
     """Description of a value of the evidence."""
 
     words: str
-    """What it is."""
+    """Its name."""
     why: str
     """Meaning of a value beyond its limit."""
     factor: float = 1.0

@@ -76,12 +76,12 @@ def read_mesh(path: Path) -> Mesh | None:
 
 
 def scene(mesh: Mesh, strips_m: list[Array], object_from_upright: Array) -> Mapping[str, Any]:
-    """Return what the viewer draws, in values that JSON holds.
+    """Return the data of the viewer as JSON values.
 
     Args:
         mesh: the model.
         strips_m: lines around it, each (n, 3): cameras.
-        object_from_upright: (3, 3) right, down and forward as columns: how it stands at first.
+        object_from_upright: (3, 3) right, down and forward as columns: initial orientation.
     """
     eye_from_upright = np.diag([1.0, -1.0, -1.0])  # whose y is up and whose z points back
     places = np.rint((mesh.vertices_m - mesh.centre_m) / mesh.radius_m * _STEPS).astype("<i2")
@@ -165,7 +165,7 @@ def shade(
 
 
 def portrait(mesh: Mesh, object_from_upright: Array, size: tuple[int, int]) -> bytes:
-    """Return a picture of a model as it stands, from above on the left, as JPEG.
+    """Return a picture of an upright model, from above on the left, as JPEG.
 
     Args:
         mesh: the model.
@@ -184,10 +184,10 @@ def look_at(centre_m: Array, direction: Array, distance_m: float, up: Array) -> 
     """Return object_from_camera (4, 4) of a camera that looks at a point from a direction.
 
     Args:
-        centre_m: (3,) what it looks at.
+        centre_m: (3,) point looked at.
         direction: (3,) from there to the camera.
         distance_m: between the two.
-        up: (3,) what is up in the picture.
+        up: (3,) up direction of the picture.
     """
     forward = -np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
     right = np.cross(forward, up)

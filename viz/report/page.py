@@ -55,7 +55,7 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
 
 
 def _opening(loop: Mapping[str, float] | None) -> list[tuple[str, str, str]]:
-    """Return by how much the loop was open, as a key figure; nothing where no loop was closed."""
+    """Return the loop closure error as a key value; nothing without a closed loop."""
     if loop is None:
         return []
     value = f"{loop['opening_deg']:.1f}°, {loop['sigmas']:.1f} sd"

@@ -1,4 +1,4 @@
-"""What is read of a run: its report in the nouns of the package, and the clouds and images of its recording."""
+"""Data of a run: its report as types of the package, and the clouds and images of its recording."""
 
 from __future__ import annotations
 
