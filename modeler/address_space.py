@@ -1,4 +1,4 @@
-"""Memory as the system gives it: room for libraries that cannot do without, and one heap for all threads."""
+"""Process memory: address space required by libraries, and one heap for all threads."""
 
 import ctypes
 import mmap
@@ -8,7 +8,7 @@ _M_ARENA_MAX = -8  # of mallopt(3)
 
 
 def share_one_heap() -> None:
-    """Let all threads that begin from now on allocate from one heap, where the C library has one for each.
+    """Let all new threads allocate from one heap, instead of one per thread as in the C library.
 
     What a thread frees stays in its heap. With two threads, 500 frames took 210 MiB more than with one heap; kernels
     allocate too seldom to wait for each other.
@@ -18,13 +18,13 @@ def share_one_heap() -> None:
 
 
 def check_room(size: int) -> None:
-    """Refuse limits of the address space (`ulimit -v`) that leave less than so many bytes; no memory is used.
+    """Reject limits of the address space (`ulimit -v`) that leave too few bytes; no memory is used.
 
-    Native code does not tell of such limits: OpenBLAS tries for ever to get its buffers, or ends the process, as Rerun
+    Native code does not report such limits: OpenBLAS retries forever to get its buffers, or ends the process, as Rerun
     does.
 
     Raises:
-        OSError: where there is no such room.
+        OSError: if there is too little.
     """
     if sys.platform == "linux":
         mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=mmap.PROT_READ).close()

@@ -37,7 +37,7 @@ class DiskArrays:
         """Return an array that is on disk.
 
         Raises:
-            OSError: where it cannot be written.
+            OSError: if it cannot be written.
         """
         if not array.size:
             return array

@@ -1,8 +1,8 @@
-"""How a depth camera errs, from what surrounds the object: tables, floors, walls.
+"""Noise statistics of a depth camera from planes around the object: tables, floors, walls.
 
-A plane is linear in inverse depth, so what is left of a plane fitted to a tile of the image is noise. Its
-autocorrelation tells over how many pixels errors are alike (method.md, eq. 23), and the same tile in two frames, how
-much of it stays from frame to frame, as what belongs to a projected pattern or to the lens (eq. 27).
+A plane is linear in inverse depth, so the residual of a plane fitted to a tile of the image is noise. Its
+autocorrelation gives the area over which errors are correlated (method.md, eq. 23), and the same tile in two frames the
+fixed-pattern share, such as that of a projected pattern or the lens (eq. 27).
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from scipy.ndimage import maximum_filter
 
 from modeler.types import Array, BoolArray, Float32Array, Frame
 
-_TILES_PX: Final = (48, 24)  # the first of which there are enough: small tiles take wide errors for the plane's
+_TILES_PX: Final = (48, 24)  # the first size with enough tiles: small tiles absorb widely correlated errors
 _MIN_TILES: Final = 10  # of a size
 _MARGIN_PX: Final = 8  # from the object and its mixed pixels
-_FRAMES: Final = 4  # more show the same surface again
+_FRAMES: Final = 4  # more are redundant
 _NOT_PLANE: Final = 4.0  # times the median of the tiles' variances
 _BALL_PX: Final = 6  # side of the squares over which errors are averaged, as by the smoothing of surface
 
 
 class RangeNoise(NamedTuple):
-    """How a depth camera errs."""
+    """Noise statistics of a depth camera."""
 
     area_px: float
-    """Integral of the autocorrelation of inverse depth over the image: 1 px² where pixels err independently."""
+    """Integral of the autocorrelation of inverse depth over the image: 1 px² for independent pixels."""
     pattern_share: float | None = None
-    """Share of the variance of errors, averaged as smoothing does, that stays from frame to frame; None where no two
+    """Share of the variance of errors, averaged as smoothing does, that repeats from frame to frame; None if no two
     frames show the same plane."""
 
 
 def range_noise(looks: Sequence[tuple[Frame, BoolArray]]) -> RangeNoise | None:
-    """Return how a camera errs on what surrounds an object; None where too little of that is plane.
+    """Return the noise statistics of a camera around an object; None without enough planar surface.
 
     Args:
         looks: frames with masks (h, w) of the object, of which a few are looked at. Pixels without depth are 0 or NaN.
@@ -61,7 +61,7 @@ def _inverse(depth_m: Float32Array, mask: BoolArray) -> Array:
 
 
 def _left_of_planes(inverse: Array, tile_px: int) -> Array:
-    """Return what planes fitted to the tiles of an image (h, w) leave of them (n, tile²); NaN where one has holes."""
+    """Return the residuals (n, tile²) of planes fitted to the tiles of an image (h, w); NaN for tiles with holes."""
     rows, columns = (size // tile_px for size in inverse.shape)
     whole = inverse[: rows * tile_px, : columns * tile_px].reshape(rows, tile_px, columns, tile_px)
     return _without_plane(whole.swapaxes(1, 2).reshape(-1, tile_px**2), tile_px)
@@ -82,7 +82,7 @@ def _median_variance(residuals: Sequence[Array]) -> float:
 
 
 def _pattern_share(residuals: Sequence[Array], calm: Sequence[BoolArray], tile_px: int) -> float | None:
-    """Return the share of the variance that stays from frame to frame, of errors averaged over squares."""
+    """Return the share of the variance that repeats from frame to frame, of errors averaged over squares."""
     squares = tile_px // _BALL_PX
     means = [
         _without_plane(
@@ -103,7 +103,7 @@ def _pattern_share(residuals: Sequence[Array], calm: Sequence[BoolArray], tile_p
 
 
 def _correlated_area(noise: Array) -> float:
-    """Return the integral in px of the autocorrelation of noise (n, t, t), out to the distance where it is first 0."""
+    """Return the integral in px of the autocorrelation of noise (n, t, t), up to its first zero."""
     size = noise.shape[1]
     padded = 2 * size, 2 * size
     power = np.mean(np.abs(np.fft.rfft2(noise, padded)) ** 2, axis=0)

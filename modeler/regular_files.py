@@ -1,6 +1,6 @@
-"""Regular files: the one place where files that a user names, or that lie in a folder the user names, are opened.
+"""Regular files: the only place that opens files named by a user, or in a folder named by a user.
 
-A FIFO, a socket or a device can block whoever opens it, or never end; only regular files are read.
+A FIFO, a socket or a device can block or never end; only regular files are read.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _KINDS = {
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading, never waiting for anybody.
+    """Open a regular file for reading, without blocking.
 
-    The file is looked at before it is opened, because opening a device can have effects, and again once it is open,
+    The file is checked before it is opened, because opening a device can have effects, and again once it is open,
     because another program may have replaced it in between.
 
     Raises:
-        InputError: where it is anything else than a regular file.
-        OSError: where it is missing or cannot be opened.
+        InputError: if it is anything else than a regular file.
+        OSError: if it is missing or cannot be opened.
     """
     _check(path, os.stat(path).st_mode)
     try:
@@ -53,10 +53,10 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def check_regular(path: Path) -> None:
-    """Refuse what is no regular file, for libraries that open a path by themselves.
+    """Reject other than regular files, for libraries that open paths themselves.
 
     Raises:
-        InputError: where it is anything else, missing, or cannot be opened.
+        InputError: if it is anything else, missing, or cannot be opened.
     """
     try:
         open_regular(path).close()
@@ -68,8 +68,8 @@ def create_regular(path: Path) -> None:
     """Create an empty regular file, or empty the one that is there.
 
     Raises:
-        InputError: where something else has its name.
-        OSError: where it cannot be created or written to.
+        InputError: if something else has its name.
+        OSError: if it cannot be created or written to.
     """
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC, 0o666)
     try:
@@ -80,21 +80,21 @@ def create_regular(path: Path) -> None:
 
 
 def left_behind(path: Path, ending: str) -> Iterator[Path]:
-    """Yield what killed processes were to replace a path by: beside it, named `.NAME.PROCESS` and the ending."""
+    """Yield partial files left by killed processes next to a path, named `.NAME.PROCESS` and the suffix."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.*{ending}"):
         try:
             os.kill(int(left.name.removesuffix(ending).rpartition(".")[2]), 0)
         except (ProcessLookupError, OverflowError):
             yield left
         except (ValueError, PermissionError):
-            pass  # not ours, or still at it
+            pass  # not ours, or still running
 
 
 def read_regular(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
     """Return the content of a regular file.
 
     Raises:
-        InputError: where it is anything else, larger than `most_bytes`, missing, or cannot be read.
+        InputError: if it is anything else, larger than `most_bytes`, missing, or cannot be read.
     """
     try:
         with open_regular(path) as file:
@@ -107,19 +107,19 @@ def read_regular(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
 
 
 def read_json(path: Path, most_bytes: int = MAX_BYTES) -> Any:
-    """Return what a JSON file holds.
+    """Return the contents of a JSON file.
 
     Raises:
-        InputError: where it is no regular file, too large, missing, cannot be read, or is not valid JSON.
+        InputError: if it is no regular file, too large, missing, cannot be read, or is not valid JSON.
     """
     return parse_json(read_regular(path, most_bytes), path)
 
 
 def parse_json(content: str | bytes, path: Path) -> Any:
-    """Return what JSON text holds; `path` is where it comes from, for messages.
+    """Return the contents of JSON text; `path` is its source, for messages.
 
     Raises:
-        InputError: where it is not valid JSON, or nested too deeply.
+        InputError: if it is not valid JSON, or nested too deeply.
     """
     try:
         return json.loads(content)
@@ -142,10 +142,10 @@ def unreadable(path: Path, error: OSError) -> InputError:
 
 
 def _check(path: Path, mode: int) -> None:
-    """Refuse what is no regular file by its mode.
+    """Reject other than regular files by mode.
 
     Raises:
-        InputError: where it is none.
+        InputError: if it is none.
     """
     if not stat.S_ISREG(mode):
         kind = _KINDS.get(stat.S_IFMT(mode), "something else")

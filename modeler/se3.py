@@ -1,6 +1,6 @@
-"""Rigid motions and their uncertainty: the one home of the conventions.
+"""Rigid motions and their uncertainty: the definition of the conventions.
 
-A pose is a 4×4 matrix named `target_from_source`: it takes homogeneous points in `source` to points in `target`, in
+A pose is a 4×4 matrix named `target_from_source`: it maps homogeneous points in `source` to points in `target`, in
 metres, and composes by cancelling neighbours. A tangent vector is ξ = (rotation in rad, translation in m), the order of
 GTSAM's `Pose3`, applied from the right: `pose @ exp(ξ)`. Every 6×6 covariance is of that ξ. Functions broadcast over
 leading axes.
@@ -65,7 +65,7 @@ def inverse(pose: Array) -> Array:
 def moved(pose: Array, xi: Array, about_m: Array) -> Array:
     """Return motions (..., 4, 4) after ξ (..., 6) about a point (3,) of what they move: pose · C · exp(ξ) · C⁻¹.
 
-    C is the shift to the point: about an object's centre rotation and translation have least to do with each other.
+    C is the shift to the point: about an object's centre, rotation and translation are least correlated.
     """
     shape = np.broadcast_shapes(np.shape(pose)[:-2], np.shape(xi)[:-1])
     poses = np.broadcast_to(np.asarray(pose, dtype=np.float64), (*shape, 4, 4)).reshape(-1, 4, 4)
@@ -121,8 +121,8 @@ def composed_covariance(covariance_ab: Array, pose_bc: Array, covariance_bc: Arr
 def covariance_about(covariance: Array, point_m: Array) -> Array:
     """Return the covariance (..., 6, 6) of η in `pose @ exp(ξ) = moved(pose, η, point_m)` where ξ has `covariance`.
 
-    About an object's centre rotation and translation have least to do with each other, and the translation is that of
-    the centre. With `-point_m` it leads back: from about a point to about the origin.
+    About an object's centre, rotation and translation are least correlated, and the translation is that of the
+    centre. With `-point_m` it leads back: from about a point to about the origin.
 
     Args:
         covariance: (..., 6, 6) of ξ, which turns about the origin of what the pose moves.

@@ -1,9 +1,9 @@
 """Self-calibration: the focal length under which the loops of a run close.
 
 A surface at angle θ to the image plane, seen with a focal length too short by a factor c, appears at atan(c tan θ), so
-that turns come out too small or too large, and the turns of a closed loop do not sum up to 360°. A run estimates its
-focal length from how its edges move with it, which holds near the one that was given. Here every edge is registered
-again under each estimate, until it stays (method.md, eq. S2).
+that estimated rotations are too small or too large, and those of a closed loop do not sum up to 360°. A run estimates
+its focal length from the derivatives of its edges, which hold near the given one. Here every edge is registered again
+under each estimate, until convergence (method.md, eq. S2).
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class FocalCalibrator:
     """Estimates the focal length from the views and the edges of a run."""
 
     prior_sigma: float = 0.05
-    """Standard deviation of log c before anything is seen. Focal lengths that came with three captures were off by 4 to
-    10 %, fitted ones by 1 %."""
+    """Prior standard deviation of log c. Given focal lengths of three captures were off by 4 to 10 %, calibrated ones
+    by 1 %."""
     reach: float = 0.15
     """Largest |log c| that is considered: three standard deviations."""
 
@@ -54,8 +54,8 @@ class FocalCalibrator:
         """Return the focal length of least graph error.
 
         Args:
-            views: by frame number, made with the focal length that was given.
-            edges: of the run. Closures take part also where they were refused because the chain contradicts them.
+            views: by frame number, made with the given focal length.
+            edges: of the run. Closures also take part if they were rejected as contradicting the chain.
             sensor: that made the views.
             register: as the run did.
             prior: of the run.
@@ -72,9 +72,9 @@ class FocalCalibrator:
         return located(told_at, rounds=_MAX_ROUNDS, enough=_CONVERGED, reach=self.reach)
 
     def _registered(self, edge: Edge, made: _Made, register: Register, prior: AbstractPrior) -> Factor | None:
-        """Return an edge as it is under another focal length; None where nothing says how that changes it.
+        """Return an edge under another focal length; None if its change is unknown.
 
-        Where it cannot be registered again, as steps at the limit of what is found, it is as its derivative foretells.
+        If it cannot be registered again, such as steps at the limit of the search, its derivative predicts the change.
 
         Args:
             edge: of the run, whose solution proposes where to search: the focal length changes it by a few degrees.
@@ -88,10 +88,10 @@ class FocalCalibrator:
             foretold = collapse_modes(edge.posterior.under(made.centre))
             return Factor(edge, foretold) if foretold.by_focal.any() else None
         pose = collapse_modes(posterior)
-        # Over a wide stretch: the derivatives that registrations state are noisier, which makes steps too small.
+        # Over a wide interval: the derivatives of registrations are noisier, which makes steps too small.
         ends = [register(made.view(edge.source, s), made.view(edge.target, s), proposal) for s in (-_NODE, _NODE)]
         less, more = (se3.log(se3.inverse(pose.mean) @ collapse_modes(end).mean) for end in ends)
-        bend = 0.5 * (less + more)  # far beyond what is stated where one of them is another mode
+        bend = 0.5 * (less + more)  # far beyond the predicted change if one of them is another mode
         if all(end.usable for end in ends) and bend @ np.linalg.solve(pose.covariance, bend) <= _SAME_MODE**2:
             pose = replace(pose, by_focal=(more - less) / (2.0 * _NODE))
         return Factor(edge, pose) if pose.by_focal.any() else None
@@ -99,7 +99,7 @@ class FocalCalibrator:
 
 @dataclass(frozen=True, eq=False)
 class _Made:
-    """Views as they are under another focal length."""
+    """Views under another focal length."""
 
     views: Mapping[int, RayImage]
     sensor: Sensor
@@ -107,7 +107,7 @@ class _Made:
     """log c."""
 
     def view(self, frame: int, shift: float = 0.0) -> RayImage:
-        """Return a view at the centre, or beside it."""
+        """Return a view at the centre, or at a node next to it."""
         if (frame, shift) not in self._known:
             self._known[frame, shift] = self.sensor.refocused(self.views[frame], self.centre + shift)
         return self._known[frame, shift]

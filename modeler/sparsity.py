@@ -1,4 +1,4 @@
-"""Depth images with pixels missing at random: how far apart measurements are, and what lies between them."""
+"""Depth images with pixels missing at random: distance between measurements, and interpolation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _WIDE_PX = 10
 def measured_share(measured: BoolArray, within: BoolArray | None = None) -> float:
     """Return the share of measured pixels next to measured ones: about 1 where an image only has holes.
 
-    Next to is beside, above and below, and up to 10 px away where that leaves gaps: measurements may lie on a grid.
+    Neighbours are the four adjacent pixels, or those up to 10 px away if gaps remain: measurements may form a grid.
 
     Args:
         measured: (h, w).
@@ -43,7 +43,7 @@ def measured_share(measured: BoolArray, within: BoolArray | None = None) -> floa
 
 
 def gap_px(share: float) -> float:
-    """Return the radius in px of the largest gaps that random loss leaves, where a share of the pixels is measured.
+    """Return the radius in px of the largest gaps of random loss, for a share of measured pixels.
 
     A disc of n pixels holds no measurement with probability (1 - share)^n. Below 1 px there is nothing between
     measurements.
@@ -74,7 +74,7 @@ def nearest_depth(depth_m: Float32Array, measured: BoolArray, within: BoolArray,
 def closed(measured: BoolArray, gap: float) -> BoolArray:
     """Return measured pixels (h, w) and those between them: their morphological closing by a disc.
 
-    A pixel is left out where any empty disc holds it, and there are dozens of them: with 1.5 times the radius of
+    A pixel is left out if any of dozens of empty discs contains it: with 1.5 times the radius of
     `gap_px` the probability is below 1 % again.
     """
     if not measured.any():
@@ -84,7 +84,7 @@ def closed(measured: BoolArray, gap: float) -> BoolArray:
 
 
 def interpolated(depth_m: Float32Array, camera: Camera) -> Float32Array:
-    """Return depth (h, w) in which pixels between measurements lie on planes of those around; a dense image as it is.
+    """Return depth (h, w) with pixels between measurements on planes of their neighbours; dense images are unchanged.
 
     Args:
         depth_m: (h, w) in m; not positive or NaN = no measurement.

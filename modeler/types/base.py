@@ -1,4 +1,4 @@
-"""Array types, the error for unusable input, and how attempts end."""
+"""Array types, the error for unusable input, and outcomes of attempts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class InputError(Exception):
 
 
 class Outcome(enum.Enum):
-    """How an attempt ended, each with a sentence of advice."""
+    """Outcome of an attempt, with a sentence of advice."""
 
     CONVERGED = "converged", "The posterior has one narrow mode; nothing to do."
     AMBIGUOUS = "ambiguous", "Several poses explain the images; add a prior (table, turntable) or more views."

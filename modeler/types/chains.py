@@ -67,7 +67,7 @@ class Chains:
         return cls(index, np.array(roots), np.array(depths), np.array(above), np.array(means), np.array(covariances))
 
     def joined(self, target: int, source: int) -> bool:
-        """Return whether a chain leads from one frame to another."""
+        """Return whether a chain connects two frames."""
         both = self.index.get(target), self.index.get(source)
         return None not in both and self.root[both[0]] == self.root[both[1]]
 
@@ -93,13 +93,13 @@ class Chains:
         return np.where(one == other, depth, self.depth[one] - 1)
 
     def _ancestors(self, frames: _Numbers, heights: _Numbers) -> _Numbers:
-        """Return the indices (m,) of the frames that lie so many edges (m,) above others (m,)."""
+        """Return the indices (m,) of the frames that lie the given number of edges (m,) above others (m,)."""
         for level, up in enumerate(self.above):
             frames = np.where(heights >> level & 1, up[frames], frames)
         return frames
 
     def _lifted(self, frames: _Numbers, heights: _Numbers) -> tuple[Array, Array]:
-        """Return mean (m, 4, 4) and covariance (m, 6, 6) of the motion to the frame so many edges (m,) above."""
+        """Return mean (m, 4, 4) and covariance (m, 6, 6) of the motion to the frame a number of edges (m,) above."""
         mean, covariance = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros((len(frames), 6, 6))
         for level, up in enumerate(self.above):
             some = np.flatnonzero(heights >> level & 1)

@@ -1,4 +1,4 @@
-"""The poses of a robot's hand: where it was when a frame was taken."""
+"""The poses of a robot's hand by time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from modeler import se3
 from modeler.types.base import Array, InputError
 from modeler.types.views import Frame
 
-_SAME_TIME_S = 1e-3  # poses and frames at most so far apart count as simultaneous
+_SAME_TIME_S = 1e-3  # largest time difference of simultaneous poses and frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class HandPoses:
         """Return the hand's pose (4, 4) at a frame, and its standard deviation (2,) from interpolation: rad, m.
 
         Raises:
-            InputError: where there are no poses near enough in time.
+            InputError: if there are no poses near enough in time.
         """
         after = int(np.searchsorted(self.times_s, frame.time_s))
         for number in (after - 1, after):

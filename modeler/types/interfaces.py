@@ -1,4 +1,4 @@
-"""The abstract interfaces: densities of poses, priors that state them, and registration methods."""
+"""The abstract interfaces: densities of poses, priors, and registration methods."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class AbstractPoseDensity(ABC):
     """
 
     evidence: bool
-    """True: independent knowledge, which becomes part of the edge. False: a proposal, which only guides the search."""
+    """True: independent evidence, which becomes part of the edge. False: a proposal, which only guides the search."""
 
     @abstractmethod
     def sample(self, count: int, rng: np.random.Generator) -> Array:
@@ -33,9 +33,9 @@ class AbstractPoseDensity(ABC):
         """Return the normalised log density (n,) of poses (n, 4, 4); -inf outside the support."""
 
     def log_evidence(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of the independent knowledge at poses (n, 4, 4), which enters the posterior.
+        """Return the log density (n,) of the independent evidence at poses (n, 4, 4), which enters the posterior.
 
-        By default all of the density if it is evidence; if it is a proposal, 0 within its support and -inf outside.
+        By default the whole density if it is evidence; if it is a proposal, 0 within its support and -inf outside.
         """
         log_density = self.log_density(target_from_source)
         return log_density if self.evidence else np.where(np.isfinite(log_density), 0.0, -np.inf)
@@ -43,10 +43,10 @@ class AbstractPoseDensity(ABC):
 
 @dataclass(frozen=True)
 class SharedAxis:
-    """One axis about which all steps turn: what they have in common beyond the information in each edge."""
+    """One axis common to all steps: information beyond that in each edge."""
 
     sigma_tilt_rad: float
-    """Standard deviation of the tilt out of the axis in one step; infinite where edges already hold its direction."""
+    """Standard deviation of the tilt out of the axis in one step; infinite if edges already contain its direction."""
     sigma_shift_m: float
     """Standard deviation of the slip across the axis in one step."""
 
@@ -86,13 +86,13 @@ class AbstractPrior(ABC):
         """Return the density of target_from_source, the same for the same views.
 
         Raises:
-            InputError: where the views lack what the prior needs (a table, say).
+            InputError: if the views lack what the prior needs, such as a table.
         """
 
     def relaxed(self, steps: float) -> AbstractPrior:
-        """Return the prior with limits that hold for a motion of several steps; by default the prior itself.
+        """Return the prior with limits for a motion of several steps; by default the prior itself.
 
-        Used after lost frames, and where the motion seems to exceed the limits.
+        Used after lost frames, and if the motion seems to exceed the limits.
 
         Args:
             steps: number of steps, at least 1.
@@ -100,9 +100,9 @@ class AbstractPrior(ABC):
         return self
 
     def unlimited(self) -> AbstractPrior | None:
-        """Return the prior without limits on the motion, where these are assumed; by default None: they are known.
+        """Return the prior without limits on the motion, if these are defaults; by default None: they are given.
 
-        Used where nothing within the limits matches.
+        Used if nothing within the limits matches.
         """
         return None
 
@@ -120,7 +120,7 @@ class AbstractPrior(ABC):
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
         """Return the axis that all steps between consecutive views share; by default None.
 
-        It must hold only information that no edge holds, so that nothing is counted twice.
+        It must only contain information that no edge contains, so that nothing is counted twice.
         """
         return None
 
@@ -130,7 +130,7 @@ class AbstractRegistrar(ABC):
 
     @property
     def method(self) -> AbstractRegistrar:
-        """The registrar itself, without a memory around it."""
+        """The registrar itself, without a cache around it."""
         return self
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""The fused object, and the step that brings it: what leaves the loop."""
+"""The fused object and the events: the outputs of the loop."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ObjectModel:
     normals: Array
     """(n, 3) unit normals of the cloud."""
     colours: npt.NDArray[np.uint8] | None
-    """(n, 3) RGB of the cloud, where the input has colour."""
+    """(n, 3) RGB of the cloud, if the input has colour."""
     vertices_m: Array
     """(v, 3) mesh vertices."""
     triangles: npt.NDArray[np.int64]
@@ -35,10 +35,10 @@ class ObjectModel:
     vertex_colours: npt.NDArray[np.uint8] | None
     """(v, 3) RGB of the vertices."""
     vertex_views: npt.NDArray[np.int64] | None = None
-    """(v,) how many views saw each vertex; 0 = unobserved, interpolated to close a gap. None: not known."""
+    """(v,) number of views that saw each vertex; 0 = unobserved, interpolated to close a gap. None: unknown."""
     vertex_sigmas_m: Array | None = None
-    """(v,) standard deviation of each vertex along its normal, as far as noise and poses are known to err; inf = made
-    up. None: not known."""
+    """(v,) standard deviation of each vertex along its normal, from noise and poses; inf =
+    interpolated. None: unknown."""
 
 
 def no_model() -> ObjectModel | None:
@@ -56,21 +56,21 @@ class Step:
     frame: Frame
     """The frame as read."""
     segmentation: Segmentation
-    """What of it is the object."""
+    """The segmentation of the object."""
     view: RayImage | None
-    """The frame prepared for registration; None where the object was not found."""
+    """The frame prepared for registration; None if the object was not found."""
     posteriors: tuple[Posterior, ...]
     """Registrations since the step before: with this frame as source, in the final step those of the refinement."""
     edges: tuple[Edge, ...]
-    """Their judgement."""
+    """Their edges, accepted or not."""
     left_out: Reason | None
-    """Why the frame is no part of the model; None: it is."""
+    """Why the frame is not part of the model; None: it is."""
     solution: Solution
     """All poses so far."""
     make_model: Callable[[], ObjectModel | None] = no_model
     """Makes `model`."""
     edges_so_far: tuple[Edge, ...] = ()
-    """Every edge judged so far, in order."""
+    """Every edge so far, accepted or not, in order."""
     views: Mapping[int, RayImage] = field(default_factory=dict)
     """Every accepted view by frame number."""
     last: bool = False
@@ -97,7 +97,7 @@ class Searching:
 
 @dataclass(frozen=True)
 class Refining:
-    """After the last frame, further pairs of views are registered to make the poses more precise."""
+    """After the last frame, further pairs of views are registered to improve the poses."""
 
     done: int
     """Pairs registered so far."""
@@ -111,4 +111,4 @@ class Fusing:
 
 
 Event = Step | Searching | Refining | Fusing
-"""What happens in a run."""
+"""An event of a run."""

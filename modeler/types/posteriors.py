@@ -36,7 +36,7 @@ class PoseGaussian:
         return replace(self, mean=self.mean @ se3.exp(log_factor * self.by_focal))
 
     def widened(self, sigma_focal: float) -> PoseGaussian:
-        """Return the Gaussian under a focal length of which the logarithm has a standard deviation."""
+        """Return the Gaussian for a focal length whose logarithm has a standard deviation."""
         return replace(self, covariance=self.covariance + sigma_focal**2 * np.outer(self.by_focal, self.by_focal))
 
     @cached_property
@@ -66,7 +66,7 @@ class Posterior:
     pose: PoseGaussian
     """target_from_source: mean and covariance; with separate modes, the heaviest one's mean and the spread of all."""
     outcome: Outcome
-    """How the attempt ended."""
+    """Outcome of the registration."""
     overlap: float
     """Share (0..1) of the surface that both cameras should see, at the mean, that both do see."""
     least_overlap: float = field(default=0.0, kw_only=True)
@@ -74,7 +74,7 @@ class Posterior:
     contradicted: bool = field(default=False, kw_only=True)
     """Whether the images contradict the mean more than 99 of 100 right ones, if the method can test this."""
     samples: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    """(n, 4, 4) samples of target_from_source; empty where the method draws none."""
+    """(n, 4, 4) samples of target_from_source; empty if the method draws none."""
     weights: Array = field(default_factory=lambda: np.zeros(0))
     """(n,) weights of the samples, summing to 1."""
     modes: tuple[Mode, ...] = ()
@@ -97,7 +97,7 @@ class Posterior:
 
     @property
     def convincing(self) -> bool:
-        """Whether a pose came out that the images do not contradict."""
+        """Whether the result is a pose that the images do not contradict."""
         return self.usable and not self.contradicted
 
     @property
@@ -116,7 +116,7 @@ class Posterior:
         return replace(self, pose=self.pose.widened(sigma_focal), modes=modes)
 
     def without_samples(self) -> Posterior:
-        """Return the posterior without its samples, most of its memory, which are not needed once it is judged."""
+        """Return the posterior without its samples, most of its memory, which are not needed after acceptance tests."""
         return replace(self, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
 
 
@@ -134,7 +134,7 @@ def are_separate(modes: Sequence[Mode]) -> bool:
 def pooled(modes: Sequence[Mode], weights: Array | None = None) -> PoseGaussian:
     """Return a Gaussian with the mean of the heaviest mode, and the second moment of all modes about it.
 
-    The mean of several modes lies at none of them; the heaviest alone would be over-confident.
+    The mean of several modes is near none of them; the heaviest alone would be overconfident.
 
     Args:
         modes: at least one.

@@ -1,4 +1,4 @@
-"""Why frames and edges take part or are left out: values with figures, and the one place that words them."""
+"""Reasons why frames and edges take part or are left out: values, and their texts."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Final, TypeAlias
 from modeler.types.base import Outcome
 
 ACCEPTED: Final = "accepted"
-"""What a report says of a frame that is part of the model."""
+"""Outcome in a report of a frame that is part of the model."""
 
 
 @dataclass(frozen=True)
 class NearExtrapolation:
-    """The pose lies near where steady motion leads."""
+    """The pose is near the extrapolated motion."""
 
     angle_deg: float
 
@@ -33,7 +33,7 @@ class JoinsPrevious:
     outcome: Outcome
     overlap: float
     support: NearExtrapolation | ConfirmedBy | None = None
-    """What else speaks for it; None: nothing was needed."""
+    """Further support; None: not needed."""
 
 
 @dataclass(frozen=True)
@@ -46,17 +46,17 @@ class Relocalised:
 
 @dataclass(frozen=True)
 class JoinsSegments:
-    """The edge joins two segments, between which nothing is known of the motion."""
+    """The edge joins two segments, between which there is no motion prior."""
 
     share: float
-    """Probability (0..1) that the segments lie on each other so, among all ways that were found."""
+    """Probability (0..1) of this alignment of the segments among all that were found."""
     rival_deg: float
-    """Rotation in degrees to the likeliest other way."""
+    """Rotation in degrees to the likeliest alternative."""
 
 
 @dataclass(frozen=True)
 class ElsewhereThanSegments:
-    """The registration contradicts the way in which the segments lie on each other."""
+    """The registration contradicts the alignment of the segments."""
 
     angle_deg: float
     """Rotation between the two."""
@@ -67,12 +67,12 @@ class NotJoined:
     """The frame belongs to a segment that nothing joins with the rest."""
 
     views: int
-    """Number of the segment's."""
+    """Number of views of the segment."""
 
 
 @dataclass(frozen=True)
 class Failed:
-    """The attempt ended without a posterior or a view to go on with."""
+    """The attempt ended without a usable posterior or view."""
 
     outcome: Outcome
 
@@ -115,17 +115,17 @@ class NotPlaced:
 
 @dataclass(frozen=True)
 class OpenRotation:
-    """The edge leaves the rotation about an axis open, and the graph knows it no better."""
+    """The rotation of the edge about an axis is uncertain, and the graph does not reduce this."""
 
     sigma_deg: float
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """How far a registration is from what the graph predicts."""
+    """Distance of a registration from the graph's prediction."""
 
     distance: float
-    """Mahalanobis distance, of the nearest modes where there are several."""
+    """Mahalanobis distance, of the nearest modes if there are several."""
     max_distance: float
     angle_deg: float
     """Angle between the two."""
@@ -148,7 +148,7 @@ class OptimisationOutlier:
 
 @dataclass(frozen=True)
 class Stated:
-    """A reason of which only the words are known, as a report holds them."""
+    """A reason of which only the text is known, as from a report."""
 
     words: str
 
@@ -181,7 +181,7 @@ def code(reason: Reason) -> str:
 
 
 def explain(reason: Reason) -> str:
-    """Return a reason in words: what was found, and what to do about it."""
+    """Return a reason in words, with advice."""
     match reason:
         case Failed(outcome):
             return f"{outcome.label}: {outcome.advice}"
@@ -192,7 +192,7 @@ def explain(reason: Reason) -> str:
 
 
 def advice(reason: Reason) -> str:
-    """Return in words what to do about a reason; "" where there is nothing to do."""
+    """Return the advice for a reason; "" if there is none."""
     match reason:
         case Failed(outcome):
             return outcome.advice
@@ -203,7 +203,7 @@ def advice(reason: Reason) -> str:
 
 
 def summary(reason: Reason) -> str:
-    """Return in words what was found, without advice."""
+    """Return a reason in words, without advice."""
     match reason:
         case JoinsPrevious(outcome, overlap, support):
             return f"joins the previous view: {outcome.label}, overlap {overlap:.2f}{_supported(support)}"

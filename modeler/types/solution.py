@@ -1,4 +1,4 @@
-"""The edges of a graph, how they hang together, and the poses that they lead to."""
+"""The edges of a graph, their connectivity, and the optimised poses."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from modeler.types.posteriors import PoseGaussian, Posterior
 from modeler.types.reasons import Reason
 
 EdgeKind = Literal["odometry", "closure", "span", "join"]
-"""What an edge is for: to place a frame, to close a loop with a view that the object had turned away from, to span
+"""Purpose of an edge: to place a frame, to close a loop with a view that the object had turned away from, to span
 several steps between frames that others placed, or to join two segments, between which there is no motion
 prior: the object was laid down differently, or regrasped."""
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A posterior as an edge of the graph: accepted, or judged and left out."""
+    """A posterior as an edge of the graph, accepted or rejected."""
 
     posterior: Posterior
     """The registration behind the edge."""
     kind: EdgeKind
-    """What the edge is for."""
+    """Purpose of the edge."""
     accepted: bool
     """Whether the edge takes part in the optimisation."""
     reason: Reason
@@ -49,9 +49,9 @@ class Edge:
 
 
 AWAY_DEG: Final = 90.0
-"""Rotation from which on the object has turned away from a view: half of what that saw of a sphere is left."""
+"""Rotation beyond which the object has turned away from a view: half of the visible part of a sphere remains."""
 NEAR_DEG: Final = 45.0
-"""Rotation up to which two views share surface whatever the shape: 85 % of what each sees of a sphere."""
+"""Rotation up to which two views share surface for any shape: 85 % of the visible part of a sphere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +63,11 @@ class FocalLength:
     sigma: float
     """Its standard deviation."""
     prior_sigma: float
-    """The same before the edges are asked."""
+    """Its prior standard deviation."""
     loops: int
     """Number of loops used."""
     sigmas_before: float
-    """Root mean square of the loops' normalised residuals with the one given: 1 where all is true; 0 without a loop."""
+    """Root mean square of the loops' normalised residuals with the one given: 1 if calibrated; 0 without a loop."""
     sigmas_after: float
     """The same at the mean."""
     by_focal: Mapping[int, Array] = field(repr=False)
@@ -100,7 +100,7 @@ class Solution:
     odometry: Mapping[int, Array] = field(default_factory=dict)
     """object_from_camera (4, 4) of the pairwise chain alone, before closure."""
     outliers: tuple[Edge, ...] = ()
-    """Accepted edges that the optimisation left out as outliers, since the others contradict them."""
+    """Accepted edges that the optimisation left out as outliers, as the others contradict them."""
     relative_covariance: Callable[[int, int], Array] = _unsolved
     """Covariance (6, 6) of `relative(target, source)`, computed when called."""
     edge_poses: Mapping[tuple[int, int], PoseGaussian] = field(default_factory=dict)
@@ -110,7 +110,7 @@ class Solution:
     focal: FocalLength | None = None
     """Estimate of the focal length, whose uncertainty is part of the covariances; None: exact."""
     camera_from_axis: Array | None = None
-    """(4, 4), whose third direction is the axis of all steps; None where none was estimated, or it does not fit."""
+    """(4, 4), whose third direction is the axis of all steps; None if none was estimated, or it does not fit."""
 
     def takes_part(self, edge: Edge) -> bool:
         """Return whether an edge was accepted and the optimisation did not leave it out since."""
@@ -139,8 +139,8 @@ class Solution:
 def loops_closed(edges: Sequence[Edge]) -> int:
     """Return how many closures close a loop: those without which the graph remains connected.
 
-    A closure that is a bridge of the graph is checked by nothing: where two consecutive views share little surface and
-    an early view places the next frame, the graph is a tree and has no loop.
+    A closure that is a bridge of the graph is unconfirmed: if two consecutive views share little surface and an early
+    view places the next frame, the graph is a tree and has no loop.
     """
     closures = np.array([edge.kind == "closure" for edge in edges], dtype=bool)
     if not closures.any():
@@ -185,7 +185,7 @@ def _parts(ends: npt.NDArray[np.int64], everything: npt.NDArray[np.int64]) -> in
 
 @dataclass(frozen=True)
 class LoopOpening:
-    """By how much a chain of odometry edges misses the closure that joins its ends, before the optimisation."""
+    """The error of a chain of odometry edges against the closure that joins its ends, before the optimisation."""
 
     source: int
     """Frame number of the closure's source."""
@@ -196,13 +196,13 @@ class LoopOpening:
     rotation_rad: float
     """Rotation between the closure and the chain."""
     translation_m: float
-    """Distance between where they put the object."""
+    """Distance between the object's positions under the two."""
     sigmas: float
     """Root of NEES/6 under the covariances of chain and closure: about 1 if these are calibrated."""
 
     @property
     def words(self) -> str:
-        """The opening in words."""
+        """The closure error in words."""
         return (
             f"the loop from frame {self.target} to {self.source} has a closure error of "
             f"{np.degrees(self.rotation_rad):.1f}° and "
@@ -234,13 +234,13 @@ def loop_openings(edges: Sequence[Edge], solution: Solution, centroids_m: Mappin
 
 
 def loop_opening(edges: Sequence[Edge], solution: Solution, centroids_m: Mapping[int, Array]) -> LoopOpening | None:
-    """Return the opening of the loop of most edges, of several the widest; None without a loop."""
+    """Return the closure error of the loop with most edges, the largest of several; None without a loop."""
     openings = loop_openings(edges, solution, centroids_m)
     return max(openings, key=lambda opening: (opening.edges, opening.sigmas), default=None)
 
 
 def _opening(edge: Edge, closure: PoseGaussian, chain: PoseGaussian, count: int, centroid_m: Array) -> LoopOpening:
-    """Return how far a closure is from the chain between its frames."""
+    """Return the error between a closure and the chain of its frames."""
     xi = se3.log(se3.inverse(closure.mean) @ chain.mean)
     squared = xi @ np.linalg.solve(closure.covariance + chain.covariance, xi)
     moved_m = se3.transform(chain.mean, centroid_m[None]) - se3.transform(closure.mean, centroid_m[None])

@@ -58,9 +58,9 @@ class Frame:
 
     @property
     def unoccluded(self) -> Frame:
-        """The frame with nothing known of where an occluder is: no depth, and no object.
+        """The frame without depth and object at occluders.
 
-        It hides whether the object or empty space is behind it. All that compares views goes by this.
+        Behind an occluder may be object or free space. All comparisons of views use this frame.
         """
         if self.occluder is None or not self.occluder.any():
             return self
