@@ -1,4 +1,4 @@
-"""Concurrent work in a second thread, if more than one is available; results are the same."""
+"""Work in a thread of its own beside other work, where there is more than one thread; results are the same."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ T = TypeVar("T")
 
 
 def several() -> bool:
-    """Return whether more than one thread may compute, by Numba's rule: its variable, else the number of cores."""
+    """Return whether more than one thread may compute, by what Numba goes by: its variable, or else the cores."""
     return int(os.environ.get("NUMBA_NUM_THREADS") or len(os.sched_getaffinity(0))) > 1
 
 
 def both(first: Callable[[], S], second: Callable[[], T]) -> tuple[S, T]:
-    """Return what two functions return, computed concurrently if there is more than one thread."""
+    """Return what two functions return, computed side by side where there is more than one thread."""
     if not several():
         return first(), second()
     with ThreadPoolExecutor(1, thread_name_prefix="beside") as thread:
@@ -27,9 +27,9 @@ def both(first: Callable[[], S], second: Callable[[], T]) -> tuple[S, T]:
 
 
 def each(make: Callable[[S], T], items: Iterable[S]) -> Generator[T, None, None]:
-    """Yield what a function makes of items, in their order; two at a time if there is more than one thread.
+    """Yield what a function makes of items, in their order; two at a time where there is more than one thread.
 
-    While one runs Python, the other may compute. Items that are not requested are not started.
+    While one runs Python, the other may compute. Where nobody waits for the rest, it is not begun.
     """
     if not several():
         yield from map(make, items)
@@ -40,9 +40,9 @@ def each(make: Callable[[S], T], items: Iterable[S]) -> Generator[T, None, None]
 
 @contextmanager
 def behind(use: Callable[[T], None]) -> Iterator[Callable[[T], None]]:
-    """Use items in a separate thread, at most one item late; immediately with a single thread.
+    """Use items in a thread of its own, one item late at most; at once where there is one thread only.
 
-    Its exceptions are raised with the next item, or at the end.
+    What it raises is raised with the next item, or at the end.
     """
     if not several():
         yield use
@@ -61,9 +61,9 @@ def behind(use: Callable[[T], None]) -> Iterator[Callable[[T], None]]:
 
 @contextmanager
 def ahead(make: Callable[[S], T]) -> Iterator[Callable[[S], Callable[[], T]]]:
-    """Start to make items in a separate thread, in order, and retrieve each later.
+    """Begin to make things in a thread of its own, in the order in which they are begun, and ask for each later.
 
-    With a single thread, each is made on retrieval.
+    Where there is one thread only, each is made when it is asked for.
     """
     if not several():
         yield lambda item: lambda: make(item)
