@@ -79,9 +79,8 @@ def find(
 ) -> Found:
     """Find the object in a depth image, NaN where nothing was measured or no object may be.
 
-    On a downsampled image, points above the support and in front of the background are clustered in space. The cluster
-    with the largest area in the object's zone is chosen, with those that an occluder separates from it. Its pixels are
-    then refined at full resolution.
+    Points above the support and in front of the background are clustered at low resolution. The cluster with the
+    largest area in the object's zone is chosen, with those that an occluder separates from it, and refined.
     """
     if scene.zone_m is None:
         return Found(np.zeros(depth_m.shape, dtype=np.bool_))
@@ -175,9 +174,7 @@ def _beside(region: BoolArray) -> Labels:
 
 
 def _joined(best: int, labels: Labels, in_zone: BoolArray, neighbours: Labels) -> BoolArray:
-    """Return which clusters (k,) are the object: the best one, and those whose connection it or an occluder hides.
-
-    These are next to one of the two in the image, and mostly where the object is in other frames.
+    """Return the object's clusters (k,): the best, and those next to it or an occluder that are mostly in its zone.
 
     Args:
         best: number of a cluster.
@@ -204,10 +201,7 @@ def _refine(
     reach_m: Array,
     gap_m: float,
 ) -> BoolArray:
-    """Return the object's pixels at full resolution, given those in the downsampled image.
-
-    Pixels next to these at a similar depth belong to the object, too.
-    """
+    """Return the object's pixels at full resolution: those near the downsampled ones at a similar depth."""
     stride = planning_stride(camera)
     mask = np.zeros(depth_m.shape, dtype=np.bool_)
     rows, columns = _window(chosen, margin=2)
@@ -302,8 +296,8 @@ def _window(mask: BoolArray, *, margin: int) -> Window:
 class Segmenter:
     """Segments the object and its support plane in the frames of a depth camera.
 
-    The camera is assumed static while the object moves between frames. Otherwise the object
-    is what stands at the image's centre. If only an island without support was measured, all of it is the object.
+    The camera is assumed static while the object moves between frames. Otherwise the object is what stands at the
+    image's centre. If only an island without support was measured, all of it is the object.
     """
 
     roi: tuple[int, int, int, int] | None = None
