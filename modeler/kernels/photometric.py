@@ -199,15 +199,28 @@ def fetch_colours(count, pixels, colours, looked_up):
             looked_up[k, j] = colours.cells[cell, k]
 
 
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def fetch_features(count, pixels, colours, transformed, seen):
+    """Write the features `seen` (n,) of the other view where the first transformed points fall, at `pixels` (n,)."""
+    for j in range(count):
+        cell = np.uint32(colours.numbers[np.uint32(max(pixels[j], np.int32(0)))])
+        seen[j] = (
+            colours.cells[cell, GRADIENT_X] * transformed[X, j]
+            + colours.cells[cell, GRADIENT_Y] * transformed[Y, j]
+            + colours.cells[cell, GRADIENT_Z] * transformed[Z, j]
+            + colours.cells[cell, OFFSET]
+        )
+
+
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
-def sum_moments(points, values, transformed, looked_up, colour, surface_m2):
+def sum_moments(points, values, transformed, looked_up, seen, surface_m2):
     """Return Σ a b, Σ a², Σ b² and the number of matches of one direction, each weighted by f."""
     product, own_square, other_square, count = ZERO, ZERO, ZERO, ZERO
     for j in range(points.shape[1]):
         distance = plane_distance(transformed, looked_up, j)
         matched = match_weight(points, transformed, looked_up, distance, surface_m2, j) > ZERO
         weight = transformed[FACING, j] if matched else ZERO
-        own, other = values[j], plane_distance(transformed, colour, j)
+        own, other = values[j], seen[j]
         product += weight * own * other
         own_square += weight * own * own
         other_square += weight * other * other

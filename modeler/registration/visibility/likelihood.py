@@ -395,9 +395,9 @@ class PairLikelihood:
         `blur_m` is the blur at which matches are selected, and the least at which they are judged.
         """
         noise_m = max(self.surface_noise_m(target_from_source, blur_m), blur_m)
-        found = self.scores(target_from_source[None], noise_m, stride=1)
+        surface = replace(self, colour=None).scores(target_from_source[None], noise_m, stride=1).surface
         independent = self.temper * self.points
-        return bool(self.temper * found.surface[0] >= 0.5 * (independent - chdtri(independent, _CHANCE)))
+        return bool(self.temper * surface[0] >= 0.5 * (independent - chdtri(independent, _CHANCE)))
 
     def colour_matches(
         self, carried: Array, matches: Array, points: IntArray, noise: MatchNoise, *, forward: bool
