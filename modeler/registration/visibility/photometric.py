@@ -235,7 +235,7 @@ def _some(count: int) -> slice:
     return slice(None, None, max(count // _ENOUGH, 1))
 
 
-def _partners(points_m: Array, view: RayImage, other: RayImage, shift_px: Array) -> tuple[np.ndarray, np.ndarray]:
+def _partners(points_m: Array, view: RayImage, other: RayImage, shift_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where points of a view fall in the other if the object only moves, without a turn.
 
     Args:
