@@ -11,7 +11,7 @@ import modeler
 from modeler import se3
 from modeler.cli.build import Build
 from modeler.cli.options import MethodOptions
-from modeler.kernels import gauss_newton, photometric, point_to_plane, scores
+from modeler.kernels import bands, gauss_newton, point_to_plane, scores
 from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
 from modeler.rays import Sensor
@@ -110,7 +110,7 @@ def test_few_spots_are_limited_and_prints_are_not(rng):
     print_[:, :1600] *= 3.0
     want = print_ / print_[0].std()
     for band in (spots, print_):
-        photometric.winsorise(band)
+        bands.winsorise(band)
         np.testing.assert_allclose(band[0].std(), 1.0, atol=0.02)
     limited = np.abs(spots[0]) > 2.9999
     assert 70 < np.count_nonzero(limited[:80])
@@ -176,7 +176,8 @@ def test_equations_of_features_are_those_of_planes_with_their_gradient(printed):
     want = np.zeros(6), np.zeros((6, 6))
     for directed, carried, sign in ((pair.forward, pose, 1.0), (pair.backward, se3.inverse(pose), -1.0)):
         matches = directed.matches(rows(carried), 0.002)
-        found = pair.colour.matches(carried, matches, 1, weight, forward=sign > 0.0)
+        points = np.flatnonzero(matches[:, point_to_plane.WEIGHT] > 0.0)
+        found = pair.colour.matches(carried, matches[points], points, 1, weight, forward=sign > 0.0)
         to_source = se3.inverse(pose) if sign > 0.0 else np.eye(4)
         arms = se3.transform(to_source, found[:, point_to_plane.POSITION]) - pair.centre_m
         gradients = found[:, point_to_plane.OTHER] @ to_source[:3, :3].T

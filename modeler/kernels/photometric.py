@@ -7,8 +7,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from modeler.kernels.point_likelihood import FACING, HALF, VECTOR_MATHS, ZERO, X, Y, Z, plane_distance
-from modeler.kernels.point_to_plane import match_weight
+from modeler.kernels.point_likelihood import FACING, ONE, VECTOR_MATHS, ZERO, X, Y, Z, plane_distance
+from modeler.kernels.point_to_plane import FACING_WEIGHT, OTHER, OWN, POSITION, RESIDUAL, WEIGHT, match_weight
 
 # Columns of a cell, the 16 bytes that are read for one point: at a point p that projects where the cell's own does, the
 # feature is gradient · p + offset to first order. They are those of a plane: `plane_distance` of a cell is the feature.
@@ -16,8 +16,6 @@ GRADIENT_X, GRADIENT_Y, GRADIENT_Z, OFFSET = 0, 1, 2, 3
 CELL_SIZE = 4
 
 _LEAST_DEVIATION = 1e-6  # of features; an image without any has none of unit variance
-_LIMIT = 3.0  # standard deviations, beyond which 0.3 % of normal features are
-_ROUNDS, _SETTLED = 10, 1e-3  # of variance and limit, each by the other, at most; and where they end
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -41,97 +39,6 @@ NO_COLOURS = Colours(
     np.zeros(0, dtype=np.float32), np.zeros((1, CELL_SIZE), dtype=np.float32), np.zeros(1, dtype=np.int32)
 )
 """One direction of views whose colours are not compared."""
-
-
-@numba.njit(cache=True, error_model="numpy")
-def explain_light(features, there, share, points_m, focal, values, cells):
-    """Write what features are, and their cells, without what another view has in the same places (method.md, eq. 18).
-
-    What is left has unit variance. Along a pixel's ray a feature stays the same, so that its gradient there adds
-    nothing at the pixel's own point.
-
-    Args:
-        features: (3, n) of the surface points: value, and derivatives by column and row in 1/px.
-        there: (3, n) the other view's, see `fetch_in_place`.
-        share: of `there` that light makes up.
-        points_m: (n, 3) the points.
-        focal: (2,) fx and fy in px.
-        values: (n,) out.
-        cells: (n + 1, 4) out; the last is left as it is.
-    """
-    count, total, square = points_m.shape[0], 0.0, 0.0
-    for j in range(count):
-        left = features[0, j] - share * there[0, j]
-        values[j] = left
-        total += left
-        square += left * left
-    variance = square / max(count, 1) - (total / max(count, 1)) ** 2
-    scale = 1.0 / max(math.sqrt(max(variance, 0.0)), _LEAST_DEVIATION)
-    for j in range(count):
-        values[j] *= scale
-        x, y, z = points_m[j]
-        by_x = scale * (features[1, j] - share * there[1, j]) * focal[0] / z
-        by_y = scale * (features[2, j] - share * there[2, j]) * focal[1] / z
-        cell = cells[j]
-        cell[GRADIENT_X], cell[GRADIENT_Y], cell[GRADIENT_Z] = by_x, by_y, -(by_x * x + by_y * y) / z
-        cell[OFFSET] = values[j]
-
-
-@numba.njit(cache=True, error_model="numpy")
-def sample_layer(layer, inside, places, scale, found):
-    """Write the features of surface points in one band, interpolated linearly from the nearest cell of its image.
-
-    Args:
-        layer: (h, w) the band.
-        inside: (h, w) which cells it holds for; a slope across others is 0.
-        places: (n, 2) row and column of each point, in px.
-        scale: width of a cell in px.
-        found: (3, n) out: value, and derivatives by column and row in 1/px.
-    """
-    height, width = layer.shape
-    for j in range(places.shape[0]):
-        row, column = places[j, 0] // scale, places[j, 1] // scale
-        by_row, by_column = ZERO, ZERO
-        if 0 < row < height - 1 and inside[row - 1, column] and inside[row + 1, column]:
-            by_row = HALF * (layer[row + 1, column] - layer[row - 1, column]) / scale
-        if 0 < column < width - 1 and inside[row, column - 1] and inside[row, column + 1]:
-            by_column = HALF * (layer[row, column + 1] - layer[row, column - 1]) / scale
-        middle = 0.5 * (scale - 1)
-        found[0, j] = (
-            layer[row, column]
-            + by_row * (places[j, 0] - row * scale - middle)
-            + by_column * (places[j, 1] - column * scale - middle)
-        )
-        found[1, j], found[2, j] = by_column, by_row
-
-
-@numba.njit(cache=True, error_model="numpy")
-def winsorise(features):
-    """Scale features to unit variance, and limit them to three standard deviations, both ways.
-
-    A few dark spots would be all that a correlation heard of, and it takes its features for normal ones. The variance
-    is that of what is left, so that spots on less than a ninth of the surface are limited, prints on more are not.
-
-    Args:
-        features: (3, n) of the surface points, in place: value, and derivatives by column and row in 1/px.
-    """
-    count, scale, limit = features.shape[1], 0.0, np.inf
-    for _ in range(_ROUNDS):
-        total, square = 0.0, 0.0
-        for j in range(count):
-            value = min(max(features[0, j], -limit), limit)
-            total += value
-            square += value * value
-        variance = square / max(count, 1) - (total / max(count, 1)) ** 2
-        last, scale = scale, max(math.sqrt(max(variance, 0.0)), _LEAST_DEVIATION)
-        limit = _LIMIT * scale
-        if abs(scale - last) <= _SETTLED * scale:
-            break
-    for j in range(count):
-        inside = abs(features[0, j]) <= limit
-        features[0, j] = min(max(features[0, j], -limit), limit) / scale
-        for k in range(1, 3):
-            features[k, j] = features[k, j] / scale if inside else ZERO
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -160,24 +67,127 @@ def find_in_place(points_m, shift_m, camera, numbers, none, found, offsets):
             offsets[j, 0], offsets[j, 1] = column - nearest_column, row - nearest_row
 
 
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def in_place(others, numbers, offsets, j):
+    """Return the feature that another view has in the place of a point, and its derivatives; 0 where it has none."""
+    k = numbers[j]
+    if k >= others.shape[1]:
+        return ZERO, ZERO, ZERO
+    by_column, by_row = others[1, k], others[2, k]
+    return others[0, k] + by_column * offsets[j, 0] + by_row * offsets[j, 1], by_column, by_row
+
+
 @numba.njit(cache=True, error_model="numpy")
-def fetch_in_place(features, numbers, offsets, found):
-    """Write the features (3, n) that another view has in the same places, 0 where it has none.
+def compare_in_place(features, others, numbers, offsets):
+    """Return sums over the points in whose place the other view shows surface, too.
 
     Args:
-        features: (3, m) of the other view's points: value, and derivatives by column and row in 1/px.
+        features: (3, n) of the points: value, and derivatives by column and row in 1/px.
+        others: (3, m) of the other view's.
         numbers: (n,) of `find_in_place`.
-        offsets: (n, 2) of `find_in_place`.
-        found: (3, n) out.
+        offsets: (n, 2) likewise.
+
+    Returns:
+        Σ a², Σ a b and Σ b² (3,) of the features a of the points and b of the other view; Σ ∇b ∇bᵀ (2, 2); and
+        Σ ∇b (a - b) (2,).
     """
+    moments, matrix, gradient = np.zeros(3), np.zeros((2, 2)), np.zeros(2)
     for j in range(numbers.shape[0]):
-        k = numbers[j]
-        if k >= features.shape[1]:
-            found[0, j], found[1, j], found[2, j] = ZERO, ZERO, ZERO
-        else:
-            value, by_column, by_row = features[0, k], features[1, k], features[2, k]
-            found[0, j] = value + by_column * offsets[j, 0] + by_row * offsets[j, 1]
-            found[1, j], found[2, j] = by_column, by_row
+        if numbers[j] >= others.shape[1]:
+            continue
+        own = features[0, j]
+        there, by_column, by_row = in_place(others, numbers, offsets, j)
+        moments[0] += own * own
+        moments[1] += own * there
+        moments[2] += there * there
+        matrix[0, 0] += by_column * by_column
+        matrix[0, 1] += by_column * by_row
+        matrix[1, 1] += by_row * by_row
+        gradient[0] += by_column * (own - there)
+        gradient[1] += by_row * (own - there)
+    matrix[1, 0] = matrix[0, 1]
+    return moments, matrix, gradient
+
+
+@numba.njit(cache=True, error_model="numpy")
+def explain_light(features, others, numbers, offsets, share, points_m, focal, values, cells):
+    """Write what features are, and their cells, without what another view has in the same places (method.md, eq. 18).
+
+    What is left has unit variance. Along a pixel's ray a feature stays the same, so that its gradient there adds
+    nothing at the pixel's own point.
+
+    Args:
+        features: see `compare_in_place`.
+        others: likewise.
+        numbers: likewise.
+        offsets: likewise.
+        share: of the other view's that light makes up, float32.
+        points_m: (n, 3) the points.
+        focal: (2,) fx and fy in px, float32.
+        values: (n,) out.
+        cells: (n + 1, 4) out.
+    """
+    count, total, square = points_m.shape[0], 0.0, 0.0
+    for j in range(count):
+        there, by_column, by_row = in_place(others, numbers, offsets, j)
+        left = features[0, j] - share * there
+        cells[j, OFFSET] = left
+        cells[j, GRADIENT_X], cells[j, GRADIENT_Y] = features[1, j] - share * by_column, features[2, j] - share * by_row
+        total += left
+        square += left * left
+    variance = square / max(count, 1) - (total / max(count, 1)) ** 2
+    scale = np.float32(1.0 / max(math.sqrt(max(variance, 0.0)), _LEAST_DEVIATION))
+    for j in range(count):
+        cell = cells[j]
+        x, y, per_z = np.float32(points_m[j, 0]), np.float32(points_m[j, 1]), ONE / np.float32(points_m[j, 2])
+        per_m = scale * per_z
+        by_x, by_y = per_m * cell[GRADIENT_X] * focal[0], per_m * cell[GRADIENT_Y] * focal[1]
+        cell[GRADIENT_X], cell[GRADIENT_Y], cell[GRADIENT_Z] = by_x, by_y, -(by_x * x + by_y * y) * per_z
+        values[j] = cell[OFFSET] = scale * cell[OFFSET]
+    cells[count] = ZERO
+
+
+@numba.njit(cache=True, error_model="numpy")
+def compare_matches(matches, rotation, values, own_cells, cells, camera, numbers, weight):
+    """Return the features of matches in the place of their surface (n, 14), as `point_to_plane.matches` has that.
+
+    The gradient of a feature is the normal, the difference of features the distance.
+
+    Args:
+        matches: (n, 14) of surface.
+        rotation: (3, 3) that carries the points into the other camera.
+        values: (n,) features of the points in their own view, and
+        own_cells: (n, 4) their cells there.
+        cells: (m + 1, 4) those of the other view.
+        camera: (4,) fx, fy, cx and cy of the other view.
+        numbers: (h, w) numbers of its surface points.
+        weight: of squared differences of features.
+    """
+    found, own = matches.copy(), np.empty(3)
+    height, width = numbers.shape
+    for j in range(matches.shape[0]):
+        position, normal = matches[j, POSITION], matches[j, OWN]
+        x, y, z = position
+        column, row = np.floor(camera[0] * x / z + camera[2] + 0.5), np.floor(camera[1] * y / z + camera[3] + 0.5)
+        cell = cells[numbers[int(min(max(row, 0), height - 1)), int(min(max(column, 0), width - 1))]]
+        # Along the surface a gradient turns with it; then it is taken along the other camera's rays.
+        across, ray, slope = 0.0, 0.0, 0.0
+        for k in range(3):
+            own[k] = 0.0
+            for m in range(3):
+                own[k] += rotation[k, m] * own_cells[j, m]
+            across += own[k] * normal[k]
+            ray += position[k] * normal[k]
+        for k in range(3):
+            own[k] -= across * normal[k]
+            slope += own[k] * position[k]
+        found[j, RESIDUAL] = cell[OFFSET] - values[j]
+        for k in range(3):
+            found[j, OWN.start + k] = own[k] - slope / min(ray, -1e-6) * normal[k]
+            found[j, OTHER.start + k] = cell[k]
+            found[j, RESIDUAL] += cell[k] * position[k]
+        found[j, WEIGHT] = weight * matches[j, FACING_WEIGHT]
+    return found
 
 
 @numba.njit(cache=True, error_model="numpy", forceinline=True)
@@ -189,15 +199,28 @@ def fetch_colours(count, pixels, colours, looked_up):
             looked_up[k, j] = colours.cells[cell, k]
 
 
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def fetch_features(count, pixels, colours, transformed, seen):
+    """Write the features `seen` (n,) of the other view where the first transformed points fall, at `pixels` (n,)."""
+    for j in range(count):
+        cell = np.uint32(colours.numbers[np.uint32(max(pixels[j], np.int32(0)))])
+        seen[j] = (
+            colours.cells[cell, GRADIENT_X] * transformed[X, j]
+            + colours.cells[cell, GRADIENT_Y] * transformed[Y, j]
+            + colours.cells[cell, GRADIENT_Z] * transformed[Z, j]
+            + colours.cells[cell, OFFSET]
+        )
+
+
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
-def sum_moments(points, values, transformed, looked_up, colour, surface_m2):
+def sum_moments(points, values, transformed, looked_up, seen, surface_m2):
     """Return Σ a b, Σ a², Σ b² and the number of matches of one direction, each weighted by f."""
     product, own_square, other_square, count = ZERO, ZERO, ZERO, ZERO
     for j in range(points.shape[1]):
         distance = plane_distance(transformed, looked_up, j)
         matched = match_weight(points, transformed, looked_up, distance, surface_m2, j) > ZERO
         weight = transformed[FACING, j] if matched else ZERO
-        own, other = values[j], plane_distance(transformed, colour, j)
+        own, other = values[j], seen[j]
         product += weight * own * other
         own_square += weight * own * own
         other_square += weight * other * other

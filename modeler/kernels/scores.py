@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from modeler.kernels.photometric import CELL_SIZE, NO_COLOURS, fetch_colours, sum_moments
+from modeler.kernels.photometric import NO_COLOURS, fetch_features, sum_moments
 from modeler.kernels.point_likelihood import buffers, invert, project, sum_over_points
 from modeler.kernels.threads import over_rows
 
@@ -37,7 +37,7 @@ def _scores(poses, projections, parameters, colours):
     result = np.zeros((poses.shape[0], 6))
     carried = np.empty(12)
     most = max(projections[0].points.shape[1], projections[1].points.shape[1])
-    (transformed, pixels, looked_up), colour = buffers(most), np.empty((CELL_SIZE, most), dtype=np.float32)
+    (transformed, pixels, looked_up), seen = buffers(most), np.empty(most, dtype=np.float32)
     for i in range(poses.shape[0]):
         for direction in range(2):  # one copy of the code: compiling is slow
             if direction == 0:
@@ -51,9 +51,9 @@ def _scores(poses, projections, parameters, colours):
             result[i, LOG_LIKELIHOOD] += total
             result[i, EXPLAINED] += explained
             if features.values.shape[0] > 0:
-                fetch_colours(features.values.shape[0], pixels, features, colour)
+                fetch_features(features.values.shape[0], pixels, features, transformed, seen)
                 moments = sum_moments(
-                    projection.points, features.values, transformed, looked_up, colour, model.blur_m * model.blur_m
+                    projection.points, features.values, transformed, looked_up, seen, model.blur_m * model.blur_m
                 )
                 for k in range(4):
                     result[i, PRODUCT + k] += moments[k]

@@ -395,15 +395,21 @@ class PairLikelihood:
         `blur_m` is the blur at which matches are selected, and the least at which they are judged.
         """
         noise_m = max(self.surface_noise_m(target_from_source, blur_m), blur_m)
-        found = self.scores(target_from_source[None], noise_m, stride=1)
+        surface = replace(self, colour=None).scores(target_from_source[None], noise_m, stride=1).surface
         independent = self.temper * self.points
-        return bool(self.temper * found.surface[0] >= 0.5 * (independent - chdtri(independent, _CHANCE)))
+        return bool(self.temper * surface[0] >= 0.5 * (independent - chdtri(independent, _CHANCE)))
 
-    def colour_matches(self, carried: Array, matches: Array, noise: MatchNoise, *, forward: bool) -> Array:
-        """Return equations of the colours of matches, as `DirectedLikelihood.matches` has those of surface."""
-        if self.colour is None:
-            return np.zeros((0, matches.shape[1]))
-        return self.colour.matches(carried, matches, noise.band, weight_of(noise.correlation), forward=forward)
+    def colour_matches(
+        self, carried: Array, matches: Array, points: IntArray, noise: MatchNoise, *, forward: bool
+    ) -> Array:
+        """Return equations of the colours of matches, as `DirectedLikelihood.matches` has those of surface.
+
+        There are none where colours are not compared, or do not agree; see `PairColour.matches`.
+        """
+        weight = weight_of(noise.correlation)
+        if self.colour is None or weight == 0.0:
+            return matches[:0]
+        return self.colour.matches(carried, matches, points, noise.band, weight, forward=forward)
 
     def normal_equations(self, poses: Array, noise: MatchNoise, *, stride: int) -> tuple[Array, Array]:
         """Return gradients (n, 6) and matrices (n, 6, 6) of the matches for ξ of poses (n, 4, 4) about the centre.

@@ -14,9 +14,8 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy import ndimage
 
-from modeler.kernels import photometric, point_to_plane, scores
+from modeler.kernels import bands, photometric, scores
 from modeler.kernels.photometric import Colours
 from modeler.kernels.shading import harmonics_of, shading_of
 from modeler.types import Array, Frame, RayImage
@@ -32,7 +31,7 @@ VALUE, BY_COLUMN, BY_ROW = 0, 1, 2
 _BLACK = 4.0  # added to 8-bit values: below it noise and rounding would rule their logarithm
 _LOGS = (np.log(np.arange(256) + _BLACK) / 3.0).astype(np.float32)  # of each of three 8-bit values, a third
 _ALIGNED = 2  # band by which images are aligned: print of a tin turns by more than its width
-_SHADED = 2000  # points from which the shading of a view is fitted
+_ENOUGH = 2000  # points of a view from which its light is told
 _CREASE = 3.0  # standard deviations by which shading changes where surface has an edge, beyond noise of its normals
 _NORMAL_QUARTILE = 0.6745  # median magnitude of a standard normal variable
 _LEVEL = 1.0 / 255.0  # smallest change of a bright colour's logarithm that 8 bits show
@@ -57,7 +56,6 @@ class PairColour:
     target_points: np.ndarray
     """(m,) of the target's."""
     _unmoved: dict[int, float] = field(default_factory=dict)
-    _places: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     _left: dict[int, tuple[_Features, _Features]] = field(default_factory=dict)
     _made: dict[tuple[int, int], tuple[Colours, Colours]] = field(default_factory=dict)
 
@@ -114,40 +112,27 @@ class PairColour:
         found[..., 3:, :] = sigma_m * np.swapaxes(poses[..., :2, :3], -1, -2)
         return found
 
-    def matches(self, carried: Array, matches: Array, band: int, weight: float, *, forward: bool) -> Array:
-        """Return the features of matches (n, 12) of one direction in the place of their surface, see `point_to_plane`.
+    def matches(
+        self, carried: Array, matches: Array, points: np.ndarray, band: int, weight: float, *, forward: bool
+    ) -> Array:
+        """Return the features of matches (n, 14) of one direction in the place of their surface, see `point_to_plane`.
 
         The gradient of a feature is the normal, the difference of features the distance.
 
         Args:
             carried: (4, 4) the transform that carries the points into the other camera.
-            matches: of all points, `point_to_plane.matches`.
+            matches: `point_to_plane.matches` that are matches,
+            points: (n,) and of which points.
             band: number of the band.
             weight: of squared differences of features.
             forward: whether the points are the source's.
         """
-        colours = self.colours(band, 1)
-        theirs, mirror = colours if forward else colours[::-1]
+        own, theirs = self._explained(band) if forward else self._explained(band)[::-1]
         other, chosen = (self.target, self.source_points) if forward else (self.source, self.target_points)
-        position = matches[:, point_to_plane.POSITION]
-        camera = other.frame.camera
-        z = np.maximum(position[:, 2], 1e-6)
-        column = np.clip(np.round(camera.fx * position[:, 0] / z + camera.cx), 0, camera.width - 1)
-        row = np.clip(np.round(camera.fy * position[:, 1] / z + camera.cy), 0, camera.height - 1)
-        numbers = other.numbers[row.astype(np.int64), column.astype(np.int64)]
-        cells, own = theirs.cells[numbers].astype(np.float64), mirror.cells[chosen, :3].astype(np.float64)
-        normals = matches[:, point_to_plane.OWN]
-        # Along the surface a gradient turns with it; then it is taken along the other camera's rays.
-        own = own @ carried[:3, :3].T
-        own -= normals * np.sum(own * normals, axis=1, keepdims=True)
-        slope = np.sum(own * position, axis=1) / np.minimum(np.sum(normals * position, axis=1), -1e-6)
-        own -= normals * slope[:, None]
-        found = matches.copy()
-        found[:, point_to_plane.OWN], found[:, point_to_plane.OTHER] = own, cells[:, :3]
-        found[:, point_to_plane.RESIDUAL] = np.sum(cells[:, :3] * position, axis=1) + cells[:, 3] - theirs.values
-        matched = matches[:, point_to_plane.WEIGHT] > 0.0
-        found[:, point_to_plane.WEIGHT] = weight * matched * matches[:, point_to_plane.FACING_WEIGHT]
-        return found
+        camera, rotation, numbers = other.frame.camera, np.ascontiguousarray(carried[:3, :3]), chosen[points]
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        sides = own.values[numbers], own.cells[numbers], theirs.cells
+        return photometric.compare_matches(matches, rotation, *sides, lens, other.numbers, weight)
 
     def colours(self, band: int, stride: int) -> tuple[Colours, Colours]:
         """Return the two directions of a band, at every `stride`-th point."""
@@ -166,8 +151,12 @@ class PairColour:
     def _explained(self, band: int) -> tuple[_Features, _Features]:
         """Return what light does not explain of the features of all points of source and target in a band."""
         if band not in self._left:
-            share, (there, back) = max(self.unmoved(band), 0.0), self._in_place(band)
-            self._left[band] = _explained(self.source, band, there, share), _explained(self.target, band, back, share)
+            there, back = self._partners
+            share = max(self.unmoved(band), 0.0)
+            self._left[band] = (
+                _explained(self.source, self.target, there, band, share),
+                _explained(self.target, self.source, back, band, share),
+            )
         return self._left[band]
 
     def patches(self, band: int) -> float:
@@ -181,22 +170,16 @@ class PairColour:
         What stays in its place while the object turns is light: highlights, shading, fixed pattern noise.
         """
         if band not in self._unmoved:
-            there, found = self._in_place(band)[0], self._partners[0][0] < len(self.target.pixels)
-            self._unmoved[band] = _correlation(view_features(self.source)[band][VALUE] * found, there[VALUE])
+            own, others = (view_features(view)[band] for view in (self.source, self.target))
+            some = _some(own.shape[1])
+            partners = (part[some] for part in self._partners[0])
+            (own_square, product, square), _, _ = photometric.compare_in_place(own[:, some], others, *partners)
+            self._unmoved[band] = product / max(math.sqrt(own_square * square), 1e-12)
         return self._unmoved[band]
-
-    def _in_place(self, band: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return features (3, n) of the target in the places of the source's points, and vice versa; 0 for none."""
-        if band not in self._places:
-            self._places[band] = (
-                _in_other(view_features(self.target)[band], self._partners[0]),
-                _in_other(view_features(self.source)[band], self._partners[1]),
-            )
-        return self._places[band]
 
     @cached_property
     def _partners(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """See `_in_place`: of the source's points in the target, and vice versa."""
+        """Where the target shows what the source's points do if that is light, and vice versa: see `_aligned`."""
         return _aligned(self.source, self.target), _aligned(self.target, self.source)
 
 
@@ -223,7 +206,7 @@ def unshifted(equations: Array, shifts: Array) -> Array:
         shifts: (..., 6, 2) their shifts by a standard deviation, as motions ξ.
     """
     felt, across = equations @ shifts, np.swapaxes(shifts, -1, -2)
-    return np.eye(6) - felt @ np.linalg.solve(np.eye(2) + across @ felt, across)
+    return np.eye(6) - felt @ np.linalg.inv(np.eye(2) + across @ felt) @ across
 
 
 def weight_of(correlation: float) -> float:
@@ -237,20 +220,26 @@ def _aligned(view: RayImage, other: RayImage) -> tuple[np.ndarray, np.ndarray]:
 
     Centroids err by more than the finest bands are wide. One step of least squares (Lucas and Kanade 1981).
     """
+    some = _some(len(view.points_m))
     own, others = view_features(view)[_ALIGNED], view_features(other)[_ALIGNED]
-    partners = _partners(view, other, np.zeros(2))
-    there = _in_other(others, partners)
-    slopes = there[[BY_COLUMN, BY_ROW]].astype(np.float64)
-    apart = (own[VALUE] - there[VALUE]) * (partners[0] < len(other.pixels))
-    step = np.linalg.lstsq(slopes @ slopes.T, slopes @ apart, rcond=None)[0]
+    partners = _partners(view.points_m[some], view, other, np.zeros(2))
+    _, matrix, gradient = photometric.compare_in_place(own[:, some], others, *partners)
+    step = np.linalg.lstsq(matrix, gradient, rcond=None)[0]
     width_px = FINEST_PX * 2**_ALIGNED  # farther features are not linear
-    return _partners(view, other, step * min(1.0, width_px / max(float(np.linalg.norm(step)), 1e-12)))
+    shift_px = step * min(1.0, width_px / max(float(np.linalg.norm(step)), 1e-12))
+    return _partners(view.points_m, view, other, shift_px)
 
 
-def _partners(view: RayImage, other: RayImage, shift_px: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the points of a view fall in the other if the object only moves, without a turn.
+def _some(count: int) -> slice:
+    """Return which of so many points, evenly spread, tell what the light does."""
+    return slice(None, None, max(count // _ENOUGH, 1))
+
+
+def _partners(points_m: Array, view: RayImage, other: RayImage, shift_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where points of a view fall in the other if the object only moves, without a turn.
 
     Args:
+        points_m: (n, 3).
         view: the points'.
         other: where they fall.
         shift_px: (2,) columns and rows from where the difference of the centroids brings them.
@@ -259,55 +248,47 @@ def _partners(view: RayImage, other: RayImage, shift_px: Array) -> tuple[np.ndar
         Number (n,) of the other view's point there, see `RayImage.numbers`; and columns and rows (n, 2) from its pixel.
     """
     camera = other.frame.camera
-    found = np.empty(len(view.points_m), dtype=np.int32)
-    offsets = np.zeros((len(view.points_m), 2), dtype=np.float32)
+    found = np.empty(len(points_m), dtype=np.int32)
+    offsets = np.zeros((len(points_m), 2), dtype=np.float32)
     lens = np.array([camera.fx, camera.fy, camera.cx + shift_px[0], camera.cy + shift_px[1]])
     photometric.find_in_place(
-        view.points_m, other.centroid_m - view.centroid_m, lens, other.numbers, len(other.pixels), found, offsets
+        points_m, other.centroid_m - view.centroid_m, lens, other.numbers, len(other.pixels), found, offsets
     )
     return found, offsets
 
 
-def _in_other(others: np.ndarray, partners: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return what features (3, m) of the other view are in the same places, (3, n); see `_partners`; 0 for none."""
-    there = np.empty((3, len(partners[0])), dtype=np.float32)
-    photometric.fetch_in_place(others, *partners, there)
-    return there
-
-
-def _explained(view: RayImage, band: int, there: np.ndarray, share: float) -> _Features:
+def _explained(
+    view: RayImage, other: RayImage, partners: tuple[np.ndarray, np.ndarray], band: int, share: float
+) -> _Features:
     """Return a view's features in a band without a share of the other view's in the same places (eq. 18).
 
     Args:
         view: the view.
+        other: the other view.
+        partners: where the view's points are there, see `_partners`.
         band: number of the band.
-        there: (3, n) of the other view in the same places.
         share: that light makes up.
     """
     features, camera = view_features(view)[band], view.frame.camera
     left = _Features(
         np.empty(features.shape[1], dtype=np.float32),
-        np.zeros((features.shape[1] + 1, photometric.CELL_SIZE), dtype=np.float32),
+        np.empty((features.shape[1] + 1, photometric.CELL_SIZE), dtype=np.float32),
     )
-    photometric.explain_light(features, there, share, view.points_m, np.array([camera.fx, camera.fy]), *left)
+    focal = np.array([camera.fx, camera.fy], dtype=np.float32)
+    others = view_features(other)[band]
+    photometric.explain_light(features, others, *partners, np.float32(share), view.points_m, focal, *left)
     return left
 
 
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the correlation of features (n,) about 0."""
-    scale = math.sqrt(float(np.sum(a * a)) * float(np.sum(b * b)))
-    return float(np.sum(a * b)) / scale if scale > 0.0 else 0.0
-
-
 def view_features(view: RayImage) -> np.ndarray:
-    """Return the features of a view's surface points, see `features` and `photometric.winsorise`.
+    """Return the features of a view's surface points, see `features` and `bands.winsorise`.
 
     They are made once, as a view is part of several pairs.
     """
     if view not in _KNOWN:
         found = features(view.frame, view.pixels, view.normals)
         for band in found:
-            photometric.winsorise(band)
+            bands.winsorise(band)
         _KNOWN[view] = found
     return _KNOWN[view]
 
@@ -326,46 +307,54 @@ def features(frame: Frame, pixels: np.ndarray, normals: np.ndarray) -> np.ndarra
     found = np.zeros((BANDS, 3, len(pixels)), dtype=np.float32)
     if frame.colour is None or not len(pixels):
         return found
-    low, high = pixels.min(axis=0), pixels.max(axis=0) + 1
-    places = pixels - low
-    red, green, blue = frame.colour[pixels[:, 0], pixels[:, 1]].T
-    logs = _LOGS[red] + _LOGS[green] + _LOGS[blue]
+    low, high = (np.array([choose(axis) for axis in pixels.T]) for choose in (np.min, np.max))
     most = 2 ** (BANDS - 1)  # sides are halved that often
-    images = np.zeros((3, *(-(-(high - low) // most) * most)), dtype=np.float32)  # colours, shading, where surface is
-    images[:, places[:, 0], places[:, 1]] = logs - logs.mean(), _shading(logs, normals), np.ones(len(logs))
-    scale, inner = 1, _blurred(images, FINEST_PX)
+    images = np.zeros(
+        (3, *(-(-(high + 1 - low) // most) * most)), dtype=np.float32
+    )  # colours, shading, where surface is
+    places, logs = np.empty((len(pixels), 2), dtype=np.int32), np.empty(len(pixels), dtype=np.float32)
+    bands.look_up(frame.colour, pixels, low, _LOGS, places, logs)
+    bands.lay_out(places, logs - logs.mean(), _shading(logs, normals), images)
+    halvings, inner = 0, _blurred(images, FINEST_PX)
     for band in range(BANDS):
-        outer = _blurred(images, 2.0 * FINEST_PX * 2**band / scale)
-        colours, shading = _means(inner) - _means(outer)
-        layer, inside = _unshaded(colours, shading, images[2] > 0.0)
-        photometric.sample_layer(layer, inside, places, scale, found[band])
+        outer = _blurred(images, 2.0 * FINEST_PX * 2**band / 2**halvings)
+        layers = np.empty((2, *images.shape[1:]), dtype=np.float32)
+        bands.subtract_means(inner, outer, images[2], layers)
+        steady = _unshaded(layers, images[2])
+        bands.sample_layer(layers[0], steady, places, halvings, found[band])
         if band == 0:
             inner = outer
         else:  # the next band is taken from images of half the size
-            images, inner, scale = _halved(images), _halved(outer), 2 * scale
+            images, inner, halvings = _halved(images), _halved(outer), halvings + 1
     return found
 
 
 def _shading(logs: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Return what harmonics of normals (n, 3) tell of logarithms of colours (n,) (Basri and Jacobs 2003)."""
-    some = slice(None, None, max(len(logs) // _SHADED, 1))
+    some = _some(len(logs))
     basis = np.column_stack([np.ones(len(logs[some])), harmonics_of(normals[some], np.eye(4))])
     inverse = np.linalg.pinv(basis.T @ basis, rcond=1e-4, hermitian=True)  # few faces tell few harmonics
     return shading_of(normals, inverse @ (basis.T @ logs[some]))
 
 
-def _unshaded(colours: np.ndarray, shading: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a band (h, w) of colours without what that of the shading explains, and which pixels it holds for.
+def _unshaded(layers: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """Take what the shading explains off a band of colours, and return which pixels (h, w) it holds for.
 
     Lamps that stay with the camera light the faces of a plain box unlike, and their edges would be its print: where
     shading changes by more than the noise of the normals would have it, there is no telling. Where that noise prevails,
     the band of the shading explains little.
+
+    Args:
+        layers: (2, h, w) the band of the colours, changed in place, and that of the shading.
+        surface: (h, w) above 0 where surface is.
     """
-    colours, shading = colours * inside, shading * inside
-    power = float(np.vdot(shading, shading)) + np.count_nonzero(inside) * _LEVEL**2
-    noise = max(float(np.median(np.abs(shading[inside]))) / _NORMAL_QUARTILE, _LEVEL)
-    steady = inside & (np.abs(shading) <= _CREASE * noise)
-    return (colours - np.float32(float(np.vdot(colours, shading)) / power) * shading) * steady, steady
+    colours, shading = layers
+    inside = np.flatnonzero(surface)
+    changes = np.abs(shading.ravel()[inside[_some(len(inside))]])
+    noise = max(float(np.median(changes)) / _NORMAL_QUARTILE, _LEVEL)
+    steady = np.empty(surface.shape, dtype=np.bool_)
+    bands.subtract_shading(colours, shading, surface, np.float32(_LEVEL**2), np.float32(_CREASE * noise), steady)
+    return steady
 
 
 def _halved(images: np.ndarray) -> np.ndarray:
@@ -377,9 +366,8 @@ def _halved(images: np.ndarray) -> np.ndarray:
 
 def _blurred(images: np.ndarray, width_px: float) -> np.ndarray:
     """Return images (k, h, w) blurred by a Gaussian."""
-    return ndimage.gaussian_filter(images, width_px, mode="constant", truncate=_REACH, axes=(1, 2))
-
-
-def _means(blurred: np.ndarray) -> np.ndarray:
-    """Return Gaussian means (k - 1, h, w) over surface, from blurred images of which the last is its share."""
-    return np.asarray(blurred[:-1] / np.maximum(blurred[-1], np.float32(1e-3)))
+    weights = np.exp(-0.5 * (np.arange(int(_REACH * width_px + 0.5) + 1) / width_px) ** 2)
+    weights /= 2.0 * weights.sum() - weights[0]
+    blurred = np.empty_like(images)
+    bands.blur(images, weights.astype(np.float32), blurred)
+    return blurred

@@ -235,18 +235,20 @@ def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Eq
     ]
     for directed, carried, sign in directions:
         found = directed.matches(rows(carried), noise.surface_m)
+        points = np.flatnonzero(found[:, point_to_plane.WEIGHT] > 0.0)
+        surface = found[points]
+        positions = surface[:, point_to_plane.POSITION]
         to_source = np.eye(4) if sign < 0.0 else se3.inverse(pose)
-        for kind, matches in enumerate((found, pair.colour_matches(carried, found, noise, forward=sign > 0.0))):
-            used = matches[matches[:, point_to_plane.WEIGHT] > 0.0]
-            moves = following(carried, used[:, point_to_plane.POSITION])
-            focal = [np.sum(used[:, k] * moves, axis=1) for k in (point_to_plane.OWN, point_to_plane.OTHER)]
-            arms = se3.transform(to_source, used[:, point_to_plane.POSITION]) - pair.centre_m
+        arms, moves = se3.transform(to_source, positions) - pair.centre_m, following(carried, positions)
+        colours = pair.colour_matches(carried, surface, points, noise, forward=sign > 0.0)
+        for part, used, pattern in zip(parts, (surface, colours), (directed.pattern, FixedPattern()), strict=True):
+            at, follow = arms[: len(used)], moves[: len(used)]  # all or none
+            focal = [np.sum(used[:, k] * follow, axis=1) for k in (point_to_plane.OWN, point_to_plane.OTHER)]
             own, other = (used[:, k] @ to_source[:3, :3].T for k in (point_to_plane.OWN, point_to_plane.OTHER))
-            derivatives = [sign * np.hstack([np.cross(arms, normals), normals]) for normals in (own, other)]
+            derivatives = [sign * _levered(at, normals) for normals in (own, other)]
             residuals, weights = used[:, point_to_plane.RESIDUAL], used[:, point_to_plane.WEIGHT]
-            pattern = directed.pattern if kind == 0 else FixedPattern()
-            slopes, bent = _counted(pattern, used, arms, to_source[:3, :3], directed.image.frame.camera)
-            parts[kind].append((arms, *derivatives, residuals, weights, *focal, sign * slopes, bent))
+            slopes, bent = _counted(pattern, used, at, to_source[:3, :3], directed.image.frame.camera)
+            part.append((at, *derivatives, residuals, weights, *focal, sign * slopes, bent))
     surface, colours = (Equations(*(np.concatenate(columns) for columns in zip(*part, strict=True))) for part in parts)
     return surface, colours
 
@@ -266,7 +268,13 @@ def _counted(pattern: FixedPattern, used: Array, arms: Array, to_source: Array, 
     slopes, curvatures = pattern.derivatives(used, camera)
     slopes, levers = slopes @ to_source.T, _levers(arms) @ to_source
     bent = np.einsum("nik,nkl,njl->ij", levers, curvatures, levers, optimize=True)[None]
-    return np.hstack([np.cross(arms, slopes), slopes]), np.asarray(bent, dtype=np.float64)
+    return _levered(arms, slopes), np.asarray(bent, dtype=np.float64)
+
+
+def _levered(arms: Array, slopes: Array) -> Array:
+    """Return derivatives (n, 6) by ξ of what has derivatives (n, 3) by the positions (n, 3) of points."""
+    (x, y, z), (a, b, c) = arms.T, slopes.T
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)
 
 
 def _levers(arms: Array) -> Array:

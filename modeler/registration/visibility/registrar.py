@@ -47,6 +47,8 @@ class ModeSamples:
 
         Under its own noise a mode that matches badly is forgiven.
         """
+        if reference is self:
+            return self.samples
         samples, best = self.samples, int(np.argmax(self.samples.log_likelihoods))
         under_reference = pair.tempered(
             samples.poses[best : best + 1], reference.noise_m, typical_misfit=reference.typical_misfit
