@@ -139,7 +139,7 @@ class TablePrior(AbstractPrior):
     sigma_height_m: float = WOBBLE_M
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
     limits_assumed: bool = False
-    """Whether the limits are usual, but not known: where nothing within them matches, any turn and shift is possible."""
+    """Whether the limits are usual, but not known: where nothing within them matches, any motion on the table is."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
