@@ -146,7 +146,7 @@ class Search:
         # The volumes of two modes may outweigh their likelihoods as much as a negligible mode is outweighed.
         order = order[scores[order] > scores.max() + 2.0 * np.log(MIN_MODE_SHARE)]
         poses, part = poses[order], part[order]
-        precisions = np.linalg.inv([prior.covariance for prior in priors])[part]
+        precisions = np.array([np.linalg.inv(prior.covariance) for prior in priors], dtype=np.float64)[part]
         spreads = _spreads(pair, precisions, poses, fine_m)
         found = Candidates(poses, scores[order], spreads, any(_anywhere(prior) for prior in priors))
         if pair.overlap(found.poses[0]) > min_overlap:
