@@ -112,13 +112,13 @@ def test_the_sequence_says_what_is_known_unless_it_is_asked_otherwise(
     ("name", "expected"),
     [
         ("general", GeneralPrior(limits_assumed=True)),
-        ("table", TablePrior()),
+        ("table", TablePrior(limits_assumed=True)),
         ("axes", AxesPrior(GeneralPrior(limits_assumed=True))),
-        ("features+table", FeaturesPrior(TablePrior())),
-        ("table+velocity+axes", AxesPrior(VelocityPrior(TablePrior()))),
+        ("features+table", FeaturesPrior(TablePrior(limits_assumed=True))),
+        ("table+velocity+axes", AxesPrior(VelocityPrior(TablePrior(limits_assumed=True)))),
         ("turntable", TurntablePrior(25.0, 3.0)),
         ("table+turntable", TurntablePrior(25.0, 3.0, needs_table=True)),
-        ("table+general", ProductPrior(TablePrior(), GeneralPrior(limits_assumed=True))),
+        ("table+general", ProductPrior(TablePrior(limits_assumed=True), GeneralPrior(limits_assumed=True))),
     ],
 )
 def test_names_joined_by_plus_hold_together(name: str, expected: object) -> None:

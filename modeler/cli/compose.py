@@ -28,6 +28,7 @@ from modeler.priors import (
     ProductPrior,
     TablePrior,
     TurntablePrior,
+    UsualPrior,
     VelocityPrior,
 )
 from modeler.priors.checks import ParameterError
@@ -40,6 +41,7 @@ from sequences.hand_shapes import hand_poses
 from sequences.input_files import frame_number
 
 _GIVEN = {
+    "usual": (),
     "general": ("max_rotation_deg", "max_offset_m"),
     "table": ("max_rotation_deg", "max_shift_m"),
     "turntable": (
@@ -238,8 +240,10 @@ def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[s
 def _known(name: str, given: dict[str, Any], sequence: AbstractSequence | None) -> AbstractPrior:
     """Return a prior that is evidence, by its name."""
     match name:
+        case "usual":
+            return UsualPrior()
         case "table":
-            return TablePrior(**given)
+            return TablePrior(**given, limits_assumed=not given)
         case "turntable":
             return _turntable(given, {} if sequence is None else sequence.motion or {})
         case "held":

@@ -211,7 +211,8 @@ class Experiment:
         def attempt(known: AbstractPoseDensity) -> Posterior:
             return register(method, source, target, known, seed=self.seed)
 
-        return anywhere(attempt(density), prior, lambda unlimited: attempt(unlimited.between(source, target)))
+        within = attempt(density)
+        return anywhere(within, prior, (source, target), lambda unlimited: attempt(unlimited.between(source, target)))
 
 
 def _blank(sequence: str, method: str, pair: Pair, truth: Array | None) -> Trial:

@@ -117,7 +117,9 @@ class Modeler:
             InputError: where the views lack what the prior needs.
         """
         attempt = partial(self._register, self.registrar, source, target)
-        return attempt(prior) if prior is not None else anywhere(attempt(self.prior), self.prior, attempt)
+        if prior is not None:
+            return attempt(prior)
+        return anywhere(attempt(self.prior), self.prior, (source, target), attempt)
 
     def suggest(
         self, known: Step, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None

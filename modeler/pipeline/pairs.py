@@ -79,7 +79,12 @@ def register(
     return registrar.register(source, target, density, rng=rng)
 
 
-def anywhere(within: Posterior, prior: AbstractPrior, attempt: Callable[[AbstractPrior], Posterior]) -> Posterior:
+def anywhere(
+    within: Posterior,
+    prior: AbstractPrior,
+    views: tuple[RayImage, RayImage],
+    attempt: Callable[[AbstractPrior], Posterior],
+) -> Posterior:
     """Return a registration, or that of any motion where it does not convince and limits of its prior were assumed.
 
     Of several places, none within the usual limits, none is known to be right.
@@ -87,9 +92,11 @@ def anywhere(within: Posterior, prior: AbstractPrior, attempt: Callable[[Abstrac
     Args:
         within: the registration with the prior.
         prior: what is known of the motion.
+        views: source and target.
         attempt: registers the same pair with another prior.
     """
-    unlimited = None if within.convincing else prior.unlimited()
+    convincing = within.convincing and not prior.doubts(within.pose.mean, *views)
+    unlimited = None if convincing else prior.unlimited()
     if unlimited is None:
         return within
     other = attempt(unlimited)

@@ -7,6 +7,7 @@ accept that the object turned so far: it must match better by as much as motions
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from threading import Lock
@@ -144,9 +145,18 @@ class Tracker:
 
     def spans(self, pairs: Sequence[tuple[int, int]]) -> Iterator[Posterior]:
         """Yield posteriors of pairs (source, target) of views of the graph that were not registered yet."""
-        prior = self.known.relaxed(_SPAN_STEPS)
-        predicted = [PredictedProposal(prior, self.state.solution.relative_gaussian(t, s)) for s, t in pairs]
+        predicted = [self._within(s, t, self.state.solution.relative_gaussian(t, s)) for s, t in pairs]
         yield from self._pairs([(self.state.views[source], target) for source, target in pairs], predicted)
+
+    def _within(self, source: int, target: int, motion: PoseGaussian) -> PredictedProposal:
+        """Return the prior of a pair in the graph; assumed limits that exclude its motion were left already."""
+        prior, unlimited = self.known.relaxed(_SPAN_STEPS), self.known.unlimited()
+        if unlimited is not None:
+            views = self.state.views
+            with suppress(InputError):
+                known = prior.between(views[source], views[target])
+                prior = prior if _inside(known, motion.mean[None])[0] else unlimited
+        return PredictedProposal(prior, motion)
 
     def explained(self, edges: Iterable[Edge]) -> tuple[Edge, ...]:
         """Return judged edges, those to which the prior does not apply with the reason."""
@@ -197,7 +207,8 @@ class Tracker:
             known = prior.between(view, self.state.views[odometry.target])
             odometry = replace(preferred(odometry, wider, known), seconds=seconds)
         if not again:
-            odometry = anywhere(odometry, prior, partial(self._pair, view, odometry.target))
+            views = (view, self.state.views[odometry.target])
+            odometry = anywhere(odometry, prior, views, partial(self._pair, view, odometry.target))
         posteriors = (odometry,)
         while not again and not self._placed(posteriors):
             target = self.closer.relocalisation_target(posteriors, self.state.map_view)

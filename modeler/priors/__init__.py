@@ -10,6 +10,8 @@ from modeler.priors.proposals import AxesPrior as AxesPrior
 from modeler.priors.proposals import FeaturesPrior as FeaturesPrior
 from modeler.priors.proposals import PredictedProposal as PredictedProposal
 from modeler.priors.proposals import VelocityPrior as VelocityPrior
+from modeler.priors.table import AnyTurn as AnyTurn
 from modeler.priors.table import TablePrior as TablePrior
 from modeler.priors.turntable import TurntablePrior as TurntablePrior
 from modeler.priors.turntable import turntable_in as turntable_in
+from modeler.priors.usual import UsualPrior as UsualPrior

@@ -63,8 +63,11 @@ class AnyMotion(AbstractPrior):
 
     def between(self, source: RayImage, target: RayImage) -> GeneralDensity:
         """Return the density of target_from_source."""
-        offset_m = min(self.max_offset * max(source.size_m, target.size_m, 1e-3), MAX_LENGTH_M)
-        return GeneralDensity(source.centroid_m, target.centroid_m, np.pi, offset_m)
+        return GeneralDensity(source.centroid_m, target.centroid_m, np.pi, self.reach_m(source, target))
+
+    def reach_m(self, source: RayImage, target: RayImage) -> float:
+        """Return the largest distance of the centroids."""
+        return min(self.max_offset * max(source.size_m, target.size_m, 1e-3), MAX_LENGTH_M)
 
 
 @dataclass(frozen=True, eq=False)

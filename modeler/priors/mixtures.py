@@ -221,6 +221,11 @@ class Alternatives(AbstractPoseDensity):
         weighted = np.stack(logs) + np.log(self.probabilities)[:, None]
         return np.asarray(np.logaddexp.reduce(weighted, axis=0), dtype=np.float64)
 
+    @property
+    def alternatives(self) -> tuple[AbstractPoseDensity, ...]:
+        """The densities of which one holds."""
+        return self.densities
+
 
 @dataclass(frozen=True, eq=False)
 class DefensiveMixture(AbstractPoseDensity):

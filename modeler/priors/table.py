@@ -9,7 +9,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors.checks import check_parameters
-from modeler.priors.general import centroid_offset, relaxed_limits
+from modeler.priors.general import AnyMotion, centroid_offset, relaxed_limits
 from modeler.priors.mixtures import across_axis
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane, RayImage
 
@@ -138,6 +138,8 @@ class TablePrior(AbstractPrior):
     """Standard deviation of the rotation out of the plane, on top of the plane's own uncertainty."""
     sigma_height_m: float = WOBBLE_M
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
+    limits_assumed: bool = False
+    """Whether the limits are usual, but not known: where nothing within them matches, any motion on the table is."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -160,10 +162,37 @@ class TablePrior(AbstractPrior):
         )
         return TableDensity(plane, limit_rad, self.max_shift_m)
 
+    def unlimited(self) -> AnyTurn | None:
+        """Return the prior of any turn and shift on the table where limits are assumed, else None."""
+        return AnyTurn(self.sigma_tilt_deg, self.sigma_height_m) if self.limits_assumed else None
+
     def relaxed(self, steps: float) -> TablePrior:
         """Return the prior with limits for several steps; the tie to the plane is unchanged."""
         rotation_deg, shift_m = relaxed_limits(self.max_rotation_deg, self.max_shift_m, steps)
         return replace(self, max_rotation_deg=rotation_deg, max_shift_m=shift_m)
+
+
+@dataclass(frozen=True)
+class AnyTurn(AbstractPrior):
+    """Any turn on the table; two centroids of one object's surface are no farther apart than its size allows."""
+
+    sigma_tilt_deg: float = WOBBLE_DEG
+    """Standard deviation of the rotation out of the plane, on top of the plane's own uncertainty."""
+    sigma_height_m: float = WOBBLE_M
+    """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        check_parameters(self)
+
+    def between(self, source: RayImage, target: RayImage) -> TableDensity:
+        """Return the density of target_from_source.
+
+        Raises:
+            InputError: where neither view shows a support plane.
+        """
+        shift_m = AnyMotion().reach_m(source, target)
+        return TablePrior(180.0, shift_m, self.sigma_tilt_deg, self.sigma_height_m).between(source, target)
 
 
 @dataclass(frozen=True, eq=False)

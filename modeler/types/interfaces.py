@@ -40,6 +40,11 @@ class AbstractPoseDensity(ABC):
         log_density = self.log_density(target_from_source)
         return log_density if self.evidence else np.where(np.isfinite(log_density), 0.0, -np.inf)
 
+    @property
+    def alternatives(self) -> tuple[AbstractPoseDensity, ...]:
+        """The densities of which one holds, each of which a search covers by itself; by default the density itself."""
+        return (self,)
+
 
 @dataclass(frozen=True)
 class SharedAxis:
@@ -105,6 +110,13 @@ class AbstractPrior(ABC):
         Used if nothing within the limits matches.
         """
         return None
+
+    def doubts(self, motion: Array, source: RayImage, target: RayImage) -> bool:
+        """Return whether a motion (4, 4) within assumed limits is itself unusual; by default False.
+
+        Then motions beyond the limits, which are unusual in another way, are compared with it.
+        """
+        return False
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
         """Return the prior updated with the sequence so far (a common axis, a velocity); by default the prior itself.

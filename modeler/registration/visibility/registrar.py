@@ -108,7 +108,10 @@ class VisibilityRegistrar(AbstractRegistrar):
         typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
         likelihood = partial(pair.tempered, blur_m=noise_m, typical_misfit=typical_misfit)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
-        gaussians = GaussianMixture(found.poses, found.spreads, likelihood(found.poses) + volumes, pair.centre_m)
+        log_weights = likelihood(found.poses) + volumes
+        if len(density.alternatives) > 1:
+            log_weights += density.log_evidence(found.poses)
+        gaussians = GaussianMixture(found.poses, found.spreads, log_weights, pair.centre_m)
         samples = self.sampler.run(MixtureProposal(density, gaussians), likelihood, pair.centre_m, rng)
         return ModeSamples(samples, noise_m, typical_misfit)
 

@@ -131,7 +131,37 @@ class Search:
             min_overlap: where the best pose inside the prior's support shows more of the surface, poses beyond it
                 count only within a basin of the support.
         """
-        prior, fine_m = _moments(pair, density, rng), self.fine_m(pair)
+        fine_m, parts = self.fine_m(pair), density.alternatives
+        priors = [_moments(pair, part, rng) for part in parts]
+        descents = [self._descended(pair, part, prior, rng) for part, prior in zip(parts, priors, strict=True)]
+        started, poses = (np.concatenate(kind) for kind in zip(*descents, strict=True))
+        part = np.repeat(np.arange(len(parts)), [len(ended) for _, ended in descents])
+        inside = np.isfinite(density.log_evidence(poses))
+        outside = poses[~inside]
+        poses, part = (poses[inside], part[inside]) if inside.any() else (started, part)
+        likelihoods = pair.tempered(poses, fine_m, stride=_STRIDE)
+        # Of alternatives, one may be far denser than another, so that the likelihood does not tell which modes count.
+        scores = likelihoods + density.log_evidence(poses) if len(parts) > 1 else likelihoods
+        order = np.argsort(-scores, kind="stable")
+        # The volumes of two modes may outweigh their likelihoods as much as a negligible mode is outweighed.
+        order = order[scores[order] > scores.max() + 2.0 * np.log(MIN_MODE_SHARE)]
+        poses, part = poses[order], part[order]
+        precisions = np.array([np.linalg.inv(prior.covariance) for prior in priors], dtype=np.float64)[part]
+        spreads = _spreads(pair, precisions, poses, fine_m)
+        found = Candidates(poses, scores[order], spreads, any(_anywhere(prior) for prior in priors))
+        if pair.overlap(found.poses[0]) > min_overlap:
+            outside = self._near_support(pair, priors[-1], density, outside)
+        found = found.distinct(pair.centre_m)
+        if not len(outside):
+            return found
+        gains = pair.tempered(outside, fine_m, stride=_STRIDE) - likelihoods[order[0]]
+        best = int(np.argmax(gains))
+        return replace(found, beyond_gain=float(gains[best]), beyond=outside[best : best + 1])
+
+    def _descended(
+        self, pair: PairLikelihood, density: AbstractPoseDensity, prior: PoseGaussian, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Return starting poses (n, 4, 4), and where the descent from them ends (n, 4, 4)."""
         wanted = self.starts(pair, prior)
         started = self._drawn(pair, density, min(wanted, self.max_starts), rng)
         if wanted > self.max_starts:
@@ -139,22 +169,7 @@ class Search:
         poses, regulariser = started, self._regulariser(pair, prior)
         for blur_m in self.blurs_m(pair):
             poses = pair.descend(poses, blur_m, regulariser, steps=self.steps)
-        inside = np.isfinite(density.log_evidence(poses))
-        outside = poses[~inside]
-        poses = poses[inside] if inside.any() else started
-        scores = pair.tempered(poses, fine_m, stride=_STRIDE)
-        order = np.argsort(-scores, kind="stable")
-        # The volumes of two modes may outweigh their likelihoods as much as a negligible mode is outweighed.
-        order = order[scores[order] > scores.max() + 2.0 * np.log(MIN_MODE_SHARE)]
-        found = Candidates(poses[order], scores[order], _spreads(pair, prior, poses[order], fine_m), _anywhere(prior))
-        if pair.overlap(found.poses[0]) > min_overlap:
-            outside = self._near_support(pair, prior, density, outside)
-        found = found.distinct(pair.centre_m)
-        if not len(outside):
-            return found
-        gains = pair.tempered(outside, fine_m, stride=_STRIDE) - found.scores[0]
-        best = int(np.argmax(gains))
-        return replace(found, beyond_gain=float(gains[best]), beyond=outside[best : best + 1])
+        return started, poses
 
     def _drawn(self, pair: PairLikelihood, density: AbstractPoseDensity, count: int, rng: np.random.Generator) -> Array:
         """Return starting poses (n, 4, 4): samples of the prior that match best at twice the coarsest blur."""
@@ -214,7 +229,7 @@ def _anywhere(prior: PoseGaussian) -> bool:
     return bool(np.linalg.eigvalsh(prior.covariance[:3, :3])[0] > ANY_ROTATION_RAD**2)
 
 
-def _spreads(pair: PairLikelihood, prior: PoseGaussian, poses: Array, blur_m: float) -> Array:
-    """Return roots (n, 6, 6) of covariances from matching surface and the prior (method.md, eq. 11)."""
-    precision = pair.curvatures(poses, blur_m, stride=_STRIDE) + np.linalg.inv(prior.covariance)
+def _spreads(pair: PairLikelihood, precisions: Array, poses: Array, blur_m: float) -> Array:
+    """Return roots (n, 6, 6) of covariances from matching surface and the prior's precisions (n, 6, 6) (eq. 11)."""
+    precision = pair.curvatures(poses, blur_m, stride=_STRIDE) + precisions
     return np.asarray(np.linalg.cholesky(np.linalg.inv(precision)), dtype=np.float64)
