@@ -10,6 +10,8 @@ import numpy as np
 from modeler import se3
 from modeler.priors import (
     AnyMotion,
+    AnyTurn,
+    AutoPrior,
     AxesPrior,
     FeaturesPrior,
     GeneralPrior,
@@ -182,6 +184,9 @@ def foreseen(camera: Array) -> AbstractPrior:
 CASES: dict[str, Case] = {
     "general": Case(lambda _: GeneralPrior(max_rotation_deg=30, max_offset_m=0.03)),
     "any motion": Case(lambda _: AnyMotion()),
+    "auto": Case(lambda _: AutoPrior(GeneralPrior(30, 0.03), TablePrior(40, 0.03))),
+    "auto, no table": Case(lambda _: AutoPrior(), table=False),
+    "any turn on a table": Case(lambda _: AnyTurn()),
     "table": Case(lambda _: TablePrior(max_rotation_deg=40, max_shift_m=0.03)),
     "turntable": Case(turntable),
     "turntable on its table": Case(lambda _: TurntablePrior(24.0, 2.0, needs_table=True)),

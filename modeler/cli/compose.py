@@ -19,6 +19,7 @@ from modeler.fusion import Fuser
 from modeler.kernels import gpu
 from modeler.pipeline import Modeler, glancing
 from modeler.priors import (
+    AutoPrior,
     AxesPrior,
     FeaturesPrior,
     GeneralPrior,
@@ -28,7 +29,6 @@ from modeler.priors import (
     ProductPrior,
     TablePrior,
     TurntablePrior,
-    UsualPrior,
     VelocityPrior,
 )
 from modeler.priors.checks import ParameterError
@@ -41,7 +41,7 @@ from sequences.hand_shapes import hand_poses
 from sequences.input_files import frame_number
 
 _GIVEN = {
-    "usual": (),
+    "auto": (),
     "general": ("max_rotation_deg", "max_offset_m"),
     "table": ("max_rotation_deg", "max_shift_m"),
     "turntable": (
@@ -240,8 +240,8 @@ def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[s
 def _known(name: str, given: dict[str, Any], sequence: AbstractSequence | None) -> AbstractPrior:
     """Return a prior that is evidence, by its name."""
     match name:
-        case "usual":
-            return UsualPrior()
+        case "auto":
+            return AutoPrior()
         case "table":
             return TablePrior(**given, limits_assumed=not given)
         case "turntable":

@@ -125,6 +125,7 @@ class PriorOptions:
         None
     )
     """general: any motion within limits of rotation and shift.
+    auto: free motion, or motion on the table if one is seen; the images decide.
     table: the object stays on the table it stands on.
     turntable: it turns by a commanded step about one axis.
     held: a robot's hand carries it (robot.txt).

@@ -212,7 +212,7 @@ class Experiment:
             return register(method, source, target, known, seed=self.seed)
 
         within = attempt(density)
-        return anywhere(within, prior, (source, target), lambda unlimited: attempt(unlimited.between(source, target)))
+        return anywhere(within, prior, lambda unlimited: attempt(unlimited.between(source, target)))
 
 
 def _blank(sequence: str, method: str, pair: Pair, truth: Array | None) -> Trial:

@@ -119,7 +119,7 @@ class Modeler:
         attempt = partial(self._register, self.registrar, source, target)
         if prior is not None:
             return attempt(prior)
-        return anywhere(attempt(self.prior), self.prior, (source, target), attempt)
+        return anywhere(attempt(self.prior), self.prior, attempt)
 
     def suggest(
         self, known: Step, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None

@@ -79,12 +79,7 @@ def register(
     return registrar.register(source, target, density, rng=rng)
 
 
-def anywhere(
-    within: Posterior,
-    prior: AbstractPrior,
-    views: tuple[RayImage, RayImage],
-    attempt: Callable[[AbstractPrior], Posterior],
-) -> Posterior:
+def anywhere(within: Posterior, prior: AbstractPrior, attempt: Callable[[AbstractPrior], Posterior]) -> Posterior:
     """Return a registration, or that of any motion where it does not convince and limits of its prior were assumed.
 
     Of several places, none within the usual limits, none is known to be right.
@@ -92,11 +87,9 @@ def anywhere(
     Args:
         within: the registration with the prior.
         prior: what is known of the motion.
-        views: source and target.
         attempt: registers the same pair with another prior.
     """
-    convincing = within.convincing and not prior.doubts(within.pose.mean, *views)
-    unlimited = None if convincing else prior.unlimited()
+    unlimited = None if within.convincing else prior.unlimited()
     if unlimited is None:
         return within
     other = attempt(unlimited)

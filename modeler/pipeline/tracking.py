@@ -207,8 +207,7 @@ class Tracker:
             known = prior.between(view, self.state.views[odometry.target])
             odometry = replace(preferred(odometry, wider, known), seconds=seconds)
         if not again:
-            views = (view, self.state.views[odometry.target])
-            odometry = anywhere(odometry, prior, views, partial(self._pair, view, odometry.target))
+            odometry = anywhere(odometry, prior, partial(self._pair, view, odometry.target))
         posteriors = (odometry,)
         while not again and not self._placed(posteriors):
             target = self.closer.relocalisation_target(posteriors, self.state.map_view)

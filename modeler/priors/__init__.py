@@ -1,5 +1,6 @@
 """Nonvisual information about the motion between two views: models of evidence, and proposals that guide the search."""
 
+from modeler.priors.auto import AutoPrior as AutoPrior
 from modeler.priors.general import AnyMotion as AnyMotion
 from modeler.priors.general import GeneralPrior as GeneralPrior
 from modeler.priors.held import HeldPrior as HeldPrior
@@ -14,4 +15,3 @@ from modeler.priors.table import AnyTurn as AnyTurn
 from modeler.priors.table import TablePrior as TablePrior
 from modeler.priors.turntable import TurntablePrior as TurntablePrior
 from modeler.priors.turntable import turntable_in as turntable_in
-from modeler.priors.usual import UsualPrior as UsualPrior

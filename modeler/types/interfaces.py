@@ -111,13 +111,6 @@ class AbstractPrior(ABC):
         """
         return None
 
-    def doubts(self, motion: Array, source: RayImage, target: RayImage) -> bool:
-        """Return whether a motion (4, 4) within assumed limits is itself unusual; by default False.
-
-        Then motions beyond the limits, which are unusual in another way, are compared with it.
-        """
-        return False
-
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
         """Return the prior updated with the sequence so far (a common axis, a velocity); by default the prior itself.
 
