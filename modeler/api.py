@@ -17,7 +17,7 @@ from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.cli.outputs import check_run_folder
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.pipeline import Modeler
-from modeler.priors import GeneralPrior
+from modeler.priors import AutoPrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.types import AbstractPrior, Camera, Frame, InputError, ObjectModel, Posterior, Solution, Step
@@ -66,8 +66,8 @@ def register(
         source_depth_m: (h, w) depth in m; 0 or NaN where nothing was measured.
         target_depth_m: (h, w), of the same camera.
         intrinsics: a `Camera`, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix.
-        prior: of the motion; None: `GeneralPrior` with rotations up to 50° and shifts of up to 4 cm, then any motion
-            if none of these matches or the images contradict the match.
+        prior: of the motion; None: `AutoPrior`, free motion or motion on the table if one is seen, with rotations up to
+            50° and shifts of up to 4 cm, then any if none of these matches or the images contradict the match.
         masks: (h, w) of source and target, true on the object; None: the object is segmented.
         colours: (h, w, 3) 8-bit RGB of source and target, aligned to depth; None: only depth is compared.
         sensor: noise of the camera; None: the first Kinect's.
@@ -95,8 +95,7 @@ def register(
         depth_m[~(depth_m > 0.0) | np.isinf(depth_m)] = np.nan
         frames.append(Frame(index, float(index), depth_m, camera, mask=mask, colour=colour))
     registrar = VisibilityRegistrar(VisibilityLikelihood(colour=colours is not None))
-    usual = GeneralPrior(limits_assumed=True)
-    modeler = Modeler(sensor=sensor or Sensor(), prior=usual, registrar=registrar, seed=seed)
+    modeler = Modeler(sensor=sensor or Sensor(), prior=AutoPrior(), registrar=registrar, seed=seed)
     scene = modeler.segmenter.scene(frames)
     views = []
     for name, frame in zip(("source", "target"), frames, strict=True):
@@ -120,7 +119,7 @@ def build(
     Args:
         sequence: a path in any format that `modeler build` reads, or an open sequence, with frames selected or not.
         out: the run folder to create: mesh, cloud, trajectory, graph, report and recording.
-        prior: of the motion between frames, or its name as in `--prior`; None: that of the sequence, else `general`.
+        prior: of the motion between frames, or its name as in `--prior`; None: that of the sequence, else `auto`.
         seed: of every random number; the same seed gives the same model.
         overwrite: replace the results of an earlier run in the folder.
 

@@ -9,12 +9,13 @@ from prior_cases import views
 
 from modeler import se3
 from modeler.closure import Closer
+from modeler.graph import Smoother
 from modeler.pipeline import Modeler
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
 from modeler.priors import AnyMotion, AutoPrior, GeneralPrior, TablePrior
 from modeler.rays import Sensor
-from modeler.types import PoseGaussian
+from modeler.types import Solution
 
 
 def test_it_is_an_even_mixture_of_free_motion_and_motion_on_the_table(rng: np.random.Generator) -> None:
@@ -57,8 +58,8 @@ def test_pairs_are_registered_again_within_limits_that_hold_their_motion(
     seen = [tabletop.view(body, poses[k], k) for k in (0, int(turn_deg))]
     target, source = (Sensor().ray_image(view.frame) for view in seen)
     prior = GeneralPrior(max_offset_m=0.2, limits_assumed=assumed)
-    state = State(views={target.index: target, source.index: source})
+    solution = Solution({target.index: np.eye(4), source.index: poses[0] @ se3.inverse(poses[int(turn_deg)])})
+    state = State(smoother=Smoother(solution=solution), views={target.index: target, source.index: source})
     tracker = Tracker(state, prior, Closer(), Sensor(), Modeler().register)
-    motion = poses[0] @ se3.inverse(poses[int(turn_deg)])
-    proposal = tracker._within(source.index, target.index, PoseGaussian(motion, 1e-4 * np.eye(6)))
-    assert isinstance(proposal.known, GeneralPrior if kept else AnyMotion)
+    found = tracker._holding(prior.relaxed(1.5), prior.unlimited(), source.index, target.index)
+    assert isinstance(found, GeneralPrior if kept else AnyMotion)

@@ -19,6 +19,8 @@ from modeler.cli.compose import chosen_prior, prior_name
 from modeler.cli.options import PriorOptions
 from modeler.priors import (
     AnyMotion,
+    AnyTurn,
+    AutoPrior,
     AxesPrior,
     FeaturesPrior,
     GeneralPrior,
@@ -86,16 +88,17 @@ TURNTABLE = Telling({"kind": "turntable", "step_deg": 25, "sigma_deg": 3})
 @pytest.mark.parametrize(
     ("motion", "given", "name"),
     [
-        (None, {}, "general"),
+        (None, {}, "auto"),
+        (None, {"max_rotation_deg": 40.0}, "general"),
         ({"kind": "general", "step_deg": 20}, {}, "general"),
-        ({"kind": "somersault"}, {}, "general"),
+        ({"kind": "somersault"}, {}, "auto"),
         ({"kind": "table"}, {}, "table"),
         ({"kind": "table"}, {"max_shift_m": 0.1}, "table"),
         ({"kind": "table"}, {"max_offset_m": 0.1}, "general"),
         ({"kind": "table"}, {"prior": "general"}, "general"),
         ({"kind": "turntable", "step_deg": 25}, {}, "turntable"),
-        ({"kind": "turntable", "step_deg": "25"}, {}, "general"),
-        ({"kind": "turntable"}, {}, "general"),
+        ({"kind": "turntable", "step_deg": "25"}, {}, "auto"),
+        ({"kind": "turntable"}, {}, "auto"),
         ({"kind": "turntable"}, {"step_deg": 24.0}, "turntable"),
         ({"kind": "held"}, {}, "general"),
         ({"kind": "poke", "pokes": {"1": POKE}}, {}, "poke"),
@@ -127,7 +130,8 @@ def test_names_joined_by_plus_hold_together(name: str, expected: object) -> None
 
 @pytest.mark.parametrize("given", [{"max_rotation_deg": 40.0}, {"max_offset_m": 0.1}])
 def test_limits_that_are_told_hold(given: dict[str, Any]) -> None:
-    assert chosen_prior(PriorOptions(), None).unlimited() == AnyMotion()
+    assert chosen_prior(PriorOptions(), None).unlimited() == AutoPrior(AnyMotion(), AnyTurn())
+    assert chosen_prior(PriorOptions(prior="general"), None).unlimited() == AnyMotion()
     assert chosen_prior(PriorOptions(**given), None).unlimited() is None
     assert chosen_prior(PriorOptions(prior="features"), None).unlimited() == FeaturesPrior(AnyMotion())
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from modeler import se3
-from modeler.priors import GeneralPrior, TablePrior, TurntablePrior, turntable_in
+from modeler.priors import AutoPrior, GeneralPrior, TablePrior, TurntablePrior, turntable_in
 from modeler.types import AbstractPrior, Failed, Outcome, Posterior, Reason, advice
 from modeler.verdict.evidence import MAX_UNSURE
 from sequences import AbstractSequence
@@ -245,9 +245,10 @@ def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | Non
     if turntable_in(prior) is not None:
         return None
     turns = step_angles_deg(report["edges"])
-    if report.get("up") is not None and isinstance(prior, GeneralPrior):
-        wide = max(turns, default=0.0) >= prior.max_rotation_deg - _NEAR_LIMIT_DEG
-        options = {"max-rotation-deg": _twice_deg(prior.max_rotation_deg)} if wide else {}
+    free = prior.free if isinstance(prior, AutoPrior) else prior
+    if report.get("up") is not None and isinstance(free, GeneralPrior):
+        wide = max(turns, default=0.0) >= free.max_rotation_deg - _NEAR_LIMIT_DEG
+        options = {"max-rotation-deg": _twice_deg(free.max_rotation_deg)} if wide else {}
         return Remedy("use the prior that the object stays on its table", {"prior": "table", **options})
     words, step, sigma = "give the rotation from frame to frame and its standard deviation", "DEG", "DEG"
     turned_deg = float(np.median(turns)) if turns else 0.0

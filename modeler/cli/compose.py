@@ -203,12 +203,16 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
 
 
 def prior_name(options: PriorOptions, sequence: AbstractSequence | None) -> str:
-    """Return the name of the requested prior; without one, that of the sequence if it is complete, else `general`."""
+    """Return the name of the requested prior; without one, that of the sequence if it is complete, else `auto`.
+
+    Parameters without a name are those of `general`.
+    """
     if options.prior is not None:
         return options.prior
     motion = {} if sequence is None else sequence.motion or {}
     kind = str(motion.get("kind"))
     enough: Mapping[str, Callable[[], object]] = {
+        "general": lambda: True,
         "table": lambda: True,
         "turntable": lambda: options.step_deg is not None or _number(motion.get("step_deg")),
         "held": lambda: sequence is not None and sequence.robot_path is not None,
@@ -216,13 +220,14 @@ def prior_name(options: PriorOptions, sequence: AbstractSequence | None) -> str:
     }
     # Parameters of another prior, given by hand, say more than the file.
     fits = options.parameters().keys() <= set(_GIVEN.get(kind, ()))
-    return kind if fits and kind in enough and enough[kind]() else "general"
+    otherwise = "general" if options.parameters() or kind == "held" else "auto"  # what is held is on no table
+    return kind if fits and kind in enough and enough[kind]() else otherwise
 
 
 def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
     """Return the name of the prior, and in words the assumptions not given by an option."""
     name, assumed = prior_name(options, sequence), []
-    if options.prior is None and name != "general":
+    if options.prior is None and name not in ("auto", "general"):
         assumed.append(f"prior {name}, from sequence.json")
     step_deg = _number((sequence.motion or {}).get("step_deg"))
     if "turntable" in name.split("+") and options.step_deg is None and step_deg is not None:

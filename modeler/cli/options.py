@@ -121,9 +121,7 @@ _Three = tuple[float, float, float]
 class PriorOptions:
     """Prior on the motion between two frames."""
 
-    prior: Annotated[str | None, tyro.conf.arg(metavar="NAME[+NAME]"), default("from sequence.json, else general")] = (
-        None
-    )
+    prior: Annotated[str | None, tyro.conf.arg(metavar="NAME[+NAME]"), default("from sequence.json, else auto")] = None
     """general: any motion within limits of rotation and shift.
     auto: free motion, or motion on the table if one is seen; the images decide.
     table: the object stays on the table it stands on.

@@ -145,18 +145,23 @@ class Tracker:
 
     def spans(self, pairs: Sequence[tuple[int, int]]) -> Iterator[Posterior]:
         """Yield posteriors of pairs (source, target) of views of the graph that were not registered yet."""
-        predicted = [self._within(s, t, self.state.solution.relative_gaussian(t, s)) for s, t in pairs]
+        priors = self.known.relaxed(_SPAN_STEPS), self.known.unlimited()
+        predicted = [
+            PredictedProposal(self._holding(*priors, s, t), self.state.solution.relative_gaussian(t, s))
+            for s, t in pairs
+        ]
         yield from self._pairs([(self.state.views[source], target) for source, target in pairs], predicted)
 
-    def _within(self, source: int, target: int, motion: PoseGaussian) -> PredictedProposal:
-        """Return the prior of a pair in the graph; assumed limits that exclude its motion were left already."""
-        prior, unlimited = self.known.relaxed(_SPAN_STEPS), self.known.unlimited()
+    def _holding(
+        self, prior: AbstractPrior, unlimited: AbstractPrior | None, source: int, target: int
+    ) -> AbstractPrior:
+        """Return a prior of a pair of the graph, or that without limits if they were assumed and exclude its motion."""
         if unlimited is not None:
-            views = self.state.views
             with suppress(InputError):
-                known = prior.between(views[source], views[target])
-                prior = prior if _inside(known, motion.mean[None])[0] else unlimited
-        return PredictedProposal(prior, motion)
+                known = prior.between(self.state.views[source], self.state.views[target])
+                motion = self.state.solution.relative(target, source)
+                return prior if _inside(known, motion[None])[0] else unlimited
+        return prior
 
     def explained(self, edges: Iterable[Edge]) -> tuple[Edge, ...]:
         """Return judged edges, those to which the prior does not apply with the reason."""
