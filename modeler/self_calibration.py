@@ -16,7 +16,7 @@ from typing import final
 import numpy as np
 
 from modeler import se3
-from modeler.graph import MovingGraph, Smoother, located
+from modeler.graph import MovingGraph, Smoother, estimate_focal_length
 from modeler.graph.pose_graph import Factor, collapse_modes
 from modeler.priors.proposals import PredictedProposal
 from modeler.rays import Sensor
@@ -63,13 +63,13 @@ class FocalCalibrator:
         known, root = prior.relaxed(_LIMIT_STEPS), min(views)
         taking_part = [edge for edge in edges if {edge.source, edge.target} <= views.keys() and _counts(edge)]
 
-        def told_at(centre: float) -> FocalLength:
+        def estimate_at(centre: float) -> FocalLength:
             made = _Made(views, sensor, centre)
             found = [self._registered(edge, made, register, known) for edge in taking_part]
             graph = MovingGraph([factor for factor in found if factor is not None], root, {})
             return graph.estimate(self.prior_sigma, -centre)
 
-        return located(told_at, rounds=_MAX_ROUNDS, enough=_CONVERGED, reach=self.reach)
+        return estimate_focal_length(estimate_at, rounds=_MAX_ROUNDS, tolerance=_CONVERGED, reach=self.reach)
 
     def _registered(self, edge: Edge, made: _Made, register: Register, prior: AbstractPrior) -> Factor | None:
         """Return an edge under another focal length; None if its change is unknown.

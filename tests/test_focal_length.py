@@ -14,8 +14,8 @@ from modeler import se3
 from modeler.closure.map_view import composed
 from modeler.evaluation import nees, rotation_error_deg, true_motion
 from modeler.fusion import widened
-from modeler.graph import MovingGraph, PoseGraph, located, solve
-from modeler.graph.focal import TURNS
+from modeler.graph import MovingGraph, PoseGraph, estimate_focal_length, solve
+from modeler.graph.focal import ROTATION_BIAS
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
@@ -114,11 +114,11 @@ def test_a_loop_tells_the_focal_length_and_the_poses_under_it(rng: np.random.Gen
 def test_a_mean_far_from_the_prior_is_believed_only_where_loops_tell_it(sigma: float, believed: bool) -> None:
     """Rounds of registration that each move it on, as a wrong edge makes them."""
 
-    def told_at(log_factor: float) -> FocalLength:
+    def estimate_at(log_factor: float) -> FocalLength:
         step = 0.07 if log_factor == 0.0 else 0.02
         return FocalLength(step, sigma, prior_sigma=0.02, loops=1, sigmas_before=3.0, sigmas_after=2.0, by_focal={})
 
-    found = located(told_at, rounds=3, enough=1.0, reach=0.1)
+    found = estimate_focal_length(estimate_at, rounds=3, tolerance=1.0, reach=0.1)
     assert (found.log_factor > 0.08, found.told_by) == ((True, "loop") if believed else (False, "prior"))
     if not believed:
         assert (found.log_factor, found.sigma) == (0.0, 0.02)
@@ -142,7 +142,7 @@ def test_covariances_are_those_of_a_graph_with_the_focal_length_as_a_variable(rn
     graph, _ = ring(0.0, rng, luck=1e-3)
     solution, prior_sigma = solve(graph, {}), 0.02
     found = MovingGraph.of(graph, solution).estimate(prior_sigma)
-    found = replace(found, sigma=float(np.sqrt(found.sigma**2 - TURNS**2)))
+    found = replace(found, sigma=float(np.sqrt(found.sigma**2 - ROTATION_BIAS**2)))
     rows = [np.eye(1, 61, 60) / prior_sigma]
     for one in graph.edges:
         local = np.linalg.inv(np.linalg.cholesky(one.posterior.pose.covariance))

@@ -8,7 +8,7 @@ from rings import OBJECT_M, covariance, edge, nees, ring, rotation_error, spin
 
 from modeler import se3
 from modeler.graph import CommonAxis, PoseGraph, solve
-from modeler.graph.axis import best_known_point, estimated_axis, slip
+from modeler.graph.axis import estimated_axis, least_variance_point, slip
 from modeler.graph.pose_graph import Factor
 from modeler.types import Array, Edge, PoseGaussian
 
@@ -66,11 +66,11 @@ def test_best_known_point_is_where_the_object_is() -> None:
     graph, _ = ring(14, rng, [])
     factors = [Factor(e, e.posterior.pose) for e in graph.edges]
     np.testing.assert_allclose(
-        best_known_point(factors), OBJECT_M, atol=0.05
+        least_variance_point(factors), OBJECT_M, atol=0.05
     )  # covariances couple turns and shifts at random
     exact = se3.adjoint(se3.translation(OBJECT_M))
     pose = PoseGaussian(np.eye(4), exact @ np.diag([1e-3, 2e-4, 5e-4, 1e-6, 1e-6, 1e-6]) @ exact.T)
-    np.testing.assert_allclose(best_known_point([Factor(edge(0, 1, pose), pose)]), OBJECT_M, atol=1e-9)
+    np.testing.assert_allclose(least_variance_point([Factor(edge(0, 1, pose), pose)]), OBJECT_M, atol=1e-9)
 
 
 def test_perfect_table_has_no_slip_and_shows_its_axis() -> None:

@@ -1,7 +1,7 @@
-"""A turntable in the graph: one axis, unknown but common to all steps, about which the object turns.
+"""A turntable in the graph: the object turns about an unknown axis that is common to all steps.
 
 Between consecutive frames target_from_source = A Rz(θ) exp(slip) A⁻¹, with A = camera_from_axis, whose third direction
-is the axis (method.md, eq. G7). A is a variable of all steps, so that what each pair of images says of it counts once.
+is the axis (method.md, eq. G7). A is one variable shared by all steps, so that each pair informs it once.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from modeler.graph.covariance import Rows, chi_square_quantile
 from modeler.graph.pose_graph import Factor, inverse_right_jacobian
 from modeler.types import Array, segments
 
-_MIN_TURN_RAD = np.radians(5.0)  # a table that has turned by less in all shows no axis
+_MIN_TURN_RAD = np.radians(5.0)  # total rotation below which the axis is not observable
 _SLIP = [0, 1, 3, 4, 5]  # components of ξ other than the rotation about the axis
 _AXIS = gtsam.symbol("a", 0)  # beyond all frame numbers
-# Standard deviations of A about its initial estimate, rad and m. A rotation about the axis changes nothing and is held;
-# the origin lies along the axis within the object; the rest is all but free.
+# Standard deviations of A about its initial estimate, rad and m. The rotation about the axis is not observable and is
+# fixed; the origin's position along the axis is loosely so; the rest is practically free.
 _AXIS_SIGMAS = np.array([1.0, 1.0, 1e-4, 1.0, 1.0, 0.03])
-_PLACE_SIGMAS = np.array([0.01, 0.01, *_AXIS_SIGMAS[2:]])  # where edges hold the direction
+_PLACE_SIGMAS = np.array([0.01, 0.01, *_AXIS_SIGMAS[2:]])  # if edges already contain the direction
 _MAX_ITERATIONS, _MAX_HALVINGS = 50, 10  # of Gauss–Newton, and of one of its steps
 _TOLERANCE = 1e-6  # of half the squared Mahalanobis distance
 _CONFIDENCE = 1.0 - 1e-6  # of the gate: a false axis costs a hundred times more than a true one
 
 
-def best_known_point(factors: Sequence[Factor]) -> Array:
-    """Return the point (3,) in camera coordinates whose motion has the least variance: where the object is."""
+def least_variance_point(factors: Sequence[Factor]) -> Array:
+    """Return the point (3,) in camera coordinates whose motion has the least variance: about the object's centre."""
     inertia, moment = np.zeros((3, 3)), np.zeros(3)
     for factor in factors:  # least Σ E|υ + ω × p|²
         spread = factor.pose.covariance / np.trace(factor.pose.covariance[:3, :3])
-        turns, mixed = spread[:3, :3], spread[:3, 3:]
-        inertia += np.trace(turns) * np.eye(3) - turns
+        rotations, mixed = spread[:3, :3], spread[:3, 3:]
+        inertia += np.trace(rotations) * np.eye(3) - rotations
         moment += np.array([mixed[1, 2] - mixed[2, 1], mixed[2, 0] - mixed[0, 2], mixed[0, 1] - mixed[1, 0]])
     return np.asarray(np.linalg.solve(inertia, moment), dtype=np.float64)
 
 
 def steps_of(factors: Sequence[Factor], frames: Iterable[int]) -> list[tuple[int, int]]:
-    """Return pairs of consecutive frames, but for those of two segments, between which a hand moved the object."""
+    """Return pairs of consecutive frames of one segment: between segments, the object was laid down or regrasped."""
     segment_of = segments([factor.edge for factor in factors])
     return [pair for pair in itertools.pairwise(sorted(frames)) if len({segment_of.get(frame) for frame in pair}) == 1]
 
@@ -51,24 +51,24 @@ def steps_of(factors: Sequence[Factor], frames: Iterable[int]) -> list[tuple[int
 def estimated_axis(
     trajectory: Mapping[int, Array], near_m: Array, pairs: Sequence[tuple[int, int]] | None = None
 ) -> Array | None:
-    """Return camera_from_axis (4, 4) that the steps between consecutive frames share best; None without rotation.
+    """Return the least-squares camera_from_axis (4, 4) of the steps between consecutive frames; None without rotation.
 
-    The object turns about its third direction in the positive sense, seen from camera coordinates, as time goes back.
+    Its third direction is the axis, oriented so that target_from_source, target earlier, turns by a positive angle.
 
     Args:
         trajectory: object_from_camera (4, 4) by frame number.
-        near_m: (3,) a point in camera coordinates, to which the origin is the nearest on the axis.
-        pairs: the frames of the steps; None: all consecutive ones.
+        near_m: (3,) a point in camera coordinates; the origin is the point of the axis nearest to it.
+        pairs: (target, source) of each step; None: all consecutive frames.
     """
     pairs = list(itertools.pairwise(sorted(trajectory))) if pairs is None else pairs
     steps = np.stack([se3.inverse(trajectory[t]) @ trajectory[s] for t, s in pairs])
-    turns = se3.log(steps)[:, :3]
-    if np.sum(np.linalg.norm(turns, axis=1)) < _MIN_TURN_RAD:
+    rotations = se3.log(steps)[:, :3]
+    if np.sum(np.linalg.norm(rotations, axis=1)) < _MIN_TURN_RAD:
         return None
-    axis = np.linalg.svd(turns)[2][0]
-    axis = axis if np.sum(turns @ axis) > 0.0 else -axis
+    axis = np.linalg.svd(rotations)[2][0]
+    axis = axis if np.sum(rotations @ axis) > 0.0 else -axis
     fixed = (np.eye(3) - steps[:, :3, :3]).reshape(-1, 3)
-    # Points on the axis stay where they are.
+    # Points on the axis are fixed.
     point = np.linalg.lstsq(np.vstack([fixed, axis]), np.append(steps[:, :3, 3].ravel(), axis @ near_m), rcond=None)[0]
     across = np.linalg.svd(axis[None])[2][1]
     camera_from_axis = np.eye(4)
@@ -118,39 +118,39 @@ class AxisSolution:
     poses: Mapping[int, Array]
     """object_from_camera (4, 4) by frame number."""
     rows: Sequence[Rows]
-    """What the axis says there: whitened rows of errors in object coordinates."""
+    """The axis' factors there: whitened rows of errors in object coordinates."""
     camera_from_axis: Array
     """(4, 4), the axis the third direction."""
 
 
 @dataclass(frozen=True)
 class CommonAxis:
-    """What is known of a turntable, beyond what the edges hold.
+    """Standard deviations of a turntable, beyond the information in the edges.
 
-    The angle of a step is not part of it: where that is known, edges hold it.
+    The angle of a step is not part of it: if it is known, edges contain it.
     """
 
     sigma_tilt_rad: float = float(np.radians(0.2))
-    """Tilt of the object against the axis in a step, by wobble or slip. Infinite where edges hold the axis' direction:
-    steps then share its place only."""
+    """Tilt of the object against the axis in a step, by wobble or slip. Infinite if edges already contain the axis'
+    direction: steps then share its position only."""
     sigma_shift_m: float = 0.0005
-    """Slip across the axis in a step. Some centimetres make a table on which the object is pushed about: steps then
+    """Slip across the axis in a step. Some centimetres describe a table on which the object is pushed about: steps then
     share the table's normal only."""
     sigma_lift_m: float = 0.0005
-    """Slip along the axis in a step; infinite where edges hold that."""
+    """Slip along the axis in a step; infinite if edges already contain it."""
 
     def solve(self, factors: Sequence[Factor], trajectory: Mapping[int, Array], root: int) -> AxisSolution | None:
-        """Return the poses of least error under factors and axis; None where factors contradict every axis.
+        """Return the poses of least error given factors and axis; None if the factors contradict any common axis.
 
         Args:
             factors: all that take part.
-            trajectory: object_from_camera (4, 4) by frame number, not far off.
+            trajectory: initial object_from_camera (4, 4) by frame number.
             root: the frame whose pose is the identity.
         """
         steps = steps_of(factors, trajectory)
         if not steps:
             return None
-        start = estimated_axis(trajectory, best_known_point(factors), steps)
+        start = estimated_axis(trajectory, least_variance_point(factors), steps)
         if start is None:
             return None
         problem = _Problem(self, factors, steps, root, start)
@@ -168,8 +168,8 @@ class CommonAxis:
     def _fits(self, steps: Sequence[tuple[Rows, Array]], cost: float) -> bool:
         """Return whether steps may share an axis that adds `cost` to the squared Mahalanobis distance (eq. G8).
 
-        That is χ² with as many degrees of freedom as the steps have conditions beyond the axis' own parameters: two of
-        its direction, two of its place.
+        It follows χ²; its degrees of freedom are the steps' conditions minus the axis' parameters, two of its direction
+        and two of its position.
         """
         free = np.isfinite([self.sigma_tilt_rad, self.sigma_shift_m])
         stacked = [np.hstack(list(blocks.values())) for blocks, _ in steps]
@@ -180,7 +180,7 @@ class CommonAxis:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Poses and axis under factors, a loose prior of the axis, and the slip of each step."""
+    """Least squares over poses and axis: the edges' factors, a weak prior of the axis, and the slip of each step."""
 
     axis: CommonAxis
     factors: Sequence[Factor]
@@ -189,7 +189,7 @@ class _Problem:
     start: Array
 
     def rows(self, poses: Mapping[int, Array]) -> list[tuple[Rows, Array]]:
-        """Return whitened derivatives by variable, blocks (m, 6), and errors (m,): of factors, the prior, and steps.
+        """Return whitened derivatives by variable, blocks (m, 6), and errors (m,), of factors, prior and steps.
 
         Args:
             poses: object_from_camera (4, 4) by frame number, and camera_from_axis.
@@ -217,7 +217,7 @@ class _Problem:
         return rows
 
     def minimised(self, poses: dict[int, Array]) -> tuple[dict[int, Array], list[tuple[Rows, Array]]]:
-        """Return poses and axis of least error, and `rows` there, by Gauss–Newton with step halving."""
+        """Return poses and axis of least error, with their `rows`, by Gauss–Newton with step halving."""
         rows = self.rows(poses)
         for _ in range(_MAX_ITERATIONS):
             linear = gtsam.GaussianFactorGraph()
@@ -245,7 +245,7 @@ class _Problem:
         return {key: block for key, block in blocks.items() if key != self.root}
 
     def _slips(self, poses: Mapping[int, Array], steps: npt.NDArray[np.int64]) -> list[Array]:
-        """Return the whitened `slip` of steps (n, 2) between a target and a source."""
+        """Return the whitened `slip` of steps (n, 2), each a target and a source."""
         axis, apart = self.axis, steps[:, 1] - steps[:, 0]
         targets, sources = (np.stack([poses[int(frame)] for frame in ends]) for ends in steps.T)
         across = (axis.sigma_shift_m, axis.sigma_shift_m, axis.sigma_lift_m)
@@ -260,7 +260,7 @@ def _half_square(rows: Sequence[tuple[Rows, Array]]) -> float:
 
 
 def _gaussian_factor(rows: Rows, right: Array) -> gtsam.JacobianFactor:
-    """Return rows of one to three variables with right sides (m,) as a GTSAM factor."""
+    """Return rows of one to three variables with right-hand sides (m,) as a GTSAM factor."""
     (key, block), *more = rows.items()
     unit = gtsam.noiseModel.Unit.Create(len(block))
     if not more:

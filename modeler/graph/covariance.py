@@ -1,18 +1,18 @@
 """Covariances of solved frames and of the motion between any two, from the square root of their information.
 
 Errors are written in object coordinates, δ_k with true object_from_camera(k) = exp(δ_k) object_from_camera(k), so that
-a factor with RᵀR the inverse of its covariance says
+a factor with RᵀR the inverse of its covariance implies
 
     R J Ad(source_from_object) (δ_source − δ_target) ~ N(0, I)                               (method.md, eq. G5)
 
-with J the derivative of its residual's logarithm, near the identity; the root has no error. Householder QR of all rows
-along a sparse ordering leaves U with UᵀU their information, as a Bayes tree: cliques of variables, each conditional on
-a separator of variables in the cliques above. Rows that are added or removed concern only the cliques on the paths from
-their variables to the roots (Kaess et al., iSAM2: Incremental smoothing and mapping using the Bayes tree, IJRR 2012);
-covariances are recovered by back substitution (Kaess and Dellaert, Covariance recovery from a square root information
-matrix, RAS 2009). Information and covariance are never formed, subtracted or inverted as a whole, so that a direction
-that no edge observes, metres wide, does not spoil others, micrometres wide. First order in the errors; factors are
-relinearised where poses have moved.
+with J the inverse right Jacobian of its residual; the root has no error. Householder QR of all rows along a sparse
+ordering gives U with UᵀU their information, as a Bayes tree: cliques of variables, each conditional on a separator of
+variables in the cliques above. Adding or removing rows affects only the cliques on the paths from their variables to
+the roots (Kaess et al., iSAM2: Incremental smoothing and mapping using the Bayes tree, IJRR 2012); covariances are
+recovered by back substitution (Kaess and Dellaert, Covariance recovery from a square root information matrix, RAS
+2009). Information and covariance are never formed, subtracted or inverted as a whole, so that an unobserved direction
+with a standard deviation of metres does not degrade others of micrometres. First order in the errors; factors are
+relinearised if poses have moved.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from modeler.types import Array
 
 Rows = Mapping[int, Array]
 """By variable, blocks (m, 6) of whitened rows."""
-_MIN_DISSECTED = 8  # variables from which nested dissection orders them, which keeps paths to the roots short
-_MAX_DEPTH = 40  # cliques on a path to a root from which it is eliminated again, which shortens it
-_PANEL = 32  # columns that LAPACK reflects at once
-_MAX_MOVED = 4e-3  # rad and m by which a pose may be off its linearisation point: 1 % of a covariance
+_MIN_DISSECTED = 8  # variables from which on nested dissection orders them, which keeps paths to the roots short
+_MAX_DEPTH = 40  # cliques on a path to a root, beyond which it is eliminated again to shorten it
+_PANEL = 32  # block size of LAPACK's QR
+_MAX_MOVED = 4e-3  # rad and m of a pose from its linearisation point: 1 % of a covariance
 (_qr,) = get_lapack_funcs(("geqrf",))
-(_trsm,) = get_blas_funcs(("trsm",))  # LAPACK's trtrs wakes threads for the smallest system
+(_trsm,) = get_blas_funcs(("trsm",))  # LAPACK's trtrs starts threads even for the smallest system
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +50,10 @@ class Clique:
     r: Array
     s: Array
     marginal: tuple[Array, ...]
-    """By variable of the separator, blocks of m rows: what it and all cliques below say of it. Upper triangular: block
-    k has its first 6 k + 6 rows alone. Empty where they say nothing."""
+    """By variable of the separator, blocks of m rows: the factor on it that this clique and all below leave. Upper
+    triangular: block k has only its first 6 k + 6 rows. Empty if they leave none."""
     rows: tuple[Rows, ...]
-    """Rows that name a frontal variable and none of a clique below."""
+    """Rows with a frontal variable and none of a clique below."""
 
     @property
     def separator_rows(self) -> Rows:
@@ -67,17 +67,17 @@ class Clique:
 
 @dataclass(frozen=True, eq=False)
 class SquareRoot:
-    """A Bayes tree of whitened rows. A value: `plus` makes a new one, which shares the cliques that stayed."""
+    """A Bayes tree of whitened rows. Immutable: `plus` returns a new one, which shares the unchanged cliques."""
 
     clique_of: Mapping[int, Clique] = field(default_factory=dict)
-    """The clique that has a variable as a frontal one."""
+    """By variable, the clique in which it is frontal."""
     rank: Mapping[int, int] = field(default_factory=dict)
-    """By variable, its place in the elimination order."""
+    """By variable, its position in the elimination order."""
     children: Mapping[Clique, tuple[Clique, ...]] = field(default_factory=dict)
-    """Of each clique, where it has any."""
+    """Children of each clique that has any."""
 
     def parent(self, clique: Clique) -> Clique | None:
-        """Return the parent of a clique, which holds all variables of its separator."""
+        """Return the parent of a clique, which contains all variables of its separator."""
         return self.clique_of[min(clique.separator, key=self.rank.__getitem__)] if clique.separator else None
 
     def path_to_roots(self, variables: Iterable[int]) -> list[Clique]:
@@ -95,11 +95,11 @@ class SquareRoot:
         return sorted(set(self.clique_of.values()), key=lambda clique: -self.rank[clique.frontals[-1]])
 
     def plus(self, added: Sequence[Rows], removed: Sequence[Rows] = ()) -> SquareRoot:
-        """Return the square root with more rows and without some others.
+        """Return the square root after adding and removing rows.
 
         Args:
-            added: rows of variables that are connected with the others once all are in.
-            removed: rows that no longer hold, known by identity.
+            added: rows that connect their variables with the others.
+            removed: rows to remove, compared by identity.
         """
         count: dict[int, int] = {}
         for variable in itertools.chain.from_iterable(added):
@@ -116,11 +116,11 @@ class SquareRoot:
         return grown
 
     def _is_deep(self, rows: Rows) -> bool:
-        """Return whether the paths from the known variables of rows to the roots are long."""
+        """Return whether the paths from the existing variables of rows to the roots are long."""
         return len(self.path_to_roots(variable for variable in rows if variable in self.clique_of)) >= _MAX_DEPTH
 
     def _with_leaves(self, leaves: Sequence[Rows]) -> SquareRoot:
-        """Return the square root with new variables, each tied by its rows to one that is in."""
+        """Return the square root with new variables, each connected by its rows to one existing variable."""
         clique_of, rank, children = dict(self.clique_of), dict(self.rank), dict(self.children)
         lowest = min(rank.values(), default=0)
         for number, rows in enumerate(leaves):
@@ -132,7 +132,7 @@ class SquareRoot:
         return SquareRoot(clique_of, rank, children)
 
     def _eliminated(self, added: Sequence[Rows], removed: Sequence[Rows]) -> SquareRoot:
-        """Return the square root with all cliques eliminated again that rows concern."""
+        """Return the square root after eliminating again all cliques that rows affect."""
         left_out = {id(rows) for rows in removed}
         concerned = dict.fromkeys(itertools.chain.from_iterable((*added, *removed)))
         top = self.path_to_roots(variable for variable in concerned if variable in self.clique_of)
@@ -157,7 +157,7 @@ class SquareRoot:
 
 
 def _is_leaf(rows: Rows, count: Mapping[int, int]) -> bool:
-    """Return whether rows tie one new variable, which no others name, to one other at most."""
+    """Return whether rows connect one new variable, which no other rows contain, to at most one other."""
     height = len(next(iter(rows.values())))
     return height == 6 and len(rows) <= 2 and sorted(count[variable] for variable in rows) in ([1], [0, 1])
 
@@ -177,17 +177,17 @@ def _ordering(rows: Sequence[Rows]) -> list[int]:
 
 
 def _cliques(rows: Sequence[Rows], order: Sequence[int], from_below: Sequence[Rows] = ()) -> list[Clique]:
-    """Return the cliques that rows leave when variables are eliminated in an order, children before parents.
+    """Return the cliques that eliminating variables in an order gives, children before parents.
 
     Args:
-        rows: those that are the cliques' own.
-        order: the variables; others that are named are given.
-        from_below: rows that stand for cliques below.
+        rows: factors.
+        order: the variables to eliminate; rows may contain others, on which the cliques are conditional.
+        from_below: `separator_rows` of cliques below.
     """
     place = {variable: number for number, variable in enumerate(order)}
     own_rows: list[list[Rows]] = [[] for _ in order]  # by the variable that is eliminated first
     child_rows: list[list[Rows]] = [[] for _ in order]  # those from below, likewise
-    named: list[set[int]] = [set() for _ in order]  # the variables of a factor that elimination leaves
+    named: list[set[int]] = [set() for _ in order]  # the variables of the factor that its elimination leaves
     for lists, more in ((own_rows, rows), (child_rows, from_below)):
         for some in more:
             number = min(place.get(variable, len(order)) for variable in some)
@@ -226,7 +226,7 @@ def _cliques(rows: Sequence[Rows], order: Sequence[int], from_below: Sequence[Ro
 def _clique(
     frontals: tuple[int, ...], separator: tuple[int, ...], own: Sequence[Rows], below: Sequence[Rows]
 ) -> Clique:
-    """Return the clique that rows leave, by QR."""
+    """Return the clique of some rows, by QR."""
     column = {variable: 6 * number for number, variable in enumerate((*frontals, *separator))}
     stacked = [*own, *below]
     heights = [len(next(iter(some.values()))) for some in stacked]
@@ -239,8 +239,8 @@ def _clique(
     reflected, *_ = _qr(matrix, lwork=_PANEL * matrix.shape[1], overwrite_a=1)
     upper = np.triu(reflected[: min(matrix.shape)])
     size = 6 * len(frontals)
-    # Copies: a part would keep the whole in memory.
-    r = upper[:size, :size].copy(order="F")  # as BLAS takes it
+    # Copies: a view would keep the whole matrix in memory.
+    r = upper[:size, :size].copy(order="F")  # for BLAS
     height, ends = len(upper) - size, range(6, 6 * len(separator) + 1, 6)
     marginal = tuple(upper[size : size + end, size + end - 6 : size + end].copy() for end in ends if height > 0)
     return Clique(frontals, separator, r, upper[:size, size:].copy(order="K"), marginal, tuple(own))
@@ -251,12 +251,12 @@ class _Linearised:
     """Factors as rows, and the square root of their information."""
 
     poses: Mapping[int, Array] = field(default_factory=dict)
-    """object_from_camera (4, 4) of each frame where its factors are linearised."""
+    """Linearisation point object_from_camera (4, 4) by frame number."""
     rows: Mapping[Factor, Rows] = field(default_factory=dict)
     square_root: SquareRoot = field(default_factory=SquareRoot)
 
     def at(self, factors: Sequence[Factor], trajectory: Mapping[int, Array], root: int) -> _Linearised:
-        """Return that of a solution, with as little work as what has changed asks for."""
+        """Return the linearisation of another solution; only what has changed is computed."""
         both = [frame for frame in trajectory if frame in self.poses]
         before, after = ([poses[frame] for frame in both] for poses in (self.poses, trajectory))
         apart = np.abs(np.reshape(before, (-1, 16)) - np.reshape(after, (-1, 16))).max(axis=1, initial=0.0)
@@ -285,12 +285,12 @@ class RelativeCovariance:
     factors: Sequence[Factor]
     """All that take part."""
     extra_rows: Sequence[Rows] = ()
-    """What else is known, as rows of errors in object coordinates; variables other than frames may take part."""
+    """Further factors, as rows of errors in object coordinates, possibly with variables other than frames."""
     before: _Linearised = field(default_factory=_Linearised)
-    """The factors of an earlier solution with the same root, as far as covariances were computed."""
+    """Linearised factors of an earlier solution with the same root."""
 
     def at(self, trajectory: Mapping[int, Array], factors: Sequence[Factor]) -> RelativeCovariance:
-        """Return that of a solution with the same root, with as little work as what has changed asks for."""
+        """Return the covariances of another solution with the same root; only what has changed is computed."""
         before = self._linearised if "_linearised" in vars(self) and not self.extra_rows else self.before
         return RelativeCovariance(trajectory, self.root, factors, before=before)
 
@@ -298,7 +298,7 @@ class RelativeCovariance:
         """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
 
         Raises:
-            KeyError: where a frame was not solved.
+            KeyError: if a frame was not solved.
         """
         linearised = self._linearised
         source_from_object = se3.adjoint(se3.inverse(linearised.poses[source]))
@@ -389,7 +389,7 @@ def _root_covariance(clique: Clique, separator: Array) -> Array:
 
 
 def _square(root: Array) -> Array:
-    """Return L with as many columns as rows at most and the same LLᵀ."""
+    """Return L with at most as many columns as rows and the same LLᵀ."""
     if root.shape[1] <= root.shape[0]:
         return root
     return np.asarray(np.linalg.qr(root.T, mode="r"), dtype=np.float64).T
@@ -397,17 +397,17 @@ def _square(root: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PoseCovariances(Mapping[int, Array]):
-    """Covariances (6, 6) of object_from_camera by frame number, computed when read.
+    """Covariances (6, 6) of object_from_camera by frame number, computed on access.
 
-    The first one that is read is computed alone; a second one computes all.
+    The first access computes one covariance; the next one computes all.
     """
 
     trajectory: Mapping[int, Array]
     """object_from_camera (4, 4) by frame number."""
     one: Callable[[int], Array]
-    """Computes one."""
+    """Computes the covariance of one frame."""
     marginals: Callable[[], Mapping[int, Array]]
-    """Computes all."""
+    """Computes the covariances of all frames."""
 
     def __getitem__(self, frame: int) -> Array:
         """Return the covariance of one pose."""
@@ -430,11 +430,11 @@ class PoseCovariances(Mapping[int, Array]):
         return len(self.trajectory)
 
     def items(self) -> ItemsView[int, Array]:
-        """Return all, the same numbers whatever was read before."""
+        """Return all covariances, independent of earlier accesses."""
         return self.marginals().items()
 
     def values(self) -> ValuesView[Array]:
-        """Return all, the same numbers whatever was read before."""
+        """Return all covariances, independent of earlier accesses."""
         return self.marginals().values()
 
     @cached_property
@@ -443,5 +443,5 @@ class PoseCovariances(Mapping[int, Array]):
 
 
 def chi_square_quantile(probability: float, degrees: int) -> float:
-    """Return the quantile of χ² with some degrees of freedom; importing `scipy.stats` for it costs a command 0.4 s."""
+    """Return a quantile of χ²; importing `scipy.stats` instead would take 0.4 s."""
     return 2.0 * float(gammaincinv(0.5 * degrees, probability))

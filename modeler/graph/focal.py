@@ -1,7 +1,7 @@
-"""The focal length as a variable that all edges share: what loops tell of it, and what it leaves uncertain.
+"""The focal length as a variable shared by all edges, estimated from loops (method.md, eq. G12 and G13).
 
-Edges are registered under a focal length that is not known exactly, and each states how its mean moves with it
-(method.md, eq. 25). Loops close under one focal length only; where there are none, its prior stays.
+Edges are registered under a focal length that is not known exactly; each has the derivative of its mean by it (eq. 25).
+Loops close under one focal length only; without loops, its prior remains.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, 
 from modeler.graph.smoother import Smoother
 from modeler.types import Array, FocalLength, Solution
 
-TURNS = 0.004
-"""Relative error of all turns alike, which loops take for one of the focal length: measured on renders."""
+ROTATION_BIAS = 0.004
+"""Relative error common to all rotations, which loops cannot distinguish from a focal length: measured on renders."""
 
-_STEP = 0.005  # for derivatives, at most, and a quarter of the prior's: some standard deviations that loops leave
+_STEP = 0.005  # of finite differences, at most a quarter of the prior's standard deviation: a few posterior ones
 _ROUNDS = 8  # of Newton's method at most; near the optimum two or three are enough
-_REACH = 3.0  # prior standard deviations within which loops are asked, and means are believed that loops hardly tell
-_GRID = 0.02  # of the logarithm at most, between the values that Newton's method starts from
-_SLOPES = 0.3  # relative error of an estimate: noise of the derivatives makes it too small, by 29 % on the bundled box
+_MAX_SIGMAS = 3.0  # prior standard deviations: range of the grid, and of estimates that hardly exceed the prior
+_GRID = 0.02  # largest spacing, in the logarithm, of starting values for Newton's method
+_DERIVATIVE_ERROR = 0.3  # relative, of an estimate: noise of the derivatives biases it to 0, by 29 % on the bundled box
 
 
 @dataclass(frozen=True, eq=False)
 class MovingGraph:
-    """Edges whose means follow the focal length: all at the logarithm of the true one over that of the views."""
+    """Edges whose means depend on the focal length, by the logarithm of the true one over that of the views."""
 
     factors: Sequence[Factor]
-    """With that of the views."""
+    """Under the focal length of the views."""
     root: int
     """Frame whose pose is the identity."""
     start: Mapping[int, Array]
-    """object_from_camera (4, 4) by frame number, to start from; frames without one start on the chain."""
+    """Initial object_from_camera (4, 4) by frame number; for other frames, dead reckoning."""
     threshold: float = 0.5 * Smoother.outlier_distance**2
     """Error in nats beyond which a loop is an outlier."""
 
     @classmethod
     def of(cls, graph: PoseGraph, solution: Solution) -> MovingGraph:
-        """Return the accepted edges of a graph, of several modes as one Gaussian each, with its solution as a start."""
+        """Return the accepted edges of a graph, one Gaussian each, with its solution as the initial value."""
         factors = [Factor(edge, solution.pose_of(edge)) for edge in graph.accepted]
         return cls(factors, graph.root or 0, solution.trajectory)
 
@@ -51,8 +51,8 @@ class MovingGraph:
         """Return the logarithm of least error, prior included, by Newton's method (method.md, eq. G12 and G13).
 
         Args:
-            prior_sigma: standard deviation of the logarithm before the edges are asked.
-            prior_mean: its mean.
+            prior_sigma: prior standard deviation of the logarithm.
+            prior_mean: its prior mean.
         """
 
         def cost(log_factor: float) -> float:
@@ -60,15 +60,15 @@ class MovingGraph:
 
         step = min(_STEP, 0.25 * prior_sigma)
         best, curvature = prior_mean, 1.0 / prior_sigma**2
-        if not all(self.at(prior_mean).inlier):  # loops that are outliers there tell nothing
-            reach = _REACH * prior_sigma
+        if not all(self.at(prior_mean).inlier):  # outliers have no gradient there
+            reach = _MAX_SIGMAS * prior_sigma
             grid = np.linspace(prior_mean - reach, prior_mean + reach, 1 + 2 * int(np.ceil(reach / _GRID)))
             best = min(grid.tolist(), key=cost)
         for _ in range(_ROUNDS if self.loops else 0):
             less, middle, more = (cost(best + shift) for shift in (-step, 0.0, step))
             curvature = max((less - 2.0 * middle + more) / step**2, 1.0 / prior_sigma**2)
             move = float(np.clip((less - more) / (2.0 * step * curvature), -2.0 * prior_sigma, 2.0 * prior_sigma))
-            while cost(best + move) > middle and abs(move) > step:  # far from the optimum steps may lead beyond it
+            while cost(best + move) > middle and abs(move) > step:  # far from the optimum, Newton steps may overshoot
                 move *= 0.5
             best += move
             if abs(move) * np.sqrt(curvature) < 0.01:
@@ -76,11 +76,11 @@ class MovingGraph:
         less, more = (self.at(best + sign * step).poses for sign in (-1.0, 1.0))
         conditions = max(6 * self.loops, 1)
         before, after = (2.0 * self.at(value).error / conditions for value in (0.0, best))
-        fitting = self.at(best)
-        agreeing = 6 * sum(fitting.inlier)
-        left = 2.0 * (fitting.error - self.threshold * fitting.inlier.count(False))
-        worse = max(left / (agreeing - 1), 1.0) if agreeing else 1.0  # than the edges state
-        sigma = float(np.linalg.norm([np.sqrt(worse / curvature), _SLOPES * best, TURNS]))
+        optimum = self.at(best)
+        conditions_met = 6 * sum(optimum.inlier)
+        residual = 2.0 * (optimum.error - self.threshold * optimum.inlier.count(False))
+        inflation = max(residual / (conditions_met - 1), 1.0) if conditions_met else 1.0  # of the edges' covariances
+        sigma = float(np.linalg.norm([np.sqrt(inflation / curvature), _DERIVATIVE_ERROR * best, ROTATION_BIAS]))
         return FocalLength(
             log_factor=best,
             sigma=min(sigma, prior_sigma),
@@ -99,18 +99,18 @@ class MovingGraph:
         return self._solved[log_factor]
 
     def _nearest(self, log_factor: float) -> Optimum:
-        """Return what is known of the solution: that under the nearest focal length, or the start."""
+        """Return the known solution under the nearest focal length, or the initial value."""
         if not self._solved:
             return Optimum(self.start, (), 0.0)
         return self._solved[min(self._solved, key=lambda known: abs(known - log_factor))]
 
     def _optimum(self, spanning: SpanningTree, near: Optimum) -> Optimum:
-        """Return the poses of least error, from others that are near."""
+        """Return the poses of least error, starting from a nearby solution."""
         tree, loops, root = spanning.tree, spanning.loops, self.root
         if not loops:
             return Optimum(chain(tree, root, {}), (), 0.0)
         start = chain(tree, root, anchored(near.poses, root))
-        # Not the loops that took part nearby: the bare chain contradicts one that all edges together can close.
+        # Inliers are not taken from nearby: dead reckoning may contradict a loop that all edges together can close.
         return optimise(tree, loops, start, root=root, threshold=self.threshold)
 
     @cached_property
@@ -123,29 +123,31 @@ class MovingGraph:
         return {}
 
 
-def located(told_at: Callable[[float], FocalLength], *, rounds: int, enough: float, reach: float) -> FocalLength:
-    """Return the focal length that edges tell when they are registered again under each estimate (method.md, eq. S2).
+def estimate_focal_length(
+    estimate_at: Callable[[float], FocalLength], *, rounds: int, tolerance: float, reach: float
+) -> FocalLength:
+    """Return the focal length, estimated iteratively from edges registered under each estimate (method.md, eq. S2).
 
-    Noise of the derivatives makes every step too small, as that of regressors does; further ones find what is missing.
+    Noise of the derivatives makes every step too small, as noise of regressors does; iteration corrects this.
 
     Args:
-        told_at: returns what edges tell that were registered under a focal length, its logarithm over the given one
-            known; relative to it.
-        rounds: of registration at most.
-        enough: of standard deviations of a step, after which edges are not registered again.
-        reach: largest logarithm.
+        estimate_at: returns the estimate by edges registered under a focal length, relative to it; its argument is the
+            logarithm of this focal length over the given one.
+        rounds: largest number of registrations of the edges.
+        tolerance: step in standard deviations below which the iteration ends.
+        reach: largest absolute logarithm.
     """
-    first = told = told_at(0.0)
+    first = estimate = estimate_at(0.0)
     centre = 0.0
     for number in range(rounds):
-        if not told.loops:  # those that there were cannot be registered with the estimate
-            return replace(told, log_factor=0.0, sigma=told.prior_sigma)
+        if not estimate.loops:  # their edges cannot be registered under the estimate
+            return replace(estimate, log_factor=0.0, sigma=estimate.prior_sigma)
         before = centre
-        centre = float(np.clip(before + told.log_factor, -reach, reach))
-        if abs(centre - before) <= enough * told.sigma or number == rounds - 1:
+        centre = float(np.clip(before + estimate.log_factor, -reach, reach))
+        if abs(centre - before) <= tolerance * estimate.sigma or number == rounds - 1:
             break
-        told = told_at(centre)
-    if told.told_by == "prior" and abs(centre) > _REACH * np.sqrt(told.prior_sigma**2 - told.sigma**2):
-        # Further from the prior's mean than evidence that weak can lead: the rounds differ, since an edge is wrong.
-        centre, told = 0.0, replace(told, sigma=told.prior_sigma)
-    return replace(told, log_factor=centre, sigmas_before=first.sigmas_before)
+        estimate = estimate_at(centre)
+    if estimate.told_by == "prior" and abs(centre) > _MAX_SIGMAS * np.sqrt(estimate.prior_sigma**2 - estimate.sigma**2):
+        # Farther from the prior's mean than such weak evidence can lead: the rounds disagree, so that an edge is wrong.
+        centre, estimate = 0.0, replace(estimate, sigma=estimate.prior_sigma)
+    return replace(estimate, log_factor=centre, sigmas_before=first.sigmas_before)

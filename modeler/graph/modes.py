@@ -1,8 +1,8 @@
-"""Edges whose posterior has several modes: which of them the loops and the other edges select.
+"""Selection among the modes of multimodal edges by loops and the other edges.
 
-A hypothesis names one mode for every such edge on a loop. Hypotheses are first scored loop by loop, along the tree,
-thousands at once; the best few are then optimised, and their evidence is Laplace's (method.md, eq. G3). Weights of
-modes are sums over all that are not far from the best: of a shape that looks the same from behind, thousands are equal.
+A hypothesis selects one mode of every such edge on a loop. Hypotheses are first scored loop by loop, along the tree,
+thousands at once; the best few are then optimised and compared by Laplace's approximation of the evidence (method.md,
+eq. G3). Weights of modes are sums over all near the best: if a shape looks the same from behind, thousands are equal.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from modeler.graph.optimise import optimise, selected
 from modeler.graph.pose_graph import Factor, chain, walk
 from modeler.types import Array, Edge
 
-_BEAM = 4096  # hypotheses kept while loops are taken one by one: all of twelve edges with two modes
+_BEAM = 4096  # hypotheses kept while loops are added one by one: all of twelve edges with two modes
 _MAX_OPTIMISED = 8  # hypotheses that are optimised
 _MARGIN_NATS = 15.0  # below the best: hypotheses farther off together weigh less than 4096 exp(-15) = 0.001
-_DECIDED = 0.9999  # weight from which a mode is taken for the only one
-_MAX_REFUTED = 1.5  # outlier loops beyond the best hypothesis' before one is dropped: one loop may be wrong itself
-_MAX_PAIRED = 16  # edges up to which the modes of two of them are changed at once
+_DECIDED = 0.9999  # weight beyond which the other modes are neglected
+_MAX_EXTRA_OUTLIERS = 1.5  # outlier loops more than the best hypothesis before one is dropped: one loop may be wrong
+_MAX_PAIR_SEARCH = 16  # edges up to which the modes of two of them are changed at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +32,14 @@ class _Segment:
     """A part of a cycle: a motion with one or several modes."""
 
     column: int | None
-    """Of the hypotheses, which names the mode; None: there is but one."""
+    """Column of the hypotheses that selects the mode; None if there is only one."""
     means: Array
     """(m, 4, 4)."""
     covariances: Array
     """(m, 6, 6)."""
 
     def of(self, hypotheses: npt.NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return mean and covariance for each hypothesis (h, edges), or one for all (1, …)."""
+        """Return means and covariances for hypotheses (h, edges), or one for all (1, …)."""
         if self.column is None:
             return self.means, self.covariances
         modes = hypotheses[:, self.column]
@@ -55,14 +55,14 @@ class Cycle:
 
     @property
     def columns(self) -> tuple[int, ...]:
-        """Of the hypotheses on which it depends."""
+        """Columns of the hypotheses on which it depends."""
         return tuple(segment.column for segment in (*self.path, self.own) if segment.column is not None)
 
     def residual(self, hypotheses: npt.NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return for hypotheses (h, edges) how far the loop is from closing.
+        """Return the closure error under hypotheses (h, edges).
 
         Returns:
-            Half the squared Mahalanobis distance (h,), and half the log determinant of its covariance (h,).
+            Half its squared Mahalanobis distance (h,), and half the log determinant of its covariance (h,).
         """
         mean, covariance = np.eye(4)[None], np.zeros((1, 6, 6))
         for segment in self.path:
@@ -77,13 +77,13 @@ class Cycle:
 def cycles(
     tree: Sequence[Factor], loops: Sequence[Factor], root: int, settled: Mapping[Edge, Array]
 ) -> tuple[tuple[Edge, ...], list[Cycle]]:
-    """Return the edges on loops whose mode is undecided, one a column of hypotheses, and the cycles that name them.
+    """Return the edges on loops whose mode is undecided, one per column of hypotheses, and the cycles through them.
 
     Args:
         tree: factors that connect the frames.
         loops: the factors beyond those.
         root: a frame of the tree.
-        settled: weights of modes, by edge, of which the heaviest is taken.
+        settled: weights of modes by edge; the heaviest is used.
     """
     above = {neighbour: (frame, factor) for frame, neighbour, factor in walk(tree, root)}
     depth = {root: 0}
@@ -145,14 +145,14 @@ def select_modes(
     threshold: float,
     before: Mapping[Edge, Array] | None = None,
 ) -> dict[Edge, Array]:
-    """Return the weights (m,) that the loops leave to the modes of each edge with several that lies on a loop.
+    """Return the weights (m,) of the modes of each multimodal edge on a loop, given the loops.
 
     Args:
         tree: factors that connect the frames.
         loops: the factors beyond those.
         root: a frame of the tree.
         threshold: half the squared Mahalanobis distance from which a loop is an outlier.
-        before: weights that fewer loops left; modes settled there stay.
+        before: weights given fewer loops; modes decided there are kept.
     """
     settled = {edge: weights for edge, weights in (before or {}).items() if weights.max() >= _DECIDED}
     if not any(factor.modes and factor.edge not in settled for factor in (*tree, *loops)):
@@ -165,7 +165,7 @@ def select_modes(
         if len(hypotheses) > 1:
             chosen = (dict(zip(search.edges, row, strict=True)) for row in hypotheses[:_MAX_OPTIMISED])
             evidence = np.array([search.evidence(tree, loops, root, modes, settled) for modes in chosen])
-            # Scores along the tree differ from the evidence by what all of the best have nearly alike.
+            # Scores along the tree differ from the evidence by nearly the same amount for all of the best.
             scores = np.concatenate([evidence, scores[len(evidence) :] + np.mean(evidence - scores[: len(evidence)])])
         shares = np.exp(scores - scores.max())
         shares = shares / shares.sum()
@@ -179,12 +179,12 @@ def select_modes(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Scores hypotheses loop by loop."""
+    """Beam search over hypotheses, scored loop by loop."""
 
     edges: tuple[Edge, ...]
-    """Whose mode is undecided, by column."""
+    """Edges whose mode is undecided, by column."""
     cycles: tuple[Cycle, ...]
-    """That depend on them, those with the fewest undecided edges first."""
+    """Cycles that depend on them, those with the fewest undecided edges first."""
     threshold: float
     """Half the squared Mahalanobis distance from which a loop is an outlier."""
 
@@ -192,7 +192,7 @@ class _Search:
     def of(
         cls, tree: Sequence[Factor], loops: Sequence[Factor], root: int, settled: Mapping[Edge, Array], threshold: float
     ) -> _Search:
-        """Return the search for the modes of all edges on loops that are not settled."""
+        """Return the search for the modes of all undecided edges on loops."""
         edges, found = cycles(tree, loops, root, settled)
         return cls(edges, tuple(sorted(found, key=lambda cycle: len(cycle.columns))), threshold)
 
@@ -204,12 +204,12 @@ class _Search:
                 if hypotheses[0, column] < 0:
                     hypotheses, scores = self._expanded(hypotheses, scores, column)
             scores = scores + self._loop_score(cycle, hypotheses)
-            alive = scores >= scores.max() - _MAX_REFUTED * self.threshold
+            alive = scores >= scores.max() - _MAX_EXTRA_OUTLIERS * self.threshold
             hypotheses, scores = hypotheses[alive], scores[alive]
-        hypotheses = _near(hypotheses, scores)[0]
+        hypotheses = _near_best(hypotheses, scores)[0]
         while True:  # recovers hypotheses that the beam dropped
             around = np.unique(np.concatenate([hypotheses, self._neighbours(hypotheses[0])]), axis=0)
-            found, scores = _near(around, self._score(around))
+            found, scores = _near_best(around, self._score(around))
             if np.array_equal(found[0], hypotheses[0]):
                 return found, scores
             hypotheses = found
@@ -222,7 +222,7 @@ class _Search:
         hypothesis: Mapping[Edge, np.int64],
         settled: Mapping[Edge, Array],
     ) -> float:
-        """Return Laplace's log evidence of a hypothesis (eq. G3), up to a constant of all hypotheses."""
+        """Return the Laplace approximation of a hypothesis' log evidence (eq. G3), up to a common constant."""
         of = {edge: int(mode) for edge, mode in hypothesis.items()}
         of |= {edge: int(np.argmax(weights)) for edge, weights in settled.items()}
         tree, loops = ([_chosen(factor, of) for factor in some] for some in (tree, loops))
@@ -240,7 +240,7 @@ class _Search:
     def _expanded(
         self, hypotheses: npt.NDArray[np.int64], scores: Array, column: int
     ) -> tuple[npt.NDArray[np.int64], Array]:
-        """Return the hypotheses with every mode of one more edge, the best of them."""
+        """Return the best hypotheses after adding each mode of one more edge."""
         weights = self._weights(column)
         expanded = np.repeat(hypotheses, len(weights), axis=0)
         expanded[:, column] = np.tile(np.arange(len(weights)), len(hypotheses))
@@ -249,10 +249,10 @@ class _Search:
         return expanded[order], scores[order]
 
     def _neighbours(self, hypothesis: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return the hypotheses that differ from one (edges,) in one edge, or in two where those are few."""
+        """Return the hypotheses that differ from one (edges,) in one edge, or in two if there are few edges."""
         single = [(column, mode) for column, edge in enumerate(self.edges) for mode in range(len(edge.posterior.modes))]
         changes = [(change,) for change in single]
-        if len(self.edges) <= _MAX_PAIRED:
+        if len(self.edges) <= _MAX_PAIR_SEARCH:
             changes += [(one, other) for one in single for other in single if one[0] < other[0]]
         neighbours = np.tile(hypothesis, (len(changes), 1))
         for row, change in zip(neighbours, changes, strict=True):
@@ -274,12 +274,12 @@ class _Search:
 
 
 def _chosen(factor: Factor, modes: Mapping[Edge, int]) -> Factor:
-    """Return a factor with the mode that a hypothesis names."""
+    """Return a factor with the mode that a hypothesis selects."""
     return Factor(factor.edge, factor.edge.posterior.modes[modes[factor.edge]].pose) if factor.edge in modes else factor
 
 
-def _near(hypotheses: npt.NDArray[np.int64], scores: Array) -> tuple[npt.NDArray[np.int64], Array]:
-    """Return the hypotheses (h, edges) whose scores (h,) are not far from the best, best first."""
+def _near_best(hypotheses: npt.NDArray[np.int64], scores: Array) -> tuple[npt.NDArray[np.int64], Array]:
+    """Return the hypotheses (h, edges) with scores (h,) near the best, best first."""
     order = np.argsort(-scores, kind="stable")
     order = order[scores[order] >= scores[order[0]] - _MARGIN_NATS][:_BEAM]
     return hypotheses[order], scores[order]

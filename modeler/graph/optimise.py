@@ -1,9 +1,9 @@
 """The nonlinear solution: least squares with outlier rejection, and its incremental update.
 
-Batch solutions are Levenberg and Marquardt's, with graduated non-convexity where loops contradict each other (Yang et
-al., Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020). A graph that grows is updated by iSAM2 (Kaess et
-al., iSAM2: Incremental smoothing and mapping using the Bayes tree, IJRR 2012), by Cholesky, which takes a sixth of the
-time of QR; by QR where one direction is so much less certain than others that Cholesky fails.
+Batch solutions use Levenberg–Marquardt, with graduated non-convexity if loops contradict each other (Yang et al.,
+Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020). A growing graph is updated by iSAM2 (Kaess et al.,
+iSAM2: Incremental smoothing and mapping using the Bayes tree, IJRR 2012) with Cholesky factorisation, which takes a
+sixth of the time of QR; with QR if one direction is so uncertain that Cholesky fails.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ import numpy as np
 from modeler.graph.pose_graph import Factor, chain
 from modeler.types import Array
 
-_PIN_SIGMA = 1e-6  # rad and m, of the root: far below any registration's
-_ANNEALING_TOLERANCE = 1e-4  # of the error; the loops that annealing chooses are then solved to convergence
-_RELINEARISE = 1e-3  # rad and m off the linearisation point: a factor's error is wrong by that share of its residual
+_ANCHOR_SIGMA = 1e-6  # rad and m, of the root: far below any registration's
+_ANNEALING_TOLERANCE = 1e-4  # of the error; the inliers that annealing finds are then solved to convergence
+_RELINEARISE = 1e-3  # rad and m from the linearisation point: relative error of a factor's residual
 _WILDFIRE = 1e-5  # changes in rad and m below which iSAM2 stops back substitution
-_MAX_ROUNDS = 8  # of relinearisation; more mean that the start was too far off
-_QUORUM = 3  # loops that agree with each other before new ones are judged by them alone
-_MAX_JUDGED = 3  # new loops that are judged so at once
+_MAX_ROUNDS = 8  # of relinearisation; if more are needed, the initial value was too far off
+_QUORUM = 3  # loops that agree with each other before new ones are tested against them alone
+_MAX_NEW_LOOPS = 3  # tested so at once
 
 Inlier = tuple[bool, ...]
-"""Which loops take part, in their order."""
+"""Whether each loop takes part, in their order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +38,9 @@ class Optimum:
     poses: Mapping[int, Array]
     """object_from_camera (4, 4) by frame number."""
     inlier: tuple[bool, ...]
-    """Which loops take part."""
+    """Whether each loop takes part."""
     error: float
-    """Half the squared Mahalanobis distance of all factors; those left out count the threshold (eq. G2)."""
+    """Half the squared Mahalanobis distance of all factors; outliers count as the threshold (eq. G2)."""
 
 
 def optimise(
@@ -52,18 +52,18 @@ def optimise(
     threshold: float,
     inlier: Sequence[bool] = (),
 ) -> Optimum:
-    """Return the optimum of method.md, eq. G1, and which loops take part: those whose error stays below the threshold.
+    """Return the optimum of method.md, eq. G1, and which loops are inliers: those whose error is below the threshold.
 
-    Where some do not, graduated non-convexity with a truncated least-squares loss chooses, unless the given choice
-    already stands: all that take part agree with the optimum, all that are left out contradict it.
+    The given inliers are kept if they are consistent with their optimum: all inliers are below the threshold, all
+    others above. Otherwise graduated non-convexity with a truncated least-squares loss selects them.
 
     Args:
         tree: factors that are trusted.
-        loops: factors that may be contradicted.
-        start: object_from_camera (4, 4) by frame number.
+        loops: factors that may be outliers.
+        start: initial object_from_camera (4, 4) by frame number.
         root: the frame whose pose is the identity.
-        threshold: half the squared Mahalanobis distance beyond which a loop is left out.
-        inlier: which of the first loops took part in an earlier solution; the others are assumed to.
+        threshold: half the squared Mahalanobis distance beyond which a loop is an outlier.
+        inlier: whether each of the first loops was an inlier in an earlier solution; the others are assumed to be.
     """
     initial = values_of(start)
     taking_part = (*inlier, *[True] * (len(loops) - len(inlier)))
@@ -80,15 +80,15 @@ def optimise(
         found = annealing.optimize()
         taking_part = tuple(bool(weight > 0.5) for weight in annealing.getWeights()[trusted:])
         chosen = selected(loops, taking_part)
-        # At full weight, where annealing ended between.
+        # With full weights, as those of annealing may be fractions.
         found = _least_squares(gtsam_graph_of([*tree, *chosen], root), found)
     error = gtsam_graph_of([*tree, *chosen], root).error(found) + threshold * taking_part.count(False)
     return Optimum(poses_of(found, start, root), taking_part, error)
 
 
 def anchor(root: int) -> gtsam.PriorFactorPose3:
-    """Return the prior that pins the root's pose at the identity."""
-    return gtsam.PriorFactorPose3(root, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, _PIN_SIGMA))
+    """Return the prior that fixes the root's pose at the identity."""
+    return gtsam.PriorFactorPose3(root, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, _ANCHOR_SIGMA))
 
 
 def values_of(poses: Mapping[int, Array]) -> gtsam.Values:
@@ -100,17 +100,17 @@ def values_of(poses: Mapping[int, Array]) -> gtsam.Values:
 
 
 def poses_of(values: gtsam.Values, frames: Iterable[int], root: int) -> dict[int, Array]:
-    """Return object_from_camera (4, 4) by frame number; the root's, pinned by `anchor`, is the identity."""
+    """Return object_from_camera (4, 4) by frame number; the root's, fixed by `anchor`, is the identity."""
     rows = np.asarray(gtsam.utilities.extractPose3(values), dtype=np.float64)  # by key: rotation, translation
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
-    # Copies: whoever keeps one pose, as a linearisation point, would keep all poses of this solution in memory.
+    # Copies: a view kept as a linearisation point would keep all poses of this solution in memory.
     found = {frame: pose.copy() for frame, pose in zip(values.keys(), poses, strict=True)}
     return {frame: found[frame] for frame in frames} | {root: np.eye(4)}
 
 
 def inliers(loops: Iterable[Factor], values: gtsam.Values, threshold: float) -> tuple[bool, ...]:
-    """Return which loops stay below the threshold."""
+    """Return which loops are below the threshold."""
     return tuple(loop.between.error(values) <= threshold for loop in loops)
 
 
@@ -120,7 +120,7 @@ def selected(loops: Sequence[Factor], taking_part: Sequence[bool]) -> list[Facto
 
 
 def gtsam_graph_of(factors: Iterable[Factor], root: int) -> gtsam.NonlinearFactorGraph:
-    """Return the prior of the root, and factors."""
+    """Return the GTSAM graph of factors and the prior of the root."""
     gtsam_graph = gtsam.NonlinearFactorGraph()
     gtsam_graph.add(anchor(root))
     for factor in factors:
@@ -134,7 +134,7 @@ def _least_squares(gtsam_graph: gtsam.NonlinearFactorGraph, start: gtsam.Values)
 
 def _parameters(tolerance: float = 1e-12) -> gtsam.LevenbergMarquardtParams:
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky gives up where one direction is 4096 times vaguer
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky fails if a standard deviation is 4096 times another
     parameters.setRelativeErrorTol(tolerance)
     parameters.setAbsoluteErrorTol(tolerance)
     return parameters
@@ -142,16 +142,22 @@ def _parameters(tolerance: float = 1e-12) -> gtsam.LevenbergMarquardtParams:
 
 @dataclass(frozen=True, eq=False)
 class IncrementalSolver:
-    """Factors with their iSAM2 solution. A value: `plus` works on a copy, which is cheap."""
+    """Factors with their iSAM2 solution. Immutable: `plus` works on a copy, which is cheap."""
 
     factors: frozenset[Factor]
     """Those that take part."""
     engine: gtsam.ISAM2
-    """Never changed."""
+    """Never modified."""
 
     @classmethod
     def of(cls, factors: Sequence[Factor], poses: Mapping[int, Array], root: int) -> IncrementalSolver | None:
-        """Return the solver of factors that connect all frames of poses, object_from_camera (4, 4) near the optimum."""
+        """Return the solver of factors that connect all frames of `poses`; None if it does not converge.
+
+        Args:
+            factors: those that take part.
+            poses: object_from_camera (4, 4) by frame number, near the optimum.
+            root: the frame whose pose is the identity.
+        """
         for factorisation in ("CHOLESKY", "QR"):
             parameters = gtsam.ISAM2Params()
             parameters.setFactorization(factorisation)
@@ -166,11 +172,11 @@ class IncrementalSolver:
         return None
 
     def plus(self, factors: Sequence[Factor], poses: Mapping[int, Array]) -> IncrementalSolver | None:
-        """Return the solver with more factors; None where it does not converge from here.
+        """Return the solver with more factors; None if it does not converge.
 
         Args:
             factors: known ones are skipped.
-            poses: object_from_camera (4, 4) from which to start, at least of the frames that are new.
+            poses: initial object_from_camera (4, 4), at least of the new frames.
         """
         new = [factor for factor in factors if factor not in self.factors]
         grown = _updated(gtsam.ISAM2(self.engine), gtsam.NonlinearFactorGraph(), new, poses)
@@ -178,7 +184,7 @@ class IncrementalSolver:
 
     @property
     def error(self) -> float:
-        """Half the squared Mahalanobis distance of all factors to the solution."""
+        """Half the squared Mahalanobis distance of all factors at the solution."""
         return self.engine.getFactorsUnsafe().error(self.values)
 
     @cached_property
@@ -190,7 +196,7 @@ class IncrementalSolver:
 def _updated(
     engine: gtsam.ISAM2, gtsam_graph: gtsam.NonlinearFactorGraph, factors: Sequence[Factor], poses: Mapping[int, Array]
 ) -> IncrementalSolver | None:
-    """Return an updated engine; None where relinearisation does not converge."""
+    """Return the solver after an update; None if relinearisation does not converge."""
     values = gtsam.Values()
     for frame in dict.fromkeys(frame for factor in factors for frame in (factor.target, factor.source)):
         if not engine.valueExists(frame):
@@ -217,15 +223,15 @@ def solve_loops(
     threshold: float,
     before: tuple[Inlier, IncrementalSolver | None] = ((), None),
 ) -> tuple[Mapping[int, Array], Inlier, IncrementalSolver | None]:
-    """Return the poses under all loops, which loops take part, and the solver that can go on from there.
+    """Return the poses given all loops, which loops are inliers, and the solver for later updates.
 
     Args:
         tree: factors that are trusted.
-        loops: factors that may be contradicted, earlier ones first.
-        start: object_from_camera (4, 4) by frame number.
+        loops: factors that may be outliers, earlier ones first.
+        start: initial object_from_camera (4, 4) by frame number.
         root: the frame whose pose is the identity.
-        threshold: half the squared Mahalanobis distance beyond which a loop is left out.
-        before: which of the loops took part in the earlier solution, and its solver.
+        threshold: half the squared Mahalanobis distance beyond which a loop is an outlier.
+        before: which of the loops were inliers of the earlier solution, and its solver.
     """
     inlier, engine = before
     if engine is not None:
@@ -248,14 +254,15 @@ def _continued(
     start: Mapping[int, Array],
     threshold: float,
 ) -> tuple[Inlier, IncrementalSolver] | None:
-    """Return which loops take part and their solution, from the earlier one; None: a batch solution is needed.
+    """Return which loops are inliers and the updated solver; None if a batch solution is needed.
 
-    Some of the new loops may be left out, if enough others agree: of the choices that stand, the one of least cost.
+    If enough earlier loops agree, some of the new ones may be outliers: of the consistent selections, the one of least
+    cost.
     """
     known, engine = before
     new = len(loops) - len(known)
     choices = [(True,) * new]
-    if sum(known) >= max(_QUORUM, 2 * known.count(False)) and new <= _MAX_JUDGED:
+    if sum(known) >= max(_QUORUM, 2 * known.count(False)) and new <= _MAX_NEW_LOOPS:
         choices = sorted(itertools.product((True, False), repeat=new), key=lambda choice: choice.count(False))
     best: tuple[float, Inlier, IncrementalSolver] | None = None
     for choice in choices:

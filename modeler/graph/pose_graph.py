@@ -1,7 +1,7 @@
-"""The pose graph: judged edges, the factors that GTSAM takes, a spanning tree and loops beyond it, dead reckoning.
+"""The pose graph: edges, their factors in GTSAM, the spanning tree and the loops beyond it, dead reckoning.
 
 Variables are object_from_camera(k). A factor is `BetweenFactorPose3(target, source, target_from_source)`, whose noise
-GTSAM expresses as `target_from_source @ exp(ξ)`, rotation first: the package's own convention, see `se3`.
+GTSAM expresses as `target_from_source @ exp(ξ)`, rotation first: the convention of `se3`.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from modeler import se3
 from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian, Posterior, are_separate, pooled
 
 ROOT_SIGMA = 1e-9
-"""Of the root's pose, in rad and m: zero for all purposes, and still positive definite."""
-_KINDS: tuple[EdgeKind, ...] = ("odometry", "span", "closure", "join")  # in the order in which a tree prefers them
+"""Standard deviation of the root's pose in rad and m: practically zero, but positive definite."""
+_KINDS: tuple[EdgeKind, ...] = ("odometry", "span", "closure", "join")  # in order of preference for the tree
 
 
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
-    """Every edge judged so far. A value: adding edges makes a new graph."""
+    """All edges so far, accepted or rejected. Immutable: adding edges returns a new graph."""
 
     edges: tuple[Edge, ...] = ()
-    """In the order in which they were judged."""
+    """In order of arrival."""
     first: int | None = None
     """Number of the first accepted frame, whose camera frame is the object frame; None: the first edge's target."""
 
@@ -41,7 +41,7 @@ class PoseGraph:
 
     @property
     def root(self) -> int | None:
-        """Number of the frame that holds the gauge; None in an empty graph."""
+        """Number of the frame that fixes the gauge; None in an empty graph."""
         if self.first is not None:
             return self.first
         return next((edge.target for edge in self.accepted), None)
@@ -49,12 +49,12 @@ class PoseGraph:
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """One edge as one Gaussian."""
+    """An edge as a single Gaussian."""
 
     edge: Edge
-    """As it was judged."""
+    """The accepted edge."""
     pose: PoseGaussian
-    """target_from_source as the optimisation takes it: of several modes, as loops have decided."""
+    """target_from_source in the optimisation; that of a multimodal edge depends on the modes that loops select."""
 
     @cached_property
     def target(self) -> int:
@@ -68,7 +68,7 @@ class Factor:
 
     @cached_property
     def modes(self) -> tuple[Mode, ...]:
-        """Those of the posterior that loops may choose between; none where they are not separate."""
+        """Modes among which loops may select; none if they are not separate."""
         return self.edge.posterior.modes if are_separate(self.edge.posterior.modes) else ()
 
     def under(self, log_factor: float) -> Factor:
@@ -84,9 +84,9 @@ class Factor:
         """The factor in GTSAM.
 
         Raises:
-            ValueError: where the covariance is not positive definite.
+            ValueError: if the covariance is not positive definite.
         """
-        # smart=False: GTSAM's tests for simpler models have thresholds that near-singular information falls through.
+        # smart=False: GTSAM may otherwise mistake near-singular information for that of a simpler model.
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(self.root_information, False)
         return gtsam.BetweenFactorPose3(self.target, self.source, gtsam.Pose3(self.pose.mean), noise)
 
@@ -95,7 +95,7 @@ class Factor:
         """R (6, 6), upper triangular, with RᵀR = Σ⁻¹: from Σ = UUᵀ with U upper triangular, R = U⁻¹.
 
         Raises:
-            ValueError: where the covariance is not positive definite.
+            ValueError: if the covariance is not positive definite.
         """
         try:
             upper = np.linalg.cholesky(self.pose.covariance[::-1, ::-1])[::-1, ::-1]
@@ -113,13 +113,13 @@ class SpanningTree:
     factors: Sequence[Factor] = ()
     """All of them, in order of arrival."""
     tree: Sequence[Factor] = ()
-    """Those that connect."""
+    """Factors of the tree."""
     loops: Sequence[Factor] = ()
-    """The rest; factors that are not connected with the root are in neither."""
+    """The other factors; those not connected with the root are in neither."""
     reached: frozenset[int] = frozenset()
     """The frames of the tree, and the root."""
     last: int = 0
-    """Index among the kinds of the least preferred one that the tree needed."""
+    """Index of the least preferred kind in the tree."""
 
     @classmethod
     def of(cls, factors: Sequence[Factor], root: int) -> SpanningTree:
@@ -141,7 +141,7 @@ class SpanningTree:
         return cls(factors, tree, loops, reached, max(map(_preference, tree), default=0))
 
     def plus(self, factors: Sequence[Factor]) -> SpanningTree | None:
-        """Return the tree with more factors; None where they would have changed it."""
+        """Return the tree with more factors; None if a new tree is needed."""
         if len(self.tree) + len(self.loops) < len(self.factors):
             return None
         tree, loops, reached, last = list(self.tree), list(self.loops), set(self.reached), self.last
@@ -163,23 +163,23 @@ def _preference(factor: Factor) -> int:
 
 
 def walk(tree: Sequence[Factor], *starts: int) -> Iterator[tuple[int, int, Factor]]:
-    """Yield (frame, neighbour, factor) over factors that make no loop, outwards from frames, nearer frames first."""
+    """Yield (frame, neighbour, factor) of a forest, breadth-first from some frames."""
     factors: dict[int, list[Factor]] = {}
     for factor in tree:
         factors.setdefault(factor.target, []).append(factor)
         factors.setdefault(factor.source, []).append(factor)
-    waiting, reached = list(starts), set(starts)
-    for frame in waiting:
+    queue, reached = list(starts), set(starts)
+    for frame in queue:
         for factor in factors.get(frame, []):
             neighbour = factor.source if factor.target == frame else factor.target
             if neighbour not in reached:
                 reached.add(neighbour)
-                waiting.append(neighbour)
+                queue.append(neighbour)
                 yield frame, neighbour, factor
 
 
 def chain(tree: Sequence[Factor], root: int, guess: Mapping[int, Array]) -> dict[int, Array]:
-    """Return object_from_camera by frame: the guess, or else dead reckoning outwards from the root."""
+    """Return object_from_camera by frame: the guess, for other frames dead reckoning."""
     poses = {root: np.eye(4)}
     poses |= {frame: guess[frame] for factor in tree for frame in (factor.target, factor.source) if frame in guess}
     poses[root] = np.eye(4)
@@ -187,7 +187,7 @@ def chain(tree: Sequence[Factor], root: int, guess: Mapping[int, Array]) -> dict
 
 
 def extended(poses: Mapping[int, Array], tree: Sequence[Factor]) -> dict[int, Array]:
-    """Return object_from_camera by frame: the known ones, then those to which factors lead from them."""
+    """Return object_from_camera by frame: the given poses, and dead reckoning from them along a tree."""
     poses = dict(poses)
     left = [factor for factor in tree if factor.target not in poses or factor.source not in poses]
     known = [frame for factor in left for frame in (factor.target, factor.source) if frame in poses]
@@ -199,7 +199,7 @@ def extended(poses: Mapping[int, Array], tree: Sequence[Factor]) -> dict[int, Ar
 
 
 def anchored(guess: Mapping[int, Array], root: int) -> Mapping[int, Array]:
-    """Return the guess moved so that the root's pose is the identity; empty without the root."""
+    """Return a guess transformed so that the root's pose is the identity; empty without the root."""
     if root not in guess:
         return {}
     if np.array_equal(guess[root], np.eye(4)):
@@ -217,11 +217,11 @@ def inverse_right_jacobian(xi: Array) -> Array:
 
 
 def collapse_modes(posterior: Posterior, weights: Array | None = None) -> PoseGaussian:
-    """Return a posterior as one Gaussian: its own, or of separate modes the heaviest, widened by the others (eq. G4).
+    """Return a posterior as one Gaussian; separate modes are pooled at the heaviest (eq. G4).
 
     Args:
         posterior: with its modes.
-        weights: (m,) of the modes, as far as loops have decided; None: the posterior's own.
+        weights: (m,) of the modes, given loops; None: the posterior's own.
     """
     return pooled(posterior.modes, weights) if are_separate(posterior.modes) else posterior.pose
 
@@ -229,7 +229,7 @@ def collapse_modes(posterior: Posterior, weights: Array | None = None) -> PoseGa
 def dead_reckoning(graph: PoseGraph) -> dict[int, PoseGaussian]:
     """Return object_from_camera by frame number along the edges that first connect each frame with the root.
 
-    These are the poses that solutions have as `odometry`. Covariances are of first order.
+    The means are `Solution.odometry`. Covariances are of first order.
     """
     root = graph.root
     if root is None:

@@ -1,16 +1,16 @@
-"""What edges share, noise of their frames and of all views and the focal length: how it widens a solution.
+"""Covariances under errors that edges share: noise of their images, of all views, and of the focal length.
 
-Of an edge's covariance Σ a share ρ is its two images' own: pixel noise moves an image as a whole, alike in all its
+A fraction ρ of an edge's covariance Σ is due to its two images: pixel noise moves an image as a whole, alike in all its
 edges. Frame k then appears not at T_k but at T_k exp(η_k), with one η_k ~ N(0, Q_k) for all its edges, and edges are
 independent measurements of covariance (1 − ρ) Σ between these apparent poses. The optimum is the same, as one factor on
 all covariances moves nothing; relative covariances are those of method.md, eq. G9: a single edge keeps its covariance,
 several edges of a frame make it no smaller than the images allow, and along a chain the images' noise cancels.
 
-All views may also err alike: one camera sees one object from one height, and puts it too near, say. Every frame then
-appears at T_k exp(β), with one β ~ N(0, B) in camera coordinates (eq. G10). Every loop still closes, so that no graph
-observes β; it cancels between frames that see the same side of the object.
+All views may also have a common error: one camera sees one object from one height, and its distance may be biased.
+Every frame then appears at T_k exp(β), with one β ~ N(0, B) in camera coordinates (eq. G10). All loops still close, and
+β is not observable; it cancels between frames that see the same side of the object.
 
-A focal length that is not known exactly moves all edges together, and widens every motion by how it follows (eq. G14).
+The error of the focal length moves all edges together; each motion's covariance grows by its derivative (eq. G14).
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ class SharedCovariance:
     factors: Sequence[Factor]
     """All that take part."""
     share: float
-    """Share (0..1) of covariances that is the frames' own noise."""
+    """Fraction (0..1) of covariances that is noise of the images."""
     common: float = 0.0
-    """B, as a share of the harmonic mean of all edges' covariances."""
+    """B, as a fraction of the harmonic mean of all edges' covariances."""
     focal: FocalLength | None = None
-    """What is known of the focal length; None: it is taken for known."""
+    """Estimate of the focal length; None: exact."""
 
     def __call__(self, target: int, source: int) -> Array:
         """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
 
         Raises:
-            KeyError: where a frame was not solved.
+            KeyError: if a frame was not solved.
         """
         return self._widened(self.independent(target, source), target, source)
 
@@ -60,27 +60,32 @@ class SharedCovariance:
     @cached_property
     def _marginals(self) -> dict[int, Array]:
         root = self.independent.root
-        return {frame: self._widened(alone, root, frame) for frame, alone in self.independent.marginals().items()}
+        return {
+            frame: self._widened(independent, root, frame)
+            for frame, independent in self.independent.marginals().items()
+        }
 
-    def _widened(self, alone: Array, target: int, source: int) -> Array:
+    def _widened(self, independent: Array, target: int, source: int) -> Array:
         if target == source:
-            return alone
+            return independent
         source_from_target = se3.inverse(self.independent.trajectory[source]) @ self.independent.trajectory[target]
-        of_target = se3.inverse_covariance(source_from_target, self._own.get(target, np.zeros((6, 6))))
-        covariance = (1.0 - self.share) * alone + self._own.get(source, np.zeros((6, 6))) + of_target  # eq. G9
+        of_target = se3.inverse_covariance(source_from_target, self._image_noise.get(target, np.zeros((6, 6))))
+        covariance = (
+            (1.0 - self.share) * independent + self._image_noise.get(source, np.zeros((6, 6))) + of_target
+        )  # eq. G9
         if self.focal is not None:
-            still = np.zeros(6)  # of frames that came later
-            apart = self.focal.by_focal.get(source, still) - self.focal.by_focal.get(target, still)
+            zero = np.zeros(6)  # of frames added since
+            apart = self.focal.by_focal.get(source, zero) - self.focal.by_focal.get(target, zero)
             moved = self.focal.sigma * se3.adjoint(se3.inverse(self.independent.trajectory[source])) @ apart
             covariance = covariance + np.outer(moved, moved)  # eq. G14
         if self.common:
             left = np.eye(6) - se3.adjoint(source_from_target)
-            covariance = covariance + left @ self._alike @ left.T  # eq. G10
+            covariance = covariance + left @ self._common_covariance @ left.T  # eq. G10
         return 0.5 * (covariance + covariance.T)
 
     @cached_property
-    def _own(self) -> dict[int, Array]:
-        """Covariances Q (6, 6) of the frames' own noise: ρ/2 of the harmonic mean of each frame's edges."""
+    def _image_noise(self) -> dict[int, Array]:
+        """Covariances Q_k (6, 6) of the noise of images: ρ/2 of the harmonic mean of each frame's edges."""
         informations: dict[int, list[Array]] = {}
         for factor in self.factors:
             information = factor.root_information.T @ factor.root_information
@@ -93,18 +98,18 @@ class SharedCovariance:
         }
 
     @cached_property
-    def _alike(self) -> Array:
+    def _common_covariance(self) -> Array:
         """B (6, 6)."""
         informations = [factor.root_information.T @ factor.root_information for factor in self.factors]
         return np.asarray(self.common * np.linalg.inv(np.mean(informations, axis=0)), dtype=np.float64)
 
 
 def shared_noise(graph: PoseGraph, solution: Solution) -> float:
-    """Estimate the share ρ of edges' covariances that is their images' own from how well loops close (eq. G11).
+    """Estimate the fraction ρ of edges' covariances that is noise of their images from the loops' errors (eq. G11).
 
-    The images' noise cancels around a loop, so that 6 l conditions of l loops are met with (1 − ρ) of the squared
-    distance of independent edges. The estimate errs towards independence by one standard error; without loops, and
-    where they close no better than independent edges, it is 0.
+    The images' noise cancels around a loop, so that the squared distance over the 6 l conditions of l loops is (1 − ρ)
+    of that of independent edges. The estimate is one standard error towards independence, and 0 without loops or if
+    they close no better than independent edges.
 
     Args:
         graph: the edges.

@@ -1,4 +1,4 @@
-"""From a pose graph to its solution, in one batch or as the graph grows."""
+"""The solution of a pose graph, in one batch or incrementally."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, 
 from modeler.graph.shared import SharedCovariance
 from modeler.types import Array, Edge, FocalLength, Solution
 
-_MAX_ROUNDS = 5  # in which an axis may change which loops take part
+_MAX_ROUNDS = 5  # of alternating between the axis and the inliers among the loops
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What a solution was computed from; by identity of edges and factors it is known what stays."""
+    """Intermediate results of a solution; edges and factors are compared by identity to find what changed."""
 
     root: int | None = None
     factors: Mapping[Edge, Factor] = field(default_factory=dict)
@@ -30,37 +30,37 @@ class _State:
     spanning: SpanningTree = field(default_factory=SpanningTree)
     """Their tree and loops."""
     decided: Mapping[Edge, Factor] = field(default_factory=dict)
-    """Edges of several modes on loops, by the modes that the loops select."""
+    """Multimodal edges on loops, with the modes that the loops select."""
     weights: Mapping[Edge, Array] = field(default_factory=dict)
-    """Weights that the loops leave to their modes."""
+    """Weights of their modes, given the loops."""
     inlier: tuple[bool, ...] = ()
-    """Which loops take part."""
+    """Whether each loop takes part."""
     solver: IncrementalSolver | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Smoother:
-    """Solves a growing graph incrementally. A value: `plus` makes a new one.
+    """Incremental solver of a growing graph. Immutable: `plus` returns a new one.
 
-    A frame with one edge is placed by it and moves no other; an edge that closes a loop is handed to iSAM2. Outlier
-    loops and modes are chosen again only where the earlier choice no longer stands. Each solution is that of the whole
-    graph, within the tolerance of the optimisation, however it grew.
+    A frame with one edge is placed by it and moves no other; edges that close loops are passed to iSAM2. Outlier loops
+    and modes are selected again only if the earlier selection is no longer consistent. Each solution is that of the
+    whole graph, within the tolerance of the optimisation, however it grew.
     """
 
     outlier_distance: float = 14.2
     """Mahalanobis distance of a loop edge from the solution beyond which it is an outlier. The default is three times
     the 99.9 % radius of six dimensions: pairwise covariances may be optimistic."""
     shared: float = 0.0
-    """Share (0..1) of edges' covariances that is their images' own noise, the same in all edges of an image; see
-    `shared_noise`, which estimates it."""
+    """Fraction (0..1) of edges' covariances that is noise of their images, the same in all edges of an image, as
+    `shared_noise` estimates it."""
     common: float = 0.0
-    """Covariance of the error common to all views, as a share of an edge's; see `SharedCovariance`."""
+    """Covariance of the error common to all views, as a fraction of an edge's; see `SharedCovariance`."""
     axis: CommonAxis | None = None
-    """The turntable, where there is one; not together with shared noise. Each solution is then a batch solution."""
+    """The turntable, if any; not together with shared noise. Each solution is then a batch solution."""
     focal: FocalLength | None = None
-    """What is known of the focal length, by which covariances are widened; None: it is taken for known."""
+    """Estimate of the focal length, whose uncertainty is added to the covariances; None: exact."""
     graph: PoseGraph = field(default_factory=PoseGraph)
-    """What is solved."""
+    """The graph."""
     solution: Solution = field(default_factory=Solution)
     """Its solution."""
     state: _State = field(default_factory=_State, repr=False)
@@ -69,15 +69,16 @@ class Smoother:
         """Return the smoother with more edges.
 
         Raises:
-            ValueError: where an accepted edge's covariance is not positive definite.
+            ValueError: if an accepted edge's covariance is not positive definite.
         """
         return self.to(self.graph.plus(edges))
 
     def to(self, graph: PoseGraph) -> Smoother:
-        """Return the smoother of a graph, with as little work as its new edges ask for.
+        """Return the smoother of a graph; only what its new edges change is computed.
 
         Raises:
-            ValueError: where an accepted edge's covariance is not positive definite, or with an axis and shared noise.
+            ValueError: if an accepted edge's covariance is not positive definite, or both axis and shared noise are
+                given.
         """
         if self.axis is not None and (self.shared or self.common):
             raise ValueError("an axis and shared noise cannot be separated; give one of them")
@@ -95,19 +96,19 @@ class Smoother:
             weights, decided = self._decided(tree, loops, root, grew=grew)
         if decided:
             tree, loops = ([decided.get(factor.edge, factor) for factor in some] for some in (tree, loops))
-        jumped = _mode_changed(decided, self.state)
-        guess = {} if jumped else anchored(self.solution.trajectory, root)
-        start = extended(guess, tree[known:]) if grew and not jumped else chain(tree, root, guess)
+        mode_changed = _mode_changed(decided, self.state)
+        guess = {} if mode_changed else anchored(self.solution.trajectory, root)
+        start = extended(guess, tree[known:]) if grew and not mode_changed else chain(tree, root, guess)
         inlier, solver = self.state.inlier, self.state.solver
         trajectory: Mapping[int, Array] = start if grew or loops else chain(tree, root, {})
         if closes:  # otherwise each new frame has one edge
-            before = ((), None) if jumped or not grew else (inlier, solver)
+            before = ((), None) if mode_changed or not grew else (inlier, solver)
             trajectory, inlier, solver = solve_loops(
                 tree, loops, start, root=root, threshold=self._threshold, before=before
             )
         state = _State(root, factors, spanning, decided, weights, inlier, solver)
         if grew and decided and inlier.count(False) > self.state.inlier.count(False):
-            # A false loop may have settled modes: all are selected anew.
+            # A false loop may have decided modes: all are selected anew.
             again = replace(self, state=_State()).to(graph)
             if len(again.solution.outliers) <= inlier.count(False):
                 return again
@@ -130,10 +131,10 @@ class Smoother:
         """Return the solution without its odometry.
 
         Args:
-            state: what it was computed from.
+            state: intermediate results.
             factors: tree and loops, with the modes that the loops select.
             trajectory: object_from_camera (4, 4) by frame number, without an axis.
-            grew: whether the graph grew from that of the solution before.
+            grew: whether the graph is an extension of the previous solution's.
         """
         root, (tree, loops), inlier = state.root or 0, factors, state.inlier
         with_axis: AxisSolution | None = None
@@ -157,7 +158,7 @@ class Smoother:
         )
 
     def _factors(self, graph: PoseGraph) -> dict[Edge, Factor]:
-        """Return every accepted edge of a graph as one Gaussian, those of the solved graph's as they are."""
+        """Return every accepted edge of a graph as one Gaussian, reusing factors of the solved graph."""
         known, count = self.state.factors, len(self.graph.edges)
         if known and graph.edges[:count] == self.graph.edges:
             new = [edge for edge in graph.edges[count:] if edge.accepted]
@@ -183,7 +184,7 @@ class Smoother:
         root: int,
         grew: bool,
     ) -> RelativeCovariance | SharedCovariance:
-        """Return the covariances of a solution; where the graph grew, from those before."""
+        """Return the covariances of a solution, updated from the previous ones if the graph grew."""
         before = self.solution.relative_covariance
         if isinstance(before, SharedCovariance):
             before = before.independent
@@ -203,7 +204,7 @@ class Smoother:
         trajectory: Mapping[int, Array],
         state: _State,
     ) -> tuple[tuple[bool, ...], AxisSolution | None]:
-        """Return which loops take part where steps share an axis, and the solution; None: they share none."""
+        """Return which loops are inliers, and the solution with a common axis; None if there is none."""
         inlier, with_axis = state.inlier, None
         for _ in range(_MAX_ROUNDS):
             found = axis.solve([*tree, *selected(loops, inlier)], trajectory, state.root or 0)
@@ -218,7 +219,7 @@ class Smoother:
     def _decided(
         self, tree: Sequence[Factor], loops: Sequence[Factor], root: int, *, grew: bool
     ) -> tuple[dict[Edge, Array], dict[Edge, Factor]]:
-        """Return the weights that loops leave to the modes of edges, and these edges as one Gaussian each."""
+        """Return the weights of the modes of edges given the loops, and these edges as one Gaussian each."""
         before = self.state.weights if grew else {}
         weights = select_modes(tree, loops, root=root, threshold=self._threshold, before=before)
         decided = {
@@ -231,12 +232,12 @@ class Smoother:
 
 
 def _weights(factor: Factor, decided: Mapping[Edge, Array]) -> Array:
-    """Return the weights of a factor's modes: what loops leave, or else the posterior's own."""
+    """Return the weights of a factor's modes: those given the loops, or else the posterior's own."""
     return decided.get(factor.edge, np.array([mode.weight for mode in factor.modes]))
 
 
 def _mode_changed(decided: Mapping[Edge, Factor], state: _State) -> bool:
-    """Return whether another mode was selected than that of the poses so far."""
+    """Return whether the selected mode of some edge has changed."""
     before = ((factor, state.decided.get(edge) or state.factors.get(edge)) for edge, factor in decided.items())
     return any(old is not None and not np.array_equal(factor.pose.mean, old.pose.mean) for factor, old in before)
 
@@ -253,20 +254,20 @@ def solve(
 ) -> Solution:
     """Optimise the poses of all frames that accepted edges connect with the first.
 
-    Edges that first connect a frame, odometry before closures, cannot be contradicted and are trusted. The others close
-    loops; outliers are left out, see `optimise`. Of an edge with several modes the loops select one, see `modes`. A
-    growing graph is solved faster by `Smoother`.
+    Edges that first connect a frame, odometry before closures, form a tree and are trusted. The others close loops;
+    outliers are left out, see `optimise`. Loops select among the modes of multimodal edges, see `modes`. A growing
+    graph is solved faster by `Smoother`.
 
     Args:
         graph: the edges.
-        guess: object_from_camera (4, 4) by frame number, to start from; frames without one start on the chain.
+        guess: initial object_from_camera (4, 4) by frame number; for other frames, dead reckoning.
         outlier_distance: see `Smoother`.
         shared: see `Smoother`.
         common: see `Smoother`.
-        axis: the turntable, where there is one.
+        axis: the turntable, if any.
         focal: see `Smoother`; of a solution of the same graph.
 
     Raises:
-        ValueError: where an accepted edge's covariance is not positive definite.
+        ValueError: if an accepted edge's covariance is not positive definite.
     """
     return Smoother(outlier_distance, shared, common, axis, focal, solution=Solution(guess)).to(graph).solution

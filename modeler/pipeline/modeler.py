@@ -12,7 +12,7 @@ import numpy as np
 from modeler.beside import ahead
 from modeler.closure import Closer
 from modeler.fusion import Fuser, Preview, conditional_covariances, widened
-from modeler.graph import CommonAxis, MovingGraph, located, shared_noise
+from modeler.graph import CommonAxis, MovingGraph, estimate_focal_length, shared_noise
 from modeler.pipeline.joining import LEAST_JOINS, Joiner, Segment
 from modeler.pipeline.pairs import Prepared, anywhere, prepare, register
 from modeler.pipeline.state import State
@@ -351,14 +351,14 @@ class Run:
         """
         at, sensor = 0.0, self.modeler.sensor
 
-        def told_at(log_factor: float) -> FocalLength:
+        def estimate_at(log_factor: float) -> FocalLength:
             nonlocal state, at
             if log_factor != at:
                 moved = state.under(log_factor - at, sensor)
                 state, at = moved.again(self.modeler.tracker(moved).spans), log_factor
             return MovingGraph.of(state.graph, state.solution).estimate(sigma, -at)
 
-        focal = located(told_at, rounds=3, enough=1.0, reach=_FOCAL_REACH * sigma)
+        focal = estimate_focal_length(estimate_at, rounds=3, tolerance=1.0, reach=_FOCAL_REACH * sigma)
         return (state if focal.log_factor == at else state.under(focal.log_factor - at, sensor)), focal
 
     def _step(self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge]) -> Step:
