@@ -101,7 +101,7 @@ def register(
     for name, frame in zip(("source", "target"), frames, strict=True):
         prepared = modeler.prepare(frame, scene)
         if prepared.view is None:
-            raise InputError(f"the {name} image has {prepared.flaw.label}: {prepared.flaw.advice}")
+            raise InputError(f"the {name} image has {prepared.failure.label}: {prepared.failure.advice}")
         views.append(prepared.view)
     return modeler.register(*views, prior=prior)
 

@@ -61,5 +61,5 @@ def test_pairs_are_registered_again_within_limits_that_hold_their_motion(
     solution = Solution({target.index: np.eye(4), source.index: poses[0] @ se3.inverse(poses[int(turn_deg)])})
     state = State(smoother=Smoother(solution=solution), views={target.index: target, source.index: source})
     tracker = Tracker(state, prior, Closer(), Sensor(), Modeler().register)
-    found = tracker._holding(prior.relaxed(1.5), prior.unlimited(), source.index, target.index)
+    found = tracker._applicable(prior.relaxed(1.5), prior.unlimited(), source.index, target.index)
     assert isinstance(found, GeneralPrior if kept else AnyMotion)

@@ -531,4 +531,4 @@ def test_only_frames_that_a_view_followed_soon_are_tried_again_newest_first() ->
     lost = {k: Prepared(FRAMES[k], all_object, None) for k in (1, 4, 5)}
     views = {k: tabletop.view(BOX, POSES[k], k) for k in (0, 7)}
     state = State(views=views, lost=lost, places={k: k for k in range(9)})
-    assert list(state.overdue()) == [(5, 7), (4, 7)]
+    assert list(state.retries()) == [(5, 7), (4, 7)]

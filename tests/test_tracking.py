@@ -13,7 +13,7 @@ from test_pipeline import FRAMES, Oracle, modeler, run, trajectory_error
 
 from modeler import se3
 from modeler.closure import Closer
-from modeler.pipeline import Modeler, glancing
+from modeler.pipeline import Modeler, quick_registrar
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker, preferred
 from modeler.rays import Sensor
@@ -96,7 +96,7 @@ def found(outcome: Outcome, wider_deg: float, gain_nats: float, overlap: float =
 
     state = State(views={0: view(0)}, places={0: 0, 1: 1})
     tracker = Tracker(state, Limits(), Closer(), Sensor(), register)
-    (posterior,) = result(tracker.locate(view(1), 0, again=False))
+    (posterior,) = result(tracker.locate(view(1), 0, retry=False))
     assert posterior.usable
     assert posterior.seconds == (1.0 if outcome is Outcome.CONVERGED else 2.0)
     sense = np.sign((se3.inverse(ABOUT_OBJECT) @ posterior.pose.mean @ ABOUT_OBJECT)[0, 2] * turned(1.0)[0, 2])
@@ -150,7 +150,7 @@ def test_limits_that_are_assumed_hold_while_something_within_them_matches(
 
     state = State(views={0: view(0)}, places={0: 0, 1: 1})
     tracker = Tracker(state, Limits(assumed=assumed), Closer(), Sensor(), register)
-    (posterior,) = result(tracker.locate(view(1), 0, again=False))
+    (posterior,) = result(tracker.locate(view(1), 0, retry=False))
     assert posterior.usable == placed
     assert asked == [LIMIT_DEG, 2.0 * LIMIT_DEG, *([180.0] if assumed else [])]
     assert posterior.seconds == len(asked)
@@ -219,11 +219,11 @@ def outcomes(steps: list[Step]) -> list[tuple[int, bool, Reason | None]]:
 
 
 def test_after_one_frame_searched_for_in_vain_others_that_are_hidden_are_only_glanced_at() -> None:
-    registrar, glance = Oracle(blind=HIDDEN), Oracle(blind=HIDDEN)
-    steps = run(registrar=registrar, glance=glance)
+    registrar, quick = Oracle(blind=HIDDEN), Oracle(blind=HIDDEN)
+    steps = run(registrar=registrar, quick=quick)
     # At the end they are tried among each other: they might be a segment of their own.
     assert {source for source, target in registrar.asked if target not in HIDDEN} & HIDDEN == {2}
-    assert {source for source, _ in glance.asked} >= {3, 4, 5}
+    assert {source for source, _ in quick.asked} >= {3, 4, 5}
     whole = run(registrar=Oracle(blind=HIDDEN))
     assert outcomes(steps) == outcomes(whole)
     assert sorted(steps[-1].solution.trajectory) == [0, 1, 6, 7, 8]
@@ -234,7 +234,7 @@ def test_after_one_frame_searched_for_in_vain_others_that_are_hidden_are_only_gl
 def test_a_frame_hidden_now_and_then_is_searched_for_at_the_previous_view_alone() -> None:
     hidden = frozenset({2, 4, 6})
     registrar = Oracle(blind=hidden)
-    steps = run(registrar=registrar, glance=Oracle(blind=hidden))
+    steps = run(registrar=registrar, quick=Oracle(blind=hidden))
     assert [target for source, target in registrar.asked if source == 6] == [5]
     assert sorted(steps[-1].solution.trajectory) == [0, 1, 3, 5, 7, 8]
 
@@ -242,7 +242,7 @@ def test_a_frame_hidden_now_and_then_is_searched_for_at_the_previous_view_alone(
 def test_a_glance_never_joins_frames_itself() -> None:
     """What it takes for surface is searched for as ever: false hopes change nothing but the cost."""
     registrar, hopeful = Oracle(blind=HIDDEN), Oracle(noise=100.0)
-    steps = run(registrar=registrar, glance=hopeful)
+    steps = run(registrar=registrar, quick=hopeful)
     whole = Oracle(blind=HIDDEN)
     assert outcomes(steps) == outcomes(run(registrar=whole))
     assert registrar.asked == whole.asked
@@ -252,24 +252,24 @@ def test_a_glance_never_joins_frames_itself() -> None:
 def test_lost_frames_are_found_from_far_round_by_way_of_glances() -> None:
     early = frozenset((source, target) for source in (3, 4, 5, 6) for target in range(source) if target < 3)
     parts = Oracle(apart=early, reach=9.0), Oracle(apart=early, reach=9.0)
-    last = run(registrar=parts[0], glance=parts[1])[-1]
+    last = run(registrar=parts[0], quick=parts[1])[-1]
     assert parts[1].asked
     assert set(last.solution.trajectory) == set(range(9))
     assert trajectory_error(last) < 1e-6
 
 
 def test_a_search_is_announced_for_lost_frames_and_no_others() -> None:
-    maker = modeler(registrar=Oracle(blind=HIDDEN), glance=Oracle(blind=HIDDEN))
+    maker = modeler(registrar=Oracle(blind=HIDDEN), quick=Oracle(blind=HIDDEN))
     assert {event.frame for event in maker.run(FRAMES, Scene()) if isinstance(event, Searching)} == HIDDEN
     assert not any(isinstance(event, Searching) for event in modeler().run(FRAMES, Scene()))
 
 
 def test_a_glance_is_a_smaller_search_of_the_same_likelihood() -> None:
     registrar = VisibilityRegistrar(likelihood=VisibilityLikelihood(points=500), min_overlap=0.3)
-    glance = glancing(registrar)
-    assert isinstance(glance, VisibilityRegistrar)
-    assert (glance.likelihood.points, glance.min_overlap) == (500, 0.3)
-    assert glance.search.max_starts < registrar.search.max_starts
-    assert glance.sampler.max_draws < registrar.sampler.max_draws
-    assert glance.max_modes == 1
-    assert glancing(IcpRegistrar()) is None
+    quick = quick_registrar(registrar)
+    assert isinstance(quick, VisibilityRegistrar)
+    assert (quick.likelihood.points, quick.min_overlap) == (500, 0.3)
+    assert quick.search.max_starts < registrar.search.max_starts
+    assert quick.sampler.max_draws < registrar.sampler.max_draws
+    assert quick.max_modes == 1
+    assert quick_registrar(IcpRegistrar()) is None

@@ -110,8 +110,8 @@ def test_a_brick_may_lie_either_way_round_and_that_is_said() -> None:
     quarter = se3.exp(np.array([0.0, 0.0, 0.5 * np.pi, 0.0, 0.0, 0.0]))
     ways = [Alignment(pose) for pose in (quarter, np.eye(4), halfway)]
     parts = Segment(views, Solution(one), ()), Segment(moved, Solution(other), ())
-    found = Joiner().weighed(*parts, ways)
-    assert [Joiner().stands(*parts, way) for way in found] == [True, True, False]
+    found = Joiner().weighted(*parts, ways)
+    assert [Joiner().is_consistent(*parts, way) for way in found] == [True, True, False]
     assert 0.05 < found[0].share < 0.95
     assert found[1].share > 0.05
     assert found[2].share < 1e-6

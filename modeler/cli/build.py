@@ -105,9 +105,9 @@ class Build:
         with alone(self.out):
             before = RunFolder(self.out).changed_versions(meta) if self.resume else ()
             folder = RunFolder.open(self.out, overwrite=self.overwrite, resume=self.resume)
-            glance = None if modeler.glance is None else Remembered(modeler.glance, folder.pairs, meta.versions)
+            quick = None if modeler.quick is None else Remembered(modeler.quick, folder.pairs, meta.versions)
             registrar = Remembered(modeler.registrar, folder.pairs, meta.versions)
-            modeler = replace(modeler, registrar=registrar, glance=glance)
+            modeler = replace(modeler, registrar=registrar, quick=quick)
             if before:
                 say(f"the run was begun with {', '.join(before)}: its pairs are registered again")
             if remark:

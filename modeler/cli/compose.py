@@ -17,7 +17,7 @@ from modeler.cli.options import Method, MethodOptions, ObjectOptions, PriorOptio
 from modeler.closure import Closer
 from modeler.fusion import Fuser
 from modeler.kernels import gpu
-from modeler.pipeline import Modeler, glancing
+from modeler.pipeline import Modeler, quick_registrar
 from modeler.priors import (
     AutoPrior,
     AxesPrior,
@@ -78,7 +78,7 @@ def modeler(
         sensor=Sensor(sigma_focal=NOMINAL_FOCAL) if noise is None else Sensor(*noise),
         prior=chosen_prior(prior_options, sequence),
         registrar=chosen,
-        glance=glancing(chosen),
+        quick=quick_registrar(chosen),
         closer=Closer(),
         fuser=Fuser(),
         seed=method.seed,

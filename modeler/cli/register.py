@@ -50,8 +50,8 @@ class Register:
         for index in (self.source, self.target):
             prepared = modeler.prepare(sequence.frame(index), scene)
             if prepared.view is None:
-                flaw = prepared.flaw
-                raise InputError(f"{self.sequence}: frame {index} has {flaw.label}. {outcome_advice(flaw)}")
+                failure = prepared.failure
+                raise InputError(f"{self.sequence}: frame {index} has {failure.label}. {outcome_advice(failure)}")
             views.append(prepared.view)
         posterior = modeler.register(*views).widened(modeler.sensor.sigma_focal)
         what_to_do = outcome_advice(posterior.outcome, modeler.prior, posterior)

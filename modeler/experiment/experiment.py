@@ -11,7 +11,7 @@ import numpy as np
 
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.experiment.trials import Trial
-from modeler.pipeline import anywhere, prepare, register
+from modeler.pipeline import prepare, register, retry_unlimited
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.types import (
@@ -182,7 +182,7 @@ class Experiment:
         """Return a frame prepared for registration, as sparse as the experiment has it, or why it cannot be."""
         prepared = prepare(frame, scene, self.segmenter, sensor)
         if prepared.view is None:
-            return prepared.flaw
+            return prepared.failure
         if self.points is None:
             return prepared.view
         rng = np.random.default_rng([self.seed, frame.index, _SPARSE_STREAM])
@@ -212,7 +212,7 @@ class Experiment:
             return register(method, source, target, known, seed=self.seed)
 
         within = attempt(density)
-        return anywhere(within, prior, lambda unlimited: attempt(unlimited.between(source, target)))
+        return retry_unlimited(within, prior, lambda unlimited: attempt(unlimited.between(source, target)))
 
 
 def _blank(sequence: str, method: str, pair: Pair, truth: Array | None) -> Trial:

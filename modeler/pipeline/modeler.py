@@ -1,4 +1,4 @@
-"""The loop: frames in, events out. Estimation does not know that it is watched."""
+"""The pipeline: frames in, events out. Visualisation only consumes events."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from modeler.beside import ahead
 from modeler.closure import Closer
 from modeler.fusion import Fuser, Preview, conditional_covariances, widened
 from modeler.graph import CommonAxis, MovingGraph, estimate_focal_length, shared_noise
-from modeler.pipeline.joining import LEAST_JOINS, Joiner, Segment
-from modeler.pipeline.pairs import Prepared, anywhere, prepare, register
+from modeler.pipeline.joining import MIN_JOINS, Joiner, Segment
+from modeler.pipeline.pairs import Prepared, prepare, register, retry_unlimited
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
 from modeler.priors import GeneralPrior
@@ -41,8 +41,8 @@ from modeler.types import (
     Step,
 )
 
-_FOCAL_REACH = 5.0  # prior standard deviations: nominal focal lengths of captures were off by up to 4.5
-_LEAST_SEGMENT = 3  # frames that fit each other: two may do so by chance
+_FOCAL_REACH = 5.0  # prior standard deviations: nominal focal lengths of captures are off by up to 4.5
+_MIN_SEGMENT = 3  # frames that fit each other: two may do so by chance
 
 T = TypeVar("T")
 
@@ -50,44 +50,45 @@ T = TypeVar("T")
 @final
 @dataclass(frozen=True)
 class Modeler:
-    """Builds the model of an object while it is being turned before the camera.
+    """Builds the model of an object while it turns in front of the camera.
 
-    Each frame is registered against the previous accepted view and against earlier views to which the object seems to
-    have come back (paper, section VI-D); the posteriors become edges of a pose graph, the solved poses fuse the views.
+    Each frame is registered against the previous accepted view, and against earlier views to which the object seems to
+    have returned (paper, section VI-D). The posteriors become edges of a pose graph, with whose optimised poses the
+    views are fused.
     """
 
     segmenter: Segmenter = field(default_factory=Segmenter)
     """Finds the object."""
     sensor: Sensor = field(default_factory=Sensor)
-    """Noise of the camera."""
+    """Noise model of the camera."""
     prior: AbstractPrior = field(default_factory=GeneralPrior)
-    """What is known of motions before the images are compared."""
+    """Prior on the motion between two frames."""
     registrar: AbstractRegistrar = field(default_factory=VisibilityRegistrar)
     """Registers two views."""
     closer: Closer = field(default_factory=Closer)
-    """Chooses the pairs and judges the results."""
+    """Selects pairs to register and accepts or rejects the results."""
     fuser: Fuser = field(default_factory=Fuser)
-    """Makes the model."""
+    """Fuses views into a mesh."""
     common_noise: float = 0.1
-    """Covariance of the error that all views of a run share, as a share of an edge's. No loop observes it: over many
-    rendered runs, whose truth is known, the covariances of poses come out no smaller than they may be with this."""
-    glance: AbstractRegistrar | None = None
-    """A cheap registration of frames in which the object is probably hidden: a search follows only where they
-    match (see `glancing`). None: every lost frame is searched for."""
+    """Covariance of the error common to all views of a run, as a fraction of an edge's. Loops do not observe it; with
+    this value, covariances of poses are calibrated over many rendered runs, whose ground truth is known."""
+    quick: AbstractRegistrar | None = None
+    """A cheap registrar for frames in which the object is probably hidden: the full search follows only if it finds a
+    match (see `quick_registrar`). None: full searches only."""
     seed: int = 0
-    """Each pair draws from a generator of its own, made from this and the two frame numbers."""
+    """Each pair has its own random generator, seeded with this and the two frame numbers."""
 
     def run(self, frames: Iterable[Frame], scene: Scene) -> Iterator[Event]:
-        """Build a model and yield what happens: for each frame a `Step`, the last of which has the final model.
+        """Build a model and yield events: for each frame a `Step`, the last of which has the final model.
 
-        To skip or cut short the refinement, go through the phases of `start(scene)` instead.
+        To skip or shorten the refinement, iterate over the phases of `start(scene)` instead.
 
         Args:
             frames: in order of time; read one ahead, because the last frame is always compared with the first.
-            scene: what the segmenter learnt from the sequence.
+            scene: as the segmenter estimated it from the sequence.
 
         Raises:
-            InputError: where two frames have the same number.
+            InputError: if two frames have the same number.
         """
         run = self.start(scene)
         yield from run.track(frames)
@@ -110,37 +111,37 @@ class Modeler:
         Args:
             source: one view.
             target: another.
-            prior: what is known of the motion; None: the modeler's own, and any motion where its limits are assumed and
-                nothing within them matches, or the images contradict what does.
+            prior: of the motion. None: the modeler's own; if its limits are defaults, then any motion if nothing within
+                them matches, or the images contradict the match.
 
         Raises:
-            InputError: where the views lack what the prior needs.
+            InputError: if the views lack what the prior needs.
         """
         attempt = partial(self._register, self.registrar, source, target)
         if prior is not None:
             return attempt(prior)
-        return anywhere(attempt(self.prior), self.prior, attempt)
+        return retry_unlimited(attempt(self.prior), self.prior, attempt)
 
     def suggest(
         self, known: Step, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None
     ) -> Suggestions:
-        """Return what to do next: the view, turn or poke that tells most of poses and surface.
+        """Return the next actions (view, turn or poke), ranked by information gain on poses and surface.
 
         Args:
             known: the newest step of a run.
-            candidates: what can be done; None: turns either way, pokes, laying the object on its side.
-            goal: what is good enough; None: every pose known to 1°, 95 % of what can be seen was seen.
+            candidates: possible actions; None: turns either way, pokes, laying the object on its side.
+            goal: when to stop; None: every pose known to 1°, 95 % of the visible surface seen.
 
         Raises:
-            InputError: where no view has a pose yet.
+            InputError: if no view has a pose yet.
         """
         return suggest(self.belief(known.views, known.solution, known.edges_so_far), candidates, goal)
 
     def belief(self, views: Mapping[int, RayImage], solution: Solution, edges: Sequence[Edge]) -> Belief:
-        """Return what is known after some views, and what further ones would go through.
+        """Return the belief about poses and surface after some views, with these components.
 
         Raises:
-            InputError: where no view has a pose.
+            InputError: if no view has a pose.
         """
 
         def ready(view: RayImage) -> RayImage:
@@ -151,12 +152,12 @@ class Modeler:
         return Belief.of(views, solution, edges, prior, closer=self.closer, likelihood=likelihood, ready=ready)
 
     def tracker(self, state: State) -> Tracker:
-        """Return what registers the views of a run with these components."""
-        glance = None if self.glance is None else partial(self._register, self.glance)
-        return Tracker(state, self.prior, self.closer, self.sensor, self.register, glance)
+        """Return the tracker of a run in some state, with these components."""
+        quick_register = None if self.quick is None else partial(self._register, self.quick)
+        return Tracker(state, self.prior, self.closer, self.sensor, self.register, quick_register)
 
     def joiner(self, tracker: Tracker) -> Joiner:
-        """Return what joins segments of a run."""
+        """Return the joiner of segments of a run, with these components."""
         return Joiner(self.registrar, tracker.ready, seed=self.seed)
 
     def _register(
@@ -168,33 +169,32 @@ class Modeler:
 @final
 @dataclass(eq=False)
 class Run:
-    """One run of the loop and the only owner of its state: five phases in order, each a stream of events.
+    """One run and the only owner of its state: five phases in order, each a stream of events.
 
-    A consumer in a hurry omits `revisit`, `rejoin` or `refine`, or stops consuming one of them: `finish` takes what is
-    there.
+    To save time, `revisit`, `rejoin` and `refine` may be omitted or stopped at any event; `finish` uses what is there.
     """
 
     modeler: Modeler
     """The components."""
     scene: Scene
-    """What the segmenter learnt from the sequence."""
+    """As the segmenter estimated it from the sequence."""
     state: State = field(default_factory=State)
-    """What is known so far."""
+    """The state so far."""
 
     def __post_init__(self) -> None:
-        """Begin without a model."""
+        """Start with an empty preview."""
         self._preview = Preview(self.modeler.fuser)
 
     def track(self, frames: Iterable[Frame], *, live: bool = False) -> Iterator[Step | Searching]:
-        """Place each frame among the views before it. A frame that cannot be placed is reported and left out.
+        """Register each frame against earlier views. A frame that cannot be placed is reported and left out.
 
         Args:
             frames: in order of time.
-            live: each frame is placed before the next is read, which may take as long as somebody needs to turn the
-                object. Otherwise the next is prepared meanwhile, and the last one is always compared with the first.
+            live: process each frame before reading the next one, which may only come once somebody has turned the
+                object. Otherwise the next one is prepared meanwhile, and the last is always compared with the first.
 
         Raises:
-            InputError: where two frames have the same number.
+            InputError: if two frames have the same number.
         """
         with ahead(partial(self.modeler.prepare, scene=self.scene)) as preparing:
             coming = map(preparing, frames)
@@ -204,35 +204,35 @@ class Run:
                 yield from self._place(found, self.state.latest, last=last)
 
     def revisit(self) -> Iterator[Step | Searching]:
-        """Register lost frames again, newest first, with the views that followed them; yield steps of those placed."""
+        """Retry lost frames, newest first, against the views that followed them; yield steps of those placed."""
         tried: set[tuple[int, int]] = set()
-        while waiting := [pair for pair in self.state.overdue() if pair not in tried]:
-            tried.add(waiting[0])
-            frame, neighbour = waiting[0]
+        while pairs := [pair for pair in self.state.retries() if pair not in tried]:
+            tried.add(pairs[0])
+            frame, neighbour = pairs[0]
             yield Searching(frame)
             lost = self.state.lost[frame]
             assert lost.view is not None
             view = self.modeler.tracker(self.state).ready(lost.view)
-            yield from self._place(replace(lost, view=view), neighbour, again=True)
+            yield from self._place(replace(lost, view=view), neighbour, retry=True)
 
     def rejoin(self) -> Iterator[Step | Searching]:
-        """Build segments of lost frames that fit each other, and join them with the rest; yield steps of their frames.
+        """Build segments of lost frames and join them with the rest; yield steps of their frames.
 
-        Where the object was put down otherwise, nothing that is known of its motion holds from the frames before to
-        those after, and all of those are lost; among themselves they are as good as any.
+        If the object was laid down differently or regrasped, the motion prior does not hold between the frames before
+        and after, and all frames after are lost; among these it holds.
         """
         tried: set[int] = set()
-        while stretches := [some for some in self.state.stretches() if len({*some} - tried) >= _LEAST_SEGMENT]:
-            frames = [frame for frame in max(stretches, key=len) if frame not in tried]
+        while intervals := [some for some in self.state.lost_intervals() if len({*some} - tried) >= _MIN_SEGMENT]:
+            frames = [frame for frame in max(intervals, key=len) if frame not in tried]
             segment = yield from self._segment(frames)
-            tried |= {*segment.views} if len(segment.views) >= _LEAST_SEGMENT else {*frames}
-            if len(segment.views) >= _LEAST_SEGMENT:
+            tried |= {*segment.views} if len(segment.views) >= _MIN_SEGMENT else {*frames}
+            if len(segment.views) >= _MIN_SEGMENT:
                 yield from self._joined(segment)
 
     def refine(self) -> Iterator[Refining]:
         """Register further pairs of views, whose edges make the poses more precise.
 
-        None where all steps share an axis: the noise that the edges of a frame share is not modelled together with it.
+        None if all steps share an axis: the noise common to the edges of a frame is not modelled together with it.
         """
         if self.modeler.prior.shared_axis(list(self.state.views.values())) is not None:
             return
@@ -246,24 +246,24 @@ class Run:
             yield Refining(len(self.state.spans), len(pairs))
 
     def finish(self) -> Iterator[Step | Fusing]:
-        """Solve the graph with the noise that its edges share, make the final model and yield the last step."""
+        """Solve the graph with the noise that its edges share, fuse the final model and yield the last step."""
         newest, model = self.state.newest, None
         if newest is None:
             return
         self._solve()
         if self.state.views:
             yield Fusing()
-            sure = conditional_covariances(self.state.solution, self.state.graph.edges)
-            model = self.modeler.fuser.fuse(self.state.views, self.state.solution.trajectory, sure)
+            conditional = conditional_covariances(self.state.solution, self.state.graph.edges)
+            model = self.modeler.fuser.fuse(self.state.views, self.state.solution.trajectory, conditional)
             model = widened(model, self.state.solution)
         spans = self.state.spans
         last = self._step(newest, [edge.posterior for edge in spans], spans)
         yield replace(last, last=True, make_model=lambda: model)
 
     def _segment(self, frames: Sequence[int]) -> Generator[Searching, None, State]:
-        """Place lost frames among each other, and return what comes of it; it begins where two of them fit."""
-        apart, tracker = self.state.apart(frames), self.modeler.tracker(self.state)
-        part = Run(self.modeler, self.scene, apart)
+        """Register lost frames among each other and return their state; the first two that match start the segment."""
+        subset, tracker = self.state.subset(frames), self.modeler.tracker(self.state)
+        part = Run(self.modeler, self.scene, subset)
         for frame in frames:
             yield Searching(frame)
             lost = self.state.lost[frame]
@@ -271,24 +271,24 @@ class Run:
             lost = replace(lost, view=tracker.ready(lost.view), left_out=None)
             for _ in part._place(lost, part.state.latest, last=frame == frames[-1]):
                 pass
-            if frame not in part.state.views and len(part.state.views) == 1:  # the first may show it in a hand
-                part.state = apart
+            if frame not in part.state.views and len(part.state.views) == 1:  # the first may show the object in a hand
+                part.state = subset
                 for _ in part._place(lost, None):
                     pass
         return part.state
 
     def _joined(self, segment: State) -> Iterator[Step]:
-        """Join a segment with the views so far where that can be; yield steps of its frames."""
+        """Join a segment with the views so far, if possible; yield steps of its frames."""
         joiner = self.modeler.joiner(self.modeler.tracker(self.state))
         parts = [Segment(state.views, state.solution, state.graph.edges) for state in (self.state, segment)]
         alignments = joiner.join(parts[0], parts[1])
         joins = alignments[0].edges if alignments else ()
         lost, left_out = self.state.lost, None
-        united = self.state.united(segment, joins) if sum(edge.accepted for edge in joins) >= LEAST_JOINS else None
-        if united is None or sum(united.solution.takes_part(edge) for edge in joins) < LEAST_JOINS:
+        merged = self.state.merged(segment, joins) if sum(edge.accepted for edge in joins) >= MIN_JOINS else None
+        if merged is None or sum(merged.solution.takes_part(edge) for edge in joins) < MIN_JOINS:
             left_out = NotJoined(len(segment.views))
         else:
-            self.state = united
+            self.state = merged
         if (newest := self.state.newest) is not None and newest.frame.index in segment.views:
             self.state = replace(self.state, newest=replace(newest, left_out=left_out))
         for frame in sorted(segment.views, key=lambda frame: self.state.places[frame]):
@@ -296,42 +296,42 @@ class Run:
             yield self._step(replace(lost[frame], left_out=left_out), [edge.posterior for edge in edges], edges)
 
     def _place(
-        self, prepared: Prepared, previous: int | None, *, last: bool = False, again: bool = False
+        self, prepared: Prepared, previous: int | None, *, last: bool = False, retry: bool = False
     ) -> Iterator[Step | Searching]:
         """Register a frame, add it to the graph and to the model, and yield its step.
 
         Args:
             prepared: the frame.
-            previous: the view to register it to first; None where there is none.
+            previous: the view to register it against first, if any.
             last: whether it is the last of the sequence.
-            again: whether it was lost before: then there is no step where it still is.
+            retry: whether it was lost before: then it has a step only if it is placed.
         """
         tracker, posteriors = self.modeler.tracker(self.state), ()
         if prepared.view is not None and previous is not None:
-            posteriors = yield from tracker.locate(prepared.view, previous, again=again)
-            posteriors += tracker.closures(prepared.view, posteriors, last=last, again=again)
+            posteriors = yield from tracker.locate(prepared.view, previous, retry=retry)
+            posteriors += tracker.closures(prepared.view, posteriors, last=last, retry=retry)
         steps = self.state.steps(prepared.frame.index, previous)
-        lasting = [posterior.without_samples() for posterior in posteriors]
-        edges = tracker.explained(self.modeler.closer.judge(lasting, self.state.map_view, steps=steps))
-        prepared = replace(prepared, left_out=_left_out(prepared, edges, first=not self.state.views))
+        compact = [posterior.without_samples() for posterior in posteriors]
+        edges = tracker.explained(self.modeler.closer.judge(compact, self.state.map_view, steps=steps))
+        prepared = replace(prepared, left_out=_reason_left_out(prepared, edges, first=not self.state.views))
         self.state = self.state.joined(prepared, edges)
         if prepared.accepted:
             number = prepared.frame.index
             if self.modeler.closer.is_keyframe(number, self.state.map_view):
                 self.state = replace(self.state, keyframes=(*self.state.keyframes, number))
-        if prepared.accepted or not again:
+        if prepared.accepted or not retry:
             yield self._step(prepared, posteriors, edges)
 
     def _solve(self) -> None:
-        """Solve the graph with what its edges share: an axis about which all steps turn, or noise, and a focal length.
+        """Solve the graph with what its edges share: an axis of all steps or else noise, and the focal length.
 
-        The images of every pair say where the axis lies, so that it makes the first pairs as precise as the last, and
-        what each pair says of it counts once. The noise is that of a frame's image in all its edges, and that of all
-        images. Where loops tell the focal length, views and edges become those of the one they tell.
+        The axis is estimated from all pairs, so that it makes the first pairs as precise as the last, and each pair
+        informs it once. Noise is shared by the edges of a frame and by all views. If loops determine the focal length,
+        views and edges are converted to its estimate.
         """
         state, focal = self.state.with_spans(), None
         if (sigma := self.modeler.sensor.sigma_focal) > 0.0 and len(state.solution.trajectory) > 1:
-            state, focal = self._focused(state, sigma)
+            state, focal = self._with_focal_length(state, sigma)
         axis = self.modeler.prior.shared_axis(list(state.views.values()))
         if axis is None:
             shared = shared_noise(state.graph, state.solution)
@@ -340,14 +340,14 @@ class Run:
             tilt_rad, shift_m = axis.sigma_tilt_rad, axis.sigma_shift_m
             self.state = state.solved(axis=CommonAxis(tilt_rad, shift_m, sigma_lift_m=np.inf), focal=focal)
 
-    def _focused(self, state: State, sigma: float) -> tuple[State, FocalLength]:
-        """Return a state under the focal length that its loops tell, and what that is.
+    def _with_focal_length(self, state: State, sigma: float) -> tuple[State, FocalLength]:
+        """Return a state under the focal length estimated from its loops, and the estimate.
 
-        Where it is far from the given one, edges are registered again, for how they follow it is known roughly.
+        If it is far from the given one, edges are registered again, because their derivatives are approximate.
 
         Args:
             state: with all edges.
-            sigma: standard deviation of the focal length's logarithm.
+            sigma: prior standard deviation of the focal length's logarithm.
         """
         at, sensor = 0.0, self.modeler.sensor
 
@@ -355,14 +355,14 @@ class Run:
             nonlocal state, at
             if log_factor != at:
                 moved = state.under(log_factor - at, sensor)
-                state, at = moved.again(self.modeler.tracker(moved).spans), log_factor
+                state, at = moved.reregistered(self.modeler.tracker(moved).spans), log_factor
             return MovingGraph.of(state.graph, state.solution).estimate(sigma, -at)
 
         focal = estimate_focal_length(estimate_at, rounds=3, tolerance=1.0, reach=_FOCAL_REACH * sigma)
         return (state if focal.log_factor == at else state.under(focal.log_factor - at, sensor)), focal
 
     def _step(self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge]) -> Step:
-        """Return what a frame brought, and what is known after it."""
+        """Return the event of a processed frame."""
         views, solution = self.state.views, self.state.solution
         return Step(
             frame=prepared.frame,
@@ -379,7 +379,7 @@ class Run:
 
 
 def _with_last(items: Iterable[T]) -> Iterator[tuple[T, bool]]:
-    """Yield items with whether they are the last, by taking one ahead."""
+    """Yield items with whether they are the last, by reading one ahead."""
     remaining = iter(items)
     for item in remaining:
         for following in remaining:
@@ -388,10 +388,10 @@ def _with_last(items: Iterable[T]) -> Iterator[tuple[T, bool]]:
         yield item, True
 
 
-def _left_out(prepared: Prepared, edges: Sequence[Edge], *, first: bool) -> Reason | None:
-    """Return why a frame is left out; None: it is not."""
+def _reason_left_out(prepared: Prepared, edges: Sequence[Edge], *, first: bool) -> Reason | None:
+    """Return why a frame is left out; None if it is not."""
     if prepared.view is None:
-        return Failed(prepared.flaw)
+        return Failed(prepared.failure)
     if first or any(edge.accepted for edge in edges):
         return None
     return edges[0].reason

@@ -1,4 +1,4 @@
-"""A frame prepared for registration, and a pair of them registered: the same for runs, experiments and joins."""
+"""Preparation of frames and registration of pairs: the same for runs, experiments and joins."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from modeler.types import (
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A frame, the object in it, and what registration needs of it."""
+    """A frame, its segmentation, and its view for registration."""
 
     frame: Frame
     """As read."""
     segmentation: Segmentation
-    """What of it is the object."""
+    """The object in it."""
     view: RayImage | None
-    """None where the object was not found."""
+    """None if the object was not found."""
     left_out: Reason | None = None
-    """Why the frame is no part of the model, once that is known."""
+    """Why the frame is not part of the model, once known."""
 
     @property
-    def flaw(self) -> Outcome:
-        """What is wrong with a frame that has no view."""
+    def failure(self) -> Outcome:
+        """Why a frame has no view."""
         found = self.segmentation.outcome
         return Outcome.TOO_FEW_POINTS if found is Outcome.CONVERGED else found
 
     @property
     def accepted(self) -> bool:
-        """Whether the frame is part of the model, once that is known."""
+        """Whether the frame is part of the model, once known."""
         return self.view is not None and self.left_out is None
 
 
@@ -52,7 +52,7 @@ def prepare(frame: Frame, scene: Scene, segmenter: Segmenter, sensor: Sensor) ->
 
     Args:
         frame: as read.
-        scene: what the segmenter learnt from the sequence.
+        scene: as the segmenter estimated it from the sequence.
         segmenter: finds the object.
         sensor: of the camera.
     """
@@ -72,21 +72,23 @@ def register(
         registrar: the method.
         source: one view.
         target: another.
-        density: of target_from_source before the images are compared.
-        seed: with the two frame numbers it makes the pair's own random generator.
+        density: prior density of target_from_source.
+        seed: of the pair's random generator, together with the two frame numbers.
     """
     rng = np.random.default_rng([seed, source.index, target.index])
     return registrar.register(source, target, density, rng=rng)
 
 
-def anywhere(within: Posterior, prior: AbstractPrior, attempt: Callable[[AbstractPrior], Posterior]) -> Posterior:
-    """Return a registration, or that of any motion where it does not convince and limits of its prior were assumed.
+def retry_unlimited(
+    within: Posterior, prior: AbstractPrior, attempt: Callable[[AbstractPrior], Posterior]
+) -> Posterior:
+    """Return a registration, or one without limits if it is not convincing and the prior's limits are defaults.
 
-    Of several places, none within the usual limits, none is known to be right.
+    If several modes are found, none within the usual limits, none can be trusted: only a converged result counts.
 
     Args:
         within: the registration with the prior.
-        prior: what is known of the motion.
+        prior: of the motion.
         attempt: registers the same pair with another prior.
     """
     unlimited = None if within.convincing else prior.unlimited()

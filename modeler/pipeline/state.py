@@ -1,4 +1,4 @@
-"""What a run knows after some frames."""
+"""The state of a run."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from modeler.pipeline.pairs import Prepared
 from modeler.rays import Sensor
 from modeler.types import Edge, FocalLength, InputError, PoseGaussian, Posterior, RayImage, Solution
 
-_READY_BYTES, _LEAST_READY = 128 * 2**20, 8  # of views kept ready, 13 of 640 × 480; however large, so many are
-_REVISITED = 3  # frames at most between a lost one and a view that followed it, to which it is registered again
+_READY_BYTES, _MIN_READY = 128 * 2**20, 8  # of views whose images stay in memory: 13 of 640 × 480, at least 8
+_REVISITED = 3  # largest distance in frames between a lost frame and the later view against which it is retried
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is known after some frames."""
+    """The state of a run after some frames. Immutable."""
 
     graph: PoseGraph = field(default_factory=PoseGraph)
-    """Every edge judged so far."""
+    """All edges so far."""
     smoother: Smoother = field(default_factory=Smoother)
     """Its solution."""
     views: Mapping[int, RayImage] = field(default_factory=dict)
     """The accepted views by frame number, in order of acceptance, without the images that a likelihood looks up."""
     keyframes: tuple[int, ...] = ()
-    """Those of them that are keyframes."""
+    """Numbers of the views that are keyframes."""
     network: PathNetwork = field(default_factory=PathNetwork)
     """That of the edges before the newest frame's."""
     ready: Mapping[int, RayImage] = field(default_factory=dict)
-    """The newest of them with these images."""
+    """The newest views, with the images that a likelihood looks up."""
     places: Mapping[int, int] = field(default_factory=dict)
-    """How many frames were read before each."""
+    """By frame number, the number of frames read before."""
     lost: Mapping[int, Prepared] = field(default_factory=dict)
     """Frames that show the object and were left out."""
     newest: Prepared | None = None
-    """The frame read last in order of time, once it is judged."""
-    vain: int = 0
-    """How many frames were searched for in vain since a search last found one."""
+    """The newest processed frame in order of time."""
+    failed_searches: int = 0
+    """Number of frames lost since a search last placed one."""
     spans: tuple[Edge, ...] = ()
-    """Edges of the refinement, which the graph does not hold yet."""
+    """Edges of the refinement, which are not in the graph yet."""
     store: ViewStore = field(default_factory=ViewStore)
-    """What keeps the views and the lost frames."""
+    """Storage of the views and the lost frames."""
 
     @property
     def solution(self) -> Solution:
@@ -56,23 +56,23 @@ class State:
 
     @cached_property
     def map_view(self) -> MapView:
-        """What closures are chosen and judged by."""
+        """The map by which closures are selected and tested."""
         return MapView(self.views, self.solution, self.graph.edges, self.keyframes, self.network)
 
     @property
     def latest(self) -> int | None:
-        """Number of the view accepted last; None where there is none."""
+        """Number of the view accepted last, if any."""
         return next(reversed(list(self.views)), None)
 
     def steps(self, frame: int, other: int | None) -> int:
-        """Return how many frames apart two that were read are; 1 without another."""
+        """Return the number of frames read from one frame to another; 1 without another."""
         return 1 if other is None else abs(self.places[frame] - self.places[other])
 
     def read(self, prepared: Prepared) -> State:
-        """Return the state once one more frame is read.
+        """Return the state after reading one more frame.
 
         Raises:
-            InputError: where its number is that of an earlier one.
+            InputError: if its number is that of an earlier one.
         """
         frame = prepared.frame.index
         if frame in self.places:
@@ -80,14 +80,20 @@ class State:
         return replace(self, places={**self.places, frame: len(self.places)})
 
     def joined(self, prepared: Prepared, edges: Sequence[Edge]) -> State:
-        """Return the state once a frame is judged."""
+        """Return the state after a frame with its edges, whether it was accepted or not."""
         number, graph = prepared.frame.index, self.graph.plus(edges)
-        light = self._stored(prepared)
-        newest = self.newest if number in self.lost else light
-        if light.view is None:
+        stored = self._with_stored_images(prepared)
+        newest = self.newest if number in self.lost else stored
+        if stored.view is None:
             return replace(self, graph=graph, newest=newest)
         if not prepared.accepted:
-            return replace(self, graph=graph, newest=newest, lost={**self.lost, number: light}, vain=self.vain + 1)
+            return replace(
+                self,
+                graph=graph,
+                newest=newest,
+                lost={**self.lost, number: stored},
+                failed_searches=self.failed_searches + 1,
+            )
         found = number in self.lost or (bool(edges) and not edges[0].accepted)
         graph = graph if graph.first is not None else replace(graph, first=number)
         ready = {**self.ready, number: prepared.view}
@@ -95,25 +101,25 @@ class State:
             self,
             graph=graph,
             smoother=self.smoother.to(graph),
-            views={**self.views, number: light.view},
+            views={**self.views, number: stored.view},
             network=self.map_view.network,
             ready=newest_ready(ready),
             newest=newest,
-            vain=0 if found else self.vain,
+            failed_searches=0 if found else self.failed_searches,
             lost={frame: other for frame, other in self.lost.items() if frame != number},
         )
 
     def refined(self, edges: Sequence[Edge]) -> State:
-        """Return the state with more edges between views that are in it, of which `with_spans` makes use."""
+        """Return the state with more edges between its views, which `with_spans` adds to the graph."""
         return replace(self, spans=(*self.spans, *edges))
 
     def with_spans(self) -> State:
-        """Return the state whose graph holds the edges of the refinement."""
+        """Return the state with the edges of the refinement in its graph."""
         graph = self.graph.plus(self.spans)
         return replace(self, graph=graph, smoother=self.smoother.to(graph))
 
-    def stretches(self) -> list[list[int]]:
-        """Return the lost frames in order of time, those between which no view was accepted together."""
+    def lost_intervals(self) -> list[list[int]]:
+        """Return the lost frames in order of time, grouped by the accepted views in between."""
         found: list[list[int]] = []
         among = sorted({*self.lost, *self.views}, key=lambda frame: self.places[frame])
         for before, frame in zip([None, *among], among, strict=False):
@@ -121,12 +127,12 @@ class State:
                 found = [*found[:-1], [*found[-1], frame]] if before in self.lost else [*found, [frame]]
         return found
 
-    def apart(self, frames: Sequence[int]) -> State:
-        """Return what is known of some lost frames alone: that they were read."""
+    def subset(self, frames: Sequence[int]) -> State:
+        """Return a state of some lost frames alone, without views or edges."""
         return State(places=self.places, lost={frame: self.lost[frame] for frame in frames}, store=self.store)
 
-    def united(self, segment: State, joins: Sequence[Edge]) -> State:
-        """Return the state with another of frames that are lost here, and edges between both."""
+    def merged(self, segment: State, joins: Sequence[Edge]) -> State:
+        """Return the state merged with that of a segment of its lost frames, with the edges that join them."""
         graph = self.graph.plus([*segment.graph.edges, *joins])
         return replace(
             self,
@@ -138,11 +144,11 @@ class State:
         )
 
     def under(self, log_factor: float, sensor: Sensor) -> State:
-        """Return the state as it is under another focal length: its views, edges and poses.
+        """Return the state under another focal length: its views, edges and poses.
 
         Args:
             log_factor: logarithm of the other focal length over that of the views.
-            sensor: that made the views.
+            sensor: of the views.
         """
         moved = {edge: replace(edge, posterior=edge.posterior.under(log_factor)) for edge in self.graph.edges}
         views: dict[int, RayImage] = {}
@@ -158,8 +164,8 @@ class State:
         smoother = replace(self.smoother, focal=None).to(graph)
         return replace(self, graph=graph, smoother=smoother, views=views, ready=ready, newest=newest, spans=spans)
 
-    def again(self, register: Callable[[Sequence[tuple[int, int]]], Iterable[Posterior]]) -> State:
-        """Return the state with the edges that take part registered again where that finds them at the same place.
+    def reregistered(self, register: Callable[[Sequence[tuple[int, int]]], Iterable[Posterior]]) -> State:
+        """Return the state with accepted edges registered again, replacing those whose new pose is consistent.
 
         Args:
             register: returns the posteriors of pairs (source, target) of its views.
@@ -183,19 +189,19 @@ class State:
         common: float = 0.0,
         focal: FocalLength | None = None,
     ) -> State:
-        """Return the state solved with what its edges share: an axis or noise, and a focal length; see `Smoother`."""
+        """Return the state solved with a common axis or shared noise, and a focal length; see `Smoother`."""
         smoother = replace(self.smoother, axis=axis, shared=shared, common=common, focal=focal)
         return replace(self, smoother=smoother.to(self.graph))
 
-    def overdue(self) -> Iterator[tuple[int, int]]:
-        """Yield lost frames, newest first, each with the view that followed it soonest, if that was soon."""
+    def retries(self) -> Iterator[tuple[int, int]]:
+        """Yield lost frames, newest first, each with the next accepted view, if that followed within a few frames."""
         for frame in sorted(self.lost, key=lambda frame: -self.places[frame]):
             after = [view for view in self.views if 0 < self.places[view] - self.places[frame] <= _REVISITED]
             if after:
                 yield frame, min(after, key=lambda view: self.places[view])
 
-    def _stored(self, prepared: Prepared) -> Prepared:
-        """Return a frame whose images are in the store."""
+    def _with_stored_images(self, prepared: Prepared) -> Prepared:
+        """Return a frame with its images in the store."""
         if prepared.frame.index in self.lost:
             return replace(self.lost[prepared.frame.index], left_out=prepared.left_out)
         if prepared.view is None:
@@ -209,20 +215,17 @@ class State:
 
 
 def newest_ready(views: Mapping[int, RayImage]) -> dict[int, RayImage]:
-    """Return the last of some views, those whose images for registration are to stay in memory.
-
-    Of others these images are made again.
-    """
+    """Return the newest views, whose images for registration stay in memory; others are recomputed on demand."""
     kept, size = [], 0
     for frame, view in reversed(list(views.items())):
         size += sum(image.nbytes for image in view.layers.values())
-        if size > _READY_BYTES and len(kept) >= _LEAST_READY:
+        if size > _READY_BYTES and len(kept) >= _MIN_READY:
             break
         kept.append((frame, view))
     return dict(reversed(kept))
 
 
 def _same_place(before: PoseGaussian, after: PoseGaussian) -> bool:
-    """Return whether a registration found what it did under another focal length, or another mode."""
+    """Return whether registrations under two focal lengths agree, and not in different modes."""
     xi = se3.log(se3.inverse(before.mean) @ after.mean)
     return bool(xi @ np.linalg.solve(before.covariance + after.covariance, xi) <= Smoother.outlier_distance**2)

@@ -1,7 +1,7 @@
-"""Which pairs of views a run registers, with which prior, and which of two registrations counts.
+"""Selection of the pairs that a run registers, of their priors, and among repeated registrations.
 
-An object with sides alike matches as well a quarter turn on. That a mode lies beyond the prior's limits is no reason to
-accept that the object turned so far: it must match better by as much as motions beyond the limits are rare.
+An object with similar sides matches as well after a quarter turn. A mode beyond the prior's limits is therefore only
+accepted if its evidence outweighs the small prior probability of such motions.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from modeler import se3
 from modeler.beside import each
 from modeler.closure import Closer
-from modeler.pipeline.pairs import anywhere
+from modeler.pipeline.pairs import retry_unlimited
 from modeler.pipeline.state import State, newest_ready
 from modeler.priors import PredictedProposal
 from modeler.rays import Sensor
@@ -43,13 +43,13 @@ from modeler.types import (
     pooled,
 )
 
-_BEYOND = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # how a motion beyond the prior may end
-_PATIENCE = 1  # frames searched for in vain, from which on further ones are glanced at first
-_SPAN_STEPS = 2.0  # steps for which limits hold where the graph predicts a motion, so that they do not cut it off
-_GLANCE_SHARE = 0.25  # of the starts of a search and of the samples drawn at most
-_SURPRISE_NATS = 7.0  # one motion of a thousand exceeds the prior's limits
-_MORE_OVERLAP = 0.15  # sides that are alike match about as much; the right mode shows more than the end of the limits
-_ELSEWHERE_RAD = 0.26  # two registrations turned against each other by more are two modes
+_LIMIT_OUTCOMES = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # possible for motions beyond the limits
+_MAX_FAILED_SEARCHES = 1  # from which on further frames get a quick registration first
+_SPAN_STEPS = 2.0  # steps of the limits if the graph predicts the motion, so that they do not truncate it
+_QUICK_FRACTION = 0.25  # of the starts of a search and of the largest number of samples
+_BEYOND_LIMITS_NATS = 7.0  # one motion in a thousand exceeds the prior's limits
+_MORE_OVERLAP = 0.15  # similar sides have about the same overlap; the true mode has more than one at the limits
+_SEPARATE_RAD = 0.26  # registrations that differ by a larger rotation are two modes
 _MIN_MODE_WEIGHT = 0.01
 
 
@@ -59,78 +59,78 @@ class Tracker:
     """Registers a new view against earlier ones, and views of the graph with each other."""
 
     state: State
-    """What is known so far."""
+    """The state of the run."""
     prior: AbstractPrior
-    """What is known of motions before the images are compared."""
+    """Prior on the motion between two frames."""
     closer: Closer
-    """Chooses the pairs."""
+    """Selects the pairs."""
     sensor: Sensor
-    """Makes again what registration needs of a view, where it is no longer in memory."""
+    """Recomputes the images of views that are no longer in memory."""
     register: Callable[[RayImage, RayImage, AbstractPrior], Posterior]
-    """Of a source and a target."""
-    glance: Callable[[RayImage, RayImage, AbstractPrior], Posterior] | None = None
-    """As `register`, but gives hopeless pairs up early; None: the method has no such mode."""
+    """Registers a source and a target."""
+    quick_register: Callable[[RayImage, RayImage, AbstractPrior], Posterior] | None = None
+    """As `register`, at lower cost, see `quick_registrar`; None if the method has no such mode."""
     refusals: dict[tuple[int, int], PriorRefused] = field(default_factory=dict)
-    """Why the prior does not apply to a pair, by (source, target): filled as pairs are registered."""
-    made: dict[int, RayImage] = field(default_factory=dict)
-    """The views made ready again last, by frame number: pairs registered one after the other share them."""
+    """Why the prior does not apply to a pair, by (source, target); filled as pairs are registered."""
+    cache: dict[int, RayImage] = field(default_factory=dict)
+    """The views recomputed last, by frame number, which successive pairs share."""
     _lock: Lock = field(default_factory=Lock)
 
     @cached_property
     def known(self) -> AbstractPrior:
-        """The prior with what the sequence taught it so far."""
+        """The prior with what was learned from the sequence so far."""
         return self.prior.learned(self.state.solution, self.state.graph.edges)
 
     def locate(
-        self, view: RayImage, previous: int, *, again: bool
+        self, view: RayImage, previous: int, *, retry: bool
     ) -> Generator[Searching, None, tuple[Posterior, ...]]:
-        """Register a new view with the previous one, and where that does not place it, with others.
+        """Register a new view against the previous one and, if that does not place it, against others.
 
         Args:
             view: the new view.
-            previous: the view to register it to first.
-            again: whether it was lost before: then only that one is tried.
+            previous: the view to register it against first.
+            retry: whether it was lost before: then only that one is tried.
 
         Yields:
-            That the previous view does not place it, before others are tried.
+            An event before other views are tried.
 
         Returns:
             The posteriors, that of the previous view first.
         """
         steps = self.state.steps(view.index, previous)
         prior = self.known
-        wary = self.glance is not None and self.state.vain >= _PATIENCE
-        if wary and (steps > 1 or again):
-            glances = yield from self._glances(view, previous, again=again)
-            if not _promising(glances[-1]):
-                return glances
+        quick_first = self.quick_register is not None and self.state.failed_searches >= _MAX_FAILED_SEARCHES
+        if quick_first and (steps > 1 or retry):
+            attempts = yield from self._quick_attempts(view, previous, retry=retry)
+            if not _promising(attempts[-1]):
+                return attempts
         odometry = self._pair(view, previous, prior.relaxed(steps) if steps > 1 else prior)
         if self._placed([odometry]):
             return (odometry,)
-        if wary and steps == 1 and not again and not odometry.matches:
-            glances = yield from self._glances(view, previous, again=again)
-            if not _promising(glances[-1]):
-                return (odometry, *glances[1:])
+        if quick_first and steps == 1 and not retry and not odometry.matches:
+            attempts = yield from self._quick_attempts(view, previous, retry=retry)
+            if not _promising(attempts[-1]):
+                return (odometry, *attempts[1:])
         yield Searching(view.index)
-        return self._relocalised(view, odometry, again=again)
+        return self._relocalised(view, odometry, retry=retry)
 
     def closures(
-        self, view: RayImage, posteriors: Sequence[Posterior], *, last: bool, again: bool
+        self, view: RayImage, posteriors: Sequence[Posterior], *, last: bool, retry: bool
     ) -> tuple[Posterior, ...]:
-        """Register a new view with earlier ones that the object seems to have come back to; none where it is lost.
+        """Register a new view against earlier ones to which the object seems to have returned; none if it is lost.
 
         Args:
             view: the new view.
             posteriors: of `locate`.
             last: whether it is the last of the sequence.
-            again: whether it was lost before.
+            retry: whether it was lost before.
         """
         steps = self.state.steps(view.index, posteriors[0].target)
         base, _ = self.closer.placement(posteriors, self.state.map_view, steps=steps)
         if base is None:
             return ()
         tried = {posterior.target for posterior in posteriors}
-        tried |= {edge.target for edge in self.state.graph.edges if edge.source == view.index} if again else set()
+        tried |= {edge.target for edge in self.state.graph.edges if edge.source == view.index} if retry else set()
         targets = self.closer.closure_targets(base, self.state.map_view, last=last)
         targets = [target for target in targets if target not in tried]
         predicted = [
@@ -147,15 +147,15 @@ class Tracker:
         """Yield posteriors of pairs (source, target) of views of the graph that were not registered yet."""
         priors = self.known.relaxed(_SPAN_STEPS), self.known.unlimited()
         predicted = [
-            PredictedProposal(self._holding(*priors, s, t), self.state.solution.relative_gaussian(t, s))
+            PredictedProposal(self._applicable(*priors, s, t), self.state.solution.relative_gaussian(t, s))
             for s, t in pairs
         ]
         yield from self._pairs([(self.state.views[source], target) for source, target in pairs], predicted)
 
-    def _holding(
+    def _applicable(
         self, prior: AbstractPrior, unlimited: AbstractPrior | None, source: int, target: int
     ) -> AbstractPrior:
-        """Return a prior of a pair of the graph, or that without limits if they were assumed and exclude its motion."""
+        """Return the prior of a pair of the graph, without its limits if they are defaults and exclude the motion."""
         if unlimited is not None:
             with suppress(InputError):
                 known = prior.between(self.state.views[source], self.state.views[target])
@@ -164,7 +164,7 @@ class Tracker:
         return prior
 
     def explained(self, edges: Iterable[Edge]) -> tuple[Edge, ...]:
-        """Return judged edges, those to which the prior does not apply with the reason."""
+        """Return edges, with the reason for those to which the prior does not apply."""
         return tuple(
             replace(edge, reason=self.refusals.get((edge.source, edge.target), edge.reason))
             if edge.posterior.outcome is Outcome.NOT_KNOWN
@@ -177,44 +177,44 @@ class Tracker:
         known = view if view.layers else self.state.ready.get(view.index)
         if known is None:
             with self._lock:
-                known = self.made.pop(view.index, None)
+                known = self.cache.pop(view.index, None)
             known = known or self.sensor.ray_image(view.frame, view.plane)
             with self._lock:
-                self.made[view.index] = known
-                for frame in set(self.made) - set(newest_ready(self.made)):
-                    del self.made[frame]
+                self.cache[view.index] = known
+                for frame in set(self.cache) - set(newest_ready(self.cache)):
+                    del self.cache[frame]
         return known
 
-    def _glances(
-        self, view: RayImage, previous: int, *, again: bool
+    def _quick_attempts(
+        self, view: RayImage, previous: int, *, retry: bool
     ) -> Generator[Searching, None, tuple[Posterior, ...]]:
-        """Return glances at the previous view and at others till surface matches or none is left.
+        """Return quick registrations against the previous view and others until one matches or none is left.
 
-        After frames that were searched for in vain (a hand hides the object), the next is probably hidden too.
+        After failed searches (a hand hides the object), the object is probably hidden in the next frame too.
         """
         relaxed = self.known.relaxed(max(self.state.steps(view.index, previous), 2))
-        glances, target = (), previous
+        attempts, target = (), previous
         while target is not None:
-            glances = (*glances, self._pair(view, target, relaxed, briefly=True))
-            if again or _promising(glances[-1]):
+            attempts = (*attempts, self._pair(view, target, relaxed, quick=True))
+            if retry or _promising(attempts[-1]):
                 break
             yield Searching(view.index)
-            target = self.closer.relocalisation_target(glances, self.state.map_view)
-        return glances
+            target = self.closer.relocalisation_target(attempts, self.state.map_view)
+        return attempts
 
-    def _relocalised(self, view: RayImage, odometry: Posterior, *, again: bool) -> tuple[Posterior, ...]:
-        """Return posteriors of a view that the previous one does not place: with a wider prior, and of other views."""
+    def _relocalised(self, view: RayImage, odometry: Posterior, *, retry: bool) -> tuple[Posterior, ...]:
+        """Return posteriors of a view that the previous one does not place: with wider limits, then of other views."""
         steps, prior = self.state.steps(view.index, odometry.target), self.known
         relaxed = prior.relaxed(max(steps, 2))
-        if steps == 1 and odometry.outcome in _BEYOND:  # the motion may be larger than the prior allows for one step
+        if steps == 1 and odometry.outcome in _LIMIT_OUTCOMES:  # the motion may exceed the limits for one step
             wider = self._pair(view, odometry.target, relaxed)
             seconds = odometry.seconds + wider.seconds
             known = prior.between(view, self.state.views[odometry.target])
             odometry = replace(preferred(odometry, wider, known), seconds=seconds)
-        if not again:
-            odometry = anywhere(odometry, prior, partial(self._pair, view, odometry.target))
+        if not retry:
+            odometry = retry_unlimited(odometry, prior, partial(self._pair, view, odometry.target))
         posteriors = (odometry,)
-        while not again and not self._placed(posteriors):
+        while not retry and not self._placed(posteriors):
             target = self.closer.relocalisation_target(posteriors, self.state.map_view)
             if target is None:
                 break
@@ -227,13 +227,13 @@ class Tracker:
         return self.closer.placement(posteriors, self.state.map_view, steps=steps)[0] is not None
 
     def _pairs(self, pairs: Sequence[tuple[RayImage, int]], priors: Sequence[AbstractPrior]) -> Iterator[Posterior]:
-        """Yield the posteriors of pairs, in their order."""
+        """Yield the posteriors of pairs, in order."""
         yield from each(lambda asked: self._pair(*asked[0], asked[1]), zip(pairs, priors, strict=True))
 
-    def _pair(self, source: RayImage, target: int, prior: AbstractPrior, *, briefly: bool = False) -> Posterior:
-        """Register a view against an accepted one; where the prior does not apply, that is the outcome."""
+    def _pair(self, source: RayImage, target: int, prior: AbstractPrior, *, quick: bool = False) -> Posterior:
+        """Register a view against an accepted one; the outcome is `NOT_KNOWN` if the prior does not apply."""
         view = self.ready(self.state.views[target])
-        register = self.glance if briefly and self.glance is not None else self.register
+        register = self.quick_register if quick and self.quick_register is not None else self.register
         try:
             return register(self.ready(source), view, prior)
         except InputError as error:
@@ -241,50 +241,49 @@ class Tracker:
             return failed(source, view, Outcome.NOT_KNOWN)
 
 
-def _promising(glance: Posterior) -> bool:
-    """Return whether a search may place a frame that was glanced at; a match cut off by the limits does not."""
-    return glance.matches and glance.outcome is not Outcome.AT_LIMIT
+def _promising(attempt: Posterior) -> bool:
+    """Return whether a full search may place a frame after a quick registration: it matches, not at the limits."""
+    return attempt.matches and attempt.outcome is not Outcome.AT_LIMIT
 
 
-def glancing(registrar: AbstractRegistrar) -> AbstractRegistrar | None:
-    """Return a registrar that gives up a hopeless pair at a small part of the cost; None where its method has none.
+def quick_registrar(registrar: AbstractRegistrar) -> AbstractRegistrar | None:
+    """Return a cheaper version of a registrar for pairs that may share no surface; None if its method has none.
 
-    Views without common surface cost most of all: every mode that the search finds is sampled. A glance samples the
-    best mode alone.
+    Such pairs are the most expensive: every mode that the search finds is sampled. Here only the best mode is.
     """
     if not isinstance(registrar, VisibilityRegistrar):
         return None
-    sampler = replace(registrar.sampler, max_draws=int(_GLANCE_SHARE * registrar.sampler.max_draws))
-    return replace(registrar, search=registrar.search.scaled(_GLANCE_SHARE), sampler=sampler, max_modes=1)
+    sampler = replace(registrar.sampler, max_draws=int(_QUICK_FRACTION * registrar.sampler.max_draws))
+    return replace(registrar, search=registrar.search.scaled(_QUICK_FRACTION), sampler=sampler, max_modes=1)
 
 
 def preferred(within: Posterior, wider: Posterior, known: AbstractPoseDensity) -> Posterior:
-    """Return which registration counts for a view that a prior's limits seemed to cut off.
+    """Return the preferred registration of a view whose motion seemed to exceed the prior's limits.
 
     Args:
-        within: its registration in the limits.
-        wider: that in wider ones.
-        known: the motion that is known, with its limits.
+        within: its registration within the limits.
+        wider: that within wider limits.
+        known: the prior density, with the limits.
     """
     if within.outcome is Outcome.AT_LIMIT and within.matches and wider.usable:
-        elsewhere = se3.rotation_angle(se3.inverse(within.pose.mean) @ wider.pose.mean) > _ELSEWHERE_RAD
-        # Unless it has one mode: a mean between modes may lie inside, and is at none of them.
-        possible = wider.outcome is Outcome.CONVERGED and _inside(known, wider.pose.mean[None])[0]
+        separate = se3.rotation_angle(se3.inverse(within.pose.mean) @ wider.pose.mean) > _SEPARATE_RAD
+        # Only for one mode: the mean of several may lie inside without being near any of them.
+        inside = wider.outcome is Outcome.CONVERGED and _inside(known, wider.pose.mean[None])[0]
         better_nats = wider.log_evidence - within.log_evidence
-        alike = wider.overlap < within.overlap + _MORE_OVERLAP
-        if elsewhere and not possible and alike and better_nats < _SURPRISE_NATS:
+        similar_overlap = wider.overlap < within.overlap + _MORE_OVERLAP
+        if separate and not inside and similar_overlap and better_nats < _BEYOND_LIMITS_NATS:
             return replace(within, outcome=Outcome.AMBIGUOUS)
     return _discounted(wider, known)
 
 
 def _discounted(posterior: Posterior, known: AbstractPoseDensity) -> Posterior:
-    """Return a posterior with modes beyond the limits as unlikely as such motions are."""
+    """Return a posterior whose modes beyond the limits are weighted by the prior probability of such motions."""
     if not are_separate(posterior.modes):
         return posterior
     inside = _inside(known, np.stack([mode.pose.mean for mode in posterior.modes]))
     if inside.all() or not inside.any():
         return posterior
-    weights = np.array([mode.weight for mode in posterior.modes]) * np.where(inside, 1.0, np.exp(-_SURPRISE_NATS))
+    weights = np.array([mode.weight for mode in posterior.modes]) * np.where(inside, 1.0, np.exp(-_BEYOND_LIMITS_NATS))
     weights /= weights.sum()
     order = [int(place) for place in np.argsort(-weights, kind="stable") if weights[place] >= _MIN_MODE_WEIGHT]
     total = float(weights[order].sum())
@@ -301,5 +300,5 @@ def _discounted(posterior: Posterior, known: AbstractPoseDensity) -> Posterior:
 
 
 def _inside(known: AbstractPoseDensity, motions: Array) -> BoolArray:
-    """Return which motions (n, 4, 4) are within the limits."""
+    """Return whether motions (n, 4, 4) are within the limits, (n,)."""
     return np.isfinite(known.log_density(motions))
