@@ -227,7 +227,7 @@ def test_a_gaussian_needs_a_covariance(bad: Array) -> None:
 
 
 MAY_BE_ZERO = {"step_sigma_deg", "axis_sigma_deg", "axis_sigma_m", "wobble_deg", "wobble_m"}  # known for certain
-UNITLESS = {"regrasp_probability", "steps", "bumps", "max_offset", "min_elongation", "friction_sigma"}
+UNITLESS = {"regrasp_probability", "steps", "kernels", "max_offset", "min_elongation", "friction_sigma"}
 
 
 def test_names_of_parameters_carry_units() -> None:

@@ -1,4 +1,4 @@
-"""Free motion, or motion on a table: which of the two it is, the images decide."""
+"""Free motion, or motion on a table; the images decide."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _TABLE_PROBABILITY = 0.5  # even odds; motion on a table is about 12 nats denser
 
 @dataclass(frozen=True)
 class AutoPrior(AbstractPrior):
-    """A mixture of free motion and of motion on the table, if the views show one.
+    """A mixture of free motion and motion on the table, if the views show one (method.md, eq. 28).
 
-    Where the images agree with motion on the table, the posterior is as certain as under the table prior; where they
-    contradict it, as for an object that is lifted, it is that of free motion.
+    If the images agree with motion on the table, the posterior is that of the table prior; if they contradict it, as
+    for an object that is lifted, it is that of free motion.
     """
 
     free: AbstractPrior = field(default_factory=lambda: GeneralPrior(limits_assumed=True))
-    """Of an object that leaves its table, or has none."""
+    """Prior of an object that leaves the table, or of one without a table."""
     table: AbstractPrior = field(default_factory=lambda: TablePrior(limits_assumed=True))
-    """Of an object that stays on its table."""
+    """Prior of an object that stays on the table."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the density of target_from_source."""
@@ -40,6 +40,6 @@ class AutoPrior(AbstractPrior):
         return replace(self, free=self.free.relaxed(steps), table=self.table.relaxed(steps))
 
     def unlimited(self) -> AutoPrior | None:
-        """Return the prior without limits on the motion, where these are assumed."""
+        """Return the prior without limits on the motion, if these are defaults, else None."""
         free, table = self.free.unlimited(), self.table.unlimited()
         return None if free is None or table is None else replace(self, free=free, table=table)

@@ -1,6 +1,6 @@
-"""Which values parameters of priors may have: one schema for options, files and code.
+"""Validation of the parameters of priors: one schema for options, files and code.
 
-The unit is the ending of a parameter's name. Upper limits reject values in another unit, such as lengths in mm.
+A parameter's name ends with its unit. Upper limits reject values in another unit, such as lengths in mm.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ class ParameterError(InputError):
     """A parameter out of range."""
 
     def __init__(self, name: str, value: float | Sequence[float], allowed: str) -> None:
-        """State a value and what is allowed instead.
+        """Word the error.
 
         Args:
             name: of the parameter.
             value: a number or three.
-            allowed: the range, as `a positive number of metres, at most 5`.
+            allowed: the range, such as `a positive number of metres, at most 5`.
         """
         numbers = value if isinstance(value, Sequence) else (value,)
         self.name = name
@@ -38,15 +38,15 @@ class ParameterError(InputError):
 
 
 def check_parameter(name: str, value: object, *, exact: bool = True) -> None:
-    """Check one parameter by the unit in its name; what is no number, or three, is not checked.
+    """Check one parameter by the unit in its name; only numbers and triples of numbers are checked.
 
     Args:
-        name: ends with its unit: `_deg`, `_m`, `_s`. `step_deg` alone may be negative.
+        name: ends with its unit: `_deg`, `_m`, `_s`. Only `step_deg` may be negative.
         value: of the parameter.
-        exact: whether a standard deviation of a turntable may be 0, as that of a simulated one is.
+        exact: whether standard deviations of a turntable may be 0, as for simulated ones.
 
     Raises:
-        ParameterError: where it is not finite, or out of range.
+        ParameterError: if it is not finite, or out of range.
     """
     if isinstance(value, tuple) and value and all(isinstance(number, int | float) for number in value):
         direction = not name.endswith("_m")
@@ -60,9 +60,9 @@ def check_parameter(name: str, value: object, *, exact: bool = True) -> None:
         if not 0.0 < abs(value) <= _MAX_TURN_DEG:
             raise ParameterError(name, value, f"a turn of -{_MAX_TURN_DEG:g} to {_MAX_TURN_DEG:g} degrees, but not 0")
     elif name.rpartition("_")[2] in _LIMITS:
-        unit, most = _LIMITS[name.rpartition("_")[2]]
-        if not (0.0 < value <= most or (value == 0.0 and exact and name in _MAY_BE_ZERO)):
-            raise ParameterError(name, value, f"a positive number of {unit}, at most {most:g}")
+        unit, largest = _LIMITS[name.rpartition("_")[2]]
+        if not (0.0 < value <= largest or (value == 0.0 and exact and name in _MAY_BE_ZERO)):
+            raise ParameterError(name, value, f"a positive number of {unit}, at most {largest:g}")
     elif isinstance(value, float) and not 0.0 < value < np.inf:
         raise ParameterError(name, value, "a positive number")
 
@@ -71,7 +71,7 @@ def check_parameters(component: Any) -> None:
     """Check the fields of a dataclass by the units in their names, to be called in `__post_init__`.
 
     Raises:
-        ParameterError: where one is not finite, or out of range.
+        ParameterError: if one is not finite, or out of range.
     """
     for field in fields(component):
         check_parameter(field.name, getattr(component, field.name))
@@ -81,8 +81,8 @@ def check_covariance(name: str, covariance: Array) -> None:
     """Check that a covariance (n, n) is finite, symmetric and positive definite.
 
     Raises:
-        InputError: where it is not.
+        InputError: if it is not.
     """
-    sound = np.isfinite(covariance).all() and np.allclose(covariance, covariance.T, rtol=1e-6, atol=0.0)
-    if not sound or np.linalg.eigvalsh(covariance)[0] <= 0.0:
-        raise InputError(f"{name} is no covariance; give a finite, symmetric, positive definite matrix")
+    valid = np.isfinite(covariance).all() and np.allclose(covariance, covariance.T, rtol=1e-6, atol=0.0)
+    if not valid or np.linalg.eigvalsh(covariance)[0] <= 0.0:
+        raise InputError(f"{name} is not a covariance; give a finite, symmetric, positive definite matrix")

@@ -1,4 +1,4 @@
-"""The axis about which several steps turn, with its uncertainty, and the sense of rotation."""
+"""Estimation of the common axis of several steps, with its uncertainty, and of the sense of rotation."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from modeler import se3
 from modeler.priors.mixtures import across_axis
 from modeler.types import Array, PoseGaussian, Posterior
 
-_LEAST_PAIRS, _MOST_PAIRS = 3, 60  # the latest of many suffice
-_LEAST_TURN_RAD = np.radians(5.0)
-_STUDENT = 5.0  # degrees of freedom of Student's t: few, so that outliers count little
+_MIN_PAIRS, _MAX_PAIRS = 3, 60  # of many, the latest suffice
+_MIN_TURN_RAD = np.radians(5.0)
+_FREEDOM = 5.0  # degrees of freedom of Student's t: few, so that outliers count little
 _ITERATIONS = 30
 _DECISIVE_LOG_ODDS = np.log(500.0)  # log odds from which the sense counts as known: three certain pairs yield 9³
 _MAX_LOG_ODDS = np.log(9.0)  # bound on the log odds of one pair, which may have missed the true mode
@@ -29,7 +29,7 @@ class Axis:
     sigma_direction_rad: float
     """Standard deviation of the direction, about each axis orthogonal to it; infinite: any direction."""
     point_m: Array | None = None
-    """(3,) a point of the line; None where its position is unknown."""
+    """(3,) a point of the line; None if its position is unknown."""
     sigma_point_m: float = 0.0
     """Standard deviation of the point, along each axis orthogonal to the line."""
 
@@ -37,9 +37,9 @@ class Axis:
 def common_axis(motions: Sequence[PoseGaussian], wobble_rad: float, wobble_m: float) -> Axis | None:
     """Fit the common axis of several motions by robust least squares on SE(3); None with fewer than three large turns.
 
-    Each motion is exp(θ S) about the unit twist S = (d, -d × p) of the axis through p along d, its own angle θ free,
-    and errs by its covariance and the wobble. Moving the axis by a twist ε moves the motion by (Ad(T⁻¹) - 1) ε.
-    Outliers are downweighted by Student's t; where the inliers scatter more than their covariances say, the axis'
+    Each motion is exp(θ S) with the unit twist S = (d, -d × p) of the axis through p along d and an angle θ of its own,
+    with errors of its covariance plus the wobble. Moving the axis by a twist ε moves the motion by (Ad(T⁻¹) - 1) ε.
+    Outliers are downweighted by Student's t; if the inliers scatter more than their covariances predict, the axis'
     covariance is scaled up accordingly.
 
     Args:
@@ -47,9 +47,9 @@ def common_axis(motions: Sequence[PoseGaussian], wobble_rad: float, wobble_m: fl
         wobble_rad: standard deviation of each motion's rotation out of the axis.
         wobble_m: standard deviation of its shift, at the axis' point.
     """
-    turning = [motion for motion in motions if np.linalg.norm(se3.log(motion.mean)[:3]) >= _LEAST_TURN_RAD]
-    turning = turning[-_MOST_PAIRS:]
-    if len(turning) < _LEAST_PAIRS:
+    turning = [motion for motion in motions if np.linalg.norm(se3.log(motion.mean)[:3]) >= _MIN_TURN_RAD]
+    turning = turning[-_MAX_PAIRS:]
+    if len(turning) < _MIN_PAIRS:
         return None
     direction, point_m = _initial_axis(turning)
     wobble = np.repeat([wobble_rad, wobble_m], 3) ** 2
@@ -59,7 +59,7 @@ def common_axis(motions: Sequence[PoseGaussian], wobble_rad: float, wobble_m: fl
         for pose in turning:
             residual, jacobian = _residual(pose, direction, point_m, wobble)
             square = float(residual @ residual)
-            weight = (_STUDENT + 5.0) / (_STUDENT + square)  # an axis fixes five of a motion's six numbers
+            weight = (_FREEDOM + 5.0) / (_FREEDOM + square)  # an axis determines five of six coordinates
             information += weight * jacobian.T @ jacobian
             gradient += weight * jacobian.T @ residual
             misfit += weight * square
@@ -83,25 +83,25 @@ def _residual(pose: PoseGaussian, direction: Array, point_m: Array, wobble: Arra
 
     The angle is eliminated. The four parameters are tilts about, and shifts along, two normals of the axis.
     """
-    # About the axis' point, near the object, rotation and shift are least correlated.
+    # About a point of the axis near the object, rotation and shift are least correlated.
     motion = se3.translation(-point_m) @ pose.mean @ se3.translation(point_m)
     covariance = se3.covariance_about(pose.covariance, point_m) + np.diag(wobble)
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     twist = np.concatenate([direction, np.zeros(3)])
-    back = se3.inverse(se3.exp(_turn(motion, direction) * twist))
+    backward = se3.inverse(se3.exp(_turn(motion, direction) * twist))
     along = whiten @ twist
     across_angle = np.eye(6) - np.outer(along, along) / (along @ along)
     moved = np.kron(np.eye(2), across_axis(direction).T)
     return (
-        across_angle @ whiten @ se3.log(back @ motion),
-        across_angle @ whiten @ (se3.adjoint(back) - np.eye(6)) @ moved,
+        across_angle @ whiten @ se3.log(backward @ motion),
+        across_angle @ whiten @ (se3.adjoint(backward) - np.eye(6)) @ moved,
     )
 
 
 def turn_sense(posteriors: Sequence[Posterior], up: Array, step_rad: float, sigma_step_rad: float) -> int:
-    """Return the sense of rotation from frame to frame about `up`: +1 right-handed, -1 left-handed, 0 not yet known.
+    """Return the sense of rotation from frame to frame about `up`: +1 right-handed, -1 left-handed, 0 undetermined.
 
-    The odds that one pair contributes are bounded, so that at least three must agree. Half turns are uninformative.
+    The log odds of a pair are bounded, so that at least three must agree. Half turns are uninformative.
 
     Args:
         posteriors: in the frame of one static camera.
@@ -113,8 +113,8 @@ def turn_sense(posteriors: Sequence[Posterior], up: Array, step_rad: float, sigm
     for posterior in posteriors:
         steps = posterior.target - posterior.source
         turn_rad, variance = steps * step_rad, abs(steps) * sigma_step_rad**2
-        forth, back = (_log_likelihood(posterior, up, turn, variance) for turn in (turn_rad, -turn_rad))
-        odds += float(np.clip(forth - back, -_MAX_LOG_ODDS, _MAX_LOG_ODDS))
+        forward, backward = (_log_likelihood(posterior, up, turn, variance) for turn in (turn_rad, -turn_rad))
+        odds += float(np.clip(forward - backward, -_MAX_LOG_ODDS, _MAX_LOG_ODDS))
     return int(np.sign(odds)) if abs(odds) > _DECISIVE_LOG_ODDS else 0
 
 
@@ -134,10 +134,10 @@ def _initial_axis(motions: Sequence[PoseGaussian]) -> tuple[Array, Array]:
     """Return an initial direction (3,), and the point (3,) of the initial axis at which the shifts are most certain."""
     vectors = np.array([se3.log(pose.mean)[:3] for pose in motions])
     direction = np.linalg.svd(vectors)[2][0]
-    stay = np.vstack([np.eye(3) - pose.mean[:3, :3] for pose in motions])
+    fixed = np.vstack([np.eye(3) - pose.mean[:3, :3] for pose in motions])
     shifts = np.concatenate([pose.mean[:3, 3] for pose in motions])
-    point_m = np.linalg.lstsq(stay, shifts, rcond=1e-2)[0]
-    # A point x shifts by υ + ω × x, whose variance is least where hat(x) cancels the correlation of υ with ω.
+    point_m = np.linalg.lstsq(fixed, shifts, rcond=1e-2)[0]
+    # A point x moves by υ + ω × x, whose variance is least if hat(x) cancels the correlation of υ with ω.
     levers = [pose.covariance[3:, :3] @ np.linalg.inv(pose.covariance[:3, :3]) for pose in motions]
     lever = np.mean(levers, axis=0)
     certain_m = 0.5 * np.array([lever[2, 1] - lever[1, 2], lever[0, 2] - lever[2, 0], lever[1, 0] - lever[0, 1]])

@@ -1,4 +1,4 @@
-"""The general prior: nothing known but that the views are neighbours (paper, section IV)."""
+"""The general prior: bounded rotation and offset between neighbouring views (paper, section IV)."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from modeler.priors.checks import MAX_LENGTH_M, check_parameters
 from modeler.priors.mixtures import directions
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage
 
-_SMALL_DEG = 30.0  # up to this turn, limits of the centroids' offset hold as given
-_WIDEST_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of what was seen of it
-_ROOM_DEG = 5.0  # for a confident proposal: limits bound the search, and must not cut the posterior off
+_SMALL_DEG = 30.0  # turn up to which the limit of the centroids' offset is used as given
+_MAX_TURN_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of its surface seen before
+_MARGIN_DEG = 5.0  # of limits around confident proposals: they bound the search, and must not truncate the posterior
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class GeneralPrior(AbstractPrior):
     max_offset_m: float = 0.04
     """Largest distance between the target's centroid and the source's, transformed."""
     limits_assumed: bool = False
-    """Whether the limits are usual, but not known: where nothing within them matches, any motion is possible."""
+    """Whether the limits are defaults: if nothing within them matches, any motion is possible."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -43,18 +43,18 @@ class GeneralPrior(AbstractPrior):
         return replace(self, max_rotation_deg=rotation_deg, max_offset_m=offset_m)
 
     def unlimited(self) -> AnyMotion | None:
-        """Return the prior of any motion where limits are assumed, else None."""
+        """Return the prior of any motion if the limits are defaults, else None."""
         return AnyMotion() if self.limits_assumed else None
 
 
 @dataclass(frozen=True)
 class AnyMotion(AbstractPrior):
-    """Any rotation; two centroids of one object's surface are no farther apart than its size allows."""
+    """Any rotation; the offset of the centroids is limited by the object's size."""
 
     max_offset: float = 2.0
-    """Largest distance between the target's centroid and the source's, transformed, as a share of the object's size.
+    """Largest distance between the target's centroid and the source's, transformed, in units of the object's size.
 
-    What opposite sides of a ball show, and the end and the side of a rod, have centroids 1.2 and 1.7 sizes apart.
+    The centroids of opposite sides of a ball are 1.2 sizes apart, those of the end and the side of a rod 1.7.
     """
 
     def __post_init__(self) -> None:
@@ -111,20 +111,21 @@ class GeneralDensity(AbstractPoseDensity):
 def relaxed_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -> tuple[float, float]:
     """Return the limits of rotation in degrees and of the centroids' offset in m for a number of steps (at least 1).
 
-    The rotation is capped at what two views can be registered across: beyond, they share too little surface. Offsets
-    add up, by the triangle inequality at most to their sum.
+    The rotation is capped, as views farther apart share too little surface to be registered. Offsets add up.
     """
-    rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, _WIDEST_DEG))
+    rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, _MAX_TURN_DEG))
     return rotation_deg, min(steps * max_offset_m, MAX_LENGTH_M)
 
 
 def turned_offset_m(max_offset_m: float, turn_rad: float) -> float:
-    """Return the limit of the centroids' offset in m for a turn of any size; up to 30 degrees the limit as given.
+    """Return the limit of the centroids' offset in m for a turn of any size; up to 30 degrees, the limit as given.
 
     The centroid of the visible surface lies in front of the object's centre, so that a turn by θ separates two of them
     by a chord proportional to 2 sin(θ/2).
     """
-    turn_rad = np.clip(abs(np.remainder(turn_rad + np.pi, 2.0 * np.pi) - np.pi), *np.radians([_SMALL_DEG, _WIDEST_DEG]))
+    turn_rad = np.clip(
+        abs(np.remainder(turn_rad + np.pi, 2.0 * np.pi) - np.pi), *np.radians([_SMALL_DEG, _MAX_TURN_DEG])
+    )
     chord = np.sin(turn_rad / 2.0) / np.sin(np.radians(_SMALL_DEG) / 2.0)
     return min(float(chord) * max_offset_m, MAX_LENGTH_M)
 
@@ -142,4 +143,4 @@ def centroid_offset(target_from_source: Array, source_centroid_m: Array, target_
 
 def reach_deg(sigma_deg: float) -> float:
     """Return the half-width of limits around a proposal with a standard deviation, in degrees."""
-    return min(4.0 * sigma_deg + _ROOM_DEG, 180.0)
+    return min(4.0 * sigma_deg + _MARGIN_DEG, 180.0)

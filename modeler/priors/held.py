@@ -1,4 +1,4 @@
-"""The held prior: a robot's hand carries the object, and its poses give the motion unless it takes the object anew."""
+"""The held prior: a robot's hand carries the object, and its poses determine the motion unless it regrasps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from modeler.priors.mixtures import Alternatives, KernelMixture, defensive_mixtu
 from modeler.types import AbstractPoseDensity, AbstractPrior, Edge, HandPoses, RayImage, Solution
 
 _STEP_DEG = 25.0  # step to which `max_offset_m` refers
-_REGRASPED_SHARE = 0.5  # of the samples: either may be true, and the search must look at both
+_REGRASPED_SHARE = 0.5  # of the samples: either may be true, and the search must cover both
 
 
 @dataclass(frozen=True)
@@ -24,25 +24,25 @@ class HeldPrior(AbstractPrior):
     Calibration errors and slip are rotations and shifts at the hand. A frame between two poses gets an interpolated
     pose, whose uncertainty grows with their distance.
 
-    Between two frames the hand may have taken the object anew. Then its motion tells nothing, and `regrasped` holds;
-    the images decide which of the two it was.
+    Between two frames the hand may have regrasped the object. Then its motion is uninformative, and the prior is
+    `regrasped`; the images decide (method.md, eq. 26).
     """
 
     hand: HandPoses
-    """Where the hand was."""
+    """Poses of the hand by time."""
     held_sigma_deg: float = 3.0
     """Standard deviation of slip and calibration error in the rotation of one motion, about each axis."""
     held_sigma_m: float = 0.008
     """Standard deviation of slip and calibration error in the shift of one motion, along each axis, at the hand."""
     regrasp_probability: float = 0.02
-    """Probability that the hand takes the object anew from one frame to the next."""
+    """Probability that the hand regrasps the object from one frame to the next."""
     regrasped: AbstractPrior = field(default_factory=lambda: GeneralPrior(limits_assumed=True))
-    """What is known of the object's motion then; evidence."""
+    """Prior of the object's motion in a regrasp; evidence."""
     steps: float = 1.0
-    """Number of steps that a motion may take."""
+    """Number of steps of a motion."""
     max_offset_m: float = 0.04
-    """Largest distance between the centroids where the hand is only a proposal (returns to earlier views); it
-    grows with turns beyond 30 degrees."""
+    """Largest distance between the centroids if the hand is only a proposal (returns to earlier views); it grows with
+    turns beyond 30 degrees."""
     newest: int | None = None
     """The last frame of a running sequence: motions to it are evidence; None: no sequence, all motions are."""
 
@@ -57,7 +57,7 @@ class HeldPrior(AbstractPrior):
         """Return the density of target_from_source.
 
         Raises:
-            InputError: where the hand's pose at one of the views is unknown.
+            InputError: if the hand's pose at one of the views is unknown.
         """
         hand_at_source, error_at_source = self.hand.at(source.frame)
         hand_at_target, error_at_target = self.hand.at(target.frame)
@@ -69,12 +69,12 @@ class HeldPrior(AbstractPrior):
         )
         moved = KernelMixture(motion[None], np.ones(1), hand_at_source[:3, 3], float(sigma_rad), float(sigma_m))
         if self.newest is None or target.index == self.newest:
-            elsewhere = self.regrasped.between(source, target)
+            regrasped = self.regrasped.between(source, target)
             probability = 1.0 - (1.0 - self.regrasp_probability) ** self.steps
-            known = Alternatives((moved, elsewhere), np.array([1.0 - probability, probability]))  # method.md, eq. 26
-            return defensive_mixture(known, [elsewhere], _REGRASPED_SHARE)
-        # The hand's motion to an earlier view already counts in the edges between; here it may only propose, within
-        # limits about it or, with another grasp, about none: shares of their volumes make the density even.
+            known = Alternatives((moved, regrasped), np.array([1.0 - probability, probability]))  # method.md, eq. 26
+            return defensive_mixture(known, [regrasped], _REGRASPED_SHARE)
+        # The hand's motion to an earlier view is already part of the edges in between; here it is only a proposal,
+        # within limits about it or, after a regrasp, about zero motion; weights by volume make the density uniform.
         offset_m = turned_offset_m(self.max_offset_m, float(se3.rotation_angle(motion)))
         limits = GeneralPrior(reach_deg(float(np.degrees(sigma_rad))), offset_m).between(source, target)
         within = (replace(limits, middle=motion[:3, :3]), self.regrasped.between(source, target))
@@ -82,12 +82,12 @@ class HeldPrior(AbstractPrior):
         return defensive_mixture(Alternatives(within, volumes / volumes.sum()), [moved])
 
     def relaxed(self, steps: float) -> HeldPrior:
-        """Return the prior with limits for several steps; their motion is the hand's, unless it lets go on the way."""
+        """Return the prior with limits for several steps; their motion is the hand's unless it regrasps."""
         offset_m = relaxed_limits(_STEP_DEG, self.max_offset_m, steps)[1]
         return replace(self, max_offset_m=offset_m, regrasped=self.regrasped.relaxed(steps), steps=steps * self.steps)
 
     def unlimited(self) -> HeldPrior | None:
-        """Return the prior by which a new grasp may turn the object in any way, where limits are assumed."""
+        """Return the prior without limits on the motion in a regrasp, if these are defaults, else None."""
         regrasped = self.regrasped.unlimited()
         return None if regrasped is None else replace(self, regrasped=regrasped)
 

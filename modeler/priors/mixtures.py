@@ -1,4 +1,4 @@
-"""Densities of which priors are composed: Gaussians, kernel mixtures and defensive mixtures on SE(3)."""
+"""Building blocks of priors: Gaussians, kernel mixtures and defensive mixtures on SE(3)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from modeler.priors.checks import check_covariance
 from modeler.types import AbstractPoseDensity, Array
 
 _NODES = 4097
-_TRIED = 4096  # samples by which the share of a proposal within the support is estimated
-_LEAST_SHARE = 0.01  # proposals with less of their mass within the support are dropped
+_OVERLAP_SAMPLES = 4096  # by which the fraction of a proposal's mass within the support is estimated
+_MIN_OVERLAP = 0.01  # proposals with a smaller fraction are dropped
 
 
 def directions(count: int, rng: np.random.Generator) -> Array:
@@ -199,7 +199,7 @@ class KernelMixture(AbstractPoseDensity):
 
 @dataclass(frozen=True, eq=False)
 class Alternatives(AbstractPoseDensity):
-    """One of several densities holds, and it is not known which: their weighted sum, all of it evidence."""
+    """A mixture of densities, one of which holds, it is not known which; all of it is evidence."""
 
     densities: tuple[AbstractPoseDensity, ...]
     """The alternatives, each evidence."""
@@ -229,20 +229,20 @@ class Alternatives(AbstractPoseDensity):
 
 @dataclass(frozen=True, eq=False)
 class DefensiveMixture(AbstractPoseDensity):
-    """A mixture of proposals and independent knowledge within the latter's support; the latter alone is evidence.
+    """A mixture of proposals and independent knowledge within the latter's support; only the latter is evidence.
 
-    Importance weights `exp(log_evidence - log_density)` remove the proposals again. The share of the independent
-    knowledge bounds those weights however wrong the proposals are (Hesterberg 1995).
+    Importance weights `exp(log_evidence - log_density)` divide the proposals out. The fraction of the independent
+    knowledge bounds those weights, however wrong the proposals are (Hesterberg 1995).
     """
 
     known: AbstractPoseDensity
-    """The independent knowledge, which may be mere limits."""
+    """The independent knowledge, possibly only limits."""
     proposals: tuple[AbstractPoseDensity, ...]
-    """Densities of where the pose may be."""
+    """Proposal densities."""
     inside: Array
-    """(k,) share of each proposal's mass within the support of `known`."""
+    """(k,) fraction of each proposal's mass within the support of `known`."""
     share: float
-    """Share (0..1) of all proposals together, equal among them."""
+    """Fraction (0..1) of all proposals together, equal among them."""
     evidence: bool = False
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
@@ -254,7 +254,7 @@ class DefensiveMixture(AbstractPoseDensity):
         poses[of_known] = self.known.sample(int(of_known.sum()), rng)
         for number, proposal in enumerate(self.proposals):
             places = np.flatnonzero(part == number)
-            while len(places):  # a share `inside`, at least 1 %, is accepted in each round
+            while len(places):  # a fraction `inside`, at least 1 %, is accepted in each round
                 drawn = proposal.sample(len(places), rng)
                 fits = np.isfinite(self.known.log_density(drawn))
                 poses[places[fits]] = drawn[fits]
@@ -284,13 +284,13 @@ def defensive_mixture(
     """Return the mixture with those proposals that overlap the support of `known`; `known` itself if none does.
 
     Args:
-        known: the independent knowledge, which may be mere limits.
-        proposals: densities of where the pose may be.
-        share: share (0..1) of all proposals together.
+        known: the independent knowledge, possibly only limits.
+        proposals: proposal densities.
+        share: fraction (0..1) of all proposals together.
     """
     rng = np.random.default_rng(0)  # equal arguments give equal densities
-    shares = [float(np.mean(np.isfinite(known.log_density(item.sample(_TRIED, rng))))) for item in proposals]
-    useful = [number for number, inside in enumerate(shares) if inside >= _LEAST_SHARE]
+    shares = [float(np.mean(np.isfinite(known.log_density(item.sample(_OVERLAP_SAMPLES, rng))))) for item in proposals]
+    useful = [number for number, inside in enumerate(shares) if inside >= _MIN_OVERLAP]
     if not useful:
         return known
     return DefensiveMixture(

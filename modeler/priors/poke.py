@@ -1,4 +1,4 @@
-"""The poke prior: the object is pushed along the table, and the push predicts its turn and shift."""
+"""The poke prior: a push along the table predicts the object's turn and shift."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError,
 _STEPS = 20  # integration steps of a push
 _PUSHES = 512  # samples of a push
 _DIMENSIONS = 7
-_LEAST_WAY = 0.1  # share of a direction in the plane: within six degrees of the normal it is an error
+_MIN_IN_PLANE = 0.1  # component of a direction in the plane: within six degrees of the normal it is an error
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Poke:
     """A straight push with a finger that does not slip on the object."""
 
     point_m: tuple[float, float, float]
-    """Where the finger touches the object at the start, in camera coordinates."""
+    """Initial contact point of the finger on the object, in camera coordinates."""
     direction: tuple[float, float, float]
     """Direction of its motion in camera coordinates, of any length, projected onto the plane."""
     length_m: float
@@ -68,7 +68,7 @@ class PokePrior(AbstractPrior):
         """Return the density of target_from_source; after several pushes that of the table prior.
 
         Raises:
-            InputError: where neither view shows a plane, no push is given, or it is directed into the plane.
+            InputError: if neither view shows a plane, no push is given, or it is directed into the plane.
         """
         earlier, later = sorted((source, target), key=lambda view: view.index)
         pokes = self._between(earlier.index, later.index)
@@ -84,7 +84,7 @@ class PokePrior(AbstractPrior):
             sigma_tilt_rad=np.radians(self.sigma_tilt_deg),
             sigma_lift_m=self.sigma_height_m,
         )
-        if np.linalg.norm(plane.axes[:2] @ pokes[0].direction) <= _LEAST_WAY * np.linalg.norm(pokes[0].direction):
+        if np.linalg.norm(plane.axes[:2] @ pokes[0].direction) <= _MIN_IN_PLANE * np.linalg.norm(pokes[0].direction):
             raise InputError(
                 f"the poke between frames {earlier.index} and {later.index} presses on the table, not along it; "
                 "give its direction in camera coordinates"
@@ -98,7 +98,7 @@ class PokePrior(AbstractPrior):
         """Return the pushes between two frames.
 
         Raises:
-            InputError: where there is none.
+            InputError: if there is none.
         """
         if not self.pokes and self.poke is not None:
             return [self.poke]
@@ -115,13 +115,13 @@ class PokePrior(AbstractPrior):
         rng = np.random.default_rng(0)  # equal pushes give equal outcomes
         noise = rng.normal(size=(_PUSHES, _DIMENSIONS))
         in_plane = plane.axes[:2]
-        way = in_plane @ np.array(poke.direction)
-        way = way / np.linalg.norm(way)
-        along_way = np.array([way, [-way[1], way[0]]])  # coordinates along the push and orthogonal to it
-        seen = before.points_m @ in_plane.T @ along_way.T
+        push = in_plane @ np.array(poke.direction)
+        push = push / np.linalg.norm(push)
+        along_push = np.array([push, [-push[1], push[0]]])  # coordinates along the push and orthogonal to it
+        seen = before.points_m @ in_plane.T @ along_push.T
         centre = seen.mean(axis=0) + self.centre_sigma_m * noise[:, :2]
         radius_m = np.sqrt(np.sum(np.var(seen, axis=0))) * np.exp(self.friction_sigma * noise[:, 2])
-        contact = along_way @ in_plane @ np.array(poke.point_m) + self.poke_sigma_m * noise[:, 3:5]
+        contact = along_push @ in_plane @ np.array(poke.point_m) + self.poke_sigma_m * noise[:, 3:5]
         bearing = np.radians(self.poke_sigma_deg) * noise[:, 5]
         length_m = np.maximum(poke.length_m + self.poke_sigma_m * noise[:, 6], 0.0)
         step = (length_m / _STEPS)[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
@@ -130,7 +130,7 @@ class PokePrior(AbstractPrior):
         lever = seen.mean(axis=0) - centre
         cos, sin = np.cos(turn), np.sin(turn)
         carried = np.stack([cos * lever[:, 0] - sin * lever[:, 1], sin * lever[:, 0] + cos * lever[:, 1]], axis=1)
-        there = (centre + shift + carried) @ along_way
+        there = (centre + shift + carried) @ along_push
         return np.column_stack([turn, there - in_plane @ plane.target_centroid_m])
 
 
@@ -145,7 +145,7 @@ class PokeDensity(AbstractPoseDensity):
     covariance: Array
     """(3, 3)."""
     backwards: bool
-    """Whether the pair leads back in time."""
+    """Whether the source is the later view."""
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
@@ -167,10 +167,10 @@ class PokeDensity(AbstractPoseDensity):
 
 
 def pushed(contact_m: Array, step_m: Array, radius_m: Array) -> tuple[Array, Array]:
-    """Return how objects on a plane turn (n,) in rad and shift (n, 2) in m under a finger that does not slip.
+    """Return turns (n,) in rad and shifts (n, 2) in m of objects on a plane, pushed by a finger that does not slip.
 
-    A limit ellipsoid ties force f and moment m at the centre of friction to the twist: v ∝ f, ω ∝ m / c², m = x × f,
-    so that the contact's velocity v + ω ẑ × x is the finger's (Lynch, Maekawa and Tanie 1992).
+    A limit ellipsoid relates force f and moment m at the centre of friction to the twist: v ∝ f, ω ∝ m / c², m = x × f,
+    such that the contact's velocity v + ω ẑ × x is the finger's (Lynch, Maekawa and Tanie 1992).
 
     Args:
         contact_m: (n, 2) contact relative to the centre of friction.

@@ -24,9 +24,9 @@ _DRAWS = 5000
 _FITTED = 1000
 _ROUNDS = 5
 _GAUSSIAN_SHARE = 0.8
-_WIDER = 1.3  # factor on the fitted Gaussian's standard deviations, so that weights stay bounded
+_INFLATION = 1.3  # factor on the fitted Gaussian's standard deviations, so that weights stay bounded
 _OVERSAMPLING = 4
-_CONTRADICTION_NATS = 25.0  # seven standard deviations
+_CONTRADICTION_NATS = 25.0  # seven standard deviations of a Gaussian
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class ProductPrior(AbstractPrior):
     """Two independent priors that both hold, such as a held object on a table."""
 
     first: AbstractPrior
-    """One."""
+    """One prior."""
     second: AbstractPrior
     """The other."""
 
@@ -42,7 +42,7 @@ class ProductPrior(AbstractPrior):
         """Return the density of target_from_source.
 
         Raises:
-            InputError: where one of the two does not apply, or they contradict each other.
+            InputError: if one of the two does not apply, or they contradict each other.
         """
         product = multiplied(self.first.between(source, target), self.second.between(source, target), source.centroid_m)
         if product is None:
@@ -67,7 +67,7 @@ class ProductPrior(AbstractPrior):
 
 @dataclass(frozen=True, eq=False)
 class Product(AbstractPoseDensity):
-    """The normalised product of two densities, sampled by importance from both and a Gaussian fitted to the product."""
+    """The normalised product of two densities, importance sampled from both and a Gaussian fitted to the product."""
 
     first: AbstractPoseDensity
     """One density."""
@@ -101,9 +101,10 @@ class Product(AbstractPoseDensity):
 
 
 def multiplied(first: AbstractPoseDensity, second: AbstractPoseDensity, centre_m: Array) -> Product | None:
-    """Return the product of two densities; None where they are disjoint or contradict each other.
+    """Return the product of two densities; None if they are disjoint or contradict each other.
 
-    A Gaussian is fitted to weighted draws of both, then to weighted draws of itself and both (population Monte Carlo).
+    A Gaussian is fitted to weighted samples of both, then to weighted samples of itself and both (population Monte
+    Carlo).
 
     Args:
         first: one density.
@@ -120,7 +121,7 @@ def multiplied(first: AbstractPoseDensity, second: AbstractPoseDensity, centre_m
         weights = np.exp(log_weights - top)
         log_volume = float(top + np.log(weights.mean()))
         chosen = drawn[resampled(weights, _FITTED, rng)]
-        gaussian = fitted(chosen, np.full(_FITTED, 1.0 / _FITTED), centre_m, _WIDER)
+        gaussian = fitted(chosen, np.full(_FITTED, 1.0 / _FITTED), centre_m, _INFLATION)
     assert gaussian is not None
     product = Product(first, second, gaussian, log_volume)
     drawn = product.sample(_FITTED, rng)

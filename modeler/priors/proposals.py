@@ -1,4 +1,4 @@
-"""Proposals: densities derived from the images or the graph, which guide the search and are no evidence."""
+"""Proposals: densities derived from the images or the graph, which guide the search but are not evidence."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from modeler.priors.general import GeneralPrior, centroid_offset
 from modeler.priors.mixtures import KernelMixture, across_axis, defensive_mixture, directions_about
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, PoseGaussian, RayImage, SharedAxis, Solution
 
-_LEAST_RAD, _LEAST_M = np.radians(2.0), 0.004  # least standard deviations: the search itself resolves less
-_WIDER = 2.0  # factor on the graph's standard deviations, which hold no systematic error
-_MOST_STEPS = 3.0  # beyond, constant velocity is no longer plausible
+_MIN_SIGMA_RAD, _MIN_SIGMA_M = np.radians(2.0), 0.004  # the search does not need more precision
+_INFLATION = 2.0  # factor on the graph's standard deviations, which do not include systematic errors
+_MAX_STEPS = 3.0  # beyond, constant velocity is no longer plausible
 
 
 @dataclass(frozen=True)
 class AbstractProposal(AbstractPrior):
-    """A prior that adds a proposal to another prior, whose evidence, limits, learning and axis remain its own."""
+    """Adds a proposal to another prior, whose evidence, limits, learning and axis it keeps."""
 
     known: AbstractPrior = field(default_factory=GeneralPrior)
     """The independent knowledge."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source; the independent knowledge alone where there is no proposal.
+        """Return the density of target_from_source; the independent knowledge alone if there is no proposal.
 
         Raises:
-            InputError: where the views lack what `known` needs.
+            InputError: if the views lack what `known` needs.
         """
         known = self.known.between(source, target)
         proposal = self.proposal(source, target, known)
@@ -39,7 +39,7 @@ class AbstractProposal(AbstractPrior):
 
     @abstractmethod
     def proposal(self, source: RayImage, target: RayImage, known: AbstractPoseDensity) -> AbstractPoseDensity | None:
-        """Return the proposed density of target_from_source; None where the views or the graph yield none.
+        """Return the proposal density of target_from_source; None if the views or the graph yield none.
 
         Args:
             source: first view.
@@ -48,7 +48,7 @@ class AbstractProposal(AbstractPrior):
         """
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
-        """Return the prior with what its independent part learned."""
+        """Return the prior with its independent part updated."""
         return replace(self, known=self.known.learned(solution, edges))
 
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
@@ -60,7 +60,7 @@ class AbstractProposal(AbstractPrior):
         return replace(self, known=self.known.relaxed(steps))
 
     def unlimited(self) -> AbstractPrior | None:
-        """Return the prior without limits on the motion, where those of its independent part are assumed."""
+        """Return the prior without limits on the motion, if those of its independent part are defaults, else None."""
         known = self.known.unlimited()
         return None if known is None else replace(self, known=known)
 
@@ -78,7 +78,7 @@ class PredictedProposal(AbstractPrior):
         """Return the density of target_from_source.
 
         Raises:
-            InputError: where the views lack what the prior needs.
+            InputError: if the views lack what the prior needs.
         """
         covariance = se3.covariance_about(self.expected.covariance, source.centroid_m)
         sigma_rad, sigma_m = (
@@ -88,8 +88,8 @@ class PredictedProposal(AbstractPrior):
             self.expected.mean[None],
             np.ones(1),
             centre_m=source.centroid_m,
-            sigma_rad=max(_WIDER * sigma_rad, _LEAST_RAD),
-            sigma_m=max(_WIDER * sigma_m, _LEAST_M),
+            sigma_rad=max(_INFLATION * sigma_rad, _MIN_SIGMA_RAD),
+            sigma_m=max(_INFLATION * sigma_m, _MIN_SIGMA_M),
             evidence=False,
         )
         return defensive_mixture(self.known.between(source, target), [guess])
@@ -121,7 +121,7 @@ class VelocityPrior(AbstractProposal):
             return None
         (before, object_from_before), (last, object_from_last) = self.trajectory[-2:]
         pace = (source.index - last) / (last - before)
-        if not 0.0 < pace <= _MOST_STEPS:
+        if not 0.0 < pace <= _MAX_STEPS:
             return None
         twist = se3.log(se3.inverse(object_from_before) @ object_from_last)
         predicted = se3.inverse(poses[target.index]) @ object_from_last @ se3.exp(pace * twist)
@@ -215,7 +215,7 @@ class AlignedAxes(AbstractPoseDensity):
 
 
 def long_axis(points_m: Array, min_elongation: float) -> Array | None:
-    """Return the first principal axis (3,) of points (n, 3); None where they are less elongated than required."""
+    """Return the first principal axis (3,) of points (n, 3); None if they are less elongated than required."""
     if len(points_m) < 3:
         return None
     variances, axes = np.linalg.eigh(np.cov(points_m.T))
@@ -224,7 +224,7 @@ def long_axis(points_m: Array, min_elongation: float) -> Array | None:
 
 
 def _onto(axis: Array, directions: Array) -> Array:
-    """Return the smallest rotations (n, 4, 4) that take a unit vector (3,) to unit vectors (n, 3)."""
+    """Return the smallest rotations (n, 4, 4) that map a unit vector (3,) to unit vectors (n, 3)."""
     crossed = np.cross(axis, directions)
     sine = np.linalg.norm(crossed, axis=1, keepdims=True)
     aside = np.where(sine > 1e-12, crossed / np.maximum(sine, 1e-300), across_axis(axis)[0])
@@ -240,21 +240,24 @@ class FeaturesPrior(AbstractProposal):
     """Standard deviation of each kernel in rotation, about each axis."""
     features_sigma_m: float = 0.006
     """Standard deviation of each kernel in the position of the centroid, along each axis."""
-    bumps: int = 24
+    kernels: int = 24
     """Largest number of kernels."""
     matcher: FeatureMatcher = field(default_factory=FeatureMatcher)
-    """How features are matched."""
+    """Matches the features."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
         check_parameters(self)
 
     def proposal(self, source: RayImage, target: RayImage, known: AbstractPoseDensity) -> KernelMixture | None:
-        """Return kernels about the poses that most matches agree with; None where too few agree."""
+        """Return kernels about the poses with most consistent matches; None if there are too few."""
         motions, votes = self.matcher.motions(source, target)
         if len(motions):
             possible = np.isfinite(known.log_density(motions))
-            motions, votes = motions[possible][: self.bumps], votes[possible][: self.bumps].astype(np.float64)
+            motions, votes = (
+                motions[possible][: self.kernels],
+                votes[possible][: self.kernels].astype(np.float64),
+            )
         if not len(motions):
             return None
         return KernelMixture(

@@ -14,7 +14,7 @@ from modeler.priors.mixtures import across_axis
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane, RayImage
 
 WOBBLE_DEG, WOBBLE_M = 0.2, 0.0007
-"""Standard deviations of how far tables deviate from planes, and turntables from pure rotation, in one step."""
+"""Standard deviations of the deviation of tables from planes, and of turntables from pure rotation, in one step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class OnPlane:
         return motion
 
     def coordinates(self, target_from_source: Array) -> tuple[Array, Array, Array]:
-        """Return turns (n,) in rad and shifts (n, 2) in m of poses (n, 4, 4), and the log density (n,) of the rest."""
+        """Return turns (n,) in rad, shifts (n, 2) in m and log densities (n,) of tilt and lift, of poses (n, 4, 4)."""
         rotation, normal = target_from_source[:, :3, :3], self.normal
         tilted = np.einsum("nij,j->ni", rotation, normal)
         upright = np.einsum("ni,i->n", tilted, normal)
@@ -82,18 +82,18 @@ def on_plane(
     Args:
         source: view before the motion.
         target: view after it.
-        turn_rad: largest turn to expect.
-        shift_m: largest shift to expect.
+        turn_rad: largest expected turn.
+        shift_m: largest expected shift.
         sigma_tilt_rad: standard deviation of the rotation out of the plane, on top of the plane's own uncertainty.
         sigma_lift_m: standard deviation of the motion along the normal, on top of the plane's own uncertainty.
 
     Raises:
-        InputError: where neither view shows a support plane.
+        InputError: if neither view shows a support plane.
     """
     plane = support(source, target)
     if plane is None:
         raise no_plane(source, target)
-    # A normal that is off by δ tilts a turn by θ about it by 2 sin(θ/2) δ, and lifts a shift by shift · δ.
+    # An error δ of the normal tilts a turn by θ about it by 2 sin(θ/2) δ, and lifts a shift by shift · δ.
     tilt_rad = 2.0 * np.sin(min(turn_rad, np.pi) / 2.0) * plane.sigma_tilt_rad
     return OnPlane(
         source.centroid_m,
@@ -113,7 +113,7 @@ def no_plane(source: RayImage, target: RayImage) -> InputError:
 
 
 def support(source: RayImage, target: RayImage) -> Plane | None:
-    """Return the support plane of two views: the mean where both show it, None where neither does."""
+    """Return the support plane of two views, the mean if both show it; None if neither does."""
     planes = [view.plane for view in (source, target) if view.plane is not None]
     if not planes:
         return None
@@ -139,7 +139,7 @@ class TablePrior(AbstractPrior):
     sigma_height_m: float = WOBBLE_M
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
     limits_assumed: bool = False
-    """Whether the limits are usual, but not known: where nothing within them matches, any motion on the table is."""
+    """Whether the limits are defaults: if nothing within them matches, any motion on the table is possible."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -149,7 +149,7 @@ class TablePrior(AbstractPrior):
         """Return the density of target_from_source.
 
         Raises:
-            InputError: where neither view shows a support plane.
+            InputError: if neither view shows a support plane.
         """
         limit_rad = float(np.radians(self.max_rotation_deg))
         plane = on_plane(
@@ -163,18 +163,18 @@ class TablePrior(AbstractPrior):
         return TableDensity(plane, limit_rad, self.max_shift_m)
 
     def unlimited(self) -> AnyTurn | None:
-        """Return the prior of any turn and shift on the table where limits are assumed, else None."""
+        """Return the prior of any turn and shift on the table if the limits are defaults, else None."""
         return AnyTurn(self.sigma_tilt_deg, self.sigma_height_m) if self.limits_assumed else None
 
     def relaxed(self, steps: float) -> TablePrior:
-        """Return the prior with limits for several steps; the tie to the plane is unchanged."""
+        """Return the prior with limits for several steps; the constraint to the plane is unchanged."""
         rotation_deg, shift_m = relaxed_limits(self.max_rotation_deg, self.max_shift_m, steps)
         return replace(self, max_rotation_deg=rotation_deg, max_shift_m=shift_m)
 
 
 @dataclass(frozen=True)
 class AnyTurn(AbstractPrior):
-    """Any turn on the table; two centroids of one object's surface are no farther apart than its size allows."""
+    """Any turn on the table; the shift of the centroids is limited by the object's size."""
 
     sigma_tilt_deg: float = WOBBLE_DEG
     """Standard deviation of the rotation out of the plane, on top of the plane's own uncertainty."""
@@ -189,7 +189,7 @@ class AnyTurn(AbstractPrior):
         """Return the density of target_from_source.
 
         Raises:
-            InputError: where neither view shows a support plane.
+            InputError: if neither view shows a support plane.
         """
         shift_m = AnyMotion().reach_m(source, target)
         return TablePrior(180.0, shift_m, self.sigma_tilt_deg, self.sigma_height_m).between(source, target)

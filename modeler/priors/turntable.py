@@ -1,4 +1,4 @@
-"""The turntable prior: a commanded step about an axis that is given, seen as the table's normal, or learned."""
+"""The turntable prior: a commanded step about an axis that is given, the table's normal, or learned."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _REACH = 8.0  # standard deviations of the turn that are sampled
 _NODES = 4097
 _UP = (0.0, -1.0, 0.0)  # opposite to gravity for an upright camera: y points down
 _BROAD_DEG, _GIVEN_DEG = 30.0, 1.0
-_LEAST = 1e-5  # rad or m: keeps densities finite where a standard deviation of 0 is given
-_VAGUE_DEG = 20.0  # a direction known no better is negligible compared with what the steps show
+_FLOOR = 1e-5  # of standard deviations in rad or m: keeps densities finite if 0 is given
+_UNKNOWN_DEG = 20.0  # standard deviation of a direction that adds little to the information of the steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +54,14 @@ class AxisTurn:
     """Standard deviation of the axis' direction, about each direction orthogonal to it; infinite: any direction."""
     sigma_wobble_rad: float
     """Standard deviation of the rotation's remainder, about each direction orthogonal to the axis."""
-    either_way: bool = False
+    unknown_sign: bool = False
     """Whether the sign of the turn is unknown."""
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Draw rotations (count, 3, 3)."""
         offsets, _, cumulative = self._turns
         turn = self.turn_rad + np.interp(rng.random(count), cumulative, offsets)
-        if self.either_way:
+        if self.unknown_sign:
             turn = turn * rng.choice([-1.0, 1.0], count)
         concentration = np.maximum(self._concentration(spread(turn)), 1e-9)
         axes = directions_about(self.axis, concentration, count, rng)
@@ -71,10 +71,10 @@ class AxisTurn:
         """Return the log density (n,) of rotations by angles (n,) in [0, π], their axes at cosines (n,) to `axis`."""
         measure = spread(angle_rad)
         concentration = np.maximum(self._concentration(measure), 1e-9)
-        forth = self._log_turn(angle_rad) + concentration * (cosine - 1.0)
-        back = self._log_turn(-angle_rad) - concentration * (cosine + 1.0)
+        forward = self._log_turn(angle_rad) + concentration * (cosine - 1.0)
+        backward = self._log_turn(-angle_rad) - concentration * (cosine + 1.0)
         normaliser = concentration / (-2.0 * np.pi * np.expm1(-2.0 * concentration) * self._share)
-        return np.logaddexp(forth, back) + np.log(normaliser / (measure + self.sigma_wobble_rad**2))
+        return np.logaddexp(forward, backward) + np.log(normaliser / (measure + self.sigma_wobble_rad**2))
 
     def line(self, angle_rad: Array, axes: Array) -> tuple[Array, Array]:
         """Return posterior directions of the axes, given the expected one and the rotations' own.
@@ -86,12 +86,12 @@ class AxisTurn:
         Returns:
             (n, 3) unit directions up to sign, and (n,) their variances in rad².
         """
-        shown = spread(angle_rad) / self.sigma_wobble_rad**2
+        measured = spread(angle_rad) / self.sigma_wobble_rad**2
         known = self.sigma_axis_rad**-2.0
         side = np.where(axes @ self.axis < 0.0, -1.0, 1.0)
-        lines = known * self.axis + (shown * side)[:, None] * axes
+        lines = known * self.axis + (measured * side)[:, None] * axes
         lengths = np.linalg.norm(lines, axis=1, keepdims=True)
-        return np.where(lengths > 0.0, lines / np.maximum(lengths, 1e-300), self.axis), 1.0 / (known + shown + 1.0)
+        return np.where(lengths > 0.0, lines / np.maximum(lengths, 1e-300), self.axis), 1.0 / (known + measured + 1.0)
 
     def _concentration(self, measure: Array) -> Array:
         """Return the concentration κ of the axis about the expected one, given 4 sin²(θ/2)."""
@@ -101,10 +101,10 @@ class AxisTurn:
 
     def _log_turn(self, angle_rad: Array) -> Array:
         """Return the log density (n,) of turns by angles (n,) on the circle."""
-        forth = self._log_wrapped(angle_rad - self.turn_rad)
-        if not self.either_way:
-            return forth
-        return np.logaddexp(forth, self._log_wrapped(angle_rad + self.turn_rad)) - np.log(2.0)
+        forward = self._log_wrapped(angle_rad - self.turn_rad)
+        if not self.unknown_sign:
+            return forward
+        return np.logaddexp(forward, self._log_wrapped(angle_rad + self.turn_rad)) - np.log(2.0)
 
     def _log_wrapped(self, offset_rad: Array) -> Array:
         offset = offset_rad - 2.0 * np.pi * np.rint(offset_rad / (2.0 * np.pi))
@@ -115,7 +115,7 @@ class AxisTurn:
 
     @cached_property
     def _turns(self) -> tuple[Array, float, Array]:
-        """Offsets of the turn (k,) from the expected, the share that the wobble does not hide, their CDF (k,)."""
+        """Offsets (k,) of the turn from its mean, the normalisation that wobble leaves, and their CDF (k,)."""
         offsets = np.linspace(-_REACH, _REACH, _NODES) * self.sigma_turn_rad
         measure = spread(self.turn_rad + offsets)
         density = np.exp(-0.5 * (offsets / self.sigma_turn_rad) ** 2) * measure / (measure + self.sigma_wobble_rad**2)
@@ -148,7 +148,7 @@ def angles_and_axes(rotations: Array) -> tuple[Array, Array]:
     angle_rad = np.arctan2(length, twice_cosine)
     axes = twice_sine / np.maximum(length, 1e-300)[:, None]
     half_turns = (length < 1e-3) & (twice_cosine < 0.0)
-    if half_turns.any():  # there the difference of R and its transpose says nothing of the axis
+    if half_turns.any():  # there R - Rᵀ vanishes and does not determine the axis
         motions = np.broadcast_to(np.eye(4), (int(half_turns.sum()), 4, 4)).copy()
         motions[:, :3, :3] = rotations[half_turns]
         vectors = se3.log(motions)[:, :3]
@@ -160,7 +160,7 @@ def angles_and_axes(rotations: Array) -> tuple[Array, Array]:
 class AboutAxis(AbstractPoseDensity):
     """A turn about an axis without translation along it.
 
-    The axis' direction is estimated from the pose's own rotation and the expected axis. Where the axis' position is
+    The axis' direction is estimated from the pose's own rotation and the expected axis. If the axis' position is
     unknown, the source's centroid is uniform on a disc orthogonal to the axis, about the target's.
     """
 
@@ -267,10 +267,10 @@ class TurntablePrior(AbstractPrior):
     axis_point_m: tuple[float, float, float] | None = None
     """A point of the axis in camera coordinates."""
     axis_sigma_deg: float | None = None
-    """Standard deviation of the axis' direction: 1 where it is given, the plane's own where a table is seen, else 30
+    """Standard deviation of the axis' direction. None: 1 if it is given, the plane's own if a table is seen, else 30
     about the camera's up (-y). 180 or more: any direction."""
     axis_sigma_m: float = 0.005
-    """Standard deviation of the axis' point, orthogonal to the axis, where one is given."""
+    """Standard deviation of the axis' point, orthogonal to the axis, if one is given."""
     max_shift_m: float = 0.05
     """Largest distance, orthogonal to the axis, between the target's centroid and the source's, transformed; it grows
     with turns beyond 30 degrees."""
@@ -279,12 +279,12 @@ class TurntablePrior(AbstractPrior):
     wobble_m: float = WOBBLE_M
     """Standard deviation of the shift that is not due to the turn about the axis."""
     needs_table: bool = False
-    """Whether views without a table are refused: the product of table and step."""
+    """Whether views without a table are rejected: the product of table and step."""
     learned_axis: Axis | None = None
     """The common axis of the pairs so far, used as a proposal."""
     sense: int = 0
-    """Sense of rotation of the pairs so far, +1 right-handed about the axis, where `step_sign` is unknown; used as a
-    proposal. 0: not known."""
+    """Sense of rotation of the pairs so far, +1 right-handed about the axis, if `step_sign` is unknown; used as a
+    proposal. 0: undetermined."""
     newest: int | None = None
     """The last frame of a running sequence: steps to it are evidence; None: no sequence, all steps are."""
 
@@ -296,7 +296,7 @@ class TurntablePrior(AbstractPrior):
         """Return the density of target_from_source.
 
         Raises:
-            InputError: where a table is needed and neither view shows one.
+            InputError: if a table is needed and neither view shows one.
         """
         plane = support(source, target)
         if plane is None and self.needs_table:
@@ -309,7 +309,7 @@ class TurntablePrior(AbstractPrior):
             density = defensive_mixture(density, [directed._density(source, target, self.learned_axis or axis)])
         if self.newest is None or target.index == self.newest:
             return density
-        # The steps to an earlier view already count in the edges between; here they may only propose.
+        # The steps to an earlier view are already part of the edges in between; here they are only a proposal.
         return defensive_mixture(self._limits(source, target), [density])
 
     def relaxed(self, steps: float) -> TurntablePrior:
@@ -326,24 +326,24 @@ class TurntablePrior(AbstractPrior):
         return replace(self, learned_axis=learned_axis, sense=sense, newest=max(solution.trajectory, default=None))
 
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
-        """Return the axis that all steps share, beyond what each edge holds; None where the axis is given.
+        """Return the axis that all steps share, beyond the information in each edge; None if the axis is given.
 
-        Edges hold the commanded step and that nothing moves along the axis. Where the direction is given or a table is
-        seen, they hold the direction as well, and the steps share the axis' position alone.
+        Edges contain the commanded step and that nothing moves along the axis. If the direction is given or a table is
+        seen, they also contain the direction, and steps share only the axis' position.
         """
         if self.axis_point_m is not None:
             return None
-        vague = all(self._axis(view.plane).sigma_direction_rad >= np.radians(_VAGUE_DEG) for view in views)
-        return SharedAxis(float(np.radians(self.wobble_deg)) if vague else np.inf, self.wobble_m)
+        unknown = all(self._axis(view.plane).sigma_direction_rad >= np.radians(_UNKNOWN_DEG) for view in views)
+        return SharedAxis(float(np.radians(self.wobble_deg)) if unknown else np.inf, self.wobble_m)
 
     def _sense(self, posteriors: Sequence[Posterior]) -> int:
-        """Return the sense of rotation of pairs, +1 right-handed about the axis; 0 = not known."""
+        """Return the sense of rotation of pairs, +1 right-handed about the axis; 0 = undetermined."""
         up = np.array(_UP if self.axis_direction is None else self.axis_direction)
         step_rad, sigma_rad = np.radians([abs(self.step_deg), self.step_sigma_deg])
         return turn_sense(posteriors, up / np.linalg.norm(up), step_rad, sigma_rad)
 
     def _axis(self, plane: Plane | None) -> Axis:
-        """Return the axis as known independently of the images, from the table if one is seen."""
+        """Return the axis as known independently of the registrations, from the table if one is seen."""
         if self.axis_direction is not None:
             direction, sigma_rad = np.array(self.axis_direction), np.radians(_GIVEN_DEG)
         elif plane is not None:
@@ -353,20 +353,20 @@ class TurntablePrior(AbstractPrior):
         if self.axis_sigma_deg is not None:
             sigma_rad = np.radians(self.axis_sigma_deg) if self.axis_sigma_deg < 180.0 else np.inf
         point_m = None if self.axis_point_m is None else np.array(self.axis_point_m)
-        return Axis(direction / np.linalg.norm(direction), max(float(sigma_rad), _LEAST), point_m, self.axis_sigma_m)
+        return Axis(direction / np.linalg.norm(direction), max(float(sigma_rad), _FLOOR), point_m, self.axis_sigma_m)
 
     def _density(self, source: RayImage, target: RayImage, axis: Axis) -> AboutAxis:
         """Return the density of turns by the commanded steps about an axis."""
         expected = self._axis(support(source, target)).direction
-        side = 1.0 if axis.direction @ expected >= 0.0 else -1.0  # the sign of a learned line is arbitrary
+        side = 1.0 if axis.direction @ expected >= 0.0 else -1.0  # the sign of a learned axis is arbitrary
         steps = target.index - source.index
         turn = AxisTurn(
             axis=side * axis.direction,
             turn_rad=float(np.radians(steps * self.step_deg)),
-            sigma_turn_rad=max(float(np.radians(self.step_sigma_deg) * np.sqrt(max(abs(steps), 1))), _LEAST),
+            sigma_turn_rad=max(float(np.radians(self.step_sigma_deg) * np.sqrt(max(abs(steps), 1))), _FLOOR),
             sigma_axis_rad=axis.sigma_direction_rad,
-            sigma_wobble_rad=max(float(np.radians(self.wobble_deg)), _LEAST),
-            either_way=self.step_sign == "unknown",
+            sigma_wobble_rad=max(float(np.radians(self.wobble_deg)), _FLOOR),
+            unknown_sign=self.step_sign == "unknown",
         )
         return AboutAxis(
             turn=turn,
@@ -374,7 +374,7 @@ class TurntablePrior(AbstractPrior):
             source_centroid_m=source.centroid_m,
             target_centroid_m=target.centroid_m,
             max_shift_m=self._shift_m(steps),
-            wobble_m=max(self.wobble_m, _LEAST),
+            wobble_m=max(self.wobble_m, _FLOOR),
         )
 
     def _shift_m(self, steps: int) -> float:
@@ -385,15 +385,15 @@ class TurntablePrior(AbstractPrior):
         """Return the uniform density within reach of the steps, on the table if one is seen."""
         steps = target.index - source.index
         turn_deg = _on_circle(steps * self.step_deg)
-        either_side_deg = reach_deg(float(self.step_sigma_deg * np.sqrt(abs(steps))))
-        whole_deg = min(abs(turn_deg) + either_side_deg, 180.0)
+        half_width_deg = reach_deg(float(self.step_sigma_deg * np.sqrt(abs(steps))))
+        limit_deg = min(abs(turn_deg) + half_width_deg, 180.0)
         if support(source, target) is None:
-            return GeneralPrior(whole_deg, self._shift_m(steps)).between(source, target)
-        density = TablePrior(whole_deg, self._shift_m(steps)).between(source, target)
-        if self.step_sign == "unknown" or either_side_deg >= 180.0:
+            return GeneralPrior(limit_deg, self._shift_m(steps)).between(source, target)
+        density = TablePrior(limit_deg, self._shift_m(steps)).between(source, target)
+        if self.step_sign == "unknown" or half_width_deg >= 180.0:
             return density
         return replace(
-            density, max_rotation_rad=float(np.radians(either_side_deg)), middle_rad=float(np.radians(turn_deg))
+            density, max_rotation_rad=float(np.radians(half_width_deg)), middle_rad=float(np.radians(turn_deg))
         )
 
 
@@ -403,7 +403,7 @@ def _on_circle(turn_deg: float) -> float:
 
 
 def turntable_in(prior: AbstractPrior) -> TurntablePrior | None:
-    """Return the turntable in a prior, of which it may be one of several parts; None where there is none."""
+    """Return the turntable prior that is, or is part of, a prior; None if there is none."""
     if isinstance(prior, TurntablePrior):
         return prior
     values = [getattr(prior, field.name) for field in fields(prior)] if is_dataclass(prior) else []
