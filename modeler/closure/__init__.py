@@ -1,4 +1,4 @@
-"""Which pairs of views to register, and which of their posteriors become edges of the graph."""
+"""Selection of pairs of views to register, and the gate by which their posteriors become edges of the graph."""
 
 from modeler.closure.closer import Closer as Closer
 from modeler.closure.consistency import ConsistencyModel as ConsistencyModel

@@ -1,4 +1,4 @@
-"""Which pairs of views are registered besides consecutive ones, and which registrations become edges."""
+"""Selection of the pairs of views to register besides consecutive ones, and of the registrations to accept."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresholds, broken, modes
+from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresholds, failure, modes
 from modeler.closure.information_gain import InformationGain
 from modeler.closure.map_view import MapView, ShortestPaths, composed
 from modeler.closure.relocaliser import Relocaliser
@@ -26,54 +26,55 @@ from modeler.types import (
     segments,
 )
 
-_MIN_PROBABILITY = 0.02  # that a view is within reach: a return whose turn was uncertain adds much information
+_MIN_PROBABILITY = 0.02  # of a view to be within reach: returns after uncertain turns add much information
 _SPAN_POWER = 6.0  # an edge over 25° adds half the information of one over none, over 50° a fourteenth
 
 
 @dataclass(frozen=True)
 class Closer:
-    """Chooses what a new view is registered against, and judges the results.
+    """Selects the views against which a new one is registered, and accepts or rejects the results.
 
-    Every view is registered against the previous one. Further pairs are tried where their edge is expected to add much
-    information: where the object comes back after turning away, or where one edge spans many small steps. A result is
-    accepted where it is consistent with the other edges (method.md, "Closure gate").
+    Every view is registered against the previous one. Further pairs are registered if their edge is expected to be
+    informative: if the object returns after turning away, or if one edge spans many small steps. A result is accepted
+    if it is consistent with the other edges (method.md, "Closure gate").
     """
 
     max_angle_deg: float = NEAR_DEG
-    """Largest predicted rotation in degrees to an earlier view for it to be tried."""
+    """Largest predicted rotation in degrees to an earlier view."""
     max_return_deg: float = 75.0
-    """The same for the last frame and the first, where no loop is closed yet: as far as views are registered at all
-    (`priors.general.relaxed_limits`). A turn of few large steps ends one step, of up to so much, before its start."""
+    """The same between the last frame and the first if no loop is closed yet: the largest rotation across which views
+    are registered (`priors.general.relaxed_limits`). A turn of few large steps ends one step before its start."""
     away_deg: float = AWAY_DEG
-    """How far in degrees the object must have turned away from an earlier view before it counts as coming back."""
+    """Rotation in degrees by which the object must have turned away from an earlier view for an edge to it to be a
+    closure."""
     keyframe_deg: float = 10.0
-    """Rotation in degrees to all keyframes from which on a view becomes one. Closures lead to keyframes alone, so that
-    the graph of many turns stays one map with chains along it, and its solution as cheap for each further turn. There
-    is always a keyframe the edge to which has 97 % of the information of one over no rotation (method.md, eq. C1)."""
+    """Least rotation in degrees between keyframes. Closures only lead to keyframes, so that the graph of many turns is
+    one map with chains along it, and each further turn costs the same. The edge to the nearest keyframe has at least
+    97 % of the information of one over no rotation (method.md, eq. C1)."""
     max_closures: int = 2
-    """Most views besides the previous one that are tried for a frame; 0 = never close."""
+    """Largest number of views, besides the previous one, to register a frame against; 0 = none."""
     min_gain_nats: float = 4.16
-    """Least expected information of a closure: 6 log 2 halves all six standard deviations."""
+    """Least expected information gain of a closure: 6 log 2 halves all six standard deviations."""
     max_spans: int = 1
-    """Most further views that are tried for each frame once all are in; 0 = none."""
+    """Largest number of further views to register each frame against once all are in; 0 = none."""
     max_span_deg: float = 55.0
     """Largest rotation in degrees to such a view: two steps of the usual 25°."""
     min_span_gain_nats: float = 0.1
-    """Least expected information of such an edge: one over two steps of 25° adds that."""
+    """Least expected information gain of such an edge: that of one over two steps of 25°."""
     max_relocations: int = 4
-    """Most earlier views that are tried for a frame that the previous view does not place."""
+    """Largest number of earlier views to register a frame against that the previous view does not place."""
     thresholds: Thresholds = field(default_factory=Thresholds)
-    """What edges other than that to the previous view must fulfil."""
+    """Requirements on all edges other than that to the previous view."""
     consistency: ConsistencyModel = field(default_factory=ConsistencyModel)
-    """How far they may be from what the graph predicts."""
+    """Limits on their deviation from the graph's prediction."""
 
     def closure_targets(self, base: Posterior, map_view: MapView, *, last: bool = False) -> tuple[int, ...]:
         """Return the views to register a frame against besides the one that places it, best first.
 
         Args:
             base: the registration that places the frame.
-            map_view: what is known so far.
-            last: whether this is the last frame: it is tried against the first wherever that is in reach.
+            map_view: the map so far.
+            last: whether this is the last frame, which is registered against the first if that is within reach.
         """
         frames = map_view.targets
         if self.max_closures == 0 or len(map_view.frames) < 2:
@@ -87,11 +88,11 @@ class Closer:
         chosen, spanned = [], False
         for candidate in gain.candidates([frames[k] for k in near], angle_deg[near], self.min_gain_nats):
             if candidate.overlap >= self.thresholds.min_overlap:
-                back = map_view.came_back(candidate.frame, base.source, gain.paths, away_deg=self.away_deg)
-                if back or not spanned:  # one span a frame is enough
+                closes = map_view.came_back(candidate.frame, base.source, gain.paths, away_deg=self.away_deg)
+                if closes or not spanned:  # one span per frame is enough
                     chosen.append(candidate.frame)
-                spanned = spanned or not back
-        first = frames[0]  # a closure on the first view is best
+                spanned = spanned or not closes
+        first = frames[0]  # a closure with the first view is preferred
         wanted = last and first != base.target and self._returns(gain, float(angle_deg[0]))
         wanted = wanted and map_view.came_back(first, base.source, gain.paths, away_deg=self.away_deg)
         if wanted or first in chosen:
@@ -99,7 +100,7 @@ class Closer:
         return tuple(chosen[: self.max_closures])
 
     def _returns(self, gain: InformationGain, angle_deg: float) -> bool:
-        """Return whether the last frame may be registered against the first view, `angle_deg` from it."""
+        """Return whether the last frame is within reach of the first view, at a predicted rotation `angle_deg`."""
         known, first = gain.map_view, gain.map_view.frames[0]
         closed = loops_closed([edge for edge in known.edges if known.solution.takes_part(edge)])
         reach_deg = self.max_angle_deg if closed else max(self.max_angle_deg, self.max_return_deg)
@@ -107,9 +108,9 @@ class Closer:
         return bool(probability[0] >= _MIN_PROBABILITY)
 
     def span_pairs(self, map_view: MapView) -> tuple[tuple[int, int], ...]:
-        """Return pairs (source, target) of views to register once all are in: those of most information for each.
+        """Return the most informative pairs (source, target) of each view to register once all are in.
 
-        Both are of one segment: between segments nothing is known of the motion.
+        Both are of one segment, as there is no motion prior between segments.
         """
         segment_of = segments([edge for edge in map_view.edges if map_view.solution.takes_part(edge)])
         frames, targets = sorted(map_view.frames), np.array(sorted(map_view.targets))
@@ -130,17 +131,17 @@ class Closer:
         return tuple(pairs)
 
     def is_keyframe(self, frame: int, map_view: MapView) -> bool:
-        """Return whether closures may lead to a view: it sees the object from where no keyframe does."""
+        """Return whether a view becomes a keyframe: no other one is near."""
         keyframes = map_view.poses(map_view.targets)
         angle_rad = se3.rotation_angle(se3.inverse(keyframes) @ map_view.solution.trajectory[frame])
         return bool(angle_rad.min(initial=np.inf) >= np.radians(self.keyframe_deg))
 
     def relocalisation_target(self, posteriors: Sequence[Posterior], map_view: MapView) -> int | None:
-        """Return the earlier view to register a lost frame against next; None: it is given up.
+        """Return the earlier view to register a lost frame against next; None to give up.
 
         Args:
-            posteriors: what was tried for the frame, the previous view first.
-            map_view: what is known so far.
+            posteriors: registrations of the frame so far, the previous view first.
+            map_view: the map so far.
         """
         if len(posteriors) > self.max_relocations:
             return None
@@ -153,37 +154,37 @@ class Closer:
 
         Args:
             posteriors: registrations of the frame, the previous view first.
-            map_view: what is known so far.
-            steps: how many frames lie between the previous view and this frame, this one counted.
+            map_view: the map so far.
+            steps: number of frames from the previous view to this one.
         """
         return self._relocaliser(map_view, self._evidence(map_view), steps=steps).placement(posteriors)
 
     def predicted_motion(self, base: Posterior, target: int, solution: Solution) -> PoseGaussian:
-        """Return target_from_source of the frame that a registration places and a view, as all edges predict it."""
+        """Return the prediction of target_from_source between a frame, placed by a registration, and a view."""
         return composed(modes(base)[0][1], solution.relative_gaussian(target, base.target))
 
     def judge(self, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1) -> tuple[Edge, ...]:
-        """Return one judged edge per posterior, in their order. The frame joins the graph if any is accepted.
+        """Return an edge, accepted or rejected, per posterior. The frame joins the graph if any is accepted.
 
-        Edges to views that the object had turned away from are closures; of the others the one that places the frame,
-        or was to, is odometry, and the rest are spans.
+        Edges to views from which the object had turned away are closures; of the others, the one that places the frame,
+        or was meant to, is odometry, and the rest are spans.
 
         Args:
             posteriors: registrations of one new frame, against the previous view first.
-            map_view: what is known so far.
-            steps: how many frames lie between the previous view and this frame, this one counted.
+            map_view: the map so far.
+            steps: number of frames from the previous view to this one.
         """
         base, base_reason = self.placement(posteriors, map_view, steps=steps)
         paths = map_view.shortest_paths(base.target) if base is not None and len(posteriors) > 1 else ShortestPaths()
         evidence, edges = self._evidence(map_view), []
         for number, posterior in enumerate(posteriors):
             consecutive = number == 0 and steps == 1
-            back = number > 0 and self._came_back(posterior, map_view, paths)
+            closes = number > 0 and self._came_back(posterior, map_view, paths)
             places = number == 0 or base is None or posterior is base
-            kind: EdgeKind = "closure" if back else "odometry" if places else "span"
+            kind: EdgeKind = "closure" if closes else "odometry" if places else "span"
             if posterior is base:
                 edges.append(Edge(posterior, kind, True, base_reason))
-            elif reason := broken(posterior) if consecutive else self.thresholds.defect(posterior, evidence):
+            elif reason := failure(posterior) if consecutive else self.thresholds.defect(posterior, evidence):
                 edges.append(Edge(posterior, kind, False, reason))
             elif base is None:
                 edges.append(Edge(posterior, kind, False, NotPlaced()))
@@ -197,7 +198,7 @@ class Closer:
         return tuple(edges)
 
     def judge_span(self, posterior: Posterior, map_view: MapView) -> Edge:
-        """Return the judged edge between two views of the graph, from a registration that it does not hold yet."""
+        """Return the edge, accepted or rejected, of a further registration between two views of the graph."""
         paths = map_view.shortest_paths(posterior.source)
         kind = "closure" if self._came_back(posterior, map_view, paths) else "span"
         predicted = map_view.solution.relative_gaussian(posterior.target, posterior.source)

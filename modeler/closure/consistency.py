@@ -1,4 +1,4 @@
-"""The gate: what a registration must fulfil to become an edge, and how far it is from what the graph predicts."""
+"""The closure gate: tests of a registration, among them consistency with the graph's prediction."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ from modeler.types import (
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What edges other than that to the previous view must fulfil; method.md has their origins."""
+    """Requirements on edges other than that to the previous view; method.md has their origins."""
 
     min_overlap: float = 0.4
-    """Smallest overlap (0..1), predicted and found."""
+    """Least overlap (0..1), predicted and measured."""
     max_evidence_drop_nats: float = 40.0
-    """How far the log evidence may lie below the median of the run's edges, a nat an effective point."""
+    """Largest difference of the log evidence from the median of the run's edges, a nat per effective point."""
     max_evidence_drop_sigmas: float = 8.0
-    """The same in robust standard deviations of the run's edges; the larger of both counts."""
+    """The same in robust standard deviations of the run's edges; the larger of both is used."""
     min_edges: int = 5
-    """Edges from which on their median evidence is known."""
+    """Least number of edges for a median."""
     max_edges: int = 30
-    """Newest edges that it is taken of."""
+    """Number of newest edges in the median."""
     max_open_deg: float = 5.0
-    """Largest standard deviation in degrees of the rotation about any axis, where the graph knows it as badly. What
-    leaves a rotation open, about the axis of a bottle, is bounded by the prior's limits, which the edges that placed
-    the frames hold already; and that axis is known too badly for a wide rotation about it not to contradict others."""
+    """Largest standard deviation in degrees of the rotation about any axis, unless the graph knows it better. An open
+    rotation, such as that about the axis of a bottle, is bounded only by the prior's limits, which are already part of
+    the edges that placed the frames; and as its axis is uncertain, wide rotations would contradict other edges."""
     known_share: float = 0.5
-    """The graph knows a rotation better where its standard deviation is below this share of the edge's."""
+    """The graph knows a rotation better if its standard deviation is below this fraction of the edge's."""
 
     def evidence_bound(self, edges: Sequence[Edge], solution: Solution) -> EvidenceBound:
-        """Return what the edges of a run so far, between neighbours, say of the evidence of further ones.
+        """Return the least log evidence of further edges, from a run's edges between neighbours so far.
 
-        How well two views match depends on shape and sensor, so that evidence says little by itself. A wrong pose
-        matches far worse than the edges of the run scatter.
+        Log evidence depends on shape and sensor and is meaningful only in comparison; that of a wrong pose is far below
+        the scatter of the run's edges.
         """
         joining = (edge for edge in reversed(edges) if edge.kind == "odometry" and solution.takes_part(edge))
         all_nats = [edge.posterior.log_evidence for edge in islice(joining, self.max_edges)]
@@ -65,8 +65,8 @@ class Thresholds:
         return EvidenceBound(median, median - drop_nats)
 
     def defect(self, posterior: Posterior, evidence: EvidenceBound) -> Reason | None:
-        """Return what keeps a posterior out of the graph, whatever the other edges say; None: nothing."""
-        if (found := broken(posterior)) is not None:
+        """Return why a posterior is rejected independently of the other edges; None if it is not."""
+        if (found := failure(posterior)) is not None:
             return found
         if not posterior.overlap >= self.min_overlap:
             return LowOverlap(posterior.overlap, self.min_overlap)
@@ -75,30 +75,30 @@ class Thresholds:
         return None
 
     def open_rotation(self, posterior: Posterior, predicted: PoseGaussian) -> OpenRotation | None:
-        """Return that a posterior leaves a rotation open that the prediction knows no better; None: it does not."""
+        """Return the reason if a posterior leaves a rotation open that the prediction does not know better, or None."""
         sigma_rad, axis = widest_rotation(posterior)
         known_rad = float(np.sqrt(axis @ predicted.covariance[:3, :3] @ axis))
         if np.degrees(sigma_rad) <= self.max_open_deg or known_rad <= self.known_share * sigma_rad:  # eq. C6
             return None
         return OpenRotation(float(np.degrees(sigma_rad)))
 
-    def stands_alone(self, posterior: Posterior, evidence: EvidenceBound) -> bool:
-        """Return whether a registration could place a frame without the previous view."""
+    def places_alone(self, posterior: Posterior, evidence: EvidenceBound) -> bool:
+        """Return whether a registration may place a frame without that of the previous view."""
         return posterior.outcome is Outcome.CONVERGED and self.defect(posterior, evidence) is None
 
 
 @dataclass(frozen=True)
 class EvidenceBound:
-    """The log evidence of a run's edges, and the least that others may have."""
+    """The log evidence of a run's edges, and the least of further ones."""
 
     median_nats: float = float("nan")
     """Median of the run's edges; NaN: not known yet."""
     min_nats: float = -float("inf")
-    """Below it the images contradict an edge."""
+    """Bound below which an edge is rejected."""
 
 
-def broken(posterior: Posterior) -> Reason | None:
-    """Return why a posterior is no Gaussian that a graph can take; None: it is one."""
+def failure(posterior: Posterior) -> Reason | None:
+    """Return why a posterior cannot be a factor of a graph; None if it can."""
     if not posterior.usable:
         return Failed(posterior.outcome)
     pose = posterior.pose
@@ -111,14 +111,14 @@ def broken(posterior: Posterior) -> Reason | None:
 
 
 def modes(posterior: Posterior) -> list[tuple[float, PoseGaussian]]:
-    """Return the separate modes of a posterior with their weights, heaviest first; itself where it has but one."""
+    """Return the separate modes of a posterior with their weights, heaviest first; its Gaussian if it has only one."""
     return [(mode.weight, mode.pose) for mode in posterior.modes] or [(1.0, posterior.pose)]
 
 
 def widest_rotation(posterior: Posterior) -> tuple[float, Array]:
     """Return the largest standard deviation in rad of the rotation about any axis, and that axis (3,).
 
-    The axis is given in the source camera. Of several modes the widest counts.
+    The axis is in source camera coordinates. Of several modes, the widest counts.
     """
     variances, axes = np.linalg.eigh(np.stack([pose.covariance[:3, :3] for _, pose in modes(posterior)]))
     widest = int(np.argmax(variances[:, -1]))
@@ -127,29 +127,29 @@ def widest_rotation(posterior: Posterior) -> tuple[float, Array]:
 
 @dataclass(frozen=True)
 class ConsistencyModel:
-    """How far a registration may be from what a chain of edges predicts.
+    """Test of a registration against the prediction by a chain of edges.
 
-    Pairwise covariances hold no systematic error, which adds up along a chain instead of averaging out. Registrations
-    are compared with wider covariances than they state.
+    Pairwise covariances do not include systematic errors, which accumulate along a chain instead of averaging out. So
+    covariances are inflated for the comparison.
     """
 
     sigma_scale: float = 2.0
-    """How many times the standard deviations of edges may understate their random errors."""
+    """Factor on the standard deviations of edges, which may be optimistic."""
     drift_deg: float = 0.15
-    """Systematic rotation error of an edge in degrees; along a chain it adds up."""
+    """Systematic rotation error of an edge in degrees; it accumulates along a chain."""
     drift_m: float = 0.00025
-    """Systematic translation error of an edge in m, at the object; along a chain it adds up."""
+    """Systematic translation error of an edge in m, at the object; it accumulates along a chain."""
     max_distance: float = 4.7390
     """Largest Mahalanobis distance: √χ²₆(0.999), which 1 of 1000 true closures exceeds."""
     min_weight: float = 0.05
-    """Share (0..1) of the posterior's mass that the agreeing modes must hold."""
+    """Least fraction (0..1) of the posterior's mass in consistent modes."""
 
     def systematic(self, length: int, centroid_m: Array) -> Array:
-        """Return the covariance (6, 6) of the systematic error of a chain of `length` edges, seen from its end.
+        """Return the covariance (6, 6) of the systematic error of a chain of `length` edges, in the camera at its end.
 
         Args:
             length: number of edges.
-            centroid_m: (3,) of the object in the camera at the chain's end.
+            centroid_m: (3,) of the object in that camera.
         """
         sigmas = length * np.repeat([np.radians(self.drift_deg), self.drift_m], 3)  # method.md, eq. C3
         return se3.covariance_about(np.diag(sigmas**2), -centroid_m)
@@ -162,11 +162,11 @@ class ConsistencyModel:
         length: int,
         centroid_m: Array,
     ) -> Consistency:
-        """Compare a registration, mode by mode, with what a chain of edges predicts of the same target_from_source.
+        """Compare a registration, mode by mode, with the prediction of target_from_source by a chain of edges.
 
         Args:
             posterior: the registration.
-            predictions: what the chain says, with weights that sum to 1.
+            predictions: modes of the prediction, with weights that sum to 1.
             length: number of edges of the chain.
             centroid_m: (3,) of the object in the source camera.
         """
@@ -192,12 +192,12 @@ class ConsistencyModel:
     def consistency_through(
         self, base: Posterior, posterior: Posterior, map_view: MapView, paths: ShortestPaths
     ) -> Consistency:
-        """Compare a registration of a frame with the path through the graph and another registration of the frame.
+        """Compare a registration of a frame with the prediction by another one and the graph.
 
         Args:
-            base: the other, which places the frame.
+            base: the other registration, which places the frame.
             posterior: target_from_source of the frame and some view.
-            map_view: what is known so far.
+            map_view: the map so far.
             paths: from the view of `base`.
         """
         through = map_view.solution.relative_gaussian(posterior.target, base.target)

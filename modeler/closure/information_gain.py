@@ -1,4 +1,4 @@
-"""Which earlier views a new one should be registered against: those whose edges should add most information."""
+"""Expected information gain of registering a view against earlier ones (method.md, eq. C1 and C2)."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from modeler import se3
 from modeler.closure.map_view import MapView, ShortestPaths
 from modeler.types import Array
 
-_MAX_EXACT = 6  # views whose gain is computed in full: those with the largest bounds
-_RECENT_EDGES = 20  # newest edges whose mean covariance stands for that of the next
-_OVERLAP_POINTS = 200  # points of a view by which its overlap is predicted
+_MAX_EXACT = 6  # views whose gain is computed exactly: those with the largest bounds
+_RECENT_EDGES = 20  # newest edges, whose mean covariance is assumed for the next
+_OVERLAP_POINTS = 200  # of a view, to predict its overlap
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """An earlier view, and what an edge to it is expected to add."""
+    """An earlier view, with the expected information gain of an edge to it."""
 
     frame: int
     """Number of the view."""
     angle_deg: float
     """Predicted rotation between the two."""
     overlap: float
-    """Share (0..1) of the earlier view's surface that should face the new one's camera."""
+    """Predicted fraction (0..1) of the earlier view's surface that faces the new one's camera."""
     gain_nats: float
-    """Information that the edge is expected to add about the motion between the two."""
+    """Expected information gain about the motion between the two."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +37,9 @@ class InformationGain:
     """Expected information of edges between one view and earlier ones."""
 
     map_view: MapView
-    """What is known so far."""
+    """The map so far."""
     previous: int
-    """The view that an edge joins the new one to; or the new view itself, where it is in the graph already."""
+    """The view to which an edge joins the new one; or the new view itself, if it is in the graph already."""
     expected: Array
     """object_from_camera (4, 4) of the new view."""
     systematic: Array
@@ -49,8 +49,8 @@ class InformationGain:
     has_own_edge: bool = True
     """Whether an edge of its own joins the new view to `previous`; False: it is `previous`."""
     power: float = 2.0
-    """Of cos θ in the information of an edge over a rotation θ. A larger one prefers small rotations, whose errors have
-    less of what edges have in common and no loop shows."""
+    """Exponent of cos θ in the information of an edge over a rotation θ. A larger one prefers small rotations, which
+    have less systematic error."""
 
     @cached_property
     def paths(self) -> ShortestPaths:
@@ -62,7 +62,7 @@ class InformationGain:
 
         Args:
             frames: numbers of the views.
-            angle_deg: (n,) predicted rotations, as uncertain as the shortest paths say.
+            angle_deg: (n,) predicted rotations, with the variances of the shortest paths.
         """
         variance_rad2, _ = self.paths.to(frames)
         own_rad2 = _rotation_variance(self._one_edge) if self.has_own_edge and self._one_edge is not None else 0.0
@@ -70,10 +70,10 @@ class InformationGain:
         return np.where(np.isinf(variance_rad2), 0.0, ndtr((self.max_angle_deg - angle_deg) / sigma_deg))
 
     def candidates(self, frames: Sequence[int], angle_deg: Array, min_gain_nats: float) -> list[Candidate]:
-        """Return the best of some earlier views, largest gain first.
+        """Return the most informative of some earlier views, largest gain first.
 
-        The shortest path bounds the covariance of the motion, so that the covariance itself is computed for a few views
-        only, however long the sequence.
+        The shortest path bounds the covariance of the motion, so that the covariance itself is computed for only a few
+        views, however long the sequence.
 
         Args:
             frames: numbers of earlier views.
@@ -104,14 +104,14 @@ class InformationGain:
 
     @cached_property
     def _one_edge(self) -> Array | None:
-        """Mean covariance (6, 6) of the newest edges; None where there are none."""
+        """Mean covariance (6, 6) of the newest edges; None if there are none."""
         solution = self.map_view.solution
         edges = [edge for edge in self.map_view.edges[-_RECENT_EDGES:] if solution.takes_part(edge)]
         recent = [solution.pose_of(edge).covariance for edge in edges]
         return np.asarray(np.mean(recent, axis=0) + self.systematic) if recent else None
 
     def _overlap(self, frame: int) -> float:
-        """Return the share of a view's surface that should face the new view's camera."""
+        """Return the predicted fraction of a view's surface that faces the new view's camera."""
         view = self.map_view.views[frame]
         count = len(view.points_m)
         chosen = np.linspace(0, count - 1, min(_OVERLAP_POINTS, count)).astype(int)

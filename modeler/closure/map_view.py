@@ -1,4 +1,4 @@
-"""What the closer knows of the frames so far: poses, edges, shortest paths between frames, and steady motion."""
+"""The map as the closer uses it: poses, edges, shortest paths between frames, and extrapolation."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ class MapView:
     solution: Solution
     """The poses so far."""
     edges: Sequence[Edge] = ()
-    """Every edge judged so far."""
+    """All edges so far, accepted or rejected."""
     keyframes: Sequence[int] | None = None
     """Views to which closures and spans may lead; None: all."""
     before: PathNetwork = field(default_factory=lambda: PathNetwork())
-    """That of fewer edges, if it is known."""
+    """The network of earlier edges, if known."""
 
     @cached_property
     def targets(self) -> list[int]:
-        """Those of them that have a pose, in order of acceptance."""
+        """Numbers of the keyframes that have a pose, in order of acceptance."""
         return self.frames if self.keyframes is None else [k for k in self.keyframes if k in self.solution.trajectory]
 
     @cached_property
@@ -54,9 +54,9 @@ class MapView:
         return self.network.shortest_paths(start)
 
     def extrapolated(self, frame: int) -> Array:
-        """Return object_from_camera (4, 4) of a frame if the motion between the two views nearest to it is steady.
+        """Return object_from_camera (4, 4) of a frame, extrapolated from the two views nearest in time (eq. C8).
 
-        For a new frame these are the last two; a frame that was left out lies between two, or before the first.
+        For a new frame these are the last two; a lost frame lies between two, or before the first.
         """
         near, *other = heapq.nsmallest(2, self.frames, key=lambda view: abs(view - frame))
         if not other:
@@ -70,8 +70,8 @@ class MapView:
         Args:
             target: number of the view.
             source: number of the other frame.
-            paths: from the view that the other frame is registered against.
-            away_deg: rotation that counts as having turned away.
+            paths: from the view against which the other frame is registered.
+            away_deg: rotation from which on it has turned away.
         """
         frames = np.array(self.frames)
         between = (frames > min(target, source)) & (frames < max(target, source))
@@ -81,12 +81,12 @@ class MapView:
 
     @cached_property
     def network(self) -> PathNetwork:
-        """What shortest paths lead along."""
+        """The network of shortest paths."""
         return self.before.plus(self.edges, self.solution)
 
 
 def composed(first: PoseGaussian, then: PoseGaussian) -> PoseGaussian:
-    """Return the motion `first`, then `then`, of independent errors: mean `then.mean @ first.mean`."""
+    """Return the motion `first`, then `then`, for independent errors: mean `then.mean @ first.mean`."""
     covariance = se3.composed_covariance(then.covariance, first.mean, first.covariance)
     by_focal = first.by_focal + se3.adjoint(se3.inverse(first.mean)) @ then.by_focal
     return PoseGaussian(then.mean @ first.mean, covariance, by_focal)
@@ -99,21 +99,21 @@ class ShortestPath:
     edges: int
     """Number of edges."""
     variance_rad2: float
-    """Sum of their rotation variances: an upper bound of the motion's, which other paths reduce."""
+    """Sum of their rotation variances: an upper bound of the motion's."""
     before: int
-    """The frame before the last on the path; the start itself at the start."""
+    """The last frame but one on the path; the start itself at the start."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShortestPaths(Mapping[int, ShortestPath]):
-    """The paths of least rotation variance from one frame to all that edges connect with it, by frame number."""
+    """The paths of least rotation variance from one frame to all connected ones, by frame number."""
 
     index: Mapping[int, int] = field(default_factory=dict)
     """Index of each frame in the arrays."""
     distances_rad2: Array = field(default_factory=lambda: np.zeros(0))
-    """(n,) sums of variances; infinite where there is no path."""
+    """(n,) sums of variances; infinite without a path."""
     before: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """(n,) index of the frame before the last on the path; its own at the start, and where there is no path."""
+    """(n,) index of the last frame but one on the path; its own at the start, and without a path."""
 
     def __getitem__(self, frame: int) -> ShortestPath:
         """Return the path to one frame."""
@@ -148,7 +148,7 @@ class ShortestPaths(Mapping[int, ShortestPath]):
         return np.where(known, self.distances_rad2[indices], np.inf), np.where(known, self.lengths[indices], 0)
 
     def along(self, frame: int) -> list[int]:
-        """Return the frames on the path from the start to one, both included; none where there is no path."""
+        """Return the frames on the path from the start to one, both included; none without a path."""
         if frame not in self:
             return []
         path = [self.index[frame]]
@@ -163,24 +163,24 @@ class ShortestPaths(Mapping[int, ShortestPath]):
 
 @dataclass(frozen=True, eq=False)
 class PathNetwork:
-    """The edges that take part, weighted by their rotation variance. A value: `plus` makes a new one."""
+    """The edges that take part, weighted by their rotation variance. Immutable: `plus` returns a new one."""
 
     edges: Sequence[Edge] = ()
-    """All that were judged, whether they take part or not."""
+    """All edges, whether they take part or not."""
     solution: Solution = field(default_factory=Solution)
-    """What says which take part, and with which poses."""
+    """Determines which take part, and with which poses."""
     ends: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     """(m, 2) source and target of those that do."""
     edge_variances_rad2: Array = field(default_factory=lambda: np.zeros(0))
-    """(m,) of the rotation."""
+    """(m,) their rotation variances."""
 
     @classmethod
     def of(cls, edges: Sequence[Edge], solution: Solution) -> PathNetwork:
-        """Return the network of judged edges, with the poses by which a solution took them."""
+        """Return the network of edges, with their poses in a solution."""
         return cls().plus(edges, solution)
 
     def plus(self, edges: Sequence[Edge], solution: Solution) -> PathNetwork:
-        """Return that of other edges, with as little work as what differs asks for."""
+        """Return the network of other edges; only what differs is computed."""
         known, old = len(self.edges), self.solution
         same = tuple(edges[:known]) == tuple(self.edges) and solution.outliers == old.outliers
         if known and not (same and old.edge_poses.items() <= solution.edge_poses.items()):
@@ -198,7 +198,7 @@ class PathNetwork:
 
     @cached_property
     def variances_rad2(self) -> csr_array:
-        """(n, n), from frame to frame."""
+        """(n, n) from frame to frame, sparse."""
         size, indices = len(self._indexed[0]), self._indexed[1]
         rows, columns = np.concatenate([indices, indices[:, ::-1]]).T
         variances = np.tile(self.edge_variances_rad2, 2)
@@ -214,7 +214,7 @@ class PathNetwork:
         return frames, indices.reshape(-1, 2)
 
     def shortest_paths(self, start: int) -> ShortestPaths:
-        """Return the shortest path from a frame to every other that edges connect with it (Dijkstra 1959)."""
+        """Return the shortest paths from a frame to all connected ones (Dijkstra 1959)."""
         if start not in self.index:
             return ShortestPaths({start: 0}, np.zeros(1), np.zeros(1, dtype=np.int64))
         index = self.index[start]

@@ -1,4 +1,4 @@
-"""Which registration places a frame, and what to register the frame against next where none does."""
+"""Selection of the registration that places a frame and, if none does, of the next view to try."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
-from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresholds, broken, modes
+from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresholds, failure, modes
 from modeler.closure.map_view import MapView
 from modeler.types import ConfirmedBy, JoinsPrevious, NearExtrapolation, NotPlaced, Posterior, Reason, Relocalised
 
 
 @dataclass(frozen=True, eq=False)
 class Relocaliser:
-    """Decides which of a frame's registrations places it.
+    """Selects which of a frame's registrations places it.
 
-    The previous view's does, frame by frame. After lost frames, and where another view has to take its place, one side
-    of the object may match another: such a registration is accepted alone only near the extrapolated motion, and
-    farther away if that of another view agrees.
+    Usually it is that of the previous view. After lost frames, or if another view has to replace it, one side of the
+    object may match another: such a registration is accepted alone only near the extrapolated motion, and farther away
+    if that of another view is consistent with it.
     """
 
     map_view: MapView
-    """What is known so far."""
+    """The map so far."""
     thresholds: Thresholds
-    """Of registrations."""
+    """Requirements on registrations."""
     evidence: EvidenceBound
-    """Of the run's edges."""
+    """Bound from the run's edges."""
     consistency: ConsistencyModel
-    """Of a registration with another."""
+    """Test of registrations against each other."""
     max_angle_deg: float
-    """Rotation in degrees from the extrapolated motion up to which a registration is accepted alone."""
+    """Largest rotation in degrees from the extrapolated motion at which a registration is accepted alone."""
     steps: int = 1
-    """How many frames lie between the previous view and this frame, this one counted."""
+    """Number of frames from the previous view to this one."""
 
     def placement(self, posteriors: Sequence[Posterior]) -> tuple[Posterior | None, Reason]:
         """Return the posterior that places a frame, and why.
@@ -44,16 +44,18 @@ class Relocaliser:
         if not posteriors:
             return None, NotPlaced()
         odometry = posteriors[0]
-        if self._follows(odometry) and (self.steps == 1 or self._angle_off_deg(odometry) <= self.max_angle_deg):
+        if self._accepts_odometry(odometry) and (
+            self.steps == 1 or self._angle_off_deg(odometry) <= self.max_angle_deg
+        ):
             return odometry, JoinsPrevious(odometry.outcome, odometry.overlap)
-        standing = [posterior for posterior in posteriors if self.thresholds.stands_alone(posterior, self.evidence)]
-        for posterior in sorted(standing, key=lambda posterior: -posterior.overlap):
+        candidates = [posterior for posterior in posteriors if self.thresholds.places_alone(posterior, self.evidence)]
+        for posterior in sorted(candidates, key=lambda posterior: -posterior.overlap):
             off_deg = self._angle_off_deg(posterior)
-            # At the largest rotation that can be registered, the posterior may be cut off.
+            # At the largest rotation that can be registered, the posterior may be truncated.
             rotation_deg = float(np.degrees(se3.rotation_angle(posterior.pose.mean)))
             support: NearExtrapolation | ConfirmedBy | None = NearExtrapolation(off_deg)
             if max(off_deg, rotation_deg) > self.max_angle_deg:
-                support = self._confirmation(posterior, standing)
+                support = self._confirmation(posterior, candidates)
             if support is None:
                 continue
             if posterior is odometry:
@@ -62,43 +64,43 @@ class Relocaliser:
         return None, NotPlaced()
 
     def next_target(self, posteriors: Sequence[Posterior]) -> int | None:
-        """Return the earlier view to register a lost frame against next; None where none is left.
+        """Return the earlier view to register a lost frame against next; None if none is left.
 
-        A posterior that stands alone needs confirmation: by the view nearest to its pose. Otherwise the view nearest to
+        A single acceptable posterior needs confirmation by the view nearest to its pose. Otherwise the view nearest to
         the extrapolated motion comes first, then those farthest from all views tried.
 
         Args:
-            posteriors: what was tried for the frame, the previous view first.
+            posteriors: registrations of the frame so far, the previous view first.
         """
         tried = [posterior.target for posterior in posteriors]
-        left = [frame for frame in self.map_view.frames if frame not in tried]
-        if not left:
+        untried = [frame for frame in self.map_view.frames if frame not in tried]
+        if not untried:
             return None
-        poses = self.map_view.poses(left)
+        poses = self.map_view.poses(untried)
         for posterior in posteriors:
-            if self.thresholds.stands_alone(posterior, self.evidence):
+            if self.thresholds.places_alone(posterior, self.evidence):
                 placed = self.map_view.solution.trajectory[posterior.target] @ posterior.pose.mean
                 angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ placed))
                 if angle_deg.min() <= self.max_angle_deg:
-                    return left[int(np.argmin(angle_deg))]
+                    return untried[int(np.argmin(angle_deg))]
         if len(tried) == 1:
             expected = self.map_view.extrapolated(posteriors[0].source)
-            return left[int(np.argmin(se3.rotation_angle(se3.inverse(poses) @ expected)))]
-        apart = [se3.rotation_angle(se3.inverse(pose) @ poses) for pose in self.map_view.poses(tried)]
-        return left[int(np.argmax(np.min(apart, axis=0)))]
+            return untried[int(np.argmin(se3.rotation_angle(se3.inverse(poses) @ expected)))]
+        distances = [se3.rotation_angle(se3.inverse(pose) @ poses) for pose in self.map_view.poses(tried)]
+        return untried[int(np.argmax(np.min(distances, axis=0)))]
 
-    def _follows(self, odometry: Posterior) -> bool:
-        """Return whether the previous view's registration is sound, and after lost frames matches like others."""
+    def _accepts_odometry(self, odometry: Posterior) -> bool:
+        """Return whether the previous view's registration is valid and, after lost frames, has enough evidence."""
         matches = self.steps == 1 or not odometry.log_evidence < self.evidence.min_nats
-        return broken(odometry) is None and matches
+        return failure(odometry) is None and matches
 
-    def _confirmation(self, posterior: Posterior, standing: Sequence[Posterior]) -> ConfirmedBy | None:
-        """Return that a registration of another view agrees with one not too far from the extrapolated motion."""
-        # Extrapolation of a random pace errs with the root of the number of steps.
+    def _confirmation(self, posterior: Posterior, candidates: Sequence[Posterior]) -> ConfirmedBy | None:
+        """Return a consistent registration of another view, if this one is near the extrapolated motion; else None."""
+        # The error of extrapolating a random walk grows with the root of the number of steps.
         if self._angle_off_deg(posterior) > float(np.sqrt(self.steps)) * self.max_angle_deg:
             return None
         paths = self.map_view.shortest_paths(posterior.target)
-        for other in standing:
+        for other in candidates:
             if other is not posterior:
                 if self.consistency.consistency_through(posterior, other, self.map_view, paths).consistent:
                     return ConfirmedBy(other.target)
