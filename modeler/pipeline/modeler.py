@@ -363,7 +363,9 @@ class Run:
 
     def _step(self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge]) -> Step:
         """Return the event of a processed frame."""
-        views, solution = self.state.views, self.state.solution
+        views, solution, ready = self.state.views, self.state.solution, self.state.ready
+        # What the pairs were registered with is at hand: who draws a pair need not make it again.
+        compared = {posterior.target: ready[posterior.target] for posterior in posteriors if posterior.target in ready}
         return Step(
             frame=prepared.frame,
             segmentation=prepared.segmentation,
@@ -374,7 +376,7 @@ class Run:
             solution=solution,
             make_model=partial(self._preview.model, views, solution.trajectory),
             edges_so_far=self.state.graph.edges,
-            views=views,
+            views={**views, **compared},
         )
 
 

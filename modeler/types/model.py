@@ -72,7 +72,8 @@ class Step:
     edges_so_far: tuple[Edge, ...] = ()
     """Every edge so far, accepted or not, in order."""
     views: Mapping[int, RayImage] = field(default_factory=dict)
-    """Every accepted view by frame number."""
+    """Every accepted view by frame number; those of the posteriors with the images that a likelihood looks up, if these
+    are in memory."""
     last: bool = False
     """True for the final step."""
 
