@@ -24,7 +24,7 @@ import numpy as np
 from far_apart.pairs import Limits, Pair, pairs
 from modeler.evaluation import rotation_error_deg
 from modeler.pipeline import Modeler
-from modeler.priors import GeneralPrior
+from modeler.priors import AutoPrior
 from modeler.registration import FpfhIcpRegistrar, KissIcpRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.baselines import kiss
 from modeler.types import AbstractRegistrar, Posterior
@@ -77,9 +77,7 @@ def _trials(pair: Pair, limits: Iterable[Limits], seed: tuple[int, int], *, colo
     def by(registrar: AbstractRegistrar, limit: Limits) -> Posterior:
         return registrar.register(pair.source, pair.target, pair.density(limit), rng=np.random.default_rng(seed))
 
-    untold = Modeler(
-        registrar=ours, prior=GeneralPrior(limits_assumed=True), seed=seed[0]
-    )  # as `modeler register` does
+    untold = Modeler(registrar=ours, prior=AutoPrior(), seed=seed[0])  # as `modeler register` does
     methods = {f"visibility, {told}": partial(by, ours, told) for told in limits if told != "default"}
     if "default" in limits:
         methods["visibility, default"] = partial(untold.register, pair.source, pair.target)

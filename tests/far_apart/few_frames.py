@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--views", type=int, default=6, metavar="N", help="of a full turn")
     parser.add_argument("--shapes", type=int, default=SHAPES, metavar="N", help="how many")
     parser.add_argument("--only", nargs="+", metavar="SHAPE", help="these shapes")
-    parser.add_argument("--prior", default="general", help="general, or table")
+    parser.add_argument("--prior", default="auto", help="auto, general, or table")
     options = parser.parse_args(arguments)
     names = options.only or shapes(options.half, options.shapes)
     known = []
