@@ -109,36 +109,36 @@ def second_derivative(cost: Callable[[Array], float], step: float = 1e-4) -> Arr
 
 def test_starts_with_the_centroids_together_where_the_prior_is_general(pair: Pair, rng: np.random.Generator) -> None:
     source, target = pair
-    begin = start(source, target, GeneralPrior(50.0, 0.04).between(source, target), rng)
+    initial = start(source, target, GeneralPrior(50.0, 0.04).between(source, target), rng)
     aligned = se3.translation(target.centroid_m - source.centroid_m)
-    assert degrees_between(begin.target_from_source, aligned) < 3.0
-    carried = se3.transform(begin.target_from_source, source.centroid_m[None])[0]
+    assert degrees_between(initial.target_from_source, aligned) < 3.0
+    carried = se3.transform(initial.target_from_source, source.centroid_m[None])[0]
     assert np.linalg.norm(carried - target.centroid_m) < 0.004
 
 
 def test_starts_at_the_centre_of_a_prior_that_knows_the_motion(pair: Pair, rng: np.random.Generator) -> None:
     source, target = pair
     truth = POSES[1] @ se3.inverse(POSES[0])
-    begin = start(source, target, Normal(truth, source.centroid_m, 0.02, 0.003), rng)
-    assert degrees_between(begin.target_from_source, truth) < 0.2
-    assert begin.sigma_rad == pytest.approx(0.02, rel=0.05)
-    assert begin.sigma_m == pytest.approx(0.003, rel=0.05)
+    initial = start(source, target, Normal(truth, source.centroid_m, 0.02, 0.003), rng)
+    assert degrees_between(initial.target_from_source, truth) < 0.2
+    assert initial.sigma_rad == pytest.approx(0.02, rel=0.05)
+    assert initial.sigma_m == pytest.approx(0.003, rel=0.05)
 
 
 def test_starts_without_turning_where_the_prior_has_no_centre(pair: Pair, rng: np.random.Generator) -> None:
     source, target = pair
-    begin = start(source, target, AnyTurn(source.centroid_m, target.centroid_m), rng)
-    np.testing.assert_allclose(begin.target_from_source, se3.translation(target.centroid_m - source.centroid_m))
+    initial = start(source, target, AnyTurn(source.centroid_m, target.centroid_m), rng)
+    np.testing.assert_allclose(initial.target_from_source, se3.translation(target.centroid_m - source.centroid_m))
 
 
 def test_spread_is_stated_at_the_start_in_our_tangent(pair: Pair, rng: np.random.Generator) -> None:
     source, target = pair
     density = Normal(POSES[1] @ se3.inverse(POSES[0]), source.centroid_m, 0.1, 0.02)
-    begin = start(source, target, density, rng)
-    xi = se3.log(se3.inverse(begin.target_from_source) @ density.sample(20_000, rng))
-    about_centre = xi @ se3.adjoint(se3.translation(-begin.centre_m)).T
+    initial = start(source, target, density, rng)
+    xi = se3.log(se3.inverse(initial.target_from_source) @ density.sample(20_000, rng))
+    about_centre = xi @ se3.adjoint(se3.translation(-initial.centre_m)).T
     # Sampled Gaussians of this spread have squared Mahalanobis length 6 on average.
-    assert np.mean(np.sum((about_centre / begin.sigmas) ** 2, axis=1)) == pytest.approx(6.0, rel=0.05)
+    assert np.mean(np.sum((about_centre / initial.sigmas) ** 2, axis=1)) == pytest.approx(6.0, rel=0.05)
 
 
 def test_thinning_keeps_one_mean_point_a_cube(rng: np.random.Generator) -> None:
@@ -202,8 +202,8 @@ def test_icp_stops_where_open3d_would(pair: Pair, rng: np.random.Generator) -> N
 
     method = IcpRegistrar()
     source, target = (Cloud.of(view) for view in pair)
-    begin = start(pair[0], pair[1], GeneralPrior(40.0, 0.03).between(*pair), rng)
-    fit = method.refine(source, target, begin.target_from_source)
+    initial = start(pair[0], pair[1], GeneralPrior(40.0, 0.03).between(*pair), rng)
+    fit = method.refine(source, target, initial.target_from_source)
     assert fit is not None
     voxel_m = cube_edges_m(source, target, method.voxels)[-1]
     reach_m = method.reach * voxel_m
@@ -358,11 +358,11 @@ def test_features_need_no_start(pair: Pair, rng: np.random.Generator) -> None:
 
 
 def test_surfaces_and_prior_add_up(pair: Pair, rng: np.random.Generator) -> None:
-    begin = start(*pair, Normal(np.eye(4), pair[0].centroid_m, 0.3, 0.01), rng)
+    initial = start(*pair, Normal(np.eye(4), pair[0].centroid_m, 0.3, 0.01), rng)
     jacobian = rng.normal(size=(40, 6))
-    found = posterior(*pair, begin, Fit(np.eye(4), jacobian, 1.0), 0.1).pose.covariance
-    about_centre = se3.adjoint(se3.translation(-begin.centre_m))
-    prior = about_centre.T @ np.diag(begin.sigmas**-2.0) @ about_centre
+    found = posterior(*pair, initial, Fit(np.eye(4), jacobian, 1.0), 0.1).pose.covariance
+    about_centre = se3.adjoint(se3.translation(-initial.centre_m))
+    prior = about_centre.T @ np.diag(initial.sigmas**-2.0) @ about_centre
     np.testing.assert_allclose(found, np.linalg.inv(jacobian.T @ jacobian + prior), rtol=1e-9, atol=1e-15)
 
 
@@ -380,18 +380,18 @@ def test_directions_that_nobody_saw_keep_the_spread_of_the_prior(
     ball, normals = ball * (1.0 + last_digit[0]), normals * (1.0 + last_digit[1])
     residuals, jacobian = plane_residuals(Matches(ball, Cloud(ball, normals), 1.0), np.eye(4))
     fit = Fit(np.eye(4), whitened_jacobian(residuals, np.ones(500), jacobian), 1.0)
-    begin = start(source, target, Normal(np.eye(4), centre, 0.3, 0.01), rng)
+    initial = start(source, target, Normal(np.eye(4), centre, 0.3, 0.01), rng)
     at_centre = se3.adjoint(se3.translation(-centre))
-    covariance = at_centre @ posterior(source, target, begin, fit, 0.1).pose.covariance @ at_centre.T
-    np.testing.assert_allclose(covariance[:3, :3], begin.sigma_rad**2 * np.eye(3), atol=1e-6 * begin.sigma_rad**2)
+    covariance = at_centre @ posterior(source, target, initial, fit, 0.1).pose.covariance @ at_centre.T
+    np.testing.assert_allclose(covariance[:3, :3], initial.sigma_rad**2 * np.eye(3), atol=1e-6 * initial.sigma_rad**2)
     assert np.all(np.sqrt(np.diag(covariance)[3:]) < 1e-5)
 
 
 def test_a_fit_of_few_matches_is_no_overlap(pair: Pair, rng: np.random.Generator) -> None:
-    begin = start(pair[0], pair[1], Normal(np.eye(4), pair[0].centroid_m, 0.1, 0.01), rng)
+    initial = start(pair[0], pair[1], Normal(np.eye(4), pair[0].centroid_m, 0.1, 0.01), rng)
     fit = IcpRegistrar().refine(Cloud.of(pair[0]), Cloud.of(pair[1]), se3.translation(np.array([0.0, 0.0, 0.5])))
     assert fit is not None
-    assert posterior(pair[0], pair[1], begin, fit, min_fitness=0.1).outcome is Outcome.NO_OVERLAP
+    assert posterior(pair[0], pair[1], initial, fit, min_fitness=0.1).outcome is Outcome.NO_OVERLAP
 
 
 def test_thinning_is_not_finer_than_the_points(rng: np.random.Generator) -> None:

@@ -20,7 +20,7 @@ from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
-from modeler.registration.visibility.refinement import following
+from modeler.registration.visibility.refinement import focal_motion
 from modeler.types import Array, Edge, FocalLength, ObjectModel, PoseGaussian, Solution, Step
 from sequences import FocalFactor, RefocusedSequence, bundled, open_sequence
 
@@ -46,7 +46,7 @@ def test_distances_of_carried_points_from_planes_follow_the_focal_length(rng: np
         normal /= np.linalg.norm(normal)
         less, more = (distance_m(carried, on_plane, normal, shift) for shift in (-step, step))
         by_focal = (more - less) / (2.0 * step)
-        np.testing.assert_allclose(following(carried, on_plane[None])[0] @ normal, by_focal, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(focal_motion(carried, on_plane[None])[0] @ normal, by_focal, rtol=1e-6, atol=1e-9)
 
 
 def test_a_posterior_states_how_its_mean_follows_the_focal_length() -> None:

@@ -220,13 +220,13 @@ def test_what_stays_in_its_place_is_found_though_centroids_err(printed):
     aside = replace(view, frame=replace(view.frame, colour=np.roll(view.frame.colour, (1, -1), axis=(0, 1))))
     pair = VisibilityLikelihood().between(view, aside, np.random.default_rng(0))
     assert pair.colour is not None
-    assert all(pair.colour.unmoved(band) > 0.8 for band in range(3))
+    assert all(pair.colour.static_correlation(band) > 0.8 for band in range(3))
 
 
 def test_a_shift_of_colours_is_eliminated(rng):
     root, shifts = rng.normal(size=(6, 6)), rng.normal(size=(6, 2))
     information = root @ root.T
-    marginal = colours.unshifted(information, shifts) @ information
+    marginal = colours.without_shift(information, shifts) @ information
     np.testing.assert_allclose(np.linalg.inv(marginal), np.linalg.inv(information) + shifts @ shifts.T, rtol=1e-8)
 
 

@@ -44,9 +44,7 @@ class Relocaliser:
         if not posteriors:
             return None, NotPlaced()
         odometry = posteriors[0]
-        if self._accepts_odometry(odometry) and (
-            self.steps == 1 or self._angle_off_deg(odometry) <= self.max_angle_deg
-        ):
+        if self._continues(odometry) and (self.steps == 1 or self._angle_off_deg(odometry) <= self.max_angle_deg):
             return odometry, JoinsPrevious(odometry.outcome, odometry.overlap)
         candidates = [posterior for posterior in posteriors if self.thresholds.places_alone(posterior, self.evidence)]
         for posterior in sorted(candidates, key=lambda posterior: -posterior.overlap):
@@ -89,7 +87,7 @@ class Relocaliser:
         distances = [se3.rotation_angle(se3.inverse(pose) @ poses) for pose in self.map_view.poses(tried)]
         return untried[int(np.argmax(np.min(distances, axis=0)))]
 
-    def _accepts_odometry(self, odometry: Posterior) -> bool:
+    def _continues(self, odometry: Posterior) -> bool:
         """Return whether the previous view's registration is valid and, after lost frames, has enough evidence."""
         matches = self.steps == 1 or not odometry.log_evidence < self.evidence.min_nats
         return failure(odometry) is None and matches

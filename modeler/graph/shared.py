@@ -60,19 +60,14 @@ class SharedCovariance:
     @cached_property
     def _marginals(self) -> dict[int, Array]:
         root = self.independent.root
-        return {
-            frame: self._widened(independent, root, frame)
-            for frame, independent in self.independent.marginals().items()
-        }
+        return {frame: self._widened(single, root, frame) for frame, single in self.independent.marginals().items()}
 
     def _widened(self, independent: Array, target: int, source: int) -> Array:
         if target == source:
             return independent
         source_from_target = se3.inverse(self.independent.trajectory[source]) @ self.independent.trajectory[target]
-        of_target = se3.inverse_covariance(source_from_target, self._image_noise.get(target, np.zeros((6, 6))))
-        covariance = (
-            (1.0 - self.share) * independent + self._image_noise.get(source, np.zeros((6, 6))) + of_target
-        )  # eq. G9
+        of_target = se3.inverse_covariance(source_from_target, self._noise.get(target, np.zeros((6, 6))))
+        covariance = (1.0 - self.share) * independent + self._noise.get(source, np.zeros((6, 6))) + of_target  # eq. G9
         if self.focal is not None:
             zero = np.zeros(6)  # of frames added since
             apart = self.focal.by_focal.get(source, zero) - self.focal.by_focal.get(target, zero)
@@ -84,7 +79,7 @@ class SharedCovariance:
         return 0.5 * (covariance + covariance.T)
 
     @cached_property
-    def _image_noise(self) -> dict[int, Array]:
+    def _noise(self) -> dict[int, Array]:
         """Covariances Q_k (6, 6) of the noise of images: ρ/2 of the harmonic mean of each frame's edges."""
         informations: dict[int, list[Array]] = {}
         for factor in self.factors:

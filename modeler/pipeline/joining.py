@@ -137,9 +137,7 @@ class Joiner:
         """Return the log-likelihoods (n,) of alignments (n, 4, 4), means over all pairs of views (eq. J1), in nats."""
         targets, sources = self._spread(target, _MAX_VIEWS), self._spread(source, _MAX_VIEWS)
         log_likelihoods = [
-            self._log_likelihoods(
-                other, view, se3.inverse(target.solution.trajectory[t]) @ poses @ source.solution.trajectory[s]
-            )
+            self._nats(other, view, se3.inverse(target.solution.trajectory[t]) @ poses @ source.solution.trajectory[s])
             for t, view in targets.items()
             for s, other in sources.items()
         ]
@@ -232,7 +230,7 @@ class Joiner:
             return Edge(posterior, "join", False, Failed(Outcome.NO_OVERLAP))
         return Edge(posterior, "join", True, JoinsSegments(1.0, 0.0))
 
-    def _log_likelihoods(self, source: RayImage, target: RayImage, poses: Array) -> Array:
+    def _nats(self, source: RayImage, target: RayImage, poses: Array) -> Array:
         """Return the log-likelihoods (n,) of poses (n, 4, 4) of a pair of views.
 
         Without the cost of no overlap, because views from opposite sides have none.
@@ -247,7 +245,7 @@ class Joiner:
         return float(
             np.mean(
                 [
-                    self._log_likelihoods(views[s], views[t], (se3.inverse(poses[t]) @ poses[s])[None])[0]
+                    self._nats(views[s], views[t], (se3.inverse(poses[t]) @ poses[s])[None])[0]
                     for t, s in itertools.combinations(views, 2)
                 ]
             )

@@ -254,10 +254,7 @@ class FeaturesPrior(AbstractProposal):
         motions, votes = self.matcher.motions(source, target)
         if len(motions):
             possible = np.isfinite(known.log_density(motions))
-            motions, votes = (
-                motions[possible][: self.kernels],
-                votes[possible][: self.kernels].astype(np.float64),
-            )
+            motions, votes = motions[possible][: self.kernels], votes[possible][: self.kernels].astype(np.float64)
         if not len(motions):
             return None
         return KernelMixture(

@@ -1,4 +1,4 @@
-"""What the sampling methods share: statistics of weighted samples, and posteriors of failed registrations."""
+"""Statistics of weighted samples, and posteriors of failed registrations."""
 
 import numpy as np
 
@@ -29,7 +29,7 @@ def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaus
 
 
 def normalised(log_weights: Array) -> Array:
-    """Return weights (n,) of sum 1; uniform ones where all are 0."""
+    """Return weights (n,) that sum to 1; uniform ones if all are 0."""
     top = np.max(log_weights)
     weights = np.exp(log_weights - top) if np.isfinite(top) else np.ones(len(log_weights))
     return weights / np.sum(weights)
@@ -62,14 +62,14 @@ def pareto_tail(log_weights: Array) -> float:
 def share_at_limit(
     density: AbstractPoseDensity, poses: Array, weights: Array, centre_m: Array, rng: np.random.Generator
 ) -> float:
-    """Return the share of weighted poses (n, 4, 4) that a random step of about 1° and 1 mm takes out of the support.
+    """Return the fraction of weighted poses (n, 4, 4) that leave the support by a random step of about 1° and 1 mm.
 
     A posterior at the limit of its prior is truncated. Rotations of the steps are about `centre_m` (3,), a point of the
     source.
     """
-    nudges = rng.normal(size=(len(poses), 6)) * np.repeat([np.radians(1.0), 0.001], 3)
-    nudged = se3.moved(poses, nudges, centre_m)
-    return float(weights @ ~np.isfinite(density.log_density(nudged)))
+    perturbations = rng.normal(size=(len(poses), 6)) * np.repeat([np.radians(1.0), 0.001], 3)
+    perturbed = se3.moved(poses, perturbations, centre_m)
+    return float(weights @ ~np.isfinite(density.log_density(perturbed)))
 
 
 def failed(
@@ -79,12 +79,12 @@ def failed(
     density: AbstractPoseDensity | None = None,
     rng: np.random.Generator | None = None,
 ) -> Posterior:
-    """Return the posterior of a registration that could not be made: the prior, or next to no knowledge.
+    """Return the posterior of a failed registration: the prior, or an uninformative Gaussian.
 
     Args:
         source: first view.
         target: second view.
-        outcome: why it could not be made.
+        outcome: why it failed.
         density: the prior, whose mean and covariance are returned; without it the standard deviations are π and 10 m.
         rng: source of all randomness, with a density.
     """

@@ -1,1 +1,1 @@
-"""Methods of others: ICP, GICP, FPFH with RANSAC, KISS-Matcher, and the paper's sampler as published."""
+"""Baselines: ICP, GICP, FPFH with RANSAC, KISS-Matcher, and the paper's sampler as published."""

@@ -1,7 +1,7 @@
-"""What the methods on bare point clouds share: thinning, where to start, and what residuals say of the uncertainty.
+"""Common parts of the point cloud baselines: voxel downsampling, initial pose, and covariance from residuals.
 
-These methods are the field's usual practice, kept as baselines. They know nothing of free space, and of the prior they
-use the centre, to start from, and the spread, for directions that the surfaces leave open.
+These methods are standard practice. They ignore free space; of the prior they use the centre as the initial pose, and
+the spread for directions that the surfaces leave open.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from modeler.types import (
 
 _START_SAMPLES = 1000
 _SPACING_POINTS = 400
-_OPEN_SPREAD_RAD = np.pi / 2  # rotations spread wider than this have no centre to speak of
-_SMALLEST_SIGMA = 1e-6  # rad or m: keeps covariances positive definite where prior or residuals vanish
+_OPEN_ROTATION_RAD = np.pi / 2  # root mean square beyond which a mean rotation is meaningless
+_MIN_SIGMA = 1e-6  # rad or m: keeps covariances positive definite if prior or residuals vanish
 
 
 @final
@@ -46,7 +46,7 @@ class Cloud:
     normals: Array
     """(n, 3) unit normals, towards the camera."""
     intensity: Array | None = None
-    """(n,) mean of red, green and blue, 0 to 1; None where colour is not asked for."""
+    """(n,) mean of red, green and blue, 0 to 1; None if colour is not used."""
 
     @staticmethod
     def of(view: RayImage) -> Cloud:
@@ -58,13 +58,13 @@ class Cloud:
         """Return the surface points of a view with their intensity.
 
         Raises:
-            InputError: where the view has points, but no colour.
+            InputError: if the view has points, but no colour.
         """
         colour, (row, column) = view.frame.colour, view.pixels.T
         if colour is None and len(view.points_m):
             raise InputError(
                 f"frame {view.index}: has no colour, which coloured ICP compares; give colour aligned to depth,"
-                " or take another method."
+                " or use another method."
             )
         intensity = np.zeros(0) if colour is None else colour[row, column].mean(axis=1) / 255.0
         return Cloud(view.points_m, view.normals, intensity)
@@ -76,7 +76,7 @@ class Cloud:
 
     @property
     def spacing_m(self) -> float:
-        """Median distance of a point to its nearest neighbour, judged by a few hundred points."""
+        """Median distance of a point to its nearest neighbour, estimated from a few hundred points."""
         some = self.points_m[:: 1 + len(self.points_m) // _SPACING_POINTS]
         distances, _ = KDTree(self.points_m).query(some, k=2)
         return float(np.median(distances[:, 1]))
@@ -96,7 +96,7 @@ class Cloud:
 
 
 def cube_edges_m(source: Cloud, target: Cloud, shares: Sequence[float]) -> list[float]:
-    """Return the edges of thinning cubes that are given shares of the larger object, but not finer than the points."""
+    """Return voxel edges, given as fractions of the larger object's size, but not finer than the points."""
     size_m, spacing_m = max(source.size_m, target.size_m), max(source.spacing_m, target.spacing_m)
     return list(dict.fromkeys(max(share * size_m, spacing_m) for share in shares))
 
@@ -104,12 +104,12 @@ def cube_edges_m(source: Cloud, target: Cloud, shares: Sequence[float]) -> list[
 @final
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a local search begins, and how far the prior says that it may be off."""
+    """The initial pose of a local search, with the prior's spread about it."""
 
     target_from_source: Array
     """(4, 4)."""
     centre_m: Array
-    """(3,) point of the source about which the spread is stated."""
+    """(3,) point of the source to which the spread refers."""
     sigma_rad: float
     """Root mean square rotation of the prior about the start, per axis."""
     sigma_m: float
@@ -124,10 +124,9 @@ class Start:
 def start(source: RayImage, target: RayImage, density: AbstractPoseDensity, rng: np.random.Generator) -> Start:
     """Return the centre of the prior: the intrinsic mean of its samples.
 
-    Its fixed point is sought from the motion that puts the centroids together without turning. Where the prior leaves
-    the rotation all but free (a root mean square over 90°) it has no centre, and that motion itself is the start, as
-    for a user who knows nothing. For a prior given by centroids and a largest rotation, the two agree within sampling
-    error.
+    Its fixed-point iteration starts from the shift that aligns the centroids. If the prior leaves the rotation open (a
+    root mean square over 90°), it has no centre, and this shift itself is the initial pose. For a prior given by
+    centroids and a largest rotation, the two agree within sampling error.
     """
     samples = density.sample(_START_SAMPLES, rng)
     if len(source.points_m) and len(target.points_m):
@@ -136,14 +135,14 @@ def start(source: RayImage, target: RayImage, density: AbstractPoseDensity, rng:
     else:
         centre_m, guess = np.zeros(3), samples[0]
     pose, _ = se3.mean(samples, np.ones(len(samples)), start=guess)
-    if _rms_angle(pose, samples) > _OPEN_SPREAD_RAD:
+    if _rms_angle(pose, samples) > _OPEN_ROTATION_RAD:
         pose = guess
     shifts = samples[:, :3, :3] @ centre_m + samples[:, :3, 3] - se3.transform(pose, centre_m[None])
     return Start(
         pose,
         centre_m,
-        sigma_rad=max(_rms_angle(pose, samples) / np.sqrt(3.0), _SMALLEST_SIGMA),
-        sigma_m=max(float(np.sqrt(np.mean(shifts**2))), _SMALLEST_SIGMA),
+        sigma_rad=max(_rms_angle(pose, samples) / np.sqrt(3.0), _MIN_SIGMA),
+        sigma_m=max(float(np.sqrt(np.mean(shifts**2))), _MIN_SIGMA),
     )
 
 
@@ -154,31 +153,31 @@ def _rms_angle(pose: Array, samples: Array) -> float:
 @final
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Points of the source, and their nearest partners within reach of where a motion puts them."""
+    """Points of the source with their correspondences: the nearest points of the target under a motion."""
 
     points_m: Array
-    """(n, 3) points of the source, those with a partner."""
+    """(n, 3) points of the source that have a correspondence."""
     partners: Cloud
-    """Their n partners."""
+    """Their n correspondences."""
     fitness: float
-    """Share of the source's points that have a partner."""
+    """Fraction of the source's points that have a correspondence."""
 
 
 def matched(source_m: Array, target: Cloud, tree: KDTree, pose: Array, reach_m: float) -> Matches:
-    """Match points (n, 3), carried by `pose`, with their nearest in `target`, which `tree` holds, within `reach_m`."""
+    """Match points (n, 3), transformed by `pose`, with the nearest of `target`, in `tree`, within `reach_m`."""
     near, partner = nearest(source_m, tree, pose, reach_m)
     return Matches(source_m[near], Cloud(target.points_m[partner], target.normals[partner]), float(np.mean(near)))
 
 
 def nearest(source_m: Array, tree: KDTree, pose: Array, reach_m: float) -> tuple[BoolArray, npt.NDArray[np.intp]]:
-    """Return which points (n,), carried by `pose`, have a nearest point of `tree` within `reach_m`, and which it is."""
+    """Return whether points (n, 3), moved by `pose`, have a neighbour in `tree` within `reach_m`, and its index."""
     distances, indices = tree.query(se3.transform(pose, source_m), distance_upper_bound=reach_m)
     near = np.isfinite(distances)
     return near, np.asarray(indices)[near]
 
 
 def plane_residuals(matches: Matches, pose: Array) -> tuple[Array, Array]:
-    """Return how far matched points p, carried by `pose`, lie from the planes (q, n) of their partners.
+    """Return the point-to-plane residuals of matched points p, with planes (q, n) of their correspondences.
 
     Returns:
         Residuals n · (pose p - q) in m, (n,), and their derivative (n, 6) by the ξ of `pose @ exp(ξ)`.
@@ -190,10 +189,10 @@ def plane_residuals(matches: Matches, pose: Array) -> tuple[Array, Array]:
 
 
 def whitened_jacobian(residuals: Array, weights: Array, jacobian: Array) -> Array:
-    """Return a least-squares fit's Jacobian (n, 6), divided by the noise that the residuals themselves show.
+    """Return a least-squares fit's Jacobian (n, 6), divided by the noise estimated from the residuals.
 
-    The usual practice assumes independent residuals and correct matches. It is over-confident by orders of magnitude,
-    and therefore the negative control in the calibration study.
+    This standard practice assumes independent residuals and correct matches. It is overconfident by orders of
+    magnitude, and therefore the negative control in the calibration study.
 
     Args:
         residuals: (n,) in m.
@@ -205,83 +204,83 @@ def whitened_jacobian(residuals: Array, weights: Array, jacobian: Array) -> Arra
 
 
 def residual_variance(squares: float, count: float) -> float:
-    """Return the variance that a sum of squared residuals leaves after fitting six numbers, never quite zero."""
-    return max(squares / max(count - 6.0, 1.0), _SMALLEST_SIGMA**2)
+    """Return the residual variance of a fit of six parameters from its sum of squares; always positive."""
+    return max(squares / max(count - 6.0, 1.0), _MIN_SIGMA**2)
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a method on clouds found."""
+    """The result of a point cloud method."""
 
     target_from_source: Array
     """(4, 4)."""
     jacobian: Array
     """(n, 6) whitened Jacobian by ξ, from the surfaces alone: JᵀJ is the information, which may be singular."""
     fitness: float
-    """Share of the source's points that have a partner."""
+    """Fraction of the source's points that have a correspondence."""
 
 
 @dataclass(frozen=True)
 class AbstractCloudRegistrar(AbstractRegistrar):
-    """A method that fits one cloud to another, and states the residual-scaled inverse Hessian as its covariance."""
+    """A method that aligns point clouds, with the residual-scaled inverse Hessian as its covariance."""
 
     min_points: int = 12
-    """Fewest points a side."""
+    """Least number of points of each cloud."""
     min_fitness: float = 0.1
-    """Smallest share of matched points that counts as overlap."""
+    """Least fraction of matched points that counts as overlap."""
 
     @abstractmethod
-    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
-        """Return what is found from a start; None where too few points are left.
+    def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the fit from an initial pose; None if there are too few points.
 
         Args:
-            source: the view whose points are carried.
-            target: the view on which they are laid.
-            begin: (4, 4) the prior's centre.
+            source: the view whose points are transformed.
+            target: the view to which they are aligned.
+            initial: (4, 4) the prior's centre.
             rng: source of all randomness.
 
         Raises:
-            InputError: where the views lack what the method compares.
+            InputError: if the views lack what the method compares.
         """
 
     def register(
         self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
-        """Return the fit from the prior's centre; what the surfaces leave open has the prior's spread.
+        """Return the fit from the prior's centre; directions that the surfaces leave open have the prior's spread.
 
         Raises:
-            InputError: where the views lack what the method compares.
+            InputError: if the views lack what the method compares.
         """
         began = time.perf_counter()
-        begin = start(source, target, density, rng)
+        initial = start(source, target, density, rng)
         found = posterior(
-            source, target, begin, self.fit(source, target, begin.target_from_source, rng), self.min_fitness
+            source, target, initial, self.fit(source, target, initial.target_from_source, rng), self.min_fitness
         )
         return replace(found, seconds=time.perf_counter() - began)
 
 
-def posterior(source: RayImage, target: RayImage, begin: Start, fit: Fit | None, min_fitness: float) -> Posterior:
+def posterior(source: RayImage, target: RayImage, initial: Start, fit: Fit | None, min_fitness: float) -> Posterior:
     """Return a fit as a posterior; without one, the prior's centre and spread as TOO_FEW_POINTS.
 
     Directions without information keep the prior's spread, so that the covariance is positive definite.
     """
     if fit is None:
-        pose = PoseGaussian(begin.target_from_source, _covariance(np.zeros((0, 6)), begin))
+        pose = PoseGaussian(initial.target_from_source, _covariance(np.zeros((0, 6)), initial))
         return Posterior(source.index, target.index, pose, Outcome.TOO_FEW_POINTS, 0.0)
-    pose = PoseGaussian(fit.target_from_source, _covariance(fit.jacobian, begin))
+    pose = PoseGaussian(fit.target_from_source, _covariance(fit.jacobian, initial))
     outcome = Outcome.CONVERGED if fit.fitness >= min_fitness else Outcome.NO_OVERLAP
     return Posterior(source.index, target.index, pose, outcome, fit.fitness)
 
 
-def _covariance(jacobian: Array, begin: Start) -> Array:
+def _covariance(jacobian: Array, initial: Start) -> Array:
     """Return the covariance (6, 6) of ξ under a whitened Jacobian (n, 6) and the prior's spread.
 
-    By QR of the two stacked, about the object's centre. Surfaces may be 10¹⁴ times as informative as the prior, and to
-    form and invert the sum of the informations would lose the prior's to rounding.
+    By QR of the two stacked, about the object's centre. Surfaces may be 10¹⁴ times as informative as the prior, whose
+    information would be lost to rounding in a sum.
     """
-    about_centre = jacobian @ se3.adjoint(se3.translation(begin.centre_m))
-    upper = np.linalg.qr(np.vstack([about_centre, np.diag(1.0 / begin.sigmas)]), mode="r")
-    root = se3.adjoint(se3.translation(begin.centre_m)) @ solve_triangular(upper, np.eye(6))
+    about_centre = jacobian @ se3.adjoint(se3.translation(initial.centre_m))
+    upper = np.linalg.qr(np.vstack([about_centre, np.diag(1.0 / initial.sigmas)]), mode="r")
+    root = se3.adjoint(se3.translation(initial.centre_m)) @ solve_triangular(upper, np.eye(6))
     covariance = root @ root.T
     return 0.5 * (covariance + covariance.T)

@@ -1,4 +1,4 @@
-"""Coloured ICP: point-to-plane ICP that matches the surface's intensity as well."""
+"""Coloured ICP: point-to-plane ICP that also aligns the surface's intensity."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from modeler.registration.baselines.clouds import Cloud, Fit, Matches, nearest, 
 from modeler.registration.baselines.icp import AbstractMultiscaleRegistrar, Linearised, by_levels, descended
 from modeler.types import Array, RayImage
 
-_FLAT = 1e-9  # share of the mean spread; only holds gradients still along which there are no neighbours
-_FEWEST = 4  # points, itself included, that show how intensity changes around a point
+_DAMPING = 1e-9  # relative to the mean spread; only fixes gradients in directions without neighbours
+_MIN_NEIGHBOURS = 4  # points, itself included, that determine the gradient of intensity at a point
 
 
 @final
 @dataclass(frozen=True)
 class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
-    """Match nearest points and fit planes and intensity together, level by level (Park, Zhou and Koltun 2017).
+    """Multi-scale ICP on distances to planes and differences of intensity (Park, Zhou and Koltun 2017).
 
-    As Open3D's coloured ICP, with its weights. The arithmetic is our own, since Open3D adds up its residuals in
-    whatever order its threads finish, so that no two runs need agree to the last bit.
+    As Open3D's coloured ICP, with its weights. Implemented here because Open3D sums residuals in the order in which its
+    threads finish, so that results are not reproducible to the bit.
     """
 
     geometry: float = 0.968
-    """Weight of squared distances in m against those of intensity, which have the rest."""
+    """Weight (0..1) of squared distances in m; squared differences of intensity have the rest."""
     neighbours: int = 30
-    """Most points from which the gradient of intensity is taken, itself included, within twice the reach."""
+    """Largest number of points, itself included, for the gradient of intensity, within twice the reach."""
 
-    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
-        """Return the local optimum nearest to the start.
+    def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the local optimum from the initial pose.
 
         Raises:
-            InputError: where a view has no colour.
+            InputError: if a view has no colour.
         """
         clouds = Cloud.coloured(source), Cloud.coloured(target)
-        return by_levels(clouds, begin, voxels=self.voxels, min_points=self.min_points, level=self.level)
+        return by_levels(clouds, initial, voxels=self.voxels, min_points=self.min_points, level=self.level)
 
     def level(self, source: Cloud, target: Cloud, pose: Array, voxel_m: float) -> Fit:
-        """Return the local optimum nearest to a pose (4, 4), for clouds with intensity thinned to cubes."""
+        """Return the local optimum from a pose (4, 4), for downsampled clouds with intensity."""
         tree, reach_m = KDTree(target.points_m), self.reach * voxel_m
         gradients = intensity_gradients(target, tree, 2.0 * reach_m, self.neighbours)
         assert source.intensity is not None
@@ -52,7 +52,7 @@ class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
             partners = Cloud(target.points_m[partner], target.normals[partner])
             matches = Matches(points_m[near], partners, float(np.mean(near)))
             gaps_m, by_gap = plane_residuals(matches, pose)
-            # Gradients lie in the tangent plane: what is off the plane does not change the intensity foreseen there.
+            # Gradients lie in the tangent plane: offsets along the normal do not change the predicted intensity.
             foreseen, by_intensity = plane_residuals(
                 Matches(matches.points_m, Cloud(partners.points_m, gradients[partner]), matches.fitness), pose
             )
@@ -66,13 +66,13 @@ class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
 
 
 def intensity_gradients(cloud: Cloud, tree: KDTree, radius_m: float, neighbours: int) -> Array:
-    """Return how intensity changes (n, 3) per m along the surface at each point: least squares in the tangent plane.
+    """Return the gradients (n, 3) of intensity per m along the surface, by least squares in the tangent planes.
 
     Args:
         cloud: points with intensity.
-        tree: holds the points.
-        radius_m: how far neighbours may be.
-        neighbours: how many are taken at most, the point itself included.
+        tree: of the points.
+        radius_m: largest distance of neighbours.
+        neighbours: largest number of neighbours, the point itself included.
     """
     assert cloud.intensity is not None
     distances, indices = tree.query(cloud.points_m, k=neighbours, distance_upper_bound=radius_m)
@@ -86,6 +86,6 @@ def intensity_gradients(cloud: Cloud, tree: KDTree, radius_m: float, neighbours:
     mean = np.trace(spread, axis1=1, axis2=2)[:, None, None] + np.finfo(float).tiny
     upright = cloud.normals[:, :, None] * cloud.normals[:, None]
     slopes = np.linalg.solve(
-        spread + mean * (upright + _FLAT * np.eye(3)), np.einsum("nki,nk->ni", arms, rises)[..., None]
+        spread + mean * (upright + _DAMPING * np.eye(3)), np.einsum("nki,nk->ni", arms, rises)[..., None]
     )
-    return np.where(known.sum(axis=1, keepdims=True) >= _FEWEST, slopes[..., 0], 0.0)
+    return np.where(known.sum(axis=1, keepdims=True) >= _MIN_NEIGHBOURS, slopes[..., 0], 0.0)

@@ -1,4 +1,4 @@
-"""Global registration by FPFH features and RANSAC, and the same refined by ICP."""
+"""Global registration by FPFH features and RANSAC, with and without refinement by ICP."""
 
 from __future__ import annotations
 
@@ -23,48 +23,48 @@ from modeler.registration.baselines.clouds import (
 from modeler.registration.baselines.icp import IcpRegistrar
 from modeler.types import Array, RayImage
 
-_DRAW = 3  # correspondences that fix a motion
-_BATCH = 2_000  # draws between two looks at the stopping rule
+_SAMPLE_SIZE = 3  # correspondences that determine a motion
+_BATCH = 2_000  # draws between evaluations of the stopping rule
 
 
 @final
 @dataclass(frozen=True)
 class FpfhRegistrar(AbstractCloudRegistrar):
-    """Match points by Fast Point Feature Histograms (Rusu et al. 2009) and take the motion most matches agree with.
+    """RANSAC on matches of Fast Point Feature Histograms (Rusu et al. 2009).
 
-    Open3D computes the features. The RANSAC follows its tutorial step for step (mutual matches, edge lengths,
-    distances, share of the cloud that finds a partner, confidence) but draws from `rng`: Open3D's own shares one
-    generator among threads, so that its seed does not fix the result (its issue 7475). The prior is not used, except
-    for its spread where nothing is seen.
+    Open3D computes the features. The RANSAC follows its tutorial (mutual matches, edge lengths, distances, fraction of
+    the cloud with a correspondence, confidence) but draws from `rng`: threads of Open3D's share one generator, so that
+    its seed does not determine the result (its issue 7475). The prior is used only for its spread in directions that
+    the surfaces leave open.
     """
 
     voxel: float = 1 / 40
-    """Edge of the thinning cubes, as a share of the object's size."""
+    """Voxel edge, as a fraction of the object's size."""
     feature_radius: float = 5.0
-    """Radius of a feature's neighbourhood, in cubes."""
+    """Radius of a feature's neighbourhood, in voxels."""
     reach: float = 1.5
-    """Largest distance of partners, in cubes."""
+    """Largest distance of correspondences, in voxels."""
     edge_ratio: float = 0.9
-    """Smallest ratio of corresponding edges of a drawn triangle."""
+    """Least ratio of corresponding edges of a drawn triangle."""
     draws: int = 100_000
     """Largest number of triangles drawn."""
     confidence: float = 0.999
-    """Draws end once a better motion would have turned up with this probability."""
+    """Probability of having found the best motion at which draws end."""
     scored_points: int = 400
-    """Points of the source, drawn at random, by which motions are compared."""
+    """Number of random points of the source by which motions are compared."""
 
-    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
-        """Return the motion that most feature matches agree with."""
-        return self.search(Cloud.of(source), Cloud.of(target), begin, rng)
+    def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the motion with most inliers among the feature matches."""
+        return self.search(Cloud.of(source), Cloud.of(target), initial, rng)
 
-    def search(self, source: Cloud, target: Cloud, otherwise: Array, rng: np.random.Generator) -> Fit | None:
-        """Return the motion that most feature matches agree with; None where too few points are left to match.
+    def search(self, source: Cloud, target: Cloud, fallback: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the motion with most inliers among the feature matches; None if there are too few points.
 
         Args:
-            source: points to carry.
-            target: points to lay them on.
-            otherwise: (4, 4) motion to return, as a poor fit, where no three matches agree.
-            rng: source of the draws.
+            source: points to transform.
+            target: points to align them with.
+            fallback: (4, 4) motion to return, as a poor fit, if no three matches agree.
+            rng: source of all randomness.
         """
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return None
@@ -81,7 +81,7 @@ class FpfhRegistrar(AbstractCloudRegistrar):
             source.points_m[pairs[:, 0]], target.points_m[pairs[:, 1]], _Score(scored, tree, reach_m), rng
         )
         if pose is None:
-            return Fit(otherwise, np.zeros((0, 6)), 0.0)
+            return Fit(fallback, np.zeros((0, 6)), 0.0)
         matches = matched(source.points_m, target, tree, pose, reach_m)
         residuals, jacobian = plane_residuals(matches, pose)
         return Fit(pose, whitened_jacobian(residuals, np.ones(len(residuals)), jacobian), matches.fitness)
@@ -89,7 +89,7 @@ class FpfhRegistrar(AbstractCloudRegistrar):
     def _ransac(self, source_m: Array, target_m: Array, score: _Score, rng: np.random.Generator) -> Array | None:
         best, best_score, drawn, needed = None, -np.inf, 0, np.inf
         while drawn < min(needed, self.draws):
-            triples = rng.integers(len(source_m), size=(min(_BATCH, self.draws - drawn), _DRAW))
+            triples = rng.integers(len(source_m), size=(min(_BATCH, self.draws - drawn), _SAMPLE_SIZE))
             drawn += len(triples)
             triples = triples[self._similar(source_m[triples], target_m[triples])]
             poses = kabsch(source_m[triples], target_m[triples])
@@ -103,7 +103,7 @@ class FpfhRegistrar(AbstractCloudRegistrar):
         return best
 
     def _similar(self, source_m: Array, target_m: Array) -> npt.NDArray[np.bool_]:
-        """Return which triangles (n, 3, 3) have nearly equal edges and no point twice."""
+        """Return whether triangles (n, 3, 3) have nearly equal edges and no point twice, (n,)."""
         source_edges, target_edges = (np.linalg.norm(t - np.roll(t, 1, axis=1), axis=2) for t in (source_m, target_m))
         shorter, longer = np.minimum(source_edges, target_edges), np.maximum(source_edges, target_edges)
         return np.all((shorter > self.edge_ratio * longer) & (shorter > 0.0), axis=1)
@@ -111,7 +111,7 @@ class FpfhRegistrar(AbstractCloudRegistrar):
 
 @dataclass(frozen=True, eq=False)
 class _Score:
-    """How well motions lay a sample of the source on the target: the share within reach, less its mean square gap."""
+    """The score of motions: the fraction of a sample of the source within reach, minus its mean squared distance."""
 
     source_m: Array
     target: KDTree
@@ -124,28 +124,28 @@ class _Score:
 
 
 def _carried(poses: Array, points_m: Array) -> Array:
-    """Carry points (n, k, 3) or (k, 3) by motions (n, 4, 4)."""
+    """Transform points (n, k, 3) or (k, 3) by motions (n, 4, 4)."""
     return points_m @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
 
 
 def _draws_needed(agreement: float, confidence: float) -> float:
-    """Return how many draws find, with that confidence, one whose matches all agree."""
-    chance = agreement**_DRAW
+    """Return the number of draws that contain, with this confidence, one of inliers only."""
+    chance = agreement**_SAMPLE_SIZE
     return 0.0 if chance >= 1.0 else float(np.log1p(-confidence) / np.log1p(-chance)) if chance > 0.0 else np.inf
 
 
 @final
 @dataclass(frozen=True)
 class FpfhIcpRegistrar(AbstractCloudRegistrar):
-    """Take the motion that most FPFH matches agree with, and start point-to-plane ICP there."""
+    """FPFH with RANSAC, refined by point-to-plane ICP."""
 
     fpfh: FpfhRegistrar = field(default_factory=FpfhRegistrar)
     """The global search."""
     icp: IcpRegistrar = field(default_factory=lambda: IcpRegistrar(voxels=(1 / 32, 1 / 64)))
-    """The refinement, with no coarse levels, whose basins are wide enough to leave a good start."""
+    """The refinement, without coarse levels, which could leave the basin of a good initial pose."""
 
-    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
-        """Return the local optimum nearest to the feature matches' motion."""
+    def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the local optimum from the motion of the feature matches."""
         clouds = Cloud.of(source), Cloud.of(target)
-        coarse = self.fpfh.search(*clouds, begin, rng)
+        coarse = self.fpfh.search(*clouds, initial, rng)
         return None if coarse is None else self.icp.refine(*clouds, coarse.target_from_source)

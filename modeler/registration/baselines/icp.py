@@ -23,17 +23,17 @@ from modeler.registration.baselines.clouds import (
 from modeler.types import Array, RayImage
 
 _STEP = 1e-6  # rad and m: a smaller step ends a level
-_DAMPING = 1e-9  # share of the mean curvature; only holds directions still that no plane sees
+_DAMPING = 1e-9  # relative to the mean curvature; only fixes unobservable directions
 
 
 @dataclass(frozen=True)
 class AbstractMultiscaleRegistrar(AbstractCloudRegistrar):
-    """A method that matches nearest points, from coarse to fine; levels left with too few points are passed over."""
+    """A method that matches nearest points, from coarse to fine; levels with too few points are skipped."""
 
     voxels: tuple[float, ...] = (1 / 8, 1 / 16, 1 / 32, 1 / 64)
-    """Edge of the thinning cubes at each level, coarse to fine, as a share of the object's size."""
+    """Voxel edge at each level, coarse to fine, as a fraction of the object's size."""
     reach: float = 2.0
-    """Largest distance of partners, in cubes."""
+    """Largest distance of correspondences, in voxels."""
     iterations: int = 60
     """Largest number of steps per level."""
 
@@ -41,19 +41,18 @@ class AbstractMultiscaleRegistrar(AbstractCloudRegistrar):
 @final
 @dataclass(frozen=True)
 class IcpRegistrar(AbstractMultiscaleRegistrar):
-    """Match nearest points within reach and move onto their planes, level by level (Chen and Medioni 1992).
+    """Multi-scale point-to-plane ICP (Chen and Medioni 1992).
 
-    As Open3D's multi-scale point-to-plane ICP with Tukey's weights: a pair whose point is as far from the plane as the
-    reach has no weight left. The arithmetic is our own, since Open3D adds up its residuals in whatever order its
-    threads finish, so that no two runs need agree to the last bit.
+    As Open3D's, with Tukey weights that vanish at the largest distance of correspondences. Implemented here because
+    Open3D sums residuals in the order in which its threads finish, so that results are not reproducible to the bit.
     """
 
-    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
-        """Return the local optimum nearest to the start."""
-        return self.refine(Cloud.of(source), Cloud.of(target), begin)
+    def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the local optimum from the initial pose."""
+        return self.refine(Cloud.of(source), Cloud.of(target), initial)
 
     def refine(self, source: Cloud, target: Cloud, target_from_source: Array) -> Fit | None:
-        """Return the local optimum nearest to a pose (4, 4); None where too few points are left to match."""
+        """Return the local optimum from a pose (4, 4); None if there are too few points."""
         return by_levels(
             (source, target), target_from_source, voxels=self.voxels, min_points=self.min_points, level=self._level
         )
@@ -72,7 +71,7 @@ class IcpRegistrar(AbstractMultiscaleRegistrar):
 @final
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """A sum of squares at a pose."""
+    """A least-squares problem, linearised at a pose."""
 
     residuals: Array
     """(n,)."""
@@ -81,7 +80,7 @@ class Linearised:
     jacobian: Array
     """(n, 6) by the ξ of `pose @ exp(ξ)`."""
     fitness: float
-    """Share of the source's points that have a partner."""
+    """Fraction of the source's points that have a correspondence."""
 
 
 def by_levels(
@@ -92,16 +91,14 @@ def by_levels(
     min_points: int,
     level: Callable[[Cloud, Cloud, Array, float], Fit],
 ) -> Fit | None:
-    """Return the fit of the finest level, each begun where the coarser one ended.
-
-    Levels that thinning leaves with too few points are passed over.
+    """Return the fit of the finest level, each starting from the result of the coarser one; None without any level.
 
     Args:
         clouds: of source and target.
-        target_from_source: (4, 4) where to begin.
-        voxels: edge of the thinning cubes at each level, coarse to fine, as a share of the object's size.
-        min_points: fewest points a side; None is returned where there are fewer.
-        level: fits thinned clouds from a pose (4, 4), given the edge of the cubes in m.
+        target_from_source: (4, 4) initial pose.
+        voxels: voxel edge at each level, coarse to fine, as a fraction of the object's size.
+        min_points: least number of points of each cloud; levels with fewer are skipped.
+        level: fits downsampled clouds from a pose (4, 4), given the voxel edge in m.
     """
     fit = None
     if min(len(cloud.points_m) for cloud in clouds) < min_points:
@@ -114,15 +111,15 @@ def by_levels(
 
 
 def descended(source: Cloud, pose: Array, iterations: int, linearised: Callable[[Array, Array], Linearised]) -> Fit:
-    """Return where steps of Gauss and Newton end.
+    """Return the result of Gauss-Newton steps.
 
     Args:
-        source: points to carry.
-        pose: (4, 4) where to begin.
+        source: points to transform.
+        pose: (4, 4) initial pose.
         iterations: largest number of steps.
-        linearised: the sum of squares for points (n, 3) of the source at a pose (4, 4).
+        linearised: returns the linearised problem for points (n, 3) of the source at a pose (4, 4).
     """
-    # About the centroid, rotation and translation hardly mix, and damping favours neither.
+    # About the centroid, rotation and translation are hardly correlated, and damping favours neither.
     source_from_centred = se3.translation(source.points_m.mean(axis=0))
     points = source.points_m - source_from_centred[:3, 3]
     pose = pose @ source_from_centred
@@ -146,17 +143,17 @@ def _tukey(ratios: Array) -> Array:
 @final
 @dataclass(frozen=True)
 class GicpRegistrar(AbstractMultiscaleRegistrar):
-    """Align by small_gicp's GICP (Segal et al. 2009) from coarse to fine, and report its Hessian.
+    """GICP of small_gicp (Segal et al. 2009) from coarse to fine, with its Hessian.
 
-    small_gicp's tangent has rotation first and perturbs from the right, as ours does. It runs on one thread, since
-    sums over threads are not the same from run to run.
+    small_gicp's tangent has rotation first and perturbs on the right, as ours does. It runs on one thread, because sums
+    over threads are not reproducible.
     """
 
     neighbours: int = 10
-    """Points from which the shape of a neighbourhood is taken."""
+    """Number of points from which the covariance of a neighbourhood is estimated."""
 
-    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
-        """Return the local optimum nearest to the start."""
+    def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the local optimum from the initial pose."""
         import small_gicp  # slow to load, and only needed here
 
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
@@ -164,7 +161,7 @@ class GicpRegistrar(AbstractMultiscaleRegistrar):
         # Between centred clouds, the damping of small_gicp's steps favours neither rotation nor translation.
         source_from_centred = se3.translation(source.centroid_m)
         target_from_centred = se3.translation(target.centroid_m)
-        pose = se3.inverse(target_from_centred) @ begin @ source_from_centred
+        pose = se3.inverse(target_from_centred) @ initial @ source_from_centred
         centred = source.points_m - source.centroid_m, target.points_m - target.centroid_m
         jacobian, fitness = None, 0.0
         for voxel_m in cube_edges_m(Cloud.of(source), Cloud.of(target), self.voxels):

@@ -1,4 +1,4 @@
-"""KISS-Matcher, and the same refined by ICP."""
+"""KISS-Matcher, refined by ICP."""
 
 from __future__ import annotations
 
@@ -27,41 +27,41 @@ def installed() -> bool:
 @final
 @dataclass(frozen=True)
 class KissIcpRegistrar(AbstractCloudRegistrar):
-    """Take the motion that KISS-Matcher finds (Lim et al., ICRA 2025), and start point-to-plane ICP there.
+    """KISS-Matcher (Lim et al., ICRA 2025), refined by point-to-plane ICP.
 
-    Faster-PFH features, matches pruned by the largest k-core of their compatibility (ROBIN), and a robust solver. Its
-    parameters are its own defaults for cubes of one unit. The prior is not used, except for its spread where nothing is
-    seen.
+    Faster-PFH features, matches pruned by the largest k-core of their compatibility graph (ROBIN), and a robust solver,
+    with its default parameters for voxels of one unit. The prior is used only for its spread in directions that the
+    surfaces leave open.
     """
 
     voxel: float = 1 / 40
-    """Edge of the thinning cubes, as a share of the object's size."""
+    """Voxel edge, as a fraction of the object's size."""
     icp: IcpRegistrar = field(default_factory=lambda: IcpRegistrar(voxels=(1 / 32, 1 / 64)))
-    """The refinement, with no coarse levels, whose basins are wide enough to leave a good start."""
+    """The refinement, without coarse levels, which could leave the basin of a good initial pose."""
 
-    def fit(self, source: RayImage, target: RayImage, begin: Array, rng: np.random.Generator) -> Fit | None:
-        """Return the local optimum nearest to KISS-Matcher's motion.
+    def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
+        """Return the local optimum from KISS-Matcher's motion.
 
         Raises:
-            InputError: where KISS-Matcher is not installed.
+            InputError: if KISS-Matcher is not installed.
         """
         if not installed():
             raise InputError(MISSING)
         clouds = Cloud.of(source), Cloud.of(target)
         if min(len(cloud.points_m) for cloud in clouds) < self.min_points:
             return None
-        return self.icp.refine(*clouds, self.search(*clouds, begin))
+        return self.icp.refine(*clouds, self.search(*clouds, initial))
 
-    def search(self, source: Cloud, target: Cloud, otherwise: Array) -> Array:
-        """Return the motion (4, 4) that KISS-Matcher finds; `otherwise` where it finds none.
+    def search(self, source: Cloud, target: Cloud, fallback: Array) -> Array:
+        """Return the motion (4, 4) that KISS-Matcher finds; `fallback` if it finds none.
 
         Args:
-            source: points to carry.
-            target: points to lay them on.
-            otherwise: (4, 4).
+            source: points to transform.
+            target: points to align them with.
+            fallback: (4, 4).
         """
-        matcher: Any = importlib.import_module("kiss_matcher")  # its types are known only where it is installed
-        (unit_m,) = cube_edges_m(source, target, (self.voxel,))  # it refuses cubes below 5 mm
+        matcher: Any = importlib.import_module("kiss_matcher")  # its types are known only if it is installed
+        (unit_m,) = cube_edges_m(source, target, (self.voxel,))  # it rejects voxels below 5 mm
         centres_m = source.points_m.mean(axis=0), target.points_m.mean(axis=0)
         centred = [
             list(((cloud.points_m - centre_m) / unit_m).astype(np.float32))
@@ -70,7 +70,7 @@ class KissIcpRegistrar(AbstractCloudRegistrar):
         with _one_processor():
             found = matcher.KISSMatcher(matcher.KISSMatcherConfig(1.0)).estimate(*centred)
         if not found.valid:
-            return otherwise
+            return fallback
         pose = np.eye(4)
         pose[:3, :3] = found.rotation
         pose[:3, 3] = centres_m[1] + unit_m * np.asarray(found.translation).ravel() - pose[:3, :3] @ centres_m[0]
@@ -79,9 +79,9 @@ class KissIcpRegistrar(AbstractCloudRegistrar):
 
 @contextmanager
 def _one_processor() -> Iterator[None]:
-    """Keep this thread, and those that a library starts for it, on one processor, where the system can.
+    """Restrict this thread, and those that a library starts for it, to one processor, if the system can.
 
-    KISS-Matcher's threads add up in whatever order they finish, so that of 27 pairs registered three times 5 differ.
+    KISS-Matcher sums in the order in which its threads finish, so that 5 of 27 pairs registered three times differ.
     """
     if not hasattr(os, "sched_setaffinity"):
         yield

@@ -1,7 +1,7 @@
 """The method of Wüthrich et al. (ICRA 2012) as published: importance sampling from the prior.
 
-Most poses carry some point in front of a surface that the other camera measured. A test of a few nanoseconds rejects
-them (`FreeSpace`) before the likelihood is evaluated.
+Most poses move some point in front of a surface that the other camera measured. A test of a few nanoseconds
+(`FreeSpace`) rejects them before the likelihood is evaluated.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, BoolArr
 
 _SAMPLES, _UNIFORM_SAMPLES = 200_000, 2_000_000
 _PILOT = 4096  # poses by which the checks are ordered
-_ANGLE_LIMIT_RAD = 2.0  # up to here rejection sampling of the rotation succeeds mostly
-_WIDENING = 1.5  # the test holds for points whose rays spread up to 1.5 times as wide as at the nearest point seen
+_ANGLE_LIMIT_RAD = 2.0  # up to which rejection sampling of the rotation mostly succeeds
+_WIDENING = 1.5  # largest spread of a point's rays for the test, relative to that of the nearest point seen
 
 
 @dataclass(frozen=True)
@@ -40,22 +40,22 @@ class PaperRegistrar(AbstractRegistrar):
     samples: int | None = None
     """Number of samples of the prior; None = 2·10⁶ of a uniform prior, 2·10⁵ of others, which take longer."""
     batch: int = 50_000
-    """Samples drawn at a time."""
+    """Number of samples drawn at a time."""
     points: int = 60
-    """Number of surface points taken from each view."""
+    """Number of surface points of each view."""
     reach_sigmas: float = 4.0
-    """Lateral standard deviations beyond which pixels are ignored; at 4 their share of the sum is e⁻⁸."""
+    """Lateral standard deviations beyond which pixels are ignored; at 4, their part of the sum is e⁻⁸."""
     reject_below: float = 1e-6
-    """A sample is rejected as soon as a point's density falls below this share of that of a hidden point."""
+    """A sample is rejected if a point's density is below this fraction of that of a hidden point."""
     min_effective: float = 10.0
     """Effective sample size below which the outcome is DEGENERATE."""
     device: gpu.Device = "auto"
-    """Where samples are drawn, tested and weighted."""
+    """Device that draws, tests and weights samples."""
 
     def register(
         self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
-        """Return the posterior of target_from_source; failure is its outcome."""
+        """Return the posterior of target_from_source; its outcome states failure."""
         started = time.perf_counter()
         if min(len(source.points_m), len(target.points_m)) < 10:
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
@@ -160,7 +160,7 @@ def ranges_m(view: RayImage) -> Array:
 
 
 def measured(view: RayImage, count: int, rng: np.random.Generator) -> Measured:
-    """Return the likelihood's inputs from a view, with up to `count` of its points."""
+    """Return the inputs of the likelihood from a view, with up to `count` of its points."""
     return Measured(measured_points(view, count, rng), ranges_m(view), intrinsics(view), noise(view))
 
 
@@ -172,12 +172,12 @@ def measured_points(view: RayImage, count: int, rng: np.random.Generator) -> Arr
     row, column = view.pixels[picked].T
     z = view.frame.depth_m[row, column].astype(np.float64)
     points = np.stack([w[row, column] * z, h[row, column] * z, z], axis=1)
-    return points[rng.permutation(len(points))]  # so that the first points tested are spread over the object
+    return points[rng.permutation(len(points))]  # so that the points tested first are spread over the object
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """The paper's likelihood's inputs from one view."""
+    """Inputs of the paper's likelihood from one view."""
 
     points_m: Array
     """(n, 3) surface points."""
@@ -193,11 +193,11 @@ class Measured:
 class FreeSpace:
     """A test that a pose fails only if it gives some point a density below `reject_below` under eq. pbd.
 
-    For a point b carried to b_A, let Σ = L + J L Jᵀ be the covariance of b_A - a_i in ray coordinates, with J = Q_A R
-    Q_B⁻¹. D of eq. pbd is the inverse of Σ's lateral part, so that pixels within reach lie within reach · √λ_max(Σ_wh);
-    and where a_i lies d > 0 behind b_A, its term is at most 2 exp(-½ d² / Σ_rr). Both entries of Σ are bounded over
-    rotations by the largest eigenvalue of Q_B⁻¹ L Q_B⁻ᵀ. So a point that lies far enough in front of the nearest pixel
-    within the widest reach has a sum below the threshold, whatever D and v are.
+    For a point b transformed to b_A, let Σ = L + J L Jᵀ be the covariance of b_A - a_i in ray coordinates, with J = Q_A
+    R Q_B⁻¹. D of eq. pbd is the inverse of Σ's lateral part, so that pixels within reach lie within reach ·
+    √λ_max(Σ_wh); and if a_i lies d > 0 behind b_A, its term is at most 2 exp(-½ d² / Σ_rr). Both entries of Σ are
+    bounded over rotations by the largest eigenvalue of Q_B⁻¹ L Q_B⁻ᵀ. So a point far enough in front of the nearest
+    pixel within the widest reach has a sum below the threshold, whatever D and v are.
     """
 
     checks: Array
@@ -211,9 +211,9 @@ class FreeSpace:
     def of(
         source: Measured, target: Measured, reach_sigmas: float, reject_below: float, *, device: str | None = None
     ) -> FreeSpace:
-        """Return the test for two views; with an infinite reach or no threshold every pose passes it.
+        """Return the test for two views; with an infinite reach or no threshold, every pose passes.
 
-        Nearest ranges are found on a device of Warp, or by the kernels of Numba.
+        Nearest ranges are computed on a Warp device, or by the Numba kernels.
         """
         limits = reach_sigmas, reject_below
         sides = _side(source, target, limits, device), _side(target, source, limits, device)
@@ -232,13 +232,13 @@ class FreeSpace:
         return replace(self, checks=np.ascontiguousarray(self.checks[np.concatenate([order, rest]).astype(int)]))
 
     def passes(self, poses: Array) -> BoolArray:
-        """Return which (m,) of poses (m, 12) pass."""
+        """Return whether poses (m, 12) pass, (m,)."""
         return kernel.passing(poses, self.checks, self.near_m, self.images)
 
 
 @dataclass(frozen=True, eq=False)
 class NumberedDraws:
-    """Samples of a uniform density, each a pure function of its number and the seed, so that none need be stored."""
+    """Samples of a uniform density, each a pure function of its number and the seed, so that none is stored."""
 
     seed: np.uint64
     limits: Array
@@ -246,7 +246,7 @@ class NumberedDraws:
 
     @staticmethod
     def of(density: AbstractPoseDensity, rng: np.random.Generator) -> NumberedDraws | None:
-        """Return the draws of a uniform density; None for any other, and where its limits make rejection slow."""
+        """Return the draws of a uniform density; None for others, or if its limits make rejection sampling slow."""
         if not isinstance(density, GeneralDensity) or not 0.0 <= density.max_rotation_rad <= _ANGLE_LIMIT_RAD:
             return None
         ends = np.sin(0.5 * density.max_rotation_rad), density.max_offset_m
@@ -278,7 +278,7 @@ def _side(
     across, down = (
         (near - full) // 2 for near, full in zip(near_m.shape[::-1], other.ranges_m.shape[::-1], strict=True)
     )
-    # K2 is at most √8 times its value for a point that is not turned, and terms are no more than the window's pixels.
+    # K2 is at most √8 times its value for an unrotated point, and there are no more terms than pixels in the window.
     terms = 2.0 * np.sqrt(8.0) * (2 * across + 1) * (2 * down + 1)
     sigmas = np.sqrt(2.0 * np.log(max(terms / reject_below, 1.0))) + 1e-6
     margins_m = sigmas * np.sqrt(noise[2, 2] + spread_m2)

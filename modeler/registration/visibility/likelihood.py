@@ -1,4 +1,4 @@
-"""The likelihood of two views, each looked up in the other, and the point-to-plane equations of matching surface."""
+"""The likelihood of a pair of views, each looked up in the other, and the point-to-plane equations of matches."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from modeler.kernels.gauss_newton import Regulariser
 from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
 from modeler.registration.visibility.fixed_pattern import FixedPattern
-from modeler.registration.visibility.photometric import UNDECIDED, PairColour, correlations, unshifted, weight_of
+from modeler.registration.visibility.photometric import ASSUMED_RHO, PairColour, correlations, weight_of, without_shift
 from modeler.se3 import matrices, rows
 from modeler.types import Array, Camera, RayImage
 
 _MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
-_SILHOUETTE_NOISE = 0.5  # error of a silhouette as a share of its pixels' lateral noise: they err independently
-_RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; how far f and g rise beside it
+_SILHOUETTE_NOISE = 0.5  # error of a silhouette as a fraction of its pixels' lateral noise, which is independent
+_RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; width of the ramps of f and g
 _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).astype(np.float32)  # see `Projection`
 IntArray = npt.NDArray[np.int64]
 _DESCENT_STRIDE = 4  # every fourth point is used for descent
-_CHANCE = 0.01  # with which a right pose is taken for one that the images contradict
-_STATED_MISFIT = 0.5  # mean of r² / 2τ² if variances are as stated
+_TAIL = 0.01  # probability of rejecting a true pose by eq. 22
+_MISFIT = 0.5  # mean of r² / 2τ² if variances are right
 
 
 class Scores(NamedTuple):
-    """What poses (n, 4, 4) score."""
+    """Scores of poses (n, 4, 4)."""
 
     surface: Array
-    """(n,) log-likelihoods of surface, not tempered (nats)."""
+    """(n,) log-likelihoods L of surface, not tempered (nats)."""
     explained: Array
-    """(n,) shares of points that matching surface explains."""
+    """(n,) fractions E of points explained by matching surface."""
     colours: Array
-    """(n,) log-likelihoods of the colours of matching surface (method.md, eq. 19); 0 where they are not compared."""
+    """(n,) log-likelihoods of the colours of matching surface (method.md, eq. 19); 0 if they are not compared."""
 
 
 class MatchNoise(NamedTuple):
-    """How far matching surface and its colours differ."""
+    """Noise of matching surface and its colours."""
 
     surface_m: float
     """Noise b of surfaces beyond that of points and planes."""
     correlation: float = 0.0
-    """Correlation of colours; 0 where they are not compared."""
+    """Correlation of colours; 0 if they are not compared."""
     band: int = 0
     """Band in which colours are compared."""
 
@@ -57,35 +57,35 @@ class VisibilityLikelihood:
     """Parameters of the likelihood: surface that faces a camera is seen by it, other surface is hidden."""
 
     points: int = 600
-    """Surface points taken from each view to search and to sample,"""
+    """Number of surface points of each view for search and sampling."""
     refining_points: int = 2400
-    """and to refine."""
+    """Number of surface points of each view for refinement."""
     surface_noise: float = 0.1
-    """Least error that smoothing leaves in a surface, common to neighbours, as a share of the sensor's range noise."""
+    """Least noise of smoothed surfaces, common to neighbours, as a fraction of the sensor's range noise."""
     surface_detail: float = 0.003
-    """Least error of local planes on a curved surface, as a share of the object's size."""
+    """Least error of local planes on a curved surface, as a fraction of the object's size."""
     hidden_share: float = 0.5
     """Prior probability η that a point that faces the other camera is hidden by another part of the object.
 
-    Points behind the measured surface lose log η. With a lower value the inside of a bowl, which is hidden at any turn,
-    would say that the bowl had not turned.
+    Points behind the measured surface cost -log η. With a lower value, the inside of a bowl, which is hidden at any
+    turn, would indicate zero rotation.
     """
     max_point_cost: float = 10.0
     """Upper bound K (nats) of the cost of one point."""
     normal_cost: float = 2.0
     """Cost κ (nats) of a match whose normals are at right angles."""
     max_independent: float = 300.0
-    """Largest number of independent measurements in the points of both views, whose common errors limit it."""
+    """Largest number of independent measurements in the points of both views, limited by common errors."""
     max_independent_colours: float = 70.0
-    """The same of their colours."""
+    """The same for their colours."""
     no_overlap_cost: float = 50.0
     """Cost (nats) of a pose under which no surface matches."""
     overlap_scale: float = 0.1
-    """Share of matching points at which that cost has fallen to its e-th part."""
+    """Fraction of matching points at which that cost has fallen to 1/e."""
     colour: bool = True
-    """Whether the colours of matching surface are compared, where both frames have them."""
+    """Whether the colours of matching surface are compared, if both frames have them."""
     device: gpu.Device = "auto"
-    """Where poses are scored; descent and refinement stay on the CPU."""
+    """Device for scoring poses; descent and refinement run on the CPU."""
 
     def between(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> PairLikelihood:
         """Return the likelihood of target_from_source, at surface points drawn with `rng`."""
@@ -94,14 +94,14 @@ class VisibilityLikelihood:
         pattern = FixedPattern.between(source, target)
         forward = DirectedLikelihood(self, _points(source, chosen[0]), target, size_m, pattern)
         backward = DirectedLikelihood(self, _points(target, chosen[1]), source, size_m, pattern)
-        seen = self.colour and source.frame.colour is not None and target.frame.colour is not None
-        if not seen:
+        coloured = self.colour and source.frame.colour is not None and target.frame.colour is not None
+        if not coloured:
             return PairLikelihood(forward, backward, size_m)
         plain = PairLikelihood(forward, backward, size_m)
         return replace(plain, colour=PairColour(source, target, *chosen))
 
     def denser(self, pair: PairLikelihood, rng: np.random.Generator) -> PairLikelihood:
-        """Return the likelihood of a pair at more points, to refine; the same where it has all of them."""
+        """Return the likelihood of a pair at more points, for refinement; the same if it already has all of them."""
         source, target = pair.backward.image, pair.forward.image
         if max(len(source.points_m), len(target.points_m)) <= self.points:
             return pair
@@ -121,18 +121,18 @@ class DirectedLikelihood:
     size_m: float
     """Size of the object, see `PairLikelihood`."""
     pattern: FixedPattern
-    """What the errors of both views have in common."""
+    """Errors common to both views."""
 
     def classify(self, pose: Array) -> np.ndarray:
         """Return the class (n,) of each point under one pose (12,): `point_likelihood.classify`."""
         return point_likelihood.classify(pose, self.projection(1), self.parameters(0.0))
 
     def residual_excess(self, pose: Array, blur_m: float) -> tuple[float, float]:
-        """Return the two sums over the matches under a pose (12,) of which eq. 8 of method.md has the ratio."""
+        """Return numerator and denominator of b² in eq. 8 of method.md, sums over the matches under a pose (12,)."""
         return point_likelihood.residual_excess(pose, self.projection(1), float(np.hypot(blur_m, self._min_blur_m)))
 
     def misfits(self, pose: Array, blur_m: float) -> Array:
-        """Return the loss (k,) in nats of each match under one pose (12,) to its distance and normals."""
+        """Return the misfit (k,) in nats of each match under one pose (12,) in distance and normals."""
         found = self.matches(pose, float(np.hypot(blur_m, self._min_blur_m)))
         found = found[found[:, point_to_plane.WEIGHT] > 0.0]
         variance = found[:, point_to_plane.FACING_WEIGHT] / found[:, point_to_plane.WEIGHT]
@@ -145,14 +145,14 @@ class DirectedLikelihood:
         return point_to_plane.matches(pose, self.projection(1), blur_m)
 
     def projection(self, stride: int) -> Projection:
-        """Return every `stride`-th point and the other view's cells, as kernels take them."""
+        """Return every `stride`-th point and the other view's cells for kernels."""
         if stride not in self._projections:
             columns = np.ascontiguousarray(self._columns[:, ::stride])
             self._projections[stride] = Projection(columns, self._cells, self._camera, _COSINES, self.pattern.packed())
         return self._projections[stride]
 
-    def parameters(self, blur_m: float, typical_misfit: float = _STATED_MISFIT) -> LikelihoodParameters:
-        """Return the parameters of the kernel under a blur of the surfaces, see method.md, eq. 4 to 6 and 21."""
+    def parameters(self, blur_m: float, typical_misfit: float = _MISFIT) -> LikelihoodParameters:
+        """Return the parameters of the kernel for surfaces with a blur, see method.md, eq. 4 to 6 and 21."""
         fx = self.image.frame.camera.fx
         lateral_px = max(self.image.sigma_wh * fx, 1.0)
         return LikelihoodParameters(
@@ -169,7 +169,7 @@ class DirectedLikelihood:
 
     @cached_property
     def _projections(self) -> dict[int, Projection]:
-        """Projections made so far, by stride."""
+        """Cached projections by stride."""
         return {}
 
     @cached_property
@@ -193,7 +193,7 @@ class DirectedLikelihood:
         return float(np.hypot(detail_m, self.model.surface_noise * self.image.sigma_r_m))
 
     def _support(self, blur_m: float) -> np.ndarray:
-        """Return the support plane as the kernel takes it, for surfaces with a blur (method.md, eq. 21)."""
+        """Return the support plane for the kernel, for surfaces with a blur (method.md, eq. 21)."""
         plane = self.image.plane
         if plane is None:
             return np.zeros(5, dtype=np.float32)
@@ -202,9 +202,9 @@ class DirectedLikelihood:
 
     @cached_property
     def _measured_share(self) -> float:
-        """Share of the pixels around the surface that carry a measurement: low for very sparse images.
+        """Fraction π of measured pixels around the surface: low for very sparse images.
 
-        Without pixels of which an occluder leaves nothing known: points that fall there count 0.
+        Pixels of occluders are left out, as points that fall there contribute 0.
         """
         rows_, columns = self.image.pixels[:: max(len(self.image.pixels) // 500, 1)].T
         height, width = self.image.frame.depth_m.shape
@@ -236,10 +236,10 @@ class PairLikelihood:
     size_m: float
     """Size of the object: root mean square distance in m of the surface points from their centroid."""
     colour: PairColour | None = None
-    """The colours of both views, where they are compared."""
+    """The colours of both views, if they are compared."""
 
     def at(self, source_points: IntArray, target_points: IntArray) -> PairLikelihood:
-        """Return the likelihood at other surface points of source and target, given by number."""
+        """Return the likelihood at other surface points of source and target, given by index."""
         target, source = self.forward.image, self.backward.image
         forward = replace(self.forward, points=_points(source, source_points))
         backward = replace(self.backward, points=_points(target, target_points))
@@ -260,25 +260,25 @@ class PairLikelihood:
 
     @property
     def patches(self) -> float:
-        """Number of disjoint smoothing balls on the surface of a view, whose errors are independent; mean of both."""
+        """Number P of independent patches of the surface of a view; mean of both."""
         return 0.5 * (self.forward.image.patches + self.backward.image.patches)
 
     @property
     def temper(self) -> float:
-        """Share n / N of independent measurements in the points (method.md, eq. 7).
+        """Fraction n / N of independent measurements in the points (method.md, eq. 7).
 
-        Smoothing and the sensor's correlated noise limit their number to that of the patches, errors common to distant
-        points that on an object that covers much of the image.
+        Smoothing and the sensor's correlated noise limit n to the number of patches; errors common to distant points
+        limit it on an object that covers much of the image.
         """
         return 1.0 / (1.0 / self.forward.model.max_independent + 1.0 / self.patches) / self.points
 
-    def scores(self, poses: Array, blur_m: float, *, stride: int, typical_misfit: float = _STATED_MISFIT) -> Scores:
-        """Return what poses score.
+    def scores(self, poses: Array, blur_m: float, *, stride: int, typical_misfit: float = _MISFIT) -> Scores:
+        """Return the scores of poses.
 
         Args:
             poses: (n, 4, 4) target_from_source.
             blur_m: blur of the surfaces in m.
-            stride: every `stride`-th point is used, and counts for as many.
+            stride: every `stride`-th point is used, with this weight.
             typical_misfit: misfit μ of a typical match (nats).
         """
         band = 0 if self.colour is None else self.colour.scored_band(blur_m)
@@ -305,43 +305,41 @@ class PairLikelihood:
         one = np.zeros(len(poses), dtype=np.int32)
         return visibility.log_likelihoods(rows(poses), one, [sides], device)
 
-    def tempered(
-        self, poses: Array, blur_m: float, *, typical_misfit: float = _STATED_MISFIT, stride: int = 1
-    ) -> Array:
+    def tempered(self, poses: Array, blur_m: float, *, typical_misfit: float = _MISFIT, stride: int = 1) -> Array:
         """Return tempered log-likelihoods (n,) of poses (n, 4, 4) (method.md, eq. 7).
 
         Args:
             poses: target_from_source.
             blur_m: blur of the surfaces in m.
             typical_misfit: misfit μ of a typical match (nats).
-            stride: every `stride`-th point is used, and counts for as many.
+            stride: every `stride`-th point is used, with this weight.
         """
         found, model = self.scores(poses, blur_m, stride=stride, typical_misfit=typical_misfit), self.forward.model
-        alone = model.no_overlap_cost * np.exp(-found.explained / model.overlap_scale)
-        return self.temper * found.surface - alone + found.colours
+        no_overlap = model.no_overlap_cost * np.exp(-found.explained / model.overlap_scale)
+        return self.temper * found.surface - no_overlap + found.colours
 
     def surfaces(self, stride: int) -> tuple[Projection, Projection]:
-        """Return every `stride`-th point of both directions, as kernels take them."""
+        """Return every `stride`-th point of both directions for kernels."""
         return self.forward.projection(stride), self.backward.projection(stride)
 
     def _colours(self, band: int, stride: int) -> tuple[Colours, Colours]:
-        """Return the colours of both directions, as kernels take them."""
+        """Return the colours of both directions for kernels."""
         return (NO_COLOURS, NO_COLOURS) if self.colour is None else self.colour.colours(band, stride)
 
     def match_noise(self, pose: Array, blur_m: float) -> MatchNoise:
-        """Return how well surfaces and colours match under a pose (4, 4), see `surface_noise_m`."""
+        """Return the noise of surfaces and colours under a pose (4, 4), see `surface_noise_m`."""
         surface_m = self.surface_noise_m(pose, blur_m)
         if self.colour is None:
             return MatchNoise(surface_m)
         band = self.colour.band(surface_m)
-        found = self._summed(pose[None], surface_m, band, stride=1, typical_misfit=_STATED_MISFIT)
+        found = self._summed(pose[None], surface_m, band, stride=1, typical_misfit=_MISFIT)
         return MatchNoise(surface_m, float(correlations(found)[0]), band)
 
     def typical_misfit(self, pose: Array, blur_m: float) -> float:
-        """Return the misfit μ at which matches under a good pose (4, 4) count 0 on average (method.md, eq. 8).
+        """Return the misfit μ at which matches under a good pose (4, 4) contribute 0 on average (method.md, eq. 8).
 
-        The stated noise of points and planes is not exact; overstated, it would reward every match, and the spin of a
-        can would lean to where most of its surface is in common.
+        The predicted noise of points and planes is not exact. If too large, it would reward every match, and bias the
+        spin of a can towards the largest overlap.
         """
         misfits = np.concatenate(
             [
@@ -350,7 +348,7 @@ class PairLikelihood:
             ]
         )
         if len(misfits) <= _MIN_MATCHES:
-            return _STATED_MISFIT
+            return _MISFIT
         hidden = self.forward.model.hidden_share
         low, high = 0.0, 2.0
         for _ in range(16):  # bisection: the mean grows with μ
@@ -362,8 +360,8 @@ class PairLikelihood:
     def surface_noise_m(self, pose: Array, blur_m: float) -> float:
         """Return the noise b of matching surfaces in m, beyond that of points and planes (method.md, eq. 8).
 
-        A nuisance parameter, at its most likely value given a pose (4, 4): what smoothing does to curved surfaces, and
-        sensor noise that neighbours share. `blur_m` is the value at which matches are selected.
+        A nuisance parameter at its most likely value given a pose (4, 4): the effect of smoothing on curved surfaces,
+        and sensor noise common to neighbours. `blur_m` is the value at which matches are selected.
         """
         forward, matched = self.forward.residual_excess(rows(pose), blur_m)
         backward, matched_backward = self.backward.residual_excess(rows(se3.inverse(pose)), blur_m)
@@ -372,7 +370,7 @@ class PairLikelihood:
         return float(np.sqrt(max((forward + backward) / (matched + matched_backward), 0.0)))
 
     def overlap(self, target_from_source: Array) -> float:
-        """Return the share of the points that both cameras should see and do."""
+        """Return the fraction of matches among the points that both cameras should see."""
         classes = np.concatenate(
             [
                 self.forward.classify(rows(target_from_source)),
@@ -390,21 +388,21 @@ class PairLikelihood:
         return float(matched / max(matched + wrong, 1))
 
     def fits(self, target_from_source: Array, blur_m: float) -> bool:
-        """Return whether the images contradict a pose (4, 4) no more than 99 of 100 right ones (method.md, eq. 22).
+        """Return whether the images contradict a pose (4, 4) no more than 99 of 100 true ones (method.md, eq. 22).
 
-        `blur_m` is the blur at which matches are selected, and the least at which they are judged.
+        `blur_m` is the blur at which matches are selected, and the least noise of surfaces.
         """
         noise_m = max(self.surface_noise_m(target_from_source, blur_m), blur_m)
         surface = replace(self, colour=None).scores(target_from_source[None], noise_m, stride=1).surface
         independent = self.temper * self.points
-        return bool(self.temper * surface[0] >= 0.5 * (independent - chdtri(independent, _CHANCE)))
+        return bool(self.temper * surface[0] >= 0.5 * (independent - chdtri(independent, _TAIL)))
 
     def colour_matches(
         self, carried: Array, matches: Array, points: IntArray, noise: MatchNoise, *, forward: bool
     ) -> Array:
-        """Return equations of the colours of matches, as `DirectedLikelihood.matches` has those of surface.
+        """Return the equations of the colours of matches, in the layout of `DirectedLikelihood.matches`.
 
-        There are none where colours are not compared, or do not agree; see `PairColour.matches`.
+        Empty if colours are not compared, or not correlated; see `PairColour.matches`.
         """
         weight = weight_of(noise.correlation)
         if self.colour is None or weight == 0.0:
@@ -412,12 +410,12 @@ class PairLikelihood:
         return self.colour.matches(carried, matches, points, noise.band, weight, forward=forward)
 
     def normal_equations(self, poses: Array, noise: MatchNoise, *, stride: int) -> tuple[Array, Array]:
-        """Return gradients (n, 6) and matrices (n, 6, 6) of the matches for ξ of poses (n, 4, 4) about the centre.
+        """Return the normal equations of the matches: gradients (n, 6) and matrices (n, 6, 6) for ξ about the centre.
 
         Args:
-            poses: target_from_source.
+            poses: (n, 4, 4) target_from_source.
             noise: of matching surface and colours.
-            stride: every `stride`-th point is used, and counts for as many.
+            stride: every `stride`-th point is used, with this weight.
         """
         colours, weight = self._colours(noise.band, stride), np.float32(weight_of(noise.correlation))
         found = gauss_newton.normal_equations(
@@ -425,7 +423,7 @@ class PairLikelihood:
         )
         (gradients, of_colour), (equations, by_colour) = (stride * np.moveaxis(part, 1, 0) for part in found)
         if self.colour is not None:
-            kept = unshifted(by_colour, self.colour.shifts(poses))
+            kept = without_shift(by_colour, self.colour.shifts(poses))
             gradients = gradients + (kept @ of_colour[:, :, None])[:, :, 0]
             equations = equations + kept @ by_colour
         return gradients, equations
@@ -433,12 +431,12 @@ class PairLikelihood:
     def curvatures(self, poses: Array, blur_m: float, *, stride: int) -> Array:
         """Return curvatures (n, 6, 6) of `tempered` by ξ about the centre, at poses (n, 4, 4) that match, best first.
 
-        They are those of squared distances, and of squared differences of features by which correlations fall.
+        They are those of squared distances, and of the squared differences of features that decrease correlations.
         """
         band, weight = 0, 0.0
         if self.colour is not None:
             band = self.colour.scored_band(blur_m)
-            found = self._summed(poses[:1], blur_m, band, stride=1, typical_misfit=_STATED_MISFIT)
+            found = self._summed(poses[:1], blur_m, band, stride=1, typical_misfit=_MISFIT)
             most = self.forward.model.max_independent_colours
             weight = self.colour.curvature(correlations(found)[0], band, most) / self.points
         colours = self._colours(band, stride)
@@ -454,22 +452,22 @@ class PairLikelihood:
         """Return poses (n, 4, 4) after Gauss-Newton steps on matching surface (method.md, eq. 10)."""
         regulariser = _per_point(regulariser, _DESCENT_STRIDE)
         band = 0 if self.colour is None else self.colour.band(blur_m)
-        colours, weight = self._colours(band, _DESCENT_STRIDE), np.float32(weight_of(UNDECIDED))
+        colours, weight = self._colours(band, _DESCENT_STRIDE), np.float32(weight_of(ASSUMED_RHO))
         surfaces = self.surfaces(_DESCENT_STRIDE)
         moved = gauss_newton.descend(rows(poses), surfaces, colours, weight, self.centre_m, blur_m, regulariser, steps)
         return matrices(moved)
 
 
 def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:
-    """Return the regulariser for equations of every `stride`-th point, which are left at their own scale."""
+    """Return the regulariser for equations of every `stride`-th point, without their weight `stride`."""
     return regulariser._replace(precision=regulariser.precision / stride, damping=regulariser.damping / stride)
 
 
 def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> IntArray:
-    """Return the numbers of `count` surface points, or of all if fewer, evenly spread over the image.
+    """Return the indices of `count` surface points, or of all if fewer, evenly spread over the image.
 
-    They follow a curve through the image that fills it, so that every stride through them is again evenly spread: what
-    differs from place to place is then the same, nearly, whichever points are chosen.
+    They are taken along a space-filling curve, so that every stride through them is again evenly spread and results
+    depend little on the choice of points.
     """
     total = len(view.points_m)
     stride = max(total / count, 1.0)
@@ -478,13 +476,13 @@ def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> IntAr
 
 
 def _points(view: RayImage, chosen: IntArray) -> Array:
-    """Return the surface points of a view with these numbers as `point_rows` does."""
+    """Return the `point_rows` of a view's surface points with these indices."""
     variances_m2 = np.asarray(view.layers["variance_m2"], dtype=np.float64)[chosen]
     return point_rows(view.points_m[chosen], view.normals[chosen], variances_m2, view.frame.camera)
 
 
 def point_rows(points_m: Array, normals: Array, variances_m2: Array, camera: Camera) -> Array:
-    """Return points (n, 9) as a `DirectedLikelihood` takes them.
+    """Return points (n, 9) for a `DirectedLikelihood`.
 
     Args:
         points_m: (n, 3) in the frame of the view that shows them.

@@ -45,7 +45,7 @@ class ModeSamples:
     def compared(self, pair: PairLikelihood, reference: ModeSamples) -> WeightedSamples:
         """Return the samples with their evidence under the nuisance parameters of another mode (method.md, eq. 13).
 
-        Under its own noise a mode that matches badly is forgiven.
+        Its own noise estimate would favour a mode that matches badly.
         """
         if reference is self:
             return self.samples
@@ -61,9 +61,9 @@ class ModeSamples:
 class VisibilityRegistrar(AbstractRegistrar):
     """The paper's likelihood with normals: surface that faces a camera is seen by it, other surface is hidden.
 
-    p(surface of B | image A, T) · p(surface of A | image B, T), each a product over points, tempered because
-    neighbouring points err alike. A search finds the modes, each is sampled and weighted, and what matching surface
-    determines well is refined by its own equations. `docs/method.md` has the equations.
+    p(surface of B | image A, T) · p(surface of A | image B, T), each a product over points, tempered because errors of
+    neighbouring points are correlated. A search finds the modes, each is sampled and weighted, and directions that
+    matching surface determines well are refined (docs/method.md).
     """
 
     likelihood: VisibilityLikelihood = field(default_factory=VisibilityLikelihood)
@@ -73,18 +73,18 @@ class VisibilityRegistrar(AbstractRegistrar):
     max_modes: int = 4
     """Largest number of modes that are sampled."""
     min_points: int = 20
-    """Views with fewer surface points are not registered: they do not determine how far matching surface differs."""
+    """Views with fewer surface points are not registered: they do not determine the noise of matching surface."""
     min_overlap: float = 0.5
-    """Least share of the surface that both views should see and do."""
+    """Least fraction of matches in the surface that both views should see."""
     max_at_limit: float = 0.2
-    """Largest share of the samples at the limit of the prior."""
+    """Largest fraction of the samples at the limit of the prior."""
     max_sigma_deg: float = 10.0
     """Largest standard deviation of a rotation that is not ambiguous."""
 
     def register(
         self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
-        """Return the posterior of target_from_source; failure is its outcome."""
+        """Return the posterior of target_from_source; its outcome states failure."""
         started = time.perf_counter()
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
@@ -97,13 +97,13 @@ class VisibilityRegistrar(AbstractRegistrar):
         dense = self.likelihood.denser(pair, rng)
         modes = [(share, self._refined(pair, dense, density, mode, rng)) for share, mode in weigh_modes(compared)]
         at_limit = self._share_at_limit(pair, density, found, modes[0][1], rng)
-        posterior = self._judged(pair, modes, found, at_limit=at_limit, seconds=time.perf_counter() - started)
+        posterior = self._posterior(pair, modes, found, at_limit=at_limit, seconds=time.perf_counter() - started)
         return replace(posterior, beyond=found.beyond) if _leads_beyond(found) else posterior
 
     def _sampled(
         self, pair: PairLikelihood, density: AbstractPoseDensity, found: Candidates, rng: np.random.Generator
     ) -> ModeSamples:
-        """Return samples of the mode of some candidates."""
+        """Return samples of the mode that some candidates form."""
         noise_m = pair.surface_noise_m(found.poses[0], self.search.fine_m(pair))
         typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
         likelihood = partial(pair.tempered, blur_m=noise_m, typical_misfit=typical_misfit)
@@ -123,7 +123,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         samples: WeightedSamples,
         rng: np.random.Generator,
     ) -> WeightedSamples:
-        """Return refined samples of a mode; those that would leave the prior's support stay."""
+        """Return refined samples of a mode; those that would leave the prior's support are kept unchanged."""
         fine_m = self.search.fine_m(pair)
         refined = self.refiner.refine(pair, dense, (samples.poses, samples.weights), rng, fine_m=fine_m)
         inside = np.isfinite(density.log_evidence(refined.poses))
@@ -138,36 +138,36 @@ class VisibilityRegistrar(AbstractRegistrar):
         heaviest: WeightedSamples,
         rng: np.random.Generator,
     ) -> float:
-        """Return the share of the heaviest mode at the limit of the prior; 1 where surface leads beyond it."""
+        """Return the fraction of the heaviest mode at the limit of the prior; 1 if descent leads beyond it."""
         if _leads_beyond(found):
             return 1.0
         return share_at_limit(density, heaviest.poses, heaviest.weights, pair.centre_m, rng)
 
-    def _judged(
+    def _posterior(
         self,
         pair: PairLikelihood,
-        weighed: list[tuple[float, WeightedSamples]],
+        weighted: list[tuple[float, WeightedSamples]],
         found: Candidates,
         *,
         at_limit: float,
         seconds: float,
     ) -> Posterior:
         """Return the posterior of weighted modes, and its outcome (method.md, "Result")."""
-        samples = np.concatenate([mode.poses for _, mode in weighed])
-        weights = np.concatenate([share * mode.weights for share, mode in weighed])
+        samples = np.concatenate([mode.poses for _, mode in weighted])
+        weights = np.concatenate([share * mode.weights for share, mode in weighted])
         modes = tuple(
             Mode(share, replace(weighted_gaussian(mode.poses, mode.weights, pair.centre_m), by_focal=mode.by_focal))
-            for share, mode in weighed
+            for share, mode in weighted
         )
         separate = len(modes) == 1 or are_separate(modes)
         pose = pooled(modes)
         if not separate:
             pose = replace(weighted_gaussian(samples, weights, pair.centre_m), by_focal=pose.by_focal)
         overlap = pair.overlap(modes[0].pose.mean)
-        # Of very many poses, some match by chance; of few, the likeliest is right though a mask be cut off.
+        # Among very many poses, some match by chance; among few, the likeliest is right even if a mask is truncated.
         contradicted = not pair.fits(modes[0].pose.mean, self.search.fine_m(pair))
-        matches = not (found.anywhere and contradicted)
-        effective = 1.0 / sum(share**2 / mode.effective_samples for share, mode in weighed)
+        matches = not (found.open_rotation and contradicted)
+        effective = 1.0 / sum(share**2 / mode.effective_samples for share, mode in weighted)
         return Posterior(
             source=pair.backward.image.index,
             target=pair.forward.image.index,
@@ -180,8 +180,8 @@ class VisibilityRegistrar(AbstractRegistrar):
             weights=weights,
             modes=modes if len(modes) > 1 else (),
             effective_samples=effective,
-            pareto_k=max(mode.pareto_k for _, mode in weighed),
-            log_evidence=float(np.logaddexp.reduce([mode.log_evidence for _, mode in weighed])),
+            pareto_k=max(mode.pareto_k for _, mode in weighted),
+            log_evidence=float(np.logaddexp.reduce([mode.log_evidence for _, mode in weighted])),
             seconds=seconds,
         )
 
@@ -197,5 +197,5 @@ class VisibilityRegistrar(AbstractRegistrar):
 
 
 def _leads_beyond(found: Candidates) -> bool:
-    """Return whether surface leads beyond the prior's support: beside it the best inside would be negligible."""
+    """Return whether descent leads beyond the prior's support: the best inside would be negligible relative to it."""
     return found.beyond_gain > -np.log(MIN_MODE_SHARE)

@@ -17,28 +17,28 @@ from modeler.types import AbstractPoseDensity, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
 
-_NEGLIGIBLE = 1e-6  # of the heaviest weight: lighter samples take no part in fits of two Gaussians
-_WIDER, _WIDE_SHARE = 2.0, 0.3  # rounds are a fifth fewer on a printed carton, a tenth on others; much the same by 0.5
+_NEGLIGIBLE = 1e-6  # of the heaviest weight: lighter samples are left out of fits of two Gaussians
+_INFLATION, _WIDE_FRACTION = 2.0, 0.3  # a fifth fewer rounds on a printed carton, a tenth on others; 0.5 is similar
 _EM_STEPS = 12  # proposals need no convergence
-_LEAST_PART = 0.05  # of the weight, which few samples hold, determines no Gaussian
-_WHITE_FLOOR = 1e-4  # of a variance, where all samples have 1
+_MIN_PART = 0.05  # of the weight: the few samples of a smaller part do not determine a Gaussian
+_WHITE_FLOOR = 1e-4  # of variances in whitened coordinates
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianMixture:
-    """Weighted Gaussians of ξ, each about a pose of its own."""
+    """A mixture of Gaussians of ξ, each about its own mean pose."""
 
     means: Array
     """(k, 4, 4) target_from_source."""
     spreads: Array
     """(k, 6, 6) lower triangular roots of the covariances of ξ about the centre."""
     log_weights: Array
-    """(k,) of any sum of exponentials."""
+    """(k,) logarithms of the weights, which need not sum to 1."""
     centre_m: Array
     """(3,) point of the source."""
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw poses (count, 4, 4), each Gaussian by its share of the weight."""
+        """Draw poses (count, 4, 4)."""
         chosen = rng.choice(len(self.means), count, p=np.exp(self.log_weights - self.log_weight))
         xi = np.einsum("nij,nj->ni", self.spreads[chosen], rng.normal(size=(count, 6)))
         return se3.moved(self.means[chosen], xi, self.centre_m)
@@ -50,11 +50,11 @@ class GaussianMixture:
         )
 
     def times(self, factor: float) -> GaussianMixture:
-        """Return the mixture with its weight multiplied."""
+        """Return the mixture with its weights multiplied by a factor."""
         return replace(self, log_weights=self.log_weights + np.log(factor))
 
     def plus(self, other: GaussianMixture) -> GaussianMixture:
-        """Return the Gaussians of both mixtures, which share a centre."""
+        """Return the Gaussians of both mixtures, which have the same centre."""
         return GaussianMixture(
             np.concatenate([self.means, other.means]),
             np.concatenate([self.spreads, other.spreads]),
@@ -62,13 +62,13 @@ class GaussianMixture:
             self.centre_m,
         )
 
-    def defended(self) -> GaussianMixture:
-        """Return the mixture with a share of its weight on the same Gaussians, wider (Hesterberg 1995).
+    def defensive(self) -> GaussianMixture:
+        """Return the defensive mixture, with a fraction of its weight on wider Gaussians (Hesterberg 1995).
 
-        Where a posterior has heavier tails than its proposal, a few samples there would outweigh all others.
+        If a posterior has heavier tails than its proposal, a few samples there would dominate.
         """
-        wide = replace(self, spreads=_WIDER * self.spreads).times(_WIDE_SHARE)
-        return self.times(1.0 - _WIDE_SHARE).plus(wide)
+        wide = replace(self, spreads=_INFLATION * self.spreads).times(_WIDE_FRACTION)
+        return self.times(1.0 - _WIDE_FRACTION).plus(wide)
 
     @cached_property
     def log_weight(self) -> float:
@@ -90,7 +90,7 @@ class GaussianMixture:
 
 @dataclass(frozen=True, eq=False)
 class MixtureProposal(AbstractPoseDensity):
-    """Proposes from a Gaussian mixture; the evidence is that of another density."""
+    """A Gaussian mixture as a proposal, with another density as the evidence."""
 
     known: AbstractPoseDensity
     """The prior."""
@@ -124,9 +124,9 @@ class WeightedSamples:
     log_evidence: float
     """Log of the mean likelihood under the prior."""
     pareto_k: float
-    """Tail index of the weights of everything that was drawn."""
+    """Pareto tail index of the weights of all samples drawn."""
     by_focal: Array = field(default_factory=lambda: np.zeros(6))
-    """(6,) derivative of their mean's ξ by the logarithm of the focal length, once it is known."""
+    """(6,) derivative of their mean's ξ by the logarithm of the focal length; 0 before refinement."""
 
     @property
     def effective_samples(self) -> float:
@@ -135,7 +135,7 @@ class WeightedSamples:
 
 
 def weigh_modes(modes: Sequence[WeightedSamples]) -> list[tuple[float, WeightedSamples]]:
-    """Return the modes with their shares of the mass, heaviest first, without those of negligible mass."""
+    """Return the modes with their posterior probabilities, heaviest first, without negligible ones."""
     log_mass = np.array([mode.log_evidence for mode in modes])
     mass = np.exp(log_mass - log_mass.max())
     mass /= mass.sum()
@@ -150,19 +150,19 @@ class _Draws:
     poses: Array
     """(n, 4, 4)."""
     log_likelihoods: Array
-    """(n,); -inf where the prior excludes a pose."""
+    """(n,); -inf outside the prior's support."""
     log_target: Array
     """(n,) log of the product of prior and likelihood."""
     log_density: Array
-    """(n,) log of the expected number of samples at each, per unit of the uniform measure: Σ N_t q_t."""
+    """(n,) log of the expected density of samples, Σ N_t q_t."""
 
     @property
     def log_weights(self) -> Array:
-        """Logs (n,) of weights whose mean is the evidence (method.md, eq. 12)."""
+        """Log weights (n,); the mean of the weights is the evidence (method.md, eq. 12)."""
         return self.log_target - self.log_density + np.log(len(self.poses))
 
     def reweighted(self, new: GaussianMixture) -> _Draws:
-        """Return the same samples for a mixture of proposals that also has `new`, weighted by its sample count."""
+        """Return the same samples after adding a proposal, weighted by its sample count, to the mixture."""
         return replace(self, log_density=np.logaddexp(self.log_density, new.log_density(self.poses)))
 
     def plus(self, other: _Draws) -> _Draws:
@@ -181,18 +181,18 @@ class AdaptiveSampler:
 
     Each round draws from a Gaussian with the moments of the weighted samples so far. All samples are weighted against
     the mixture of all proposals, so that a bad one costs samples, not correctness. While the weights are too uneven to
-    determine a covariance, they are tempered for the next proposal, which is of two Gaussians. A share of each
-    proposal is wider.
+    determine a covariance, they are tempered for the next proposal, which has two Gaussians. Proposals are defensive
+    mixtures.
     """
 
     draws: int = 400
-    """Samples of a round; regions that the first misses altogether, later ones may miss too."""
+    """Samples per round; regions that the first round misses may also be missed by later ones."""
     samples: int = 300
     """Effective sample size at which the rounds end, and largest number of samples in the result."""
     max_draws: int = 8000
-    """No further round begins after this many samples."""
+    """Number of samples after which no further round begins."""
     min_effective: float = 100.0
-    """Least effective size of samples whose covariance counts: of a proposal, and of a usable result."""
+    """Least effective sample size that determines a covariance: of a proposal, and of a usable result."""
 
     def run(
         self, proposal: AbstractPoseDensity, log_likelihood: LogLikelihood, centre_m: Array, rng: np.random.Generator
@@ -208,7 +208,7 @@ class AdaptiveSampler:
         first = proposal.sample(self.draws, rng)
         log_count = float(np.log(self.draws))
 
-        def weighed(poses: Array, log_density: Array) -> _Draws:
+        def weighted(poses: Array, log_density: Array) -> _Draws:
             log_prior = proposal.log_evidence(poses)
             possible = np.isfinite(log_prior)
             log_likelihoods = np.full(len(poses), -np.inf)
@@ -216,7 +216,7 @@ class AdaptiveSampler:
                 log_likelihoods[possible] = log_likelihood(poses[possible])
             return _Draws(poses, log_likelihoods, log_prior + log_likelihoods, log_density)
 
-        drawn, fitted = weighed(first, log_count + proposal.log_density(first)), None
+        drawn, fitted = weighted(first, log_count + proposal.log_density(first)), None
         log_weights = drawn.log_weights
         while (effective := effective_samples(log_weights)) < self.samples and len(drawn.poses) < self.max_draws:
             if effective >= self.min_effective:
@@ -224,11 +224,11 @@ class AdaptiveSampler:
             else:
                 power = _power(log_weights, self.min_effective)
                 new = _fitted_two(drawn.poses, normalised(power * log_weights), centre_m)
-            new = new.defended().times(self.draws)
+            new = new.defensive().times(self.draws)
             fitted = new if fitted is None else fitted.plus(new)
             poses = new.sample(self.draws, rng)
             log_density = np.logaddexp(log_count + proposal.log_density(poses), fitted.log_density(poses))
-            drawn = drawn.reweighted(new).plus(weighed(poses, log_density))
+            drawn = drawn.reweighted(new).plus(weighted(poses, log_density))
             log_weights = drawn.log_weights
         chosen, weights = thinned(normalised(log_weights), self.samples, rng)
         return WeightedSamples(
@@ -241,16 +241,16 @@ class AdaptiveSampler:
 
 
 def _fitted(poses: Array, weights: Array, centre_m: Array) -> GaussianMixture:
-    """Return the Gaussian of weighted poses (n, 4, 4)."""
+    """Return the Gaussian fitted to weighted poses (n, 4, 4)."""
     mean, covariance = se3.mean(poses, weights, about_m=centre_m)
     spread = np.asarray(np.linalg.cholesky(covariance + FLOOR), dtype=np.float64)
     return GaussianMixture(mean[None], spread[None], np.zeros(1), centre_m)
 
 
 def _fitted_two(poses: Array, weights: Array, centre_m: Array) -> GaussianMixture:
-    """Return two Gaussians of weighted poses (n, 4, 4), by expectation maximisation; one where one is enough.
+    """Return two Gaussians fitted to weighted poses (n, 4, 4) by expectation maximisation; one if one is enough.
 
-    A narrow peak on a broad ridge, as of a label on a ball, is fitted by no single Gaussian.
+    A single Gaussian does not fit a narrow peak on a broad ridge, such as that of a label on a ball.
     """
     one = _fitted(poses, weights, centre_m)
     heavy = weights > _NEGLIGIBLE * weights.max()
@@ -261,7 +261,7 @@ def _fitted_two(poses: Array, weights: Array, centre_m: Array) -> GaussianMixtur
     core = np.zeros(len(weights))
     core[near[np.cumsum(weights[near]) <= 0.5 * weights.sum()]] = 1.0
     members = weights * np.stack([core, 1.0 - core])
-    if not mixture.separate_two(white, weights, members, _EM_STEPS, _LEAST_PART, _WHITE_FLOOR):
+    if not mixture.separate_two(white, weights, members, _EM_STEPS, _MIN_PART, _WHITE_FLOOR):
         return one
     parts = [_fitted(poses, of / of.sum(), centre_m).times(0.5) for of in members]
     return parts[0].plus(parts[1])
@@ -270,12 +270,12 @@ def _fitted_two(poses: Array, weights: Array, centre_m: Array) -> GaussianMixtur
 def thinned(weights: Array, count: int, rng: np.random.Generator) -> tuple[npt.NDArray[np.int64], Array]:
     """Return indices (k,) of at most `count` samples, and weights (k,) under which they represent all.
 
-    Heavy samples stay as they are. Light ones are resampled systematically to equal weights, such that every sample
-    keeps its weight on average (Fearnhead and Clifford 2003).
+    Heavy samples are kept. Light ones are resampled systematically to equal weights, so that the expected weight of
+    every sample is unchanged (Fearnhead and Clifford 2003).
 
     Args:
         weights: (n,), their sum 1.
-        count: largest number of samples kept.
+        count: largest number of samples to keep.
         rng: source of all randomness.
     """
     possible = np.flatnonzero(weights)

@@ -16,13 +16,13 @@ from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 
 _STRIDE = 2  # every second point is used for scores
-ANY_ROTATION_RAD = 1.0
-"""Standard deviation of a rotation that may be any: 1.33 where all are alike, 1.0 within limits of 130°."""
+OPEN_ROTATION_RAD = 1.0
+"""Standard deviation of an open rotation: it is 1.33 if all are equally likely, 1.0 within limits of 130°."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Poses found by the search, each with a Gaussian of its surroundings."""
+    """Poses found by the search, each with a local Gaussian."""
 
     poses: Array
     """(k, 4, 4) target_from_source, best first."""
@@ -30,12 +30,12 @@ class Candidates:
     """(k,) tempered log-likelihoods (nats)."""
     spreads: Array
     """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid (method.md, eq. 11)."""
-    anywhere: bool = False
-    """Whether the prior leaves the rotation open: in every direction by `ANY_ROTATION_RAD` or more."""
+    open_rotation: bool = False
+    """Whether the prior leaves the rotation open: by `OPEN_ROTATION_RAD` or more in every direction."""
     beyond_gain: float = -np.inf
-    """How much better (nats) than the best candidate a pose beyond the prior's support is."""
+    """Difference in nats between the best pose beyond the prior's support and the best candidate."""
     beyond: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    """(1, 4, 4) that pose; (0, 4, 4) where there is none."""
+    """(1, 4, 4) that pose; (0, 4, 4) if there is none."""
 
     def __len__(self) -> int:
         """Return the number of candidates."""
@@ -48,22 +48,22 @@ class Candidates:
     def distinct(self, centre_m: Array) -> Candidates:
         """Return the candidates without those within a standard deviation of a better one (greedy)."""
         kept: list[int] = []
-        left = np.ones(len(self), dtype=bool)
+        remaining = np.ones(len(self), dtype=bool)
         near = mixture.mahalanobis_distances(se3.rows(self.poses), self.spreads, centre_m) <= 1.0
         for number in range(len(self)):
-            if left[number]:
+            if remaining[number]:
                 kept.append(number)
-                left &= ~near[number]
+                remaining &= ~near[number]
         return self.select(np.array(kept, dtype=np.int64))
 
     def modes(self, centre_m: Array, basin: Array) -> list[Candidates]:
         """Return the candidates by mode, the best mode first.
 
-        Two candidates share a mode where a chain of candidates connects them, of which neighbours have basins, of the
-        extent (6,), that overlap. A ridge, such as the spin of a can, is one mode.
+        Candidates joined by chains of overlapping basins of extent `basin` (6,) form a mode, so that a ridge, such as
+        the spin of a can, is one.
         """
-        apart = se3.difference(self.poses[:, None], self.poses[None], centre_m) / basin
-        linked = np.linalg.norm(apart, axis=-1) <= 2.0
+        distances = se3.difference(self.poses[:, None], self.poses[None], centre_m) / basin
+        linked = np.linalg.norm(distances, axis=-1) <= 2.0
         label = np.arange(len(self))
         for number in range(len(self)):  # connected components, each labelled by its best candidate
             neighbours = np.unique(label[linked[number]])
@@ -76,23 +76,23 @@ class Search:
     """Finds candidates for the modes of a posterior, coarse to fine (method.md, "Search")."""
 
     basin: float = 0.2
-    """Extent of a basin of attraction: rotation in rad, translation as a share of the object's size."""
+    """Extent of a basin of attraction: rotation in rad, translation as a fraction of the object's size."""
     per_basin: float = 3.0
-    """Starts for each basin that the prior covers,"""
+    """Number of starts per basin in the prior."""
     min_starts: int = 60
-    """but no fewer than this,"""
+    """Least number of starts."""
     max_starts: int = 400
-    """and no more,"""
+    """Largest number of starts."""
     proposals: int = 15
-    """each the best of so many samples of the prior on average."""
+    """Samples of the prior per start, of which the best are used."""
     finest: float = 0.015
-    """Blur of the surfaces in the last stage of the descent, as a share of the object's size."""
-    max_recognised: int = 400
-    """Largest number of starts on which features agree, where the prior holds more basins than `max_starts` reach."""
+    """Blur of the surfaces in the last stage of the descent, as a fraction of the object's size."""
+    max_feature_starts: int = 400
+    """Largest number of starts from feature matches, if the prior has more basins than `max_starts` reach."""
     matcher: FeatureMatcher = field(default_factory=FeatureMatcher)
-    """How features are matched."""
+    """Matches the features."""
     stages: int = 4
-    """Stages of the descent, each with half the blur of the one before."""
+    """Stages of the descent, each with half the blur of the previous one."""
     steps: int = 4
     """Gauss-Newton steps at each blur."""
 
@@ -113,7 +113,7 @@ class Search:
         return self.basin * np.repeat([1.0, pair.size_m], 3)
 
     def starts(self, pair: PairLikelihood, prior: PoseGaussian) -> int:
-        """Return the number of starts for the width of the prior, however many that is (method.md, eq. 9)."""
+        """Return the number of starts for the width of the prior, not limited by `max_starts` (method.md, eq. 9)."""
         extent = self.extent(pair)
         variances = np.linalg.eigvalsh(prior.covariance / np.outer(extent, extent))
         basins = np.sqrt(np.prod(np.maximum(variances, 1.0)))
@@ -122,14 +122,14 @@ class Search:
     def run(
         self, pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator, *, min_overlap: float
     ) -> Candidates:
-        """Return candidates, best first; always one at least.
+        """Return candidates, best first, at least one.
 
         Args:
             pair: the two views.
             density: the prior.
             rng: source of all randomness.
-            min_overlap: where the best pose inside the prior's support shows more of the surface, poses beyond it
-                count only within a basin of the support.
+            min_overlap: overlap of the best pose inside the prior's support above which poses beyond it count only
+                within a basin of the support.
         """
         fine_m, parts = self.fine_m(pair), density.alternatives
         priors = [_moments(pair, part, rng) for part in parts]
@@ -140,15 +140,15 @@ class Search:
         outside = poses[~inside]
         poses, part = (poses[inside], part[inside]) if inside.any() else (started, part)
         likelihoods = pair.tempered(poses, fine_m, stride=_STRIDE)
-        # Of alternatives, one may be far denser than another, so that the likelihood does not tell which modes count.
+        # One alternative may be far denser than another, so that the likelihood alone does not rank modes.
         scores = likelihoods + density.log_evidence(poses) if len(parts) > 1 else likelihoods
         order = np.argsort(-scores, kind="stable")
-        # The volumes of two modes may outweigh their likelihoods as much as a negligible mode is outweighed.
+        # The volumes of two modes may differ as much as their likelihoods: hence twice the log of a negligible share.
         order = order[scores[order] > scores.max() + 2.0 * np.log(MIN_MODE_SHARE)]
         poses, part = poses[order], part[order]
         precisions = np.array([np.linalg.inv(prior.covariance) for prior in priors], dtype=np.float64)[part]
         spreads = _spreads(pair, precisions, poses, fine_m)
-        found = Candidates(poses, scores[order], spreads, any(_anywhere(prior) for prior in priors))
+        found = Candidates(poses, scores[order], spreads, any(_is_open(prior) for prior in priors))
         if pair.overlap(found.poses[0]) > min_overlap:
             outside = self._near_support(pair, priors[-1], density, outside)
         found = found.distinct(pair.centre_m)
@@ -161,11 +161,11 @@ class Search:
     def _descended(
         self, pair: PairLikelihood, density: AbstractPoseDensity, prior: PoseGaussian, rng: np.random.Generator
     ) -> tuple[Array, Array]:
-        """Return starting poses (n, 4, 4), and where the descent from them ends (n, 4, 4)."""
+        """Return starting poses (n, 4, 4), and the poses (n, 4, 4) after descent from them."""
         wanted = self.starts(pair, prior)
         started = self._drawn(pair, density, min(wanted, self.max_starts), rng)
         if wanted > self.max_starts:
-            started = np.concatenate([started, self._recognised(pair, density)])
+            started = np.concatenate([started, self._from_features(pair, density)])
         poses, regulariser = started, self._regulariser(pair, prior)
         for blur_m in self.blurs_m(pair):
             poses = pair.descend(poses, blur_m, regulariser, steps=self.steps)
@@ -175,26 +175,26 @@ class Search:
         """Return starting poses (n, 4, 4): samples of the prior that match best at twice the coarsest blur."""
         poses, blur = density.sample(self.proposals * count, rng), self.finest * 2.0**self.stages
         found = pair.scores(poses, blur * pair.size_m, stride=8)
-        # Coarse surface matches easily: a match counts as the range that it determines, relative to a guess.
+        # A coarse match determines the depth less well than a fine one: each has the weight -log(blur / size).
         matches = np.log(blur) * found.explained * pair.points
         scores = found.surface - matches + found.colours / pair.temper
         return poses[np.argsort(-scores, kind="stable")[:count]]
 
-    def _recognised(self, pair: PairLikelihood, density: AbstractPoseDensity) -> Array:
-        """Return starting poses (n, 4, 4) on which features agree, no two in a basin, those with most matches first."""
+    def _from_features(self, pair: PairLikelihood, density: AbstractPoseDensity) -> Array:
+        """Return starting poses (n, 4, 4) from feature matches, no two in a basin, those with most matches first."""
         motions, _ = self.matcher.motions(pair.backward.image, pair.forward.image)
         motions = motions[np.isfinite(density.log_density(motions))] if len(motions) else motions
-        kept, left = [], np.ones(len(motions), dtype=bool)
-        while left.any() and len(kept) < self.max_recognised:
-            kept.append(int(np.argmax(left)))
-            apart = se3.difference(motions, motions[kept[-1]], pair.centre_m) / self.extent(pair)
-            left &= np.linalg.norm(apart, axis=1) > 1.0
+        kept, remaining = [], np.ones(len(motions), dtype=bool)
+        while remaining.any() and len(kept) < self.max_feature_starts:
+            kept.append(int(np.argmax(remaining)))
+            distances = se3.difference(motions, motions[kept[-1]], pair.centre_m) / self.extent(pair)
+            remaining &= np.linalg.norm(distances, axis=1) > 1.0
         return motions[kept]
 
     def _regulariser(self, pair: PairLikelihood, prior: PoseGaussian) -> Regulariser:
         """Return the regulariser of a descent: the prior's Gaussian, and damping (method.md, eq. 10).
 
-        Matching surface is not tempered there, so that the Gaussian approximation of a uniform prior hardly pulls
+        The likelihood is not tempered in descent, so that the Gaussian approximation of a uniform prior hardly biases
         directions that surface leaves open towards its mean.
         """
         precision = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
@@ -204,10 +204,10 @@ class Search:
     def _near_support(
         self, pair: PairLikelihood, prior: PoseGaussian, density: AbstractPoseDensity, poses: Array
     ) -> Array:
-        """Return those of poses (n, 4, 4) outside the prior's support that lie within a basin of it.
+        """Return the poses (n, 4, 4) outside the prior's support that lie within a basin of it.
 
-        Surface leads a quarter turn round a carton, where other sides of it may match better than the right ones; that
-        is no sign that the prior's limits exclude the motion.
+        Descent may lead a quarter turn around a carton, where other sides match better than the right ones; this does
+        not indicate that the prior's limits exclude the motion.
         """
         if not len(poses):
             return poses
@@ -218,15 +218,15 @@ class Search:
 
 
 def _moments(pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator) -> PoseGaussian:
-    """Return mean and covariance of the prior, of ξ about the pair's centre."""
+    """Return mean and covariance of the prior, for ξ about the pair's centre."""
     poses = density.sample(PRIOR_SAMPLES, rng)
     mean, covariance = se3.mean(poses, np.ones(len(poses)), about_m=pair.centre_m, iterations=4)
     return PoseGaussian(mean, covariance + np.diag(np.repeat([1e-4, 1e-5], 3) ** 2))
 
 
-def _anywhere(prior: PoseGaussian) -> bool:
+def _is_open(prior: PoseGaussian) -> bool:
     """Return whether a prior leaves the rotation open."""
-    return bool(np.linalg.eigvalsh(prior.covariance[:3, :3])[0] > ANY_ROTATION_RAD**2)
+    return bool(np.linalg.eigvalsh(prior.covariance[:3, :3])[0] > OPEN_ROTATION_RAD**2)
 
 
 def _spreads(pair: PairLikelihood, precisions: Array, poses: Array, blur_m: float) -> Array:
