@@ -17,23 +17,23 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 def drop_stale(folder: Path) -> None:
     """Delete the compiled kernels of a folder that are older than any source file there.
 
-    Numba keeps a kernel while its own file is unchanged, though it contains copies of functions from other files.
+    Numba keeps a kernel while its own file is unchanged, although it contains functions inlined from other files.
     """
     newest = max(path.stat().st_mtime for path in folder.glob("*.py"))
     for index in (folder / "__pycache__").glob("*.nbi"):
-        with suppress(OSError):  # another process was quicker, or we may not
+        with suppress(OSError):  # another process was faster, or no permission
             if index.stat().st_mtime < newest:
                 index.unlink()
 
 
 def compiled(module: str, name: str) -> bool:
-    """Return whether a kernel as it stands has been compiled on this machine."""
+    """Return whether the current version of a kernel has been compiled on this machine."""
     kernel = getattr(import_module(f"modeler.kernels.{module}"), name)
     return any(Path(str(kernel.stats.cache_path)).glob(f"{module}.{name}-*.nbi"))
 
 
 def on_compiling(report: Callable[[str], None]) -> None:
-    """Call `report` with the name of the module whenever the compilation of a kernel begins."""
+    """Call `report` with the name of the module when the compilation of a kernel begins."""
 
     class Reporter(event.Listener):
         def on_start(self, event: event.Event) -> None:
@@ -43,7 +43,7 @@ def on_compiling(report: Callable[[str], None]) -> None:
                 report(path.stem)
 
         def on_end(self, event: event.Event) -> None:
-            """Nothing to say."""
+            """Do nothing."""
 
     event.register("numba:compile", Reporter())
 

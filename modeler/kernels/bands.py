@@ -1,4 +1,4 @@
-"""Bands of an image of which surface covers a part: differences of Gaussian means, and what surface points see."""
+"""Band-pass filters of an image that surface covers in part, sampled at surface points (method.md, eq. 17)."""
 
 import math
 
@@ -7,22 +7,22 @@ import numpy as np
 
 from modeler.kernels.point_likelihood import HALF, ONE, VECTOR_MATHS, ZERO
 
-_LEAST_SHARE = np.float32(1e-3)  # of a mean that is surface
-_LEAST_DEVIATION = 1e-6  # of features; an image without any has none of unit variance
-_LIMIT = 3.0  # standard deviations, beyond which 0.3 % of normal features are
-_ROUNDS, _SETTLED = 10, 1e-3  # of variance and limit, each by the other, at most; and where they end
+_MIN_FRACTION = np.float32(1e-3)  # of a mean that is surface
+_MIN_DEVIATION = 1e-6  # standard deviation of features, for images without any
+_LIMIT = 3.0  # standard deviations, beyond which are 0.3 % of normal features
+_ROUNDS, _TOLERANCE = 10, 1e-3  # of the fixed-point iteration between variance and limit
 
 
 @numba.njit(cache=True)
 def look_up(colour, pixels, low, table, places, logs):
-    """Write where surface points are in an image that is cut out, and the logarithms of their colours.
+    """Write the pixels of surface points in a cropped image, and the logarithms of their colours.
 
     Args:
         colour: (h, w, 3) RGB.
         pixels: (n, 2) row and column of each point.
-        low: (2,) those of the cut image's first pixel.
-        table: (256,) what each of three values adds to the logarithm.
-        places: (n, 2) out; row and column there.
+        low: (2,) row and column of the crop's first pixel.
+        table: (256,) contribution of each channel's value to the logarithm.
+        places: (n, 2) out; row and column in the crop.
         logs: (n,) out.
     """
     for j in range(pixels.shape[0]):
@@ -34,7 +34,7 @@ def look_up(colour, pixels, low, table, places, logs):
 
 @numba.njit(cache=True)
 def lay_out(places, colours, shading, images):
-    """Write what points show into images (3, h, w), 0 elsewhere: colours (n,), shading (n,), and 1."""
+    """Write values at points into images (3, h, w), 0 elsewhere: colours (n,), shading (n,), and 1."""
     for j in range(places.shape[0]):
         row, column = places[j, 0], places[j, 1]
         images[0, row, column], images[1, row, column], images[2, row, column] = colours[j], shading[j], ONE
@@ -42,11 +42,11 @@ def lay_out(places, colours, shading, images):
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
 def blur(images, weights, blurred):
-    """Write images (k, h, w), 0 beyond their borders, blurred along both axes.
+    """Write images blurred along both axes, with zeros beyond their borders.
 
     Args:
         images: (k, h, w).
-        weights: (r + 1,) of a pixel, and of those so far from it to either side.
+        weights: (r + 1,) one half of the symmetric kernel, its centre first.
         blurred: (k, h, w) out.
     """
     count, height, width = images.shape
@@ -81,34 +81,34 @@ def blur(images, weights, blurred):
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
 def subtract_means(inner, outer, surface, band):
-    """Write a band: Gaussian means over surface, less those over a wider neighbourhood; 0 where no surface is.
+    """Write a band: Gaussian means over surface minus wider ones; 0 outside the surface.
 
     Args:
-        inner: (k + 1, h, w) blurred images, of which the last is the share of surface.
-        outer: likewise, blurred by more.
-        surface: (h, w) where it is above 0, is surface.
+        inner: (k + 1, h, w) blurred images, the last of which is the fraction of surface.
+        outer: the same with a wider blur.
+        surface: (h, w) positive on the surface.
         band: (k, h, w) out.
     """
     count, height, width = band.shape
     for k in range(count):
         for y in range(height):
             for x in range(width):
-                near, wide = max(inner[count, y, x], _LEAST_SHARE), max(outer[count, y, x], _LEAST_SHARE)
+                near, wide = max(inner[count, y, x], _MIN_FRACTION), max(outer[count, y, x], _MIN_FRACTION)
                 difference = inner[k, y, x] / near - outer[k, y, x] / wide
                 band[k, y, x] = difference if surface[y, x] > ZERO else ZERO
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
-def subtract_shading(colours, shading, surface, floor, limit, steady):
-    """Take as much of the shading off colours (h, w), in place, as explains most; all, where shading is beyond a limit.
+def subtract_shading(colours, shading, surface, floor, limit, valid):
+    """Subtract the best-fitting multiple of the shading from colours, in place; set them to 0 where shading is large.
 
     Args:
         colours: (h, w) band of the colours.
-        shading: (h, w) that of the shading.
-        surface: (h, w) where it is above 0, is surface.
-        floor: variance of the shading that is no more than rounding.
-        limit: of the shading.
-        steady: (h, w) out: where shading is within the limit.
+        shading: (h, w) band of the shading.
+        surface: (h, w) positive on the surface.
+        floor: variance of the shading due to rounding.
+        limit: of the shading's magnitude.
+        valid: (h, w) out: whether shading is within the limit.
     """
     height, width = colours.shape
     product, power = ZERO, ZERO
@@ -119,8 +119,8 @@ def subtract_shading(colours, shading, surface, floor, limit, steady):
     share = product / power
     for y in range(height):
         for x in range(width):
-            steady[y, x] = (surface[y, x] > ZERO) & (abs(shading[y, x]) <= limit)
-            colours[y, x] = colours[y, x] - share * shading[y, x] if steady[y, x] else ZERO
+            valid[y, x] = (surface[y, x] > ZERO) & (abs(shading[y, x]) <= limit)
+            colours[y, x] = colours[y, x] - share * shading[y, x] if valid[y, x] else ZERO
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
@@ -129,9 +129,9 @@ def sample_layer(layer, inside, places, halvings, found):
 
     Args:
         layer: (h, w) the band.
-        inside: (h, w) which cells it holds for; a slope across others is 0.
+        inside: (h, w) whether each cell is valid; slopes across others are 0.
         places: (n, 2) row and column of each point, in px.
-        halvings: how often the image's sides were halved: the width of a cell is 2 to this power px.
+        halvings: number of times that the image was halved: a cell is 2 to this power px wide.
         found: (3, n) out: value, and derivatives by column and row in 1/px.
     """
     height, width = layer.shape
@@ -152,10 +152,10 @@ def sample_layer(layer, inside, places, halvings, found):
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
 def winsorise(features):
-    """Scale features to unit variance, and limit them to three standard deviations, both ways.
+    """Scale features to unit variance, and limit them to ±3 standard deviations.
 
-    A few dark spots would be all that a correlation heard of, and it takes its features for normal ones. The variance
-    is that of what is left, so that spots on less than a ninth of the surface are limited, prints on more are not.
+    Otherwise a few dark spots could dominate the correlation. The variance is that after limiting, so that spots on
+    less than a ninth of the surface are limited, larger prints are not.
 
     Args:
         features: (3, n) of the surface points, in place: value, and derivatives by column and row in 1/px.
@@ -168,9 +168,9 @@ def winsorise(features):
             total += value
             square += value * value
         variance = square / max(count, 1) - (total / max(count, 1)) ** 2
-        last, scale = scale, max(math.sqrt(max(variance, 0.0)), _LEAST_DEVIATION)
+        last, scale = scale, max(math.sqrt(max(variance, 0.0)), _MIN_DEVIATION)
         limit = np.float32(_LIMIT * scale)
-        if abs(scale - last) <= _SETTLED * scale:
+        if abs(scale - last) <= _TOLERANCE * scale:
             break
     inverse = np.float32(1.0 / scale)
     for j in range(count):

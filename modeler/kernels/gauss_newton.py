@@ -26,7 +26,7 @@ from modeler.kernels.point_likelihood import (
 from modeler.kernels.point_to_plane import linearise
 from modeler.kernels.threads import over_rows
 
-_ROWS = 9  # of the equations of matches: six derivatives, residual, weight, and a buffer for products
+_ROWS = 9  # of a match's equation: six derivatives, residual, weight, and a buffer for products
 
 
 class Regulariser(NamedTuple):
@@ -51,7 +51,7 @@ def normal_equations(poses, surfaces, colours, weight, centre, surface_m):
     Args:
         poses: rows of the 3×4 matrices of target_from_source.
         surfaces: the `Projection` of the source's points in the target, and that of the target's in the source.
-        colours: their `Colours`, `photometric.NO_COLOURS` where these are not compared.
+        colours: their `Colours`, or `photometric.NO_COLOURS`.
         weight: inverse variance of the difference of features (method.md, eq. 20).
         centre: (3,) point of the source in m.
         surface_m: noise of the surfaces in m beyond that of points and planes.
@@ -67,15 +67,15 @@ def descend(poses, surfaces, colours, weight, centre, surface_m, regulariser, st
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _iterate(poses, surfaces, colours, weight, centre, surface_m, regulariser, steps):
-    """Return poses (m, 12) after some steps, or none, and the `equations` that they were last at."""
+    """Return poses (m, 12) after some steps, possibly none, and the `equations` last evaluated."""
     moved, gradients, matrices = poses.copy(), np.empty((poses.shape[0], 2, 6)), np.empty((poses.shape[0], 2, 6, 6))
     workspace = new_workspace(surfaces)
-    held, step, further, rotation = np.empty((6, 6)), np.empty(6), np.empty(12), np.empty((3, 3))
+    buffer, step, further, rotation = np.empty((6, 6)), np.empty(6), np.empty(12), np.empty((3, 3))
     for i in range(poses.shape[0]):
         for _ in range(max(steps, 1)):
             equations(moved[i], surfaces, colours, weight, centre, surface_m, workspace, gradients[i], matrices[i])
             if steps > 0:
-                regularised_step(moved[i], regulariser, centre, gradients[i], matrices[i], held, step)
+                regularised_step(moved[i], regulariser, centre, gradients[i], matrices[i], buffer, step)
                 retract(moved[i], step, centre, rotation, further)
                 for k in range(12):
                     moved[i, k] = further[k]
@@ -134,7 +134,7 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
                     about[k] = centre[k]
             project(carried, surface, transformed, pixels, found)
             linearise(surface.points, transformed, found, about, surface_m2, rows)
-            push_apart(surface, transformed, about, rows, apart)
+            add_pattern_gradient(surface, transformed, about, rows, apart)
         elif features.values.shape[0] == 0:
             continue
         else:
@@ -176,8 +176,8 @@ def accumulate(rows, count, gradient, matrix):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def push_apart(surface, transformed, about, rows, gradient):
-    """Write what the fixed pattern adds to the gradient (6,) by ζ about a point (3,) (method.md, eq. 27).
+def add_pattern_gradient(surface, transformed, about, rows, gradient):
+    """Add the fixed pattern's part to the gradient (6,) by ζ about a point (3,) (method.md, eq. 27).
 
     Args:
         surface: the `Projection` of the points.
@@ -224,16 +224,16 @@ def rotate_to_source(pose, part, block, rotated, gradient, matrix):
 
 
 @numba.njit(cache=True)
-def regularised_step(pose, regulariser, centre, gradient, matrix, held, step):
-    """Write the Gauss-Newton step (6,) of a pose (12,) from its `equations`; `held` is a buffer (6, 6)."""
+def regularised_step(pose, regulariser, centre, gradient, matrix, buffer, step):
+    """Write the Gauss-Newton step (6,) of a pose (12,) from its `equations`; `buffer` is a buffer (6, 6)."""
     away = difference(regulariser.mean, pose, centre)
     for k in range(6):
         step[k] = gradient[0, k] + gradient[1, k]
         for m in range(6):
             step[k] -= regulariser.precision[k, m] * away[m]
-            held[k, m] = matrix[0, k, m] + matrix[1, k, m] + regulariser.precision[k, m]
-        held[k, k] += regulariser.damping[k]
-    solve_positive_definite(held, step)
+            buffer[k, m] = matrix[0, k, m] + matrix[1, k, m] + regulariser.precision[k, m]
+        buffer[k, k] += regulariser.damping[k]
+    solve_positive_definite(buffer, step)
     angle = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
     if angle > regulariser.max_step_rad:
         for k in range(6):

@@ -1,4 +1,4 @@
-"""The Lie group SE(3), many poses at once: exponentials, logarithms, retractions and means.
+"""The Lie group SE(3), for many poses at once: exponentials, logarithms, retractions and means.
 
 Poses are rows of twelve numbers, the upper three rows of their matrices, or whole matrices; `se3` has the conventions.
 """
@@ -17,7 +17,7 @@ def cross(ax, ay, az, bx, by, bz):
 
 _NEAR_TRACE = 2.96  # of a rotation by 0.2 rad
 
-# asin(s) / s in powers of s², for half of such an angle to the last bit.
+# asin(s) / s in powers of s², exact to the last bit for half of such an angle.
 _ASIN_1, _ASIN_2, _ASIN_3, _ASIN_4 = 1.0 / 6.0, 3.0 / 40.0, 5.0 / 112.0, 35.0 / 1152.0
 _ASIN_5, _ASIN_6, _ASIN_7 = 63.0 / 2816.0, 231.0 / 13312.0, 143.0 / 10240.0
 
@@ -60,7 +60,7 @@ def quaternion(r00, r01, r02, r10, r11, r12, r20, r21, r22):
 def logarithm(r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz):
     """Return ξ (6 numbers: rad, m) of a motion given by its upper three rows, and a / sin(a / 2).
 
-    a is the angle of the rotation: ξ runs wider there than the uniform measure of motions, by ((a / 2) / sin(a / 2))⁴.
+    a is the angle of the rotation: the density of ξ relative to the uniform measure of motions is ((a/2) / sin(a/2))⁴.
     """
     x, y, z, cosine, scale = quaternion(r00, r01, r02, r10, r11, r12, r20, r21, r22)
     wx, wy, wz = scale * x, scale * y, scale * z
@@ -99,7 +99,7 @@ def exponential(wx, wy, wz, ux, uy, uz, r):
 def difference(first, second, centre):
     """Return ξ = log(C⁻¹ first⁻¹ second C) for poses (12,), C the shift to `centre` (3,), as `logarithm` does.
 
-    Written out: with the rotation in an array it takes three times as long.
+    Written out for speed: with the rotation in an array, it takes three times as long.
     """
     a0, a1, a2, a4, a5, a6, a8, a9, a10 = (
         first[0],
@@ -123,7 +123,7 @@ def difference(first, second, centre):
         second[9],
         second[10],
     )
-    # Displacement of the centre between the poses; then seen from `first`.
+    # Displacement of the centre between the poses; then in the frame of `first`.
     x = second[3] - first[3] + b0 * centre[0] + b1 * centre[1] + b2 * centre[2]
     y = second[7] - first[7] + b4 * centre[0] + b5 * centre[1] + b6 * centre[2]
     z = second[11] - first[11] + b8 * centre[0] + b9 * centre[1] + b10 * centre[2]
@@ -145,7 +145,7 @@ def difference(first, second, centre):
 
 @numba.njit(cache=True)
 def differences(first, second, centre):
-    """Return the `difference` (n, 6) of each two of poses (n, 12)."""
+    """Return the `difference` (n, 6) of pairs of poses (n, 12)."""
     xi = np.empty((len(first), 6))
     for i in range(len(first)):
         one = difference(first[i], second[i], centre)
@@ -214,7 +214,7 @@ def mean(poses, weights, start, about, iterations, tolerance):
     Args:
         poses: (n, 12).
         weights: (n,), their sum 1.
-        start: (12,) where the fixed-point iteration begins.
+        start: (12,) initial value of the fixed-point iteration.
         about: (3,) point in m, C the shift to it.
         iterations: largest number of steps.
         tolerance: the iteration ends at a shorter step (rad, m).

@@ -1,8 +1,8 @@
 """Dual marching cubes: the zero level set of a signed distance that is known in parts of a grid.
 
 Every cell has a vertex for each piece of surface that crosses it, and every grid edge that changes sign has a quad
-(Nielson 2004, "Dual marching cubes"). Quads need all four cells around their edge known, so the surface stays open
-where no view looked.
+(Nielson 2004, "Dual marching cubes"). A quad requires that all four cells around its edge are known, so that the
+surface is open where nothing was observed.
 
 Corners of a cell are numbered 4 dx + 2 dy + dz; its edges 4 axis + 2 a + b, with a and b the offsets along the two
 other axes in ascending order.
@@ -21,10 +21,10 @@ def _edge(first: int, second: int) -> int:
 
 
 def _pieces() -> np.ndarray:
-    """Return (256, 12) int8: which piece of surface crosses each edge of a cell, by its corners' signs; -1 = none.
+    """Return (256, 12) int8: the piece of surface that crosses each edge of a cell, by its corners' signs; -1 = none.
 
-    Bit c of the case is set where corner c is inside. Two pieces meet in a face whose diagonals differ; there the
-    inside corners are joined, which keeps thin parts whole, and the choice rests on the face alone: neighbours agree.
+    Bit c of the case is set if corner c is inside. In faces whose diagonals differ, the inside corners are joined,
+    which preserves thin parts; this depends on the face alone, so that neighbours agree.
     """
     faces = []
     for axis in range(3):
@@ -39,7 +39,7 @@ def _pieces() -> np.ndarray:
             edges = [_edge(face[k], face[(k + 1) % 4]) for k in range(4)]
             crossed = [edges[k] for k in range(4) if inside[k] != inside[(k + 1) % 4]]
             if len(crossed) == 4:
-                # Join the inside: cut off the outside corners, each with the two edges that meet there.
+                # Join the inside: separate the outside corners, each with the two edges that meet there.
                 pairs = [(edges[k - 1], edges[k]) for k in range(4) if not inside[k]]
             else:
                 pairs = [(crossed[0], crossed[1])] if crossed else []
@@ -71,7 +71,7 @@ def fill(values, totals, least):
     Args:
         values: (x, y, z) float32.
         totals: (x, y, z) float32, 0 = unknown; the outermost voxels are unknown.
-        least: least number of known neighbours; with more than half of them, open borders do not grow.
+        least: least number of known neighbours; if more than half, open borders do not grow.
     """
     counts = np.zeros(values.shape, dtype=np.uint8)
     sums = np.zeros(values.shape, dtype=np.float32)
@@ -107,10 +107,10 @@ def extract(values, totals, cells):
     Args:
         values: (x, y, z) float32, negative inside.
         totals: (x, y, z) float32, 0 = unknown; the outermost voxels are unknown.
-        cells: (n, 3) voxels of which each is the lowest corner of a cell, in ascending order: all that are crossed,
-            and as many others.
+        cells: (n, 3) voxels that are the lowest corner of a cell, in ascending order: all that are crossed, and
+            possibly others.
     """
-    cells = np.ascontiguousarray(cells)  # of one layout only: compiling is slow
+    cells = np.ascontiguousarray(cells)  # a single layout, because compiling is slow
     first, cases, count = _numbered(values, totals, cells)
     vertices, quads = _vertices(values, cells, first, cases, count)
     return vertices, _triangles(values, cells, first, cases, vertices, quads)
@@ -118,9 +118,9 @@ def extract(values, totals, cells):
 
 @njit(cache=True)
 def _numbered(values, totals, cells):
-    """Return the number of each cell's first vertex, -1 = none, its case, and how many vertices there are.
+    """Return the index of each cell's first vertex, -1 = none, its case, and the number of vertices.
 
-    A vertex stands for each piece in each cell whose eight corners are known.
+    There is a vertex for each piece in each cell whose eight corners are known.
     """
     first = np.full(values.shape, -1, dtype=np.int32)
     cases = np.zeros(values.shape, dtype=np.uint8)
@@ -137,7 +137,7 @@ def _numbered(values, totals, cells):
 
 @njit(cache=True)
 def _vertices(values, cells, first, cases, count):
-    """Return the mean (v, 3) of where each piece crosses edges, and the number of edges that quads may lie around."""
+    """Return the mean (v, 3) of each piece's crossings with edges, and the number of edges that may have quads."""
     vertices = np.zeros((count, 3))
     crossings = np.zeros(count)
     quads = 0
@@ -150,7 +150,7 @@ def _vertices(values, cells, first, cases, count):
             if piece < 0:
                 continue
             axis, a, b = edge // 4, (edge >> 1) & 1, edge & 1
-            x, y, z = _beside(i, j, k, axis, a, b)
+            x, y, z = _neighbour(i, j, k, axis, a, b)
             start = values[x, y, z]
             stop = values[x + (axis == 0), y + (axis == 1), z + (axis == 2)]
             share = start / (start - stop)
@@ -183,9 +183,9 @@ def _triangles(values, cells, first, cases, vertices, quads):
             if PIECES[cases[i, j, k], 4 * axis + 3] < 0:
                 continue
             known = True
-            for turn in range(4):  # the cells around the edge, counter-clockwise in the plane of the two other axes
+            for turn in range(4):  # the cells around the edge, counter-clockwise in the plane of the other two axes
                 one, two = int(turn == 1 or turn == 2), int(turn >= 2)
-                p, q, r = _beside(i, j, k, axis, one, two)
+                p, q, r = _neighbour(i, j, k, axis, one, two)
                 if first[p, q, r] < 0:
                     known = False
                     break
@@ -193,8 +193,8 @@ def _triangles(values, cells, first, cases, vertices, quads):
                 corner[turn] = first[p, q, r] + PIECES[cases[p, q, r], edge]
             if not known:
                 continue
-            x, y, z = _beside(i, j, k, axis, 1, 1)  # where the edge starts
-            # x × z points against y, so the middle axis turns the other way round.
+            x, y, z = _neighbour(i, j, k, axis, 1, 1)  # where the edge starts
+            # x × z = -y, so that the orientation about the middle axis is reversed.
             if (values[x, y, z] >= 0.0) != (axis == 1):
                 corner[1], corner[3] = corner[3], corner[1]
             even, odd = 0.0, 0.0
@@ -211,8 +211,8 @@ def _triangles(values, cells, first, cases, vertices, quads):
 
 
 @njit(cache=True)
-def _beside(i, j, k, axis, one, two):
-    """Return the voxel some steps away from another along the two axes other than `axis`, in ascending order."""
+def _neighbour(i, j, k, axis, one, two):
+    """Return the voxel some steps from another along the two axes other than `axis`, in ascending order."""
     if axis == 0:
         return i, j + one, k + two
     if axis == 1:
@@ -223,14 +223,14 @@ def _beside(i, j, k, axis, one, two):
 def pinched_voxels(values, totals, cells):
     """Return the voxels (m, 3) to put inside so that no edge of the zero level set has more than two triangles.
 
-    Where the corners of a face between two cells differ along its diagonals, two sheets meet in it. If each cell
-    joins them in one piece, both sheets share the edge between the two vertices; with one more corner inside, they do
-    not meet. The change may cause other pinches: repeat until nothing is returned.
+    If the corners of a face between two cells differ along its diagonals, two sheets meet in it. If each cell joins
+    them in one piece, both sheets share the edge between the two vertices; with one more corner inside, they do not
+    meet. The change may cause other pinches: repeat until nothing is returned.
 
     Args:
         values: (x, y, z) float32, negative inside.
         totals: (x, y, z) float32, 0 = unknown.
-        cells: (n, 3) voxels that are the lowest corner of a cell to look at.
+        cells: (n, 3) voxels that are the lowest corner of a cell to check.
     """
     return _pinched_voxels(values, totals, np.ascontiguousarray(cells))
 
@@ -257,7 +257,7 @@ def _pinched_voxels(values, totals, cells):
                 continue
             if not (_joined(PIECES[case], axis, 1) and _joined(PIECES[beyond], axis, 0)):
                 continue
-            # Of the two corners outside, the one nearer to the surface.
+            # The outside corner that is nearer to the surface.
             best, least = -1, np.inf
             for corner in range(4):
                 number = step | (one if corner == 1 or corner == 2 else 0) | (two if corner >= 2 else 0)
@@ -279,7 +279,7 @@ def _joined(table, axis, level):
 
     Args:
         table: (12,) piece of each edge, a row of `PIECES`.
-        axis: along which the face is perpendicular.
+        axis: to which the face is perpendicular.
         level: 0 = the face on the cell's lower side, 1 = on its upper.
     """
     first = -1
@@ -287,7 +287,7 @@ def _joined(table, axis, level):
         if other == axis:
             continue
         for side in range(2):
-            # Offsets along the two axes beside `other`, in ascending order.
+            # Offsets along the two axes other than `other`, in ascending order.
             edge = 4 * other + (2 * level + side if axis < 3 - other - axis else 2 * side + level)
             if first < 0:
                 first = table[edge]
@@ -298,7 +298,7 @@ def _joined(table, axis, level):
 
 @njit(cache=True)
 def _case(values, totals, i, j, k):
-    """Return the signs of a cell's corners as bits, 1 = inside; -1 where a corner is unknown."""
+    """Return the signs of a cell's corners as bits, 1 = inside; -1 if a corner is unknown."""
     case = 0
     for c in range(8):
         a, b, d = i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1)

@@ -1,4 +1,4 @@
-"""Gaussians on SE(3): the density of their mixtures, their distances, and mixtures of two by EM."""
+"""Gaussians on SE(3): densities of mixtures, Mahalanobis distances, and mixtures of two by EM."""
 
 import math
 
@@ -14,15 +14,15 @@ _NEGLIGIBLE = 40.0  # nats below the best Gaussian
 def log_densities(poses, means, roots, widths, log_weights, centre):
     """Return the log density (n,) at each pose, with respect to the uniform measure of rotation (rad³) and translation.
 
-    The trace of a rotation and the displacement of the centre bound the distance from each Gaussian below: the most
-    promising is evaluated first, then only those that may not be negligible.
+    The trace of a rotation and the displacement of the centre give lower bounds of the distance from each Gaussian: the
+    nearest by bound is evaluated first, then only those that may not be negligible.
 
     Args:
         poses: (n, 12) upper three rows of their matrices.
         means: (k, 12) of the components.
         roots: (k, 6, 6) upper triangular R with RᵀR the precision of ξ = log(mean⁻¹ pose) about the centre.
         widths: (k, 2) largest variances of a rotation and of a translation.
-        log_weights: (k,) of any sum of exponentials.
+        log_weights: (k,), not necessarily normalised.
         centre: (3,) point in m.
     """
     count = len(means)
@@ -38,7 +38,7 @@ def log_densities(poses, means, roots, widths, log_weights, centre):
         best = 0
         for k in range(count):
             square = (x - places[k, 0]) ** 2 + (y - places[k, 1]) ** 2 + (z - places[k, 2]) ** 2
-            turned = max(3.0 - trace_between(means[k], poses[i]), 0.0)  # no more than the square of the angle
+            turned = max(3.0 - trace_between(means[k], poses[i]), 0.0)  # at most the square of the angle
             bounds[k] = log_tops[k] - 0.5 * max(turned / widths[k, 0], square / widths[k, 1])
             if bounds[k] > bounds[best]:
                 best = k
@@ -78,9 +78,9 @@ def trace_between(a, b):
 
 @numba.njit(cache=True, inline="always")
 def log_density(mean, pose, root, log_top, centre):
-    """Return the log density of ξ at a pose (12,), and the factor that turns it into one of the uniform measure."""
+    """Return the log density of ξ at a pose (12,), and the factor to one with respect to the uniform measure."""
     w0, w1, w2, u0, u1, u2, scale = difference(mean, pose, centre)
-    # Written out: a loop over the tuple takes three times as long.
+    # Written out for speed: a loop over the tuple takes three times as long.
     z0 = root[0, 0] * w0 + root[0, 1] * w1 + root[0, 2] * w2 + root[0, 3] * u0 + root[0, 4] * u1 + root[0, 5] * u2
     z1 = root[1, 1] * w1 + root[1, 2] * w2 + root[1, 3] * u0 + root[1, 4] * u1 + root[1, 5] * u2
     z2 = root[2, 2] * w2 + root[2, 3] * u0 + root[2, 4] * u1 + root[2, 5] * u2
@@ -122,9 +122,9 @@ def separate_two(white, weights, members, steps, least, floor):
     Args:
         white: (n, 6) points.
         weights: (n,).
-        members: (2, n) weight of each point in either Gaussian to start from; overwritten by the last.
+        members: (2, n) initial weights of the points in either Gaussian; overwritten by the final ones.
         steps: number of steps.
-        least: share of the weight below which a Gaussian is not determined.
+        least: fraction of the weight below which a Gaussian is not determined.
         floor: added to the variances.
 
     Returns:

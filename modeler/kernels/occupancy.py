@@ -1,4 +1,4 @@
-"""Kernels that classify unseen space: what views observe of cells, and the surface of least area that closes gaps."""
+"""Classification of unseen space: observations of grid cells, and the surface of least area that closes gaps."""
 
 import math
 
@@ -10,7 +10,7 @@ from modeler.kernels.tsdf import project
 
 
 def observation_counts(origin, cell_m, shape, margin_m, free_m, poses, intrinsics, planes):
-    """Return how many views see cells of a grid empty, at a surface, and hidden behind one, (3, x, y, z) uint16.
+    """Return the numbers of views that see grid cells empty, at a surface, and hidden behind one, (3, x, y, z) uint16.
 
     A cell below the view's support plane counts as empty.
 
@@ -22,7 +22,7 @@ def observation_counts(origin, cell_m, shape, margin_m, free_m, poses, intrinsic
         free_m: (f, h, w) float32 depth up to which a pixel sees empty space, 0 = unknown.
         poses: (f, 3, 4) camera_from_object.
         intrinsics: (f, 4) fx, fy, cx, cy.
-        planes: (f, 4) normal and offset in the object frame, NaN where no plane is seen.
+        planes: (f, 4) normal and offset in the object frame, NaN if no plane is seen.
     """
     layers = np.arange(shape[0])
     return over_rows(
@@ -62,10 +62,10 @@ def minimal_surface(start, fixed, rounds):
     Args:
         start: (x, y, z) float32 in [-1, 1].
         fixed: (x, y, z) bool; the outermost cells must be fixed.
-        rounds: iterations.
+        rounds: number of iterations.
     """
     u, ahead = start.copy(), start.copy()
-    if len(start) < 3:  # all cells are outermost ones
+    if len(start) < 3:  # all cells are outermost
         return u
     slopes = [np.zeros_like(start) for _ in range(3)]
     step = np.float32(1.0 / math.sqrt(12.0))  # τ σ ‖∇‖² <= 1, with ‖∇‖² <= 12 in three dimensions
@@ -77,7 +77,7 @@ def minimal_surface(start, fixed, rounds):
 
 @njit(cache=True, nogil=True)
 def _ascend(layers, px, py, pz, ahead, step):
-    """Follow the gradient of the field in successive layers, and shorten the slopes to 1; they are written to."""
+    """Dual step in successive layers: ascend the field's gradient, and project the slopes to unit length, in place."""
     ny, nz = ahead.shape[1:]
     for i in range(layers[0], layers[-1] + 1):
         for j in range(ny - 1):
@@ -96,7 +96,7 @@ def _ascend(layers, px, py, pz, ahead, step):
 
 @njit(cache=True, nogil=True)
 def _descend(layers, u, ahead, px, py, pz, fixed, step):
-    """Follow the slopes' divergence in successive layers where the field u is not fixed; u and ahead are written to."""
+    """Primal step in successive layers: descend the slopes' divergence where u is not fixed; u and ahead in place."""
     ny, nz = u.shape[1:]
     for i in range(layers[0], layers[-1] + 1):
         for j in range(1, ny - 1):

@@ -1,7 +1,7 @@
 """The likelihood of Wüthrich et al. (ICRA 2012), its early rejection by free space, and numbered draws of poses.
 
-The likelihood is eq. pbd as written, with the sum over all pixels. The test of free space takes a few nanoseconds and
-rejects most poses whose likelihood would vanish.
+The likelihood is eq. pbd as published, with the sum over all pixels. The free-space test takes a few nanoseconds and
+rejects most poses with a vanishing likelihood.
 """
 
 import math
@@ -13,7 +13,7 @@ from modeler.kernels.threads import over_rows
 
 NEVER = -np.inf
 
-STRIDE = np.uint64(64)  # random numbers reserved for each draw; the chance that one needs more is 10⁻¹⁵
+STRIDE = np.uint64(64)  # random numbers reserved for each draw; the probability of needing more is 10⁻¹⁵
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 FIRST_FACTOR, SECOND_FACTOR = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 SHIFT_30, SHIFT_27, SHIFT_31 = np.uint64(30), np.uint64(27), np.uint64(31)
@@ -66,7 +66,7 @@ def inverse_3(matrix):
 
 @numba.njit(cache=True)
 def spread(first, second, third, noise):
-    """Return J L Jᵀ + L with J = first · second · third, all (3, 3); loops, as a library's product takes far longer."""
+    """Return J L Jᵀ + L with J = first · second · third, all (3, 3); loops are faster than library calls."""
     half, jacobian = np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
@@ -94,9 +94,9 @@ def point_coefficients(point_b, point_in_a, rotation, noise):
     """Return D (3 numbers: ww, wh, hh), v (3) and K2 of one point (paper, appendix).
 
     Args:
-        point_b: (3,) the point seen from B.
-        point_in_a: (3,) the same point carried into A's camera.
-        rotation: (3, 3) R⁻¹, which takes directions in B to A.
+        point_b: (3,) the point in B's camera.
+        point_in_a: (3,) the same point transformed to A's camera.
+        rotation: (3, 3) R⁻¹, which maps directions in B to A.
         noise: (3, 3) L, the sensor's covariance in ray coordinates.
     """
     in_a = spread(ray_jacobian(point_in_a), rotation, ray_jacobian_inverse(point_b), noise)
@@ -121,8 +121,8 @@ def point_density(point_b, pose, ranges_m, intrinsics, noise, reach_sigmas):
 
     Args:
         point_b: (3,) surface point in B's camera, m.
-        pose: (12,) rows of the 3×4 matrix that carries B into A.
-        ranges_m: (h, w) range r of every pixel of A; 0 = no measurement, which forbids nothing.
+        pose: (12,) rows of the 3×4 transform from B to A.
+        ranges_m: (h, w) range r of every pixel of A; 0 = no measurement, which excludes nothing.
         intrinsics: (4,) fx, fy, cx, cy of A in px.
         noise: (3, 3) L.
         reach_sigmas: pixels farther than this many lateral standard deviations are skipped; inf = none.
@@ -163,22 +163,22 @@ def point_density(point_b, pose, ranges_m, intrinsics, noise, reach_sigmas):
             if behind > 6.0:
                 total += 2.0 * math.exp(-exponent)  # 2 - erfc(6) is 2 in double precision
             elif behind > -27.3:
-                # erfc keeps its digits where 1 + erf would cancel; from 27.3 on it is 0 in double precision.
+                # erfc is accurate where 1 + erf would cancel; from 27.3 on it is 0 in double precision.
                 total += math.exp(-exponent) * math.erfc(-behind)
     return k2 * total
 
 
 def log_likelihoods(poses, points_b, ranges_m, intrinsics, noise, options):
-    """Return log p(P_B | M_A, T) (m,) for poses (paper, eq. P_B), -inf where a sample is rejected early.
+    """Return log p(P_B | M_A, T) (m,) for poses (paper, eq. P_B), -inf if a sample is rejected early.
 
     Args:
-        poses: (m, 12) rows of the 3×4 matrices that carry B into A.
+        poses: (m, 12) rows of the 3×4 transforms from B to A.
         points_b: (n, 3) surface points of B in m.
         ranges_m: (h, w) range of every pixel of A, 0 = no measurement.
         intrinsics: (4,) fx, fy, cx, cy of A in px.
         noise: (3, 3) L, the sensor's covariance in ray coordinates.
-        options: (2,) reach in lateral standard deviations (inf = all pixels); density, as a share of K2, below
-            which a point rejects the sample (0 = only where it vanishes).
+        options: (2,) reach in lateral standard deviations (inf = all pixels); density, as a fraction of K2, below
+            which a point rejects the sample (0 = only if it vanishes).
     """
     return over_rows(_log_likelihoods, poses, points_b, ranges_m, intrinsics, noise, options)
 
@@ -186,7 +186,7 @@ def log_likelihoods(poses, points_b, ranges_m, intrinsics, noise, options):
 @numba.njit(cache=True, nogil=True)
 def _log_likelihoods(poses, points_b, ranges_m, intrinsics, noise, options):
     result = np.empty(poses.shape[0])
-    # In units of K2 for a point that is not turned, so that the threshold is a number of pixels, not of 1/m.
+    # In units of K2 for an unrotated point, so that the threshold is a number of pixels, not of 1/m.
     unit = 1.0 / math.sqrt(inverse_3(2.0 * noise)[1])
     for i in range(poses.shape[0]):
         total = 0.0
@@ -229,8 +229,8 @@ def draw(number, seed, limits, pose):
         number: uint64; the same number and seed give the same pose in every thread and batch.
         seed: uint64.
         limits: (17,) sine of half the largest angle; largest offset in m; source's and target's centroid in m;
-            rotation (3, 3) from which angles count.
-        pose: (12,) rows of the 3×4 matrix that carries source into target, written to.
+            rotation (3, 3) relative to which angles are limited.
+        pose: (12,) out: rows of the 3×4 matrix of target_from_source.
     """
     counter = seed + GOLDEN * STRIDE * number
     limit = limits[0]
@@ -266,14 +266,14 @@ def draw(number, seed, limits, pose):
 
 @numba.njit(cache=True, inline="always")
 def forbidden(check, pose, near_m, image):
-    """Return whether a check's point, carried by a pose, lies in front of every measured pixel within its reach.
+    """Return whether a check's point, transformed by a pose, lies in front of every measured pixel within its reach.
 
     Args:
         check: (5,).
         pose: (12,) rows of target_from_source.
-        near_m: (h, w) float32 `nearest_ranges` of the view that the point is carried into.
+        near_m: (h, w) float32 `nearest_ranges` of the other view.
         image: (7,) fx, fy, cx, cy in px of a pixel of `near_m`; its width and height; and (r / z²)² up to which
-            `near_m` holds, in 1/m².
+            `near_m` is valid, in 1/m².
     """
     px, py, pz = check[X], check[Y], check[Z]
     if check[BACKWARD] > 0.0:
@@ -311,7 +311,7 @@ def passes(pose, checks, near_m, images):
 
 
 def passing(poses, checks, near_m, images):
-    """Return which (m,) of poses (m, 12) pass all checks.
+    """Return whether poses (m, 12) pass all checks, (m,).
 
     Args:
         poses: rows of target_from_source.
@@ -345,7 +345,7 @@ def _drawn(numbers, seed, limits):
 
 @numba.njit(cache=True)
 def verdicts(poses, checks, near_m, images):
-    """Return which (m, n) checks forbid which poses (m, 12); arguments as for `passing`."""
+    """Return whether each check forbids each pose, (m, n); arguments as for `passing`."""
     result = np.empty((poses.shape[0], checks.shape[0]), dtype=np.bool_)
     for i in range(poses.shape[0]):
         for j in range(checks.shape[0]):
@@ -355,13 +355,13 @@ def verdicts(poses, checks, near_m, images):
 
 
 def nearest_ranges(ranges_m, reach_px):
-    """Return the least range (h + 2b, w + 2a) within reach of anything that rounds to a pixel, never rounded up.
+    """Return the least range (h + 2b, w + 2a) within reach of any point that rounds to a pixel, never rounded up.
 
-    The image is padded by as many pixels (a, b) as the reach goes beyond it; where it reaches none, all is infinite.
+    The image is padded by the reach (a, b) in pixels; infinite if there is no measurement within reach.
 
     Args:
-        ranges_m: (h, w) range of every pixel in m; 0 = no measurement, which forbids nothing.
-        reach_px: (2,) half axes of the ellipse of pixels that count, along columns and rows.
+        ranges_m: (h, w) range of every pixel in m; 0 = no measurement, which excludes nothing.
+        reach_px: (2,) half axes of the ellipse within reach, along columns and rows.
     """
     across, down = math.ceil(reach_px[0] + 0.5), math.ceil(reach_px[1] + 0.5)
     return over_rows(_nearest_ranges, np.arange(ranges_m.shape[0] + 2 * down), ranges_m, reach_px, across, down)
@@ -377,7 +377,7 @@ def _nearest_ranges(rows, ranges_m, reach_px, across, down):
             other = row - down + dy
             if other < 0 or other >= height:
                 continue
-            # A point up to half a pixel from the one it rounds to.
+            # A point may be half a pixel from the one to which it rounds.
             rest = 1.0 - (max(abs(dy) - 0.5, 0.0) / reach_px[1]) ** 2
             if rest < 0.0:
                 continue

@@ -1,4 +1,4 @@
-"""Colours of surface that both views saw: their correlation, and the equations by which they move a pose."""
+"""Colours of surface seen by both views: their correlation, and their linear equations for a pose."""
 
 import math
 from typing import NamedTuple
@@ -15,43 +15,43 @@ from modeler.kernels.point_to_plane import FACING_WEIGHT, OTHER, OWN, POSITION, 
 GRADIENT_X, GRADIENT_Y, GRADIENT_Z, OFFSET = 0, 1, 2, 3
 CELL_SIZE = 4
 
-_LEAST_DEVIATION = 1e-6  # of features; an image without any has none of unit variance
+_MIN_DEVIATION = 1e-6  # standard deviation of features, for images without any
 
 FloatArray = npt.NDArray[np.float32]
 
 
 class Colours(NamedTuple):
-    """Colours of one direction of a comparison, of the points of a `Projection`."""
+    """Colours of one direction of a comparison, for the points of a `Projection`."""
 
     values: FloatArray
-    """(n,) features of the points in their own view, of unit variance; (0,) where colours are not compared."""
+    """(n,) features of the points in their own view, of unit variance; (0,) if colours are not compared."""
     cells: FloatArray
-    """(m + 1, 4) cells of colour of the other view's surface points; the last is that of no point, zeros."""
+    """(m + 1, 4) cells of colour of the other view's surface points; the last, of no point, is zero."""
     numbers: npt.NDArray[np.int32]
-    """(h · w,) number of the other view's point at each pixel, m for none."""
+    """(h · w,) index of the other view's point at each pixel, m for none."""
 
     def thinned(self, stride: int) -> "Colours":
-        """Return those of every `stride`-th point."""
+        """Return the colours of every `stride`-th point."""
         return self._replace(values=np.ascontiguousarray(self.values[::stride]))
 
 
 NO_COLOURS = Colours(
     np.zeros(0, dtype=np.float32), np.zeros((1, CELL_SIZE), dtype=np.float32), np.zeros(1, dtype=np.int32)
 )
-"""One direction of views whose colours are not compared."""
+"""Placeholder for colours that are not compared."""
 
 
 @numba.njit(cache=True, error_model="numpy")
 def find_in_place(points_m, shift_m, camera, numbers, none, found, offsets):
-    """Find where points fall in another view if they only move by a shift.
+    """Find where points fall in another view if they are only shifted.
 
     Args:
         points_m: (n, 3) the points.
         shift_m: (3,) the shift.
         camera: (4,) fx, fy, cx, cy of the other view.
-        numbers: (h, w) numbers of the other view's points,
-        none: where there is no point.
-        found: (n,) out; number of the other view's point there, the same for none.
+        numbers: (h, w) indices of the other view's points.
+        none: index for no point.
+        found: (n,) out; index of the other view's point there, or `none`.
         offsets: (n, 2) out; columns and rows from that point's pixel.
     """
     height, width = numbers.shape
@@ -69,7 +69,7 @@ def find_in_place(points_m, shift_m, camera, numbers, none, found, offsets):
 
 @numba.njit(cache=True, error_model="numpy", forceinline=True)
 def in_place(others, numbers, offsets, j):
-    """Return the feature that another view has in the place of a point, and its derivatives; 0 where it has none."""
+    """Return another view's feature at the place of a point, and its derivatives; 0 if it has no surface there."""
     k = numbers[j]
     if k >= others.shape[1]:
         return ZERO, ZERO, ZERO
@@ -79,7 +79,7 @@ def in_place(others, numbers, offsets, j):
 
 @numba.njit(cache=True, error_model="numpy")
 def compare_in_place(features, others, numbers, offsets):
-    """Return sums over the points in whose place the other view shows surface, too.
+    """Return sums over the points at whose place the other view has surface.
 
     Args:
         features: (3, n) of the points: value, and derivatives by column and row in 1/px.
@@ -110,18 +110,18 @@ def compare_in_place(features, others, numbers, offsets):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def explain_light(features, others, numbers, offsets, share, points_m, focal, values, cells):
-    """Write what features are, and their cells, without what another view has in the same places (method.md, eq. 18).
+def remove_static(features, others, numbers, offsets, share, points_m, focal, values, cells):
+    """Write features regressed on those of another view at the same places, and their cells (method.md, eq. 18).
 
-    What is left has unit variance. Along a pixel's ray a feature stays the same, so that its gradient there adds
-    nothing at the pixel's own point.
+    The result has unit variance. A feature is constant along a pixel's ray, so that its gradient in space vanishes
+    along it.
 
     Args:
         features: see `compare_in_place`.
-        others: likewise.
-        numbers: likewise.
-        offsets: likewise.
-        share: of the other view's that light makes up, float32.
+        others: see `compare_in_place`.
+        numbers: see `compare_in_place`.
+        offsets: see `compare_in_place`.
+        share: regression coefficient, float32.
         points_m: (n, 3) the points.
         focal: (2,) fx and fy in px, float32.
         values: (n,) out.
@@ -136,7 +136,7 @@ def explain_light(features, others, numbers, offsets, share, points_m, focal, va
         total += left
         square += left * left
     variance = square / max(count, 1) - (total / max(count, 1)) ** 2
-    scale = np.float32(1.0 / max(math.sqrt(max(variance, 0.0)), _LEAST_DEVIATION))
+    scale = np.float32(1.0 / max(math.sqrt(max(variance, 0.0)), _MIN_DEVIATION))
     for j in range(count):
         cell = cells[j]
         x, y, per_z = np.float32(points_m[j, 0]), np.float32(points_m[j, 1]), ONE / np.float32(points_m[j, 2])
@@ -149,18 +149,18 @@ def explain_light(features, others, numbers, offsets, share, points_m, focal, va
 
 @numba.njit(cache=True, error_model="numpy")
 def compare_matches(matches, rotation, values, own_cells, cells, camera, numbers, weight):
-    """Return the features of matches in the place of their surface (n, 14), as `point_to_plane.matches` has that.
+    """Return the equations of features of matches (n, 14), in the layout of `point_to_plane.matches`.
 
-    The gradient of a feature is the normal, the difference of features the distance.
+    The gradient of a feature replaces the normal, the difference of features the distance.
 
     Args:
         matches: (n, 14) of surface.
-        rotation: (3, 3) that carries the points into the other camera.
-        values: (n,) features of the points in their own view, and
-        own_cells: (n, 4) their cells there.
-        cells: (m + 1, 4) those of the other view.
+        rotation: (3, 3) of the points into the other camera.
+        values: (n,) features of the points in their own view.
+        own_cells: (n, 4) cells of the points in their own view.
+        cells: (m + 1, 4) cells of the other view.
         camera: (4,) fx, fy, cx and cy of the other view.
-        numbers: (h, w) numbers of its surface points.
+        numbers: (h, w) indices of its surface points.
         weight: of squared differences of features.
     """
     found, own = matches.copy(), np.empty(3)
@@ -170,7 +170,7 @@ def compare_matches(matches, rotation, values, own_cells, cells, camera, numbers
         x, y, z = position
         column, row = np.floor(camera[0] * x / z + camera[2] + 0.5), np.floor(camera[1] * y / z + camera[3] + 0.5)
         cell = cells[numbers[int(min(max(row, 0), height - 1)), int(min(max(column, 0), width - 1))]]
-        # Along the surface a gradient turns with it; then it is taken along the other camera's rays.
+        # The part along the surface rotates with it, and is then continued along the other camera's ray.
         across, ray, slope = 0.0, 0.0, 0.0
         for k in range(3):
             own[k] = 0.0
@@ -232,7 +232,7 @@ def sum_moments(points, values, transformed, looked_up, seen, surface_m2):
 def linearise_features(points, values, transformed, found, colour, centre, surface_m2, weight, rows):
     """Write the equations of features into `rows` (8, n): derivatives by ζ, residual and weight.
 
-    A feature is linear in the point's position as a plane's distance is, its gradient in the place of the normal.
+    A feature is linear in the point's position, like a plane's distance, with its gradient in place of the normal.
     """
     cx, cy, cz = np.float32(centre[0]), np.float32(centre[1]), np.float32(centre[2])
     for j in range(points.shape[1]):

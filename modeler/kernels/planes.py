@@ -7,9 +7,9 @@ import numpy as np
 
 from modeler.kernels.threads import over_rows
 
-# Columns of a cell, the 32 bytes a likelihood reads for one pixel (float32).
+# Columns of a cell, the 32 bytes that a likelihood reads for one pixel (float32).
 NORMAL_X, NORMAL_Y, NORMAL_Z = 0, 1, 2  # unit normal n of the local plane, towards the camera
-DISTANCE = 3  # of the plane from the camera, m: n · p + distance is how far p lies in front of it
+DISTANCE = 3  # of the plane from the camera, m: n · p + distance is the height of p in front of it
 VARIANCE = 4  # of that distance at the pixel, m²
 KIND = 5  # one of the four below
 DEPTH = 6  # measured z, m
@@ -17,7 +17,7 @@ SILHOUETTE = 7  # distance of a pixel outside the object from its silhouette, px
 CELL_SIZE = 8
 
 _NOWHERE_M = 1e9  # outside every ball
-# RAGGED: object, but no plane to be trusted; or hidden by something else.
+# RAGGED: object without a reliable plane, or an occluder.
 MISSING, SURFACE, RAGGED, BACKGROUND = 0.0, 1.0, 2.0, 3.0
 
 
@@ -26,7 +26,7 @@ def solve_symmetric_3(a00, a01, a02, a11, a12, a22, b0, b1, b2):
     """Solve a symmetric 3×3 system by Cramer's rule.
 
     Returns:
-        (x0, x1, x2, first diagonal element of the inverse, determinant); the determinant is 0 where it is singular.
+        (x0, x1, x2, first diagonal element of the inverse, determinant); the determinant is 0 if singular.
     """
     c00 = a11 * a22 - a12 * a12
     c01 = a02 * a12 - a01 * a22
@@ -49,7 +49,7 @@ def solve_symmetric_3(a00, a01, a02, a11, a12, a22, b0, b1, b2):
 
 @numba.njit(cache=True)
 def bounds(mask):
-    """Return the bounding box of a mask (h, w): first row, row after the last, and the same of the columns."""
+    """Return the bounding box of a mask (h, w): first row, row after the last, and the same for columns."""
     top, bottom, left, right = mask.shape[0], 0, mask.shape[1], 0
     for row in range(mask.shape[0]):
         for column in range(mask.shape[1]):
@@ -61,7 +61,7 @@ def bounds(mask):
 
 @numba.njit(cache=True)
 def padded(depth_m, mask, intrinsics, window, pad):
-    """Return x, y, z in m and 1/z in 1/m (4, h, w) of a mask's pixels in a window and `pad` around; else far away."""
+    """Return x, y, z in m and 1/z in 1/m (4, h, w) of a mask's pixels in a padded window; others are far away."""
     top, bottom, left, right = window
     fx, fy, cx, cy = intrinsics
     points = np.full((4, bottom - top + 2 * pad, right - left + 2 * pad), _NOWHERE_M, dtype=np.float32)
@@ -77,14 +77,14 @@ def padded(depth_m, mask, intrinsics, window, pad):
 
 @numba.njit(cache=True, fastmath={"contract", "nsz"})
 def add_line(centres, points, row, shift, pad, radius_m2, step, sums):
-    """Add up, for every pixel of a row, its neighbours on one line that lie within the ball around it.
+    """Sum, for every pixel of a row, over its neighbours on one line within the ball around it.
 
     Args:
-        centres: of the balls, of `padded`.
-        points: of `padded`; the neighbours.
-        row: the pixels' row, and
-        shift: by how much the line lies below it.
-        pad: of `padded`; the line is read as far as this to either side.
+        centres: of the balls, from `padded`.
+        points: the neighbours, from `padded`.
+        row: of the pixels.
+        shift: rows from the pixels down to the line.
+        pad: of `padded`; the line is read this far to either side.
         radius_m2: square of the ball's radius.
         step: between the pixels that are read.
         sums: (6, w) out: number n, Σ x, Σ x², Σ b, Σ x b, Σ b², with x the columns from the pixel and b the
@@ -125,8 +125,8 @@ def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse, 
         intrinsics: (4,) fx, fy, cx, cy in px.
         ball: radius in m; half-width of its window in px; stride between the pixels that are read.
         sigma_inverse: sensor noise of 1/z, in 1/m.
-        measured: (h, w) bool, the object pixels that planes are fitted to; the depth of others is a guess of where to
-            look for neighbours. None: all.
+        measured: (h, w) bool, the object pixels to which planes are fitted; the depth of others only determines where
+            to look for neighbours. None: all.
 
     Returns:
         (h, w, 8) float32 cells, columns as above.
@@ -181,16 +181,16 @@ def _local_planes(rows, depth_m, mask, silhouette_px, centres, points, window, i
 
 @numba.njit(cache=True)
 def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse):
-    """Write the plane through a pixel's neighbours into its cell (8,), where they determine one (method.md, eq. 1).
+    """Write the plane fitted to a pixel's neighbours into its cell (8,), if they determine one (method.md, eq. 1).
 
     Args:
         cell: with the depth of the pixel.
         sums: (10,) n, Σ x, Σ y, Σ x², Σ xy, Σ y², Σ b, Σ xb, Σ yb, Σ b² of columns and rows from the pixel and of the
             difference in 1/z.
-        w: (column - cx) / fx of the pixel, and
-        h: (row - cy) / fy.
-        fx: focal length in px, along rows, and
-        fy: along columns.
+        w: (column - cx) / fx of the pixel.
+        h: (row - cy) / fy of the pixel.
+        fx: focal length along rows in px.
+        fy: focal length along columns in px.
         sigma_inverse: least noise of 1/z, in 1/m.
     """
     n, swx, swy, sxx, sxy, syy, sb, sxb, syb, sbb = sums
@@ -212,14 +212,14 @@ def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse):
     cell[DISTANCE] = 1.0 / norm
     # The distance of a point from the plane is (1 - N · p) / |N|: its noise is z times that of 1/z over |N|.
     cell[VARIANCE] = z * z * spread * leverage / (norm * norm)
-    # A one-sided neighbourhood is the rim of a silhouette or a fold: the leverage of its pixel is high.
+    # A one-sided neighbourhood, at a silhouette or a fold, gives its pixel a high leverage.
     if n >= 8.0 and leverage * n < 1.6:
         cell[KIND] = SURFACE
 
 
 @numba.njit(cache=True)
 def frontal_points(cells, mask, intrinsics, min_cosine):
-    """Return the points where pixels' rays meet their local planes, of those that face the camera enough.
+    """Return the intersections of pixels' rays with their local planes, for planes that face the camera enough.
 
     Args:
         cells: (h, w, 8) of `local_planes`.
@@ -264,7 +264,7 @@ _STEP, _DIAGONAL = np.float32(1.0), np.float32(math.sqrt(2.0))
 
 @numba.njit(cache=True)
 def silhouette_distance(mask, limit_px):
-    """Return the distance (h, w) float32 in px of every pixel from the mask, cut at `limit_px`; by chamfer sweeps."""
+    """Return the distance (h, w) float32 in px of every pixel from the mask, at most `limit_px`, by chamfer sweeps."""
     distance = np.full(mask.shape, limit_px, dtype=np.float32)
     top, bottom, left, right = bounds(mask)
     reach = math.ceil(limit_px)  # farther from the mask nothing changes
@@ -301,7 +301,7 @@ def propagate_from_row(line, above):
 def propagate_along_row(line):
     """Propagate distances (w,) along a row.
 
-    As a running minimum of distance less column: each step depends on one comparison, and no addition.
+    As a running minimum of distance minus column: each step depends on one comparison, without addition.
     """
     least = line[0]
     for column in range(1, line.shape[0]):

@@ -1,4 +1,4 @@
-"""Kernels on oriented points: planes fitted to pixels of a depth image, and clouds sorted into voxels."""
+"""Oriented points: planes fitted to pixels of a depth image, and voxel grids of point clouds."""
 
 import math
 
@@ -22,7 +22,7 @@ def fitted_planes(depth_m, wanted, mask, intrinsics, sigma_m, max_slope):
         max_slope: tangent of the steepest angle between surface and image plane.
 
     Returns:
-        Points (n, 3) and unit normals (n, 3) in camera coordinates; normals are 0 where there is no plane.
+        Points (n, 3) and unit normals (n, 3) in camera coordinates; normals are 0 without a plane.
     """
     height, width = depth_m.shape
     points, normals = np.zeros((len(wanted), 3)), np.zeros((len(wanted), 3))
@@ -45,7 +45,7 @@ def fitted_planes(depth_m, wanted, mask, intrinsics, sigma_m, max_slope):
                 near += abs(r - row) <= 1 and abs(c - column) <= 1
         if near < 3:
             continue
-        # Ridge: a slope of 1 costs as much as a residual of one sd, so with few neighbours the plane faces the camera.
+        # Ridge regression: a slope of 1 costs as much as a residual of one sd; planes of few neighbours are frontal.
         ridge = sigma_m * sigma_m + 0.1 * step_x * step_x
         sxx, syy = sxx + ridge, syy + ridge
         determinant = sxx * syy - sxy * sxy
@@ -61,7 +61,7 @@ def fitted_planes(depth_m, wanted, mask, intrinsics, sigma_m, max_slope):
 
 @njit(cache=True)
 def voxel_numbers(points, origin, voxel_m, shape):
-    """Number the occupied voxels of a box in the order in which the points enter them.
+    """Number the occupied voxels of a box in the order of their first points.
 
     Args:
         points: (n, 3) in m.
@@ -70,7 +70,7 @@ def voxel_numbers(points, origin, voxel_m, shape):
         shape: (3,) voxels along each axis.
 
     Returns:
-        (n,) int32 number of each point's voxel, -1 outside the box; and the number of occupied voxels.
+        (n,) int32 index of each point's voxel, -1 outside the box; and the number of occupied voxels.
     """
     lookup = np.zeros(shape[0] * shape[1] * shape[2], dtype=np.int32)
     cells = np.empty(len(points), dtype=np.int32)
@@ -109,7 +109,7 @@ def neighbour_counts(points, origin, cell_m, shape):
 
     Args:
         points: (n, 3) in m.
-        origin: (3,) lowest corner of a box that holds them all.
+        origin: (3,) lowest corner of a box that contains them all.
         cell_m: side of a cell.
         shape: (3,) cells along each axis.
     """

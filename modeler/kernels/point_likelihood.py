@@ -1,6 +1,6 @@
-"""The visibility likelihood: points of one view against the surface, and the empty space, that the other measured.
+"""The visibility likelihood: points of one view against the surface and the free space measured by the other.
 
-Single precision: of a point a metre away it leaves 0.1 µm, and sixteen points go through one instruction.
+Single precision resolves 0.1 µm at a distance of 1 m, and one instruction processes sixteen points.
 """
 
 import math
@@ -31,10 +31,10 @@ UNKNOWN, MATCHED, BEHIND, IN_FRONT, HIDDEN, IN_EMPTY_SPACE, IN_SUPPORT = CLASSES
 MIN_AGREEMENT = np.float32(0.8)
 """Least cosine between the normals of a point and of the surface that it matches."""
 MAX_SIGMAS = np.float32(3.0)
-"""A point farther from the surface than this many standard deviations does not match it."""
+"""Largest distance of a match from the surface in standard deviations."""
 
 LOOSE_SIGMAS = 4.0
-"""Likewise where points are classified: what may be noise is not counted as a contradiction."""
+"""The same for `classify`: possible noise is not counted as a contradiction."""
 
 # Nodes of the table of log((1 - hidden) exp(match) + hidden); below the first it is log(hidden) within 3e-6.
 TABLE_LOW, TABLE_HIGH, TABLE_STEPS = np.float32(-14.0), np.float32(4.0), 2304
@@ -42,11 +42,11 @@ _PER_STEP = np.float32(TABLE_STEPS / (TABLE_HIGH - TABLE_LOW))
 
 _OF_SURFACE, _OF_BACKGROUND, _OF_NOTHING = np.float32(SURFACE), np.float32(BACKGROUND), np.float32(MISSING)
 
-# The flags allow fused multiply-add, one reciprocal and any order of summation; NaN and infinity stay valid. Functions
-# that a kernel calls are inlined (`forceinline`): separately compiled copies could sum in another order, and a kernel
-# just compiled would not return the same bits as one from the cache.
+# The flags allow fused multiply-add, reciprocals and any order of summation; NaN and infinity stay valid. Functions
+# that a kernel calls are inlined (`forceinline`): separately compiled copies could sum in another order, so that a
+# newly compiled kernel would not return the same bits as a cached one.
 VECTOR_MATHS = {"contract", "arcp", "nsz", "reassoc"}
-ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)  # a plain 0.5 would make double precision of all
+ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)  # a plain 0.5 would promote to double precision
 
 # Rows of the points, and of `transform_points`.
 VARIANCE_M2, COLUMN, ROW = 6, 7, 8
@@ -69,7 +69,7 @@ class Projection(NamedTuple):
     cosines: FloatArray
     """(4,) cosines between which f rises from 0 to 1, and g (method.md, eq. 4)."""
     pattern: FloatArray
-    """(2,) share χ of the variance that both views have in common at the same pixel, and 1/R² in 1/px² (eq. 27)."""
+    """(2,) fraction χ of the variance common to both views at the same pixel, and 1/R² in 1/px² (eq. 27)."""
 
 
 @numba.njit(cache=True, forceinline=True)
@@ -84,14 +84,14 @@ def invert(pose, inverse):
 
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def transform_points(pose, projection, transformed, pixels):
-    """Transform points into the other camera (method.md, eq. 4): straight-line code, which compilers vectorise.
+    """Transform points into the other camera (method.md, eq. 4): branch-free code, which compilers vectorise.
 
     Args:
         pose: (12,) rows of the 3×4 matrix.
         projection: the points and the other camera.
-        transformed: (9, n) out: position, normal, how much the point faces the camera (f, 0..1), how reliably the
-            camera measures it (g, 0..1), and which share of a match's variance both views have in common (eq. 27).
-        pixels: (n,) out: number of the pixel it falls on, row by row; -1 outside the image or behind the camera.
+        transformed: (9, n) out: position, normal, visibility f (0..1), expected coverage g (0..1), and the fraction c
+            of a match's variance that is common to both views (eq. 27).
+        pixels: (n,) out: index of the pixel on which it falls, row by row; -1 outside the image or behind the camera.
     """
     p0, p1, p2, p3 = np.float32(pose[0]), np.float32(pose[1]), np.float32(pose[2]), np.float32(pose[3])
     p4, p5, p6, p7 = np.float32(pose[4]), np.float32(pose[5]), np.float32(pose[6]), np.float32(pose[7])
@@ -130,7 +130,7 @@ def transform_points(pose, projection, transformed, pixels):
 
 @numba.njit(cache=True, forceinline=True)
 def fetch_cells(count, pixels, cells, looked_up):
-    """Copy the cells at the first `pixels` (n,) into columns of `looked_up` (8, n); outside they are `MISSING`."""
+    """Copy the cells at the first `pixels` (n,) into columns of `looked_up` (8, n); `MISSING` outside the image."""
     for j in range(count):
         cell = np.uint32(max(pixels[j], np.int32(0)))
         for k in range(CELL_SIZE):
@@ -164,7 +164,7 @@ class LikelihoodParameters(NamedTuple):
     silhouette_px: np.float32
     """Standard deviation of the silhouette."""
     clearance_m: np.float32
-    """A point this far in front of the background contradicts it."""
+    """Distance in front of the background from which on a point contradicts it."""
     max_point_cost: np.float32
     """Upper bound K of the cost of one point (nats)."""
     normal_cost: np.float32
@@ -174,7 +174,7 @@ class LikelihoodParameters(NamedTuple):
     typical_misfit: np.float32
     """Misfit μ of a typical match (nats)."""
     support: FloatArray
-    """(5,) plane that the object stands on: unit normal, offset in m, precision of heights above it in 1/m; else 0."""
+    """(5,) support plane: unit normal, offset in m, inverse standard deviation of heights above it in 1/m; else 0."""
     table: FloatArray
     """`match_table` of η."""
 
@@ -212,7 +212,7 @@ def normal_agreement(transformed, looked_up, j):
 
 @numba.njit(cache=True, inline="always")
 def depth_below(transformed, parameters, j):
-    """Return how far below the support a transformed point is, beyond the clearance (method.md, eq. 21), in sd."""
+    """Return the depth of a transformed point below the support, beyond the clearance (method.md, eq. 21), in sd."""
     support = parameters.support
     height_m = (
         support[0] * transformed[X, j]
@@ -228,11 +228,11 @@ def depth_below(transformed, parameters, j):
 def sum_over_points(points, transformed, looked_up, parameters):
     """Return the log-likelihood of transformed points, and the number explained (method.md, eq. 5, 6 and 21).
 
-    All cases are evaluated for every point, and one selected: code without branches is vectorised.
+    All cases are evaluated for every point, and one is selected: code without branches is vectorised.
 
     Args:
         points: (9, n), see `Projection`.
-        transformed: (9, n) and
+        transformed: (9, n), see `project`.
         looked_up: (8, n), see `project`.
         parameters: see `LikelihoodParameters`.
     """
@@ -245,7 +245,7 @@ def sum_over_points(points, transformed, looked_up, parameters):
         agreement = normal_agreement(transformed, looked_up, j)
         variance = points[VARIANCE_M2, j] + looked_up[VARIANCE, j] + parameters.blur_m * parameters.blur_m
         half_square = HALF * in_front * in_front / variance
-        # With what the fixed pattern would have added, were it not the same in both views.
+        # With the expected deficit due to the fixed pattern, which is the same in both views (eq. 27).
         misfit = half_square + HALF * transformed[PATTERN, j]
         match = parameters.typical_misfit - misfit - parameters.normal_cost * (ONE - agreement)
         matches = (half_square < HALF * MAX_SIGMAS * MAX_SIGMAS) & (agreement > MIN_AGREEMENT)
@@ -253,7 +253,7 @@ def sum_over_points(points, transformed, looked_up, parameters):
         node = min(np.int32(position), last)
         low, high = table[np.uint32(node)], table[np.uint32(node + np.int32(1))]
         seen = low + (position - np.float32(node)) * (high - low)
-        # Nothing hides a point in front of the measured surface.
+        # A point in front of the measured surface cannot be occluded.
         seen = max(match, -max_point_cost) if (in_front > ZERO) & (match < log_hidden) else seen
         on_surface = faces * seen - ((ONE - faces) * min(half_square, max_point_cost) if in_front > ZERO else ZERO)
         beyond = looked_up[SILHOUETTE, j] / parameters.silhouette_px
@@ -299,9 +299,8 @@ def residual_excess(pose, projection, blur_m):
     """Return the excess of squared residuals over their variances under one pose (12,) (method.md, eq. 8).
 
     Returns:
-        Sum in m² of the squared distances less what is expected of the variances of point and plane, over the points
-        that face the camera and are within `LOOSE_SIGMAS` standard deviations, `blur_m` included; and their number,
-        each counted by the share of its variance that shows.
+        Numerator in m² and denominator of b², over the points that face the camera and are within `LOOSE_SIGMAS`
+        standard deviations, `blur_m` included.
     """
     transformed, pixels, looked_up = buffers(projection.points.shape[1])
     project(pose, projection, transformed, pixels, looked_up)

@@ -1,4 +1,4 @@
-"""Matches of surface that both views measured, their point-to-plane equations, and patches of the surface."""
+"""Matches of surface measured by both views, their point-to-plane equations, and patches of the surface."""
 
 import numba
 import numpy as np
@@ -48,14 +48,14 @@ def matches(pose, projection, surface_m):
     """Return the match of each point under one pose.
 
     Args:
-        pose: (12,) rows of the 3×4 matrix that takes the points into the other camera.
+        pose: (12,) rows of the 3×4 transform of the points into the other camera.
         projection: the `Projection` of the points.
         surface_m: noise of the surfaces in m beyond that of points and planes.
 
     Returns:
         (n, 14): position in m, own normal and normal of the surface there, all in the other camera's frame; distance
-        in m in front of that surface; weight in 1/m², 0 where nothing matches; f (0..1); shift in px from the point's
-        pixel in its own view, to the right and down.
+        in m in front of that surface; weight in 1/m², 0 without a match; f (0..1); shift in px, columns and rows, from
+        the point's pixel in its own view.
     """
     transformed, pixels, cells = buffers(projection.points.shape[1])
     project(pose, projection, transformed, pixels, cells)
@@ -83,7 +83,7 @@ def linearise(points, transformed, found, centre, surface_m2, rows):
         residual = plane_distance(transformed, found, j)
         rows[6, j] = residual
         rows[7, j] = match_weight(points, transformed, found, residual, surface_m2, j)
-    for j in range(points.shape[1]):  # a separate loop: compilers prove that no more rows than these do not alias
+    for j in range(points.shape[1]):  # a second loop: compilers can rule out aliasing of only so many rows
         x, y, z = transformed[X, j] - cx, transformed[Y, j] - cy, transformed[Z, j] - cz
         # The mean of both surfaces' normals, so that neither's noise counts in full.
         normal_x = HALF * (found[NORMAL_X, j] + transformed[POINT_NORMAL_X, j])
@@ -96,7 +96,7 @@ def linearise(points, transformed, found, centre, surface_m2, rows):
 
 
 def bisected(points, halvings):
-    """Return the patch number (n,) of each point (n, 3): recursive bisection, each across its longest side.
+    """Return the patch index (n,) of each point (n, 3), by recursive bisection across the longest side.
 
     Args:
         points: (n, 3).

@@ -1,4 +1,4 @@
-"""What poses score: the log-likelihood of both views' surface, and how well its colours agree, in one projection."""
+"""Scores of poses: the log-likelihood of both views' surface, and the moments of its colours, in one projection."""
 
 import numba
 import numpy as np
@@ -12,21 +12,21 @@ LOG_LIKELIHOOD, EXPLAINED, PRODUCT, OWN_SQUARE, OTHER_SQUARE, MATCHES = 0, 1, 2,
 
 
 def scores(poses, forward, backward, forward_parameters, backward_parameters, colours=(NO_COLOURS, NO_COLOURS)):
-    """Return what each pose scores, summed over the points of two views (method.md, eq. 3 and 19).
+    """Return the scores of poses, summed over the points of two views (method.md, eq. 3 and 19).
 
-    In single precision the error is below 1e-4 nats a point, unless a point falls within 1e-3 px of a pixel's border.
+    In single precision, the error is below 1e-4 nats per point unless a point falls within 1e-3 px of a pixel's border.
 
     Args:
         poses: (m, 12) float64 rows of the 3×4 matrices of target_from_source.
-        forward: the `Projection` of one view's points in the other, and
-        backward: that of the other's in the one.
-        forward_parameters: the `LikelihoodParameters` of the one direction, and
-        backward_parameters: of the other.
+        forward: the `Projection` of the source's points in the target.
+        backward: the `Projection` of the target's points in the source.
+        forward_parameters: the `LikelihoodParameters` of the forward direction.
+        backward_parameters: the `LikelihoodParameters` of the backward direction.
         colours: the `Colours` of both directions.
 
     Returns:
-        (m, 6): log-likelihood; number of points that the other view explains; moments of the features of matching
-        points, 0 where colours are not compared. Each point counts by f.
+        (m, 6): log-likelihood; number of points explained by the other view; moments of the features of matching
+        points, 0 if colours are not compared. Points are weighted by f.
     """
     parameters = forward_parameters, backward_parameters
     return over_rows(_scores, poses, (forward, backward), parameters, colours, least=16)

@@ -1,4 +1,4 @@
-"""How lamps that stay with the camera shade a matt surface: harmonics of its normal in the camera's frame."""
+"""Shading of a matt surface by lamps fixed to the camera: harmonics of its normal in the camera's frame."""
 
 import numpy as np
 from numba import njit
@@ -8,10 +8,10 @@ HARMONICS = 8  # up to the second degree, without the constant
 
 @njit(cache=True)
 def harmonics(pose, x, y, z):
-    """Return the spherical harmonics of degrees 1 and 2 (8,), unscaled, of a direction turned into a camera's frame.
+    """Return the spherical harmonics of degrees 1 and 2 (8,), unscaled, of a direction rotated to a camera's frame.
 
-    They hold nearly all of how lamps far away shade a matt surface (Basri and Jacobs 2003, "Lambertian reflectance and
-    linear subspaces").
+    They describe nearly all shading of a matt surface by distant lamps (Basri and Jacobs 2003, "Lambertian reflectance
+    and linear subspaces").
     """
     a = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z
     b = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z
@@ -32,7 +32,7 @@ def harmonics_of(normals, pose):
 
 @njit(cache=True)
 def shading_of(normals, coefficients):
-    """Return how surface is shaded (n,) by its normals (n, 3): coefficients (9,) of a constant and the harmonics."""
+    """Return the shading (n,) of normals (n, 3), given coefficients (9,) of a constant and the harmonics."""
     result = np.empty(len(normals))
     camera = np.eye(4)
     for n in range(len(normals)):

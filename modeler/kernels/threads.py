@@ -1,4 +1,4 @@
-"""Kernels in several threads: parallel loops of Numba take several times as long to compile."""
+"""Kernels in several threads, because Numba's parallel loops take several times as long to compile."""
 
 import os
 from collections.abc import Callable
@@ -13,13 +13,13 @@ os.register_at_fork(after_in_child=_pools.clear)  # a child process has none of 
 
 
 def over_rows(kernel: Callable[..., Any], rows: np.ndarray, *arguments: Any, least: int = 4) -> Any:
-    """Return what a kernel returns for `rows`: one array or several, computed in blocks of rows and concatenated.
+    """Return a kernel's result for `rows`, one array or several, computed in blocks of rows and concatenated.
 
     Args:
-        kernel: releases the GIL (`nogil=True`); takes rows and the arguments, each row on its own.
+        kernel: releases the GIL (`nogil=True`); takes rows and the arguments, each row independently.
         rows: (m, ...).
         arguments: the same for all rows.
-        least: fewest rows that are worth a thread.
+        least: least number of rows per thread.
     """
     threads = min(numba.get_num_threads(), len(rows) // least)
     if threads <= 1:

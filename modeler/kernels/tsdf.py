@@ -1,12 +1,12 @@
 """Kernels of fusion: the truncated signed distance function (TSDF) on voxels, and observations of single points.
 
-Views are stacked: `index` (f, h, w) holds the number of the surface point seen at a pixel, -1 where there is none;
-`free_m` (f, h, w) the depth up to which a pixel sees empty space, 0 where that is unknown. `poses` (f, 3, 4) are
+Views are stacked: `index` (f, h, w) is the index of the surface point seen at a pixel, -1 for none; `free_m` (f, h, w)
+the depth up to which a pixel sees empty space, 0 if unknown. `poses` (f, 3, 4) are
 camera_from_object, and `intrinsics` (f, 4) are fx, fy, cx, cy of the stacked images. Points and normals are given in
 the object frame.
 
 A view that sees a surface within the truncation band along a voxel's pixel votes with the voxel's distance above that
-surface along its normal, a weight, and the number of the surface point. Equation numbers are those of docs/method.md.
+surface along its normal, a weight, and the index of the surface point. Equation numbers are those of docs/method.md.
 """
 
 import math
@@ -24,7 +24,7 @@ MAJORITY = 3  # a side is rejected if this many times as many votes contradict i
 
 @njit(cache=True)
 def blocks_near(points, origin, block_m, reach_m, shape):
-    """Return the coordinates (b, 3) of the blocks of a grid that come within reach of a point, in ascending order.
+    """Return the coordinates (b, 3) of the blocks of a grid within reach of a point, in ascending order.
 
     Args:
         points: (n, 3) in m.
@@ -130,10 +130,10 @@ def _integrate(
 
 @njit(cache=True)
 def collect_votes(positions, tau_m, index, free_m, poses, intrinsics, points, normals, weights):
-    """Return the votes on positions (m, 3), as `fuse_votes` takes them, and how many views see each empty.
+    """Return the votes on positions (m, 3) for `fuse_votes`, and the number of views that see each empty.
 
-    These are the number of votes (m,); the distance, weight and surface point of each, all (m, f); and (m,).
-    Arguments as for `integrate`.
+    These are the number of votes (m,); distance, weight and surface point of each vote, all (m, f); and (m,). Arguments
+    as for `integrate`.
     """
     frames, height, width = index.shape
     distance, weight = np.empty((len(positions), frames)), np.empty((len(positions), frames))
@@ -167,7 +167,7 @@ def collect_votes(positions, tau_m, index, free_m, poses, intrinsics, points, no
 
 
 def observe(queries, directions, tolerance_m, tau_m, *views):
-    """Return what the views observe at oriented points (F7 to F9).
+    """Return the observations of oriented points by the views (F7 to F9).
 
     A view supports a point if it sees a surface within `tolerance_m` along the same pixel that faces the same way.
     Colours are averaged over the supporting views.
@@ -250,10 +250,10 @@ def _observe(
 def disagreements(chosen, views, limit_m, index, poses, intrinsics, points, normals):
     """Return the distances (m, f) of surface points above the surface seen by each view, and its points there (m, f).
 
-    Distances are along the normal; NaN and -1 where a view sees no surface.
+    Distances are along the normal; NaN and -1 if a view sees no surface there.
 
     Args:
-        chosen: (m,) numbers of points.
+        chosen: (m,) indices of points.
         views: (m,) the view of each.
         limit_m: largest distance along the normal to the same surface.
         index: (f, h, w) int32.
@@ -291,8 +291,8 @@ def project(pose, camera, x, y, z):
     return u, v, depth
 
 
-# `collect_votes`, `fuse_votes` and `dominant_vote` write the next two functions out: calls would cost a fifth of their
-# time.
+# `collect_votes`, `fuse_votes` and `dominant_vote` inline the next two functions by hand: calls would take a fifth of
+# their time.
 @njit(cache=True)
 def above(x, y, z, points, normals, n):
     """Return the distance of a position above the surface at point `n`, along its normal."""
@@ -312,7 +312,7 @@ def fuse_votes(
     """Return the signed distance and weight of a position from its votes (F6). Weights of rejected votes become 0.
 
     Only votes on the same side of the object as the dominant vote are averaged. A side is rejected if most votes see
-    surface between it and its view: a few pixels at a grazing angle with errors along their rays far beyond the noise
+    surface between it and its view: a few pixels at grazing angles, with errors along their rays far beyond the noise,
     seem to look out from within the object.
 
     Args:
@@ -363,9 +363,9 @@ def fuse_votes(
 def dominant_vote(seen, distance, weight, number, normals, tau_m):
     """Return the vote that decides on which side of the object a position is, -1 = none; arguments as for `fuse_votes`.
 
-    A view that sees a position in front of a surface observes that it is empty; one that sees it behind a surface
-    extrapolates that it is full. The nearest surface decides, unless an opposing view sees the position in front of
-    its surface: this preserves walls thinner than the band.
+    A view that sees a position in front of a surface observes free space; one that sees it behind a surface only
+    extrapolates solid. The nearest surface decides, unless an opposing view sees the position in front of its surface:
+    this preserves walls thinner than the band.
     """
     best, best_score = -1, 0.0
     for k in range(seen):
@@ -386,7 +386,7 @@ def dominant_vote(seen, distance, weight, number, normals, tau_m):
 
 @njit(cache=True)
 def occluding_votes(best, position, seen, distance, weight, number, views, index, poses, intrinsics, points, normals):
-    """Return how many votes for other sides see surface between a position and the camera of the best vote.
+    """Return the number of votes for other sides that see surface between a position and the camera of the best vote.
 
     Arguments as for `fuse_votes`.
     """
@@ -425,9 +425,9 @@ def integrate_view(sums, box, *view):
         sums: (x, y, z, 6) float32: Σ w, Σ w d, Σ c, Σ c red, Σ c green, Σ c blue.
         box: (2, 3) first voxel of the box, and the one after its last.
         view: lowest corner (3,) of the box in m, object frame; side of a voxel in m; half width in m of the truncation
-            band; weight of empty space, relative to 1 for a surface seen head-on; 1 to add the view, -1 to remove what
-            was added with the same arguments; camera_from_object (3, 4); fx, fy, cx, cy (4,) of the images; number of
-            the surface point at a pixel (h, w) int32, -1 = none; depth in m up to which a pixel sees empty space
+            band; weight of empty space, relative to 1 for a surface seen head-on; 1 to add the view, -1 to remove one
+            added with the same arguments; camera_from_object (3, 4); fx, fy, cx, cy (4,) of the images; index of the
+            surface point at a pixel (h, w) int32, -1 = none; depth in m up to which a pixel sees empty space
             (h, w) float32, 0 = unknown; points (n, 3) in the object frame, normals (n, 3) and weights (n,); colours
             (n, 4), RGB and 1, or 0 without colour.
     """

@@ -1,7 +1,7 @@
-"""Likelihoods and draws of many poses at once by Warp: one source that runs on a CUDA device and, for tests, a CPU.
+"""Likelihoods and draws of many poses at once by Warp, on a CUDA device or, for tests, a CPU.
 
-What is here imports Warp only where it is used: it is an extra, takes most of a second to import, and pays for large
-work only.
+Warp is imported only where it is used: it is an optional dependency, takes most of a second to import, and pays off
+only for large batches.
 """
 
 import ctypes
@@ -10,18 +10,18 @@ from functools import cache
 from typing import Any, Literal
 
 Device = Literal["auto", "cpu", "cuda", "warp-cpu"]
-"""Where likelihoods are evaluated: `cpu` = the kernels of Numba; `warp-cpu` = those of Warp on a CPU, for tests."""
+"""Device that evaluates likelihoods: `cpu` = the Numba kernels; `warp-cpu` = the Warp kernels on a CPU, for tests."""
 
 LARGE = 10_000_000
-"""Points looked up under poses in one call from which on `auto` takes a CUDA device.
+"""Number of look-ups in one call from which on `auto` uses a CUDA device.
 
-Two CPU cores need 50 ms for these (2·10⁸ a second were measured). Sending two views of 640 by 480 pixels, 20 MB, takes
-about 2 ms at the 10 GB/s of a usual bus, so that the choice is right on any device that beats the CPU at all.
+Two CPU cores need 50 ms for these (2·10⁸ per second, measured). Copying two views of 640 by 480 pixels, 20 MB, takes
+about 2 ms at 10 GB/s, so that the choice is right on any device that is faster than the CPU.
 """
 
 
 def chosen(asked: Device, lookups: int) -> str | None:
-    """Return the name of Warp's device for a call of so many look-ups; None = the kernels of Numba."""
+    """Return the name of the Warp device for a call with this many look-ups; None = the Numba kernels."""
     if asked == "auto":
         return "cuda" if lookups >= LARGE and missing() is None else None
     return {"cpu": None, "cuda": "cuda", "warp-cpu": "cpu"}[asked]
@@ -29,7 +29,7 @@ def chosen(asked: Device, lookups: int) -> str | None:
 
 @cache
 def missing() -> str | None:
-    """Return what is missing here to evaluate on a CUDA device, and what to do; None where nothing is."""
+    """Return what is missing to evaluate on a CUDA device, and what to do; None if nothing is."""
     if importlib.util.find_spec("warp") is None:
         return "warp-lang is not installed; pip install 'modeler[gpu]'"
     without = "leave --device out, or give --device cpu"
@@ -44,7 +44,7 @@ def missing() -> str | None:
 
 @cache
 def warp() -> Any:
-    """Return Warp, made ready; it says nothing but errors."""
+    """Return the initialised Warp module; it only prints errors."""
     import warp as wp
 
     wp.config.log_level = 40

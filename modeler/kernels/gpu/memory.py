@@ -1,4 +1,4 @@
-"""Arrays of the host on a device."""
+"""Copies of host arrays on a device."""
 # pyright: reportInvalidTypeForm=false
 
 import weakref
@@ -15,12 +15,12 @@ _sent: dict[tuple[object, ...], wp.array] = {}
 
 
 def sent(array: np.ndarray, device: str, dtype: Any = None) -> wp.array:
-    """Return the copy of a host's array on a device, sent once as long as the host has it; nobody may write to it.
+    """Return the copy of a host array on a device, cached while the host array exists; it must not be modified.
 
     Args:
         array: of the host.
-        device: Warp's name of the device.
-        dtype: Warp's type of an element, such as a vector; None = that of a number.
+        device: name of the Warp device.
+        dtype: Warp type of an element, such as a vector; None = a number.
     """
     owner = array
     while isinstance(owner.base, np.ndarray):
@@ -33,5 +33,5 @@ def sent(array: np.ndarray, device: str, dtype: Any = None) -> wp.array:
 
 
 def forget() -> None:
-    """Drop what was sent."""
+    """Drop all copies."""
     _sent.clear()

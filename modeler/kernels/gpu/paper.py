@@ -1,7 +1,7 @@
-"""The likelihood, draws and test of free space of `modeler.kernels.paper` by Warp, in double precision like these.
+"""The likelihood, draws and free-space test of `modeler.kernels.paper` by Warp, also in double precision.
 
-A draw is a pure function of its number, and samples are kept in the order of their numbers: what a device returns does
-not depend on how its threads are scheduled.
+A draw is a pure function of its number, and samples are kept in the order of their numbers: results do not depend on
+the scheduling of threads.
 """
 # pyright: reportInvalidTypeForm=false
 
@@ -36,7 +36,7 @@ HIDDEN, FREE = wp.constant(wp.float64(6.0)), wp.constant(wp.float64(-27.3))
 NO_REACH, ROUNDED_DOWN = wp.constant(wp.float64(1e6)), wp.constant(wp.float64(1.0 - 1e-6))
 
 AT_ONCE = 1 << 24
-"""Draws of one launch, which take 192 MB of a device's memory."""
+"""Number of draws of one launch, which take 192 MB of device memory."""
 
 
 @wp.struct
@@ -61,13 +61,13 @@ class Tests:
 
 
 @wp.func
-def turn_of(pose: Pose) -> wp.mat33d:
+def rotation_of(pose: Pose) -> wp.mat33d:
     """Return a pose's rotation."""
     return wp.mat33d(pose[0], pose[1], pose[2], pose[4], pose[5], pose[6], pose[8], pose[9], pose[10])
 
 
 @wp.func
-def shift_of(pose: Pose) -> wp.vec3d:
+def translation_of(pose: Pose) -> wp.vec3d:
     """Return a pose's translation."""
     return wp.vec3d(pose[3], pose[7], pose[11])
 
@@ -81,7 +81,7 @@ def ray_jacobian(point: wp.vec3d) -> wp.mat33d:
 
 
 @wp.func
-def both_noises(jacobian: wp.mat33d, noise: wp.mat33d) -> wp.mat33d:
+def summed_covariance(jacobian: wp.mat33d, noise: wp.mat33d) -> wp.mat33d:
     """Return J L Jᵀ + L."""
     return jacobian * noise * wp.transpose(jacobian) + noise
 
@@ -101,8 +101,8 @@ def point_density(
     if in_a[2] <= ZERO:
         return ZERO
     q_a, q_b = ray_jacobian(in_a), ray_jacobian(point_b)
-    precision = wp.inverse(both_noises(q_a * rotation * wp.inverse(q_b), noise))
-    in_b = both_noises(q_b * wp.transpose(rotation) * wp.inverse(q_a), noise)
+    precision = wp.inverse(summed_covariance(q_a * rotation * wp.inverse(q_b), noise))
+    in_b = summed_covariance(q_b * wp.transpose(rotation) * wp.inverse(q_a), noise)
     k2 = ONE / wp.sqrt(wp.determinant(in_b))
     last = precision[2, 2]
     d_ww = precision[0, 0] - precision[2, 0] * precision[2, 0] / last
@@ -116,7 +116,7 @@ def point_density(
         determinant = d_ww * d_hh - d_wh * d_wh
         reach_w = reach_sigmas * wp.sqrt(d_hh / determinant)
         reach_h = reach_sigmas * wp.sqrt(d_ww / determinant)
-        # Clamped before they become integers: of a point almost in the camera's plane they may be huge.
+        # Clamped before conversion to integers: for points almost in the camera's plane they may be huge.
         columns, rows = wp.float64(ranges_m.shape[1]), wp.float64(ranges_m.shape[0])
         first_column = wp.int32(wp.clamp(wp.ceil(camera[0] * (w - reach_w) + camera[2]), ZERO, columns))
         last_column = wp.int32(wp.clamp(wp.floor(camera[0] * (w + reach_w) + camera[2]), -ONE, columns - ONE))
@@ -142,7 +142,7 @@ def point_density(
 def log_likelihood(
     own: View, other: View, rotation: wp.mat33d, shift_m: wp.vec3d, reach_sigmas: wp.float64, least: wp.float64
 ) -> wp.float64:
-    """Return log p(points | other view, pose), -inf where a point rejects the pose."""
+    """Return log p(points | other view, pose), -inf if a point rejects the pose."""
     threshold = least / wp.sqrt(wp.determinant(TWO * other.noise))
     total = wp.float64(0.0)
     for j in range(own.points_m.shape[0]):
@@ -166,7 +166,7 @@ def weigh(
 ):
     """Write log p(P_B | M_A, T) + log p(P_A | M_B, T) of each pose."""
     i = wp.tid()
-    rotation, shift_m = turn_of(poses[i]), shift_of(poses[i])
+    rotation, shift_m = rotation_of(poses[i]), translation_of(poses[i])
     total = log_likelihood(source, target, rotation, shift_m, reach_sigmas, least)
     if total > NEVER:
         back = wp.transpose(rotation)
@@ -184,7 +184,7 @@ def mixed(counter: wp.uint64) -> wp.uint64:
 
 @wp.func
 def on_grid(bits: wp.uint64) -> wp.float64:
-    """Return the middle of one of 2²¹ equal parts of -1 to 1."""
+    """Return the centre of one of 2²¹ equal parts of [-1, 1]."""
     return (wp.float64(bits) + HALF) * TO_GRID - ONE
 
 
@@ -259,8 +259,8 @@ def forbidden(at: wp.vec3d, margin_m: wp.float64, near_m: wp.array2d[wp.float32]
 
 @wp.func
 def passes(pose: Pose, tests: Tests) -> wp.int32:
-    """Return 1 where no check forbids a pose, else 0."""
-    rotation, shift_m = turn_of(pose), shift_of(pose)
+    """Return 1 if no check forbids a pose, else 0."""
+    rotation, shift_m = rotation_of(pose), translation_of(pose)
     for j in range(tests.checks.shape[0]):
         check = tests.checks[j]
         point = wp.vec3d(check[0], check[1], check[2])
@@ -279,7 +279,7 @@ def passes(pose: Pose, tests: Tests) -> wp.int32:
 def sift_draws(
     first: wp.uint64, seed: wp.uint64, limits: wp.array[wp.float64], tests: Tests, passing: wp.array[wp.int32]
 ):
-    """Write which of the draws numbered from `first` pass."""
+    """Write whether each of the draws numbered from `first` passes."""
     i = wp.tid()
     passing[i] = passes(draw(first + wp.uint64(i), seed, limits), tests)
 
@@ -292,7 +292,7 @@ def keep_draws(
     places: wp.array[wp.int32],
     kept: wp.array[Pose],
 ):
-    """Write the draws that pass to their places, which count from 1 and grow where one passes."""
+    """Write the draws that pass to their places: the running count of those that pass, from 1."""
     i = wp.tid()
     before = wp.int32(0)
     if i > 0:
@@ -303,7 +303,7 @@ def keep_draws(
 
 @wp.kernel
 def sift(poses: wp.array[Pose], tests: Tests, passing: wp.array[wp.int32]):
-    """Write which poses pass."""
+    """Write whether each pose passes."""
     i = wp.tid()
     passing[i] = passes(poses[i], tests)
 
@@ -316,7 +316,7 @@ def find_nearest(
     down: wp.int32,
     near_m: wp.array2d[wp.float32],
 ):
-    """Write the least range within reach of anything that rounds to a pixel, see `twin.nearest_ranges`."""
+    """Write the least range within reach of any point that rounds to a pixel, see `twin.nearest_ranges`."""
     row, column = wp.tid()
     least = wp.float32(wp.inf)
     for dy in range(-down, down + 1):
@@ -335,7 +335,7 @@ def find_nearest(
 def nearest_ranges(
     ranges_m: npt.NDArray[np.float64], reach_px: npt.NDArray[np.float64], device: str
 ) -> npt.NDArray[np.float32]:
-    """Return what `paper.nearest_ranges` returns."""
+    """Return the result of `paper.nearest_ranges`."""
     across, down = (int(np.ceil(reach + 0.5)) for reach in reach_px)
     shape = ranges_m.shape[0] + 2 * down, ranges_m.shape[1] + 2 * across
     near_m = wp.empty(shape, dtype=wp.float32, device=device)
@@ -349,13 +349,13 @@ class OnDevice:
     """The paper's likelihood and test of free space for two views, on a device."""
 
     device: str
-    """Warp's name of it."""
+    """Name of the Warp device."""
     source: Any
-    """`View`s; their points and ranges are sent once."""
+    """`View`s; their points and ranges are copied once."""
     target: Any
     tests: Any
     options: tuple[float, float]
-    """As `paper.log_likelihoods` has them."""
+    """As for `paper.log_likelihoods`."""
 
     @staticmethod
     def of(
@@ -364,13 +364,13 @@ class OnDevice:
         tests: tuple[np.ndarray, tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
         options: tuple[float, float],
     ) -> "OnDevice":
-        """Return source and target, each points (n, 3), ranges, intrinsics and noise, and a test, sent to a device.
+        """Return source and target, each points (n, 3), ranges, intrinsics and noise, and a test, on a device.
 
         Args:
-            device: Warp's name of it.
+            device: name of the Warp device.
             views: source and target.
-            tests: checks, nearest ranges and images, as `paper.passing` takes them.
-            options: as `paper.log_likelihoods` takes them.
+            tests: checks, nearest ranges and images, as for `paper.passing`.
+            options: as for `paper.log_likelihoods`.
         """
         checks, near_m, images = tests
         sifter = Tests()
@@ -383,7 +383,7 @@ class OnDevice:
     def weighed_draws(
         self, count: int, seed: np.uint64, limits: npt.NDArray[np.float64]
     ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        """Yield how many draws were tried, and poses (k, 12) and log-likelihoods (k,) of those that are possible."""
+        """Yield the number of draws, and the poses (k, 12) and log-likelihoods (k,) of those not rejected."""
         on_device = wp.array(limits, dtype=wp.float64, device=self.device)
         passing = wp.empty(min(count, AT_ONCE), dtype=wp.int32, device=self.device)
         for first in range(0, count, AT_ONCE):
@@ -395,8 +395,8 @@ class OnDevice:
             wp.launch(keep_draws, dim=tried, inputs=[*numbers, passing], outputs=[kept], device=self.device)
             yield tried, *self._weighed(kept)
 
-    def weighed(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return those of poses (m, 12) that are possible, and their log-likelihoods (k,)."""
+    def weighted(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the poses (k, 12) of (m, 12) that are not rejected, and their log-likelihoods (k,)."""
         passing = wp.empty(len(poses), dtype=wp.int32, device=self.device)
         on_device = wp.array(np.ascontiguousarray(poses), dtype=Pose, device=self.device)
         wp.launch(sift, dim=len(poses), inputs=[on_device, self.tests], outputs=[passing], device=self.device)
@@ -404,7 +404,7 @@ class OnDevice:
         return self._weighed(wp.array(np.ascontiguousarray(kept), dtype=Pose, device=self.device))
 
     def log_likelihoods(self, poses: np.ndarray) -> np.ndarray:
-        """Return log p(P_B | M_A, T) + log p(P_A | M_B, T) (m,) of poses (m, 12); -inf where one is rejected."""
+        """Return log p(P_B | M_A, T) + log p(P_A | M_B, T) (m,) of poses (m, 12); -inf if rejected."""
         return self._log_likelihoods(wp.array(np.ascontiguousarray(poses), dtype=Pose, device=self.device))
 
     def _log_likelihoods(self, poses: wp.array) -> np.ndarray:

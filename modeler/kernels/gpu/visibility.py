@@ -1,7 +1,7 @@
 """The likelihood of `modeler.kernels.point_likelihood` by Warp, for poses of any number of pairs in one launch.
 
-A thread takes one pose in one direction and adds up its points in their order: the same device gives the same bits.
-Neighbouring threads read the same points.
+A thread processes one pose in one direction and sums over points in order: results on a device are reproducible to the
+bit. Neighbouring threads read the same points.
 """
 # pyright: reportInvalidTypeForm=false
 
@@ -72,7 +72,7 @@ def of_surface(
     common: wp.float32,
     faces: wp.float32,
 ):
-    """Return what a point that falls on surface adds (method.md, eq. 5), and f if the surface explains it, else 0."""
+    """Return the log-likelihood of a point that falls on surface (eq. 5), and f if the surface explains it, else 0."""
     plane = wp.vec3(cell[0], cell[1], cell[2])
     in_front = cell[DISTANCE] + wp.dot(plane, position)
     agreement = wp.dot(plane, normal)
@@ -143,15 +143,15 @@ def sum_over_points(
 def log_likelihoods(
     poses: npt.NDArray[np.float64], pair_of: npt.NDArray[np.int32], pairs: Sequence[Pair], device: str
 ) -> npt.NDArray[np.float64]:
-    """Return the first two columns of what `scores.scores` returns, (m, 2), for poses of several pairs.
+    """Return the first two columns of `scores.scores`, (m, 2), for poses of several pairs.
 
-    The sums differ from the twin's by rounding only, unless a point falls within 1e-3 px of a pixel's border.
+    The sums differ from the twin's only by rounding, unless a point falls within 1e-3 px of a pixel's border.
 
     Args:
         poses: (m, 12) rows of the 3×4 matrices of target_from_source.
-        pair_of: (m,) number of each pose's pair.
+        pair_of: (m,) index of each pose's pair.
         pairs: the arguments of the twin after the poses.
-        device: Warp's name of it.
+        device: name of the Warp device.
     """
     sides = [
         _direction(projection, parameters, device)
@@ -169,7 +169,7 @@ def log_likelihoods(
 
 
 def _direction(projection: Projection, parameters: LikelihoodParameters, device: str) -> Any:
-    """Return the struct of one direction; points, cells and table are sent to the device once."""
+    """Return the struct of one direction; points, cells and table are copied to the device once."""
     direction = Direction()
     direction.points = sent(projection.points, device)
     direction.cells = sent(projection.cells, device, Cell)

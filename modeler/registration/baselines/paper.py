@@ -128,7 +128,7 @@ class PaperRegistrar(AbstractRegistrar):
             yield from there.weighed_draws(samples, draws.seed, draws.limits)
             return
         for poses in chain([first], batches):
-            yield len(poses), *there.weighed(poses)
+            yield len(poses), *there.weighted(poses)
 
     def _drawn(
         self, density: AbstractPoseDensity | NumberedDraws, samples: int, rng: np.random.Generator

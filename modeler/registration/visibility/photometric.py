@@ -276,7 +276,7 @@ def _regressed(
     )
     focal = np.array([camera.fx, camera.fy], dtype=np.float32)
     others = view_features(other)[band]
-    photometric.explain_light(features, others, *partners, np.float32(share), view.points_m, focal, *residual)
+    photometric.remove_static(features, others, *partners, np.float32(share), view.points_m, focal, *residual)
     return residual
 
 
