@@ -131,7 +131,7 @@ def test_the_papers_draws_that_pass_are_those_of_numba_in_their_order(device, rn
     free = FreeSpace.of(source, target, 4.0, 1e-6).ordered(draws.poses(0, 500))
     views = [(view.points_m, view.ranges_m, view.intrinsics, view.noise) for view in (source, target)]
     there = on_gpu.OnDevice.of(gpu.chosen(device, 1) or "", views, (free.checks, free.near_m, free.images), (4.0, 1e-6))
-    tried, got, found = zip(*there.weighed_draws(10_000, draws.seed, draws.limits), strict=True)
+    tried, got, found = zip(*there.weighted_draws(10_000, draws.seed, draws.limits), strict=True)
     poses = draws.poses(0, 10_000)
     passing = poses[free.passes(poses)]
     values = PaperRegistrar().log_weights(passing, (source, target))

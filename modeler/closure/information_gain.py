@@ -47,7 +47,7 @@ class InformationGain:
     max_angle_deg: float
     """Largest rotation in degrees across which views are registered."""
     has_own_edge: bool = True
-    """Whether an edge of its own joins the new view to `previous`; False: it is `previous`."""
+    """Whether an edge joins the new view to `previous`; False: it is `previous`."""
     power: float = 2.0
     """Exponent of cos θ in the information of an edge over a rotation θ. A larger one prefers small rotations, which
     have less systematic error."""

@@ -316,9 +316,9 @@ class RelativeCovariance:
                     frontal[6 * k : 6 * k + 6] = right.pop(frame)
             solved = _trsm(1.0, clique.r, frontal, trans_a=1)
             covariance = covariance + solved.T @ solved
-            carried = clique.s.T @ solved
+            update = clique.s.T @ solved
             for k, frame in enumerate(clique.separator):
-                here = carried[6 * k : 6 * k + 6]
+                here = update[6 * k : 6 * k + 6]
                 right[frame] = right[frame] - here if frame in right else -here
         return 0.5 * (covariance + covariance.T)
 

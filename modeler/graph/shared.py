@@ -27,7 +27,7 @@ from modeler.graph.pose_graph import Factor, PoseGraph
 from modeler.types import Array, FocalLength, Solution
 
 _QUANTILE = 0.16  # one standard error towards larger covariances
-_MAX_SHARE = 0.9  # of a covariance: registration has noise of its own, from its samples
+_MAX_SHARE = 0.9  # of a covariance: each registration also has sampling noise
 
 
 @dataclass(frozen=True, eq=False)

@@ -103,16 +103,16 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
     Args:
         pose: (12,) rows of target_from_source.
         surfaces: see `normal_equations`.
-        colours: likewise.
-        weight: likewise.
-        centre: likewise.
-        surface_m: likewise.
+        colours: see `normal_equations`.
+        weight: see `normal_equations`.
+        centre: see `normal_equations`.
+        surface_m: see `normal_equations`.
         workspace: of `new_workspace`.
         gradient: (2, 6) out: of surface, and of its colours.
-        matrix: (2, 6, 6) out, likewise.
+        matrix: (2, 6, 6) out: the same.
     """
     (transformed, pixels, found), colour, rows, small = workspace
-    carried, about, part, block, rotated, turned, turned_block, apart = small
+    transform, about, part, block, rotated, turned, turned_block, apart = small
     surface_m2 = np.float32(surface_m * surface_m)
     gradient[:] = 0.0
     matrix[:] = 0.0
@@ -123,16 +123,16 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
         if kind == 0:
             if direction == 0:
                 for k in range(12):
-                    carried[k] = pose[k]
+                    transform[k] = pose[k]
                 for k in range(3):
                     about[k] = pose[4 * k + 3]
                     for m in range(3):
                         about[k] += pose[4 * k + m] * centre[m]
             else:
-                invert(pose, carried)
+                invert(pose, transform)
                 for k in range(3):
                     about[k] = centre[k]
-            project(carried, surface, transformed, pixels, found)
+            project(transform, surface, transformed, pixels, found)
             linearise(surface.points, transformed, found, about, surface_m2, rows)
             add_pattern_gradient(surface, transformed, about, rows, apart)
         elif features.values.shape[0] == 0:
@@ -194,8 +194,8 @@ def add_pattern_gradient(surface, transformed, about, rows, gradient):
             continue
         x, y, z = transformed[X, j], transformed[Y, j], transformed[Z, j]
         across, down = fx * x / z + cx - surface.points[COLUMN, j], fy * y / z + cy - surface.points[ROW, j]
-        alike = 1.0 - (across * across + down * down) * per_square
-        slope = 2.0 * share * transformed[FACING, j] * alike * per_square / z
+        correlation = 1.0 - (across * across + down * down) * per_square
+        slope = 2.0 * share * transformed[FACING, j] * correlation * per_square / z
         gx, gy = slope * fx * across, slope * fy * down
         gz = -(gx * x + gy * y) / z
         x, y, z = x - about[0], y - about[1], z - about[2]
@@ -225,7 +225,7 @@ def rotate_to_source(pose, part, block, rotated, gradient, matrix):
 
 @numba.njit(cache=True)
 def regularised_step(pose, regulariser, centre, gradient, matrix, buffer, step):
-    """Write the Gauss-Newton step (6,) of a pose (12,) from its `equations`; `buffer` is a buffer (6, 6)."""
+    """Write the Gauss-Newton step (6,) of a pose (12,) from its `equations`; `buffer` (6, 6) is overwritten."""
     away = difference(regulariser.mean, pose, centre)
     for k in range(6):
         step[k] = gradient[0, k] + gradient[1, k]

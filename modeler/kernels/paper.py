@@ -21,7 +21,7 @@ SHIFT_43, SHIFT_22, SHIFT_11, SHIFT_1 = np.uint64(43), np.uint64(22), np.uint64(
 LOW_21 = np.uint64((1 << 21) - 1)
 
 X, Y, Z, MARGIN, BACKWARD = range(5)
-"""Columns of a check: a surface point (3), how far in front it may lie in m, and whether it is the target's."""
+"""Columns of a check: a surface point (3), its largest distance in front in m, and whether it is the target's."""
 
 
 @numba.njit(cache=True)

@@ -123,8 +123,8 @@ def transform_points(pose, projection, transformed, pixels):
         transformed[FACING, j] = min(max((cosine - low) * per_range, ZERO), ONE)
         transformed[COVERAGE, j] = min(max((cosine - flat) * per_turn, ZERO), ONE)
         across, down = column - HALF - points[COLUMN, j], row - HALF - points[ROW, j]
-        alike = max(ONE - (across * across + down * down) * per_square, ZERO)
-        transformed[PATTERN, j] = share * alike * alike
+        correlation = max(ONE - (across * across + down * down) * per_square, ZERO)
+        transformed[PATTERN, j] = share * correlation * correlation
         pixels[j] = pixel if inside else np.int32(-1)
 
 

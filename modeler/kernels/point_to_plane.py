@@ -38,9 +38,9 @@ def match_weight(points, transformed, found, residual, surface_m2, j):
     """Return the weight ω in 1/m² of a transformed point at a distance in m from the surface: 0 for no match."""
     variance = points[VARIANCE_M2, j] + found[VARIANCE, j] + surface_m2
     near = residual * residual <= MAX_SIGMAS * MAX_SIGMAS * variance
-    alike = normal_agreement(transformed, found, j) >= MIN_AGREEMENT
+    agrees = normal_agreement(transformed, found, j) >= MIN_AGREEMENT
     weight = transformed[FACING, j] / variance
-    return weight if (found[KIND, j] == _OF_SURFACE) & near & alike else ZERO
+    return weight if (found[KIND, j] == _OF_SURFACE) & near & agrees else ZERO
 
 
 @numba.njit(cache=True, error_model="numpy")

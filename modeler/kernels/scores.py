@@ -35,18 +35,18 @@ def scores(poses, forward, backward, forward_parameters, backward_parameters, co
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _scores(poses, projections, parameters, colours):
     result = np.zeros((poses.shape[0], 6))
-    carried = np.empty(12)
+    transform = np.empty(12)
     most = max(projections[0].points.shape[1], projections[1].points.shape[1])
     (transformed, pixels, looked_up), seen = buffers(most), np.empty(most, dtype=np.float32)
     for i in range(poses.shape[0]):
         for direction in range(2):  # one copy of the code: compiling is slow
             if direction == 0:
                 for k in range(12):
-                    carried[k] = poses[i, k]
+                    transform[k] = poses[i, k]
             else:
-                invert(poses[i], carried)
+                invert(poses[i], transform)
             projection, features, model = projections[direction], colours[direction], parameters[direction]
-            project(carried, projection, transformed, pixels, looked_up)
+            project(transform, projection, transformed, pixels, looked_up)
             total, explained = sum_over_points(projection.points, transformed, looked_up, model)
             result[i, LOG_LIKELIHOOD] += total
             result[i, EXPLAINED] += explained

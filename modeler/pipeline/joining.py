@@ -173,8 +173,8 @@ class Joiner:
         if not distinct:
             return []
         rival_deg = 0.0 if len(distinct) == 1 else float(np.degrees(_angle(distinct[0], distinct[1])))
-        why = JoinsSegments(distinct[0].share, rival_deg)
-        edges = tuple(replace(edge, reason=why) if edge.accepted else edge for edge in distinct[0].edges)
+        reason = JoinsSegments(distinct[0].share, rival_deg)
+        edges = tuple(replace(edge, reason=reason) if edge.accepted else edge for edge in distinct[0].edges)
         return [replace(distinct[0], edges=edges), *distinct[1:]]
 
     def _by_models(self, target: Segment, source: Segment) -> list[Array]:

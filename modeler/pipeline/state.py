@@ -170,11 +170,11 @@ class State:
         Args:
             register: returns the posteriors of pairs (source, target) of its views.
         """
-        lasting = [edge for edge in self.graph.accepted if edge.kind != "join" and not edge.posterior.modes]
-        found = register([(edge.source, edge.target) for edge in lasting])
+        unimodal = [edge for edge in self.graph.accepted if edge.kind != "join" and not edge.posterior.modes]
+        found = register([(edge.source, edge.target) for edge in unimodal])
         new = {
             edge: replace(edge, posterior=posterior.without_samples())
-            for edge, posterior in zip(lasting, found, strict=True)
+            for edge, posterior in zip(unimodal, found, strict=True)
             if posterior.usable and not posterior.modes and _same_place(edge.posterior.pose, posterior.pose)
         }
         graph = replace(self.graph, edges=tuple(new.get(edge, edge) for edge in self.graph.edges))

@@ -48,7 +48,7 @@ _MAX_FAILED_SEARCHES = 1  # from which on further frames get a quick registratio
 _SPAN_STEPS = 2.0  # steps of the limits if the graph predicts the motion, so that they do not truncate it
 _QUICK_FRACTION = 0.25  # of the starts of a search and of the largest number of samples
 _BEYOND_LIMITS_NATS = 7.0  # one motion in a thousand exceeds the prior's limits
-_MORE_OVERLAP = 0.15  # similar sides have about the same overlap; the true mode has more than one at the limits
+_MIN_OVERLAP_GAIN = 0.15  # similar sides have about the same overlap; the true mode has more than one at the limits
 _SEPARATE_RAD = 0.26  # registrations that differ by a larger rotation are two modes
 _MIN_MODE_WEIGHT = 0.01
 
@@ -228,7 +228,7 @@ class Tracker:
 
     def _pairs(self, pairs: Sequence[tuple[RayImage, int]], priors: Sequence[AbstractPrior]) -> Iterator[Posterior]:
         """Yield the posteriors of pairs, in order."""
-        yield from each(lambda asked: self._pair(*asked[0], asked[1]), zip(pairs, priors, strict=True))
+        yield from each(lambda pair: self._pair(*pair[0], pair[1]), zip(pairs, priors, strict=True))
 
     def _pair(self, source: RayImage, target: int, prior: AbstractPrior, *, quick: bool = False) -> Posterior:
         """Register a view against an accepted one; the outcome is `NOT_KNOWN` if the prior does not apply."""
@@ -270,7 +270,7 @@ def preferred(within: Posterior, wider: Posterior, known: AbstractPoseDensity) -
         # Only for one mode: the mean of several may lie inside without being near any of them.
         inside = wider.outcome is Outcome.CONVERGED and _inside(known, wider.pose.mean[None])[0]
         better_nats = wider.log_evidence - within.log_evidence
-        similar_overlap = wider.overlap < within.overlap + _MORE_OVERLAP
+        similar_overlap = wider.overlap < within.overlap + _MIN_OVERLAP_GAIN
         if separate and not inside and similar_overlap and better_nats < _BEYOND_LIMITS_NATS:
             return replace(within, outcome=Outcome.AMBIGUOUS)
     return _discounted(wider, known)

@@ -199,7 +199,7 @@ class KernelMixture(AbstractPoseDensity):
 
 @dataclass(frozen=True, eq=False)
 class Alternatives(AbstractPoseDensity):
-    """A mixture of densities, one of which holds, it is not known which; all of it is evidence."""
+    """A mixture of alternatives, exactly one of which is true; all of it is evidence."""
 
     densities: tuple[AbstractPoseDensity, ...]
     """The alternatives, each evidence."""
@@ -223,7 +223,7 @@ class Alternatives(AbstractPoseDensity):
 
     @property
     def alternatives(self) -> tuple[AbstractPoseDensity, ...]:
-        """The densities of which one holds."""
+        """The densities of which one is true."""
         return self.densities
 
 

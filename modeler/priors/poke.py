@@ -129,8 +129,8 @@ class PokePrior(AbstractPrior):
         # The centre of friction moves by `shift`; the centroid also turns about it.
         lever = seen.mean(axis=0) - centre
         cos, sin = np.cos(turn), np.sin(turn)
-        carried = np.stack([cos * lever[:, 0] - sin * lever[:, 1], sin * lever[:, 0] + cos * lever[:, 1]], axis=1)
-        there = (centre + shift + carried) @ along_push
+        rotated = np.stack([cos * lever[:, 0] - sin * lever[:, 1], sin * lever[:, 0] + cos * lever[:, 1]], axis=1)
+        there = (centre + shift + rotated) @ along_push
         return np.column_stack([turn, there - in_plane @ plane.target_centroid_m])
 
 

@@ -193,11 +193,11 @@ class AlignedAxes(AbstractPoseDensity):
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Draw poses (count, 4, 4)."""
-        carried = directions_about(self.target_axis, self.sigma_rad**-2.0, count, rng)
+        axes = directions_about(self.target_axis, self.sigma_rad**-2.0, count, rng)
         turn = rng.uniform(0.0, 2.0 * np.pi, count)
-        carried *= rng.choice([-1.0, 1.0], (count, 1))
+        axes *= rng.choice([-1.0, 1.0], (count, 1))
         spun = se3.exp(np.concatenate([turn[:, None] * self.source_axis, np.zeros((count, 3))], axis=1))
-        poses = _onto(self.source_axis, carried) @ spun
+        poses = _onto(self.source_axis, axes) @ spun
         place_m = self.target_centroid_m + rng.normal(0.0, self.sigma_m, (count, 3))
         poses[:, :3, 3] = place_m - poses[:, :3, :3] @ self.source_centroid_m
         return poses
@@ -227,9 +227,9 @@ def _onto(axis: Array, directions: Array) -> Array:
     """Return the smallest rotations (n, 4, 4) that map a unit vector (3,) to unit vectors (n, 3)."""
     crossed = np.cross(axis, directions)
     sine = np.linalg.norm(crossed, axis=1, keepdims=True)
-    aside = np.where(sine > 1e-12, crossed / np.maximum(sine, 1e-300), across_axis(axis)[0])
+    perpendicular = np.where(sine > 1e-12, crossed / np.maximum(sine, 1e-300), across_axis(axis)[0])
     angle_rad = np.arctan2(sine, (directions @ axis)[:, None])
-    return se3.exp(np.concatenate([angle_rad * aside, np.zeros_like(aside)], axis=1))
+    return se3.exp(np.concatenate([angle_rad * perpendicular, np.zeros_like(perpendicular)], axis=1))
 
 
 @dataclass(frozen=True)

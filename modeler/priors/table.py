@@ -55,8 +55,8 @@ class OnPlane:
         rotation, normal = target_from_source[:, :3, :3], self.normal
         tilted = np.einsum("nij,j->ni", rotation, normal)
         upright = np.einsum("ni,i->n", tilted, normal)
-        aside = tilted - upright[:, None] * normal
-        tilt_rad = np.arctan2(np.sqrt(np.einsum("ni,ni->n", aside, aside)), upright)
+        lateral = tilted - upright[:, None] * normal
+        tilt_rad = np.arctan2(np.sqrt(np.einsum("ni,ni->n", lateral, lateral)), upright)
         # The rotation without its tilt is a turn about the normal.
         twist = np.einsum("nij,ij->n", rotation, se3.hat(normal))
         turn_rad = np.arctan2(twist, np.einsum("nii->n", rotation) - upright)

@@ -185,15 +185,15 @@ class AboutAxis(AbstractPoseDensity):
         poses[:, :3, :3] = rotations
         angle_rad, axes = angles_and_axes(rotations)
         lines, variance = self.turn.line(angle_rad, axes)
-        carried, aim = self._anchor
+        anchor, expected = self._anchor
         across = _across(lines, rng)
         if self.axis.point_m is None:
-            aside = sample_disc(self.max_shift_m, count, rng)
+            lateral = sample_disc(self.max_shift_m, count, rng)
         else:
-            aside = rng.normal(size=(count, 2)) * self._sigma_across_m(angle_rad)[:, None]
+            lateral = rng.normal(size=(count, 2)) * self._sigma_across_m(angle_rad)[:, None]
         along = rng.normal(size=count) * self._sigma_along_m(variance) + self._lift_m(lines)
-        place_m = aim + (aside[:, None] @ across)[:, 0] + along[:, None] * lines
-        poses[:, :3, 3] = place_m - rotations @ carried
+        place_m = expected + (lateral[:, None] @ across)[:, 0] + along[:, None] * lines
+        poses[:, :3, 3] = place_m - rotations @ anchor
         return poses
 
     def log_density(self, target_from_source: Array) -> Array:
@@ -201,8 +201,8 @@ class AboutAxis(AbstractPoseDensity):
         angle_rad, axes = angles_and_axes(target_from_source[:, :3, :3])
         lines, variance = self.turn.line(angle_rad, axes)
         rotation = self.turn.log_density(angle_rad, axes @ self.turn.axis)
-        carried, aim = self._anchor
-        offset_m = centroid_offset(target_from_source, carried, aim)
+        anchor, expected = self._anchor
+        offset_m = centroid_offset(target_from_source, anchor, expected)
         along_m = np.sum(offset_m * lines, axis=1)
         aside_m2 = np.sum(offset_m**2, axis=1) - along_m**2
         sigma_along_m = self._sigma_along_m(variance)
@@ -225,8 +225,8 @@ class AboutAxis(AbstractPoseDensity):
 
     def _lift_m(self, lines: Array) -> Array:
         """Return the offset (n,) along lines (n, 3) of the point from its mean; the motion preserves it."""
-        carried, aim = self._anchor
-        return lines @ (carried - aim)
+        anchor, expected = self._anchor
+        return lines @ (anchor - expected)
 
     def _sigma_along_m(self, variance: Array) -> Array:
         """Return the standard deviation (n,) along lines of variances (n,) in rad²."""

@@ -20,11 +20,11 @@ about 2 ms at 10 GB/s, so that the choice is right on any device that is faster 
 """
 
 
-def chosen(asked: Device, lookups: int) -> str | None:
+def chosen(device: Device, lookups: int) -> str | None:
     """Return the name of the Warp device for a call with this many look-ups; None = the Numba kernels."""
-    if asked == "auto":
+    if device == "auto":
         return "cuda" if lookups >= LARGE and missing() is None else None
-    return {"cpu": None, "cuda": "cuda", "warp-cpu": "cpu"}[asked]
+    return {"cpu": None, "cuda": "cuda", "warp-cpu": "cpu"}[device]
 
 
 @cache

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 if TYPE_CHECKING:
-    wp = cast("Any", None)  # what Warp compiles is no Python to a type checker
+    wp = cast("Any", None)  # type checkers do not understand Warp kernels
 else:
     import warp as wp
 

@@ -16,7 +16,7 @@ from modeler.kernels import paper as twin
 from modeler.kernels.gpu.memory import sent
 
 if TYPE_CHECKING:
-    wp = cast("Any", None)  # what Warp compiles is no Python to a type checker
+    wp = cast("Any", None)  # type checkers do not understand Warp kernels
 else:
     import warp as wp
 
@@ -380,7 +380,7 @@ class OnDevice:
         source, target = (_view(view, device) for view in views)
         return OnDevice(device, source, target, sifter, options)
 
-    def weighed_draws(
+    def weighted_draws(
         self, count: int, seed: np.uint64, limits: npt.NDArray[np.float64]
     ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Yield the number of draws, and the poses (k, 12) and log-likelihoods (k,) of those not rejected."""
@@ -393,7 +393,7 @@ class OnDevice:
             wp.utils.array_scan(passing[:tried], passing[:tried], inclusive=True)
             kept = wp.empty(int(passing[tried - 1 : tried].numpy()[0]), dtype=Pose, device=self.device)
             wp.launch(keep_draws, dim=tried, inputs=[*numbers, passing], outputs=[kept], device=self.device)
-            yield tried, *self._weighed(kept)
+            yield tried, *self._weighted(kept)
 
     def weighted(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the poses (k, 12) of (m, 12) that are not rejected, and their log-likelihoods (k,)."""
@@ -401,7 +401,7 @@ class OnDevice:
         on_device = wp.array(np.ascontiguousarray(poses), dtype=Pose, device=self.device)
         wp.launch(sift, dim=len(poses), inputs=[on_device, self.tests], outputs=[passing], device=self.device)
         kept = poses[passing.numpy() > 0]
-        return self._weighed(wp.array(np.ascontiguousarray(kept), dtype=Pose, device=self.device))
+        return self._weighted(wp.array(np.ascontiguousarray(kept), dtype=Pose, device=self.device))
 
     def log_likelihoods(self, poses: np.ndarray) -> np.ndarray:
         """Return log p(P_B | M_A, T) + log p(P_A | M_B, T) (m,) of poses (m, 12); -inf if rejected."""
@@ -413,7 +413,7 @@ class OnDevice:
         wp.launch(weigh, dim=len(poses), inputs=inputs, outputs=[found], device=self.device)
         return found.numpy()
 
-    def _weighed(self, poses: wp.array) -> tuple[np.ndarray, np.ndarray]:
+    def _weighted(self, poses: wp.array) -> tuple[np.ndarray, np.ndarray]:
         found = self._log_likelihoods(poses)
         possible = np.isfinite(found)
         return poses.numpy().reshape(-1, 12)[possible], found[possible]

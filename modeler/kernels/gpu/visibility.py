@@ -17,7 +17,7 @@ from modeler.kernels.gpu.memory import sent
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
 
 if TYPE_CHECKING:
-    wp = cast("Any", None)  # what Warp compiles is no Python to a type checker
+    wp = cast("Any", None)  # type checkers do not understand Warp kernels
 else:
     import warp as wp
 
@@ -122,8 +122,8 @@ def sum_over_points(
         gain, by_surface = wp.float32(0.0), wp.float32(0.0)
         if kind == SURFACE:
             across, down = column - 0.5 - of.points[COLUMN, j], row - 0.5 - of.points[ROW, j]
-            alike = wp.max(1.0 - (across * across + down * down) * of.pattern[1], 0.0)
-            common = of.pattern[0] * alike * alike
+            correlation = wp.max(1.0 - (across * across + down * down) * of.pattern[1], 0.0)
+            common = of.pattern[0] * correlation * correlation
             gain, by_surface = of_surface(of, cell, position, normal, of.points[POINT_VARIANCE, j], common, faces)
         elif kind == BACKGROUND:
             if position[2] < cell[DEPTH] - of.clearance_m:

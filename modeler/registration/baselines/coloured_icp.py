@@ -53,10 +53,10 @@ class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
             matches = Matches(points_m[near], partners, float(np.mean(near)))
             gaps_m, by_gap = plane_residuals(matches, pose)
             # Gradients lie in the tangent plane: offsets along the normal do not change the predicted intensity.
-            foreseen, by_intensity = plane_residuals(
+            predicted, by_intensity = plane_residuals(
                 Matches(matches.points_m, Cloud(partners.points_m, gradients[partner]), matches.fitness), pose
             )
-            differences = source_intensity[near] - target_intensity[partner] - foreseen
+            differences = source_intensity[near] - target_intensity[partner] - predicted
             shares = np.sqrt([self.geometry, 1.0 - self.geometry])
             residuals = np.concatenate([shares[0] * gaps_m, shares[1] * differences])
             jacobian = np.concatenate([shares[0] * by_gap, -shares[1] * by_intensity])

@@ -93,7 +93,7 @@ class FpfhRegistrar(AbstractCloudRegistrar):
             drawn += len(triples)
             triples = triples[self._similar(source_m[triples], target_m[triples])]
             poses = kabsch(source_m[triples], target_m[triples])
-            gaps_m = np.linalg.norm(_carried(poses, source_m[triples]) - target_m[triples], axis=2)
+            gaps_m = np.linalg.norm(_transformed(poses, source_m[triples]) - target_m[triples], axis=2)
             poses = poses[np.all(gaps_m < score.reach_m, axis=1)]
             scores = score(poses)
             if np.max(scores, initial=-np.inf) > best_score:
@@ -119,11 +119,11 @@ class _Score:
 
     def __call__(self, poses: Array) -> Array:
         """Return the scores (n,) of motions (n, 4, 4)."""
-        gaps, _ = self.target.query(_carried(poses, self.source_m), distance_upper_bound=self.reach_m)
+        gaps, _ = self.target.query(_transformed(poses, self.source_m), distance_upper_bound=self.reach_m)
         return np.mean(1.0 - np.minimum(gaps / self.reach_m, 1.0) ** 2, axis=1)
 
 
-def _carried(poses: Array, points_m: Array) -> Array:
+def _transformed(poses: Array, points_m: Array) -> Array:
     """Transform points (n, k, 3) or (k, 3) by motions (n, 4, 4)."""
     return points_m @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
 

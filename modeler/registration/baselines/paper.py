@@ -61,7 +61,7 @@ class PaperRegistrar(AbstractRegistrar):
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         views = measured(source, self.points, rng), measured(target, self.points, rng)
         kept_poses, kept_weights, drawn = [], [], 0
-        for tried, passing, log_likelihoods in self._weighed(views, density, rng):
+        for tried, passing, log_likelihoods in self._weighted(views, density, rng):
             drawn += tried
             log_weights = log_likelihoods + _log_correction(density, passing)
             alive = np.isfinite(log_weights)
@@ -103,7 +103,7 @@ class PaperRegistrar(AbstractRegistrar):
             )
         return total
 
-    def _weighed(
+    def _weighted(
         self, views: tuple[Measured, Measured], density: AbstractPoseDensity, rng: np.random.Generator
     ) -> Iterator[tuple[int, Array, Array]]:
         """Yield the number of samples drawn, those (n, 12) that pass the free-space test, and their log w (n,)."""
@@ -125,7 +125,7 @@ class PaperRegistrar(AbstractRegistrar):
         tests = free.checks, free.near_m, free.images
         there = OnDevice.of(device, seen, tests, (self.reach_sigmas, self.reject_below))
         if draws is not None:
-            yield from there.weighed_draws(samples, draws.seed, draws.limits)
+            yield from there.weighted_draws(samples, draws.seed, draws.limits)
             return
         for poses in chain([first], batches):
             yield len(poses), *there.weighted(poses)

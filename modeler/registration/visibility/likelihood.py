@@ -398,7 +398,7 @@ class PairLikelihood:
         return bool(self.temper * surface[0] >= 0.5 * (independent - chdtri(independent, _TAIL)))
 
     def colour_matches(
-        self, carried: Array, matches: Array, points: IntArray, noise: MatchNoise, *, forward: bool
+        self, transform: Array, matches: Array, points: IntArray, noise: MatchNoise, *, forward: bool
     ) -> Array:
         """Return the equations of the colours of matches, in the layout of `DirectedLikelihood.matches`.
 
@@ -407,7 +407,7 @@ class PairLikelihood:
         weight = weight_of(noise.correlation)
         if self.colour is None or weight == 0.0:
             return matches[:0]
-        return self.colour.matches(carried, matches, points, noise.band, weight, forward=forward)
+        return self.colour.matches(transform, matches, points, noise.band, weight, forward=forward)
 
     def normal_equations(self, poses: Array, noise: MatchNoise, *, stride: int) -> tuple[Array, Array]:
         """Return the normal equations of the matches: gradients (n, 6) and matrices (n, 6, 6) for ξ about the centre.

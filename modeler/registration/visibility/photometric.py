@@ -113,14 +113,14 @@ class PairColour:
         return found
 
     def matches(
-        self, carried: Array, matches: Array, points: np.ndarray, band: int, weight: float, *, forward: bool
+        self, transform: Array, matches: Array, points: np.ndarray, band: int, weight: float, *, forward: bool
     ) -> Array:
         """Return the equations of features of one direction's matches, in the layout of `point_to_plane.matches`.
 
         The gradient of a feature replaces the normal, the difference of features the distance.
 
         Args:
-            carried: (4, 4) transform of the points into the other camera.
+            transform: (4, 4) transform of the points into the other camera.
             matches: (n, 14) `point_to_plane.matches` of positive weight.
             points: (n,) indices of their points.
             band: index of the band.
@@ -129,7 +129,7 @@ class PairColour:
         """
         own, theirs = self._regressed(band) if forward else self._regressed(band)[::-1]
         other, chosen = (self.target, self.source_points) if forward else (self.source, self.target_points)
-        camera, rotation, numbers = other.frame.camera, np.ascontiguousarray(carried[:3, :3]), chosen[points]
+        camera, rotation, numbers = other.frame.camera, np.ascontiguousarray(transform[:3, :3]), chosen[points]
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         sides = own.values[numbers], own.cells[numbers], theirs.cells
         return photometric.compare_matches(matches, rotation, *sides, lens, other.numbers, weight)

@@ -232,14 +232,14 @@ def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Eq
         (pair.forward, pose, 1.0),
         (pair.backward, se3.inverse(pose), -1.0),
     ]
-    for directed, carried, sign in directions:
-        found = directed.matches(rows(carried), noise.surface_m)
+    for directed, transform, sign in directions:
+        found = directed.matches(rows(transform), noise.surface_m)
         points = np.flatnonzero(found[:, point_to_plane.WEIGHT] > 0.0)
         surface = found[points]
         positions = surface[:, point_to_plane.POSITION]
         to_source = np.eye(4) if sign < 0.0 else se3.inverse(pose)
-        arms, moves = se3.transform(to_source, positions) - pair.centre_m, focal_motion(carried, positions)
-        colours = pair.colour_matches(carried, surface, points, noise, forward=sign > 0.0)
+        arms, moves = se3.transform(to_source, positions) - pair.centre_m, focal_motion(transform, positions)
+        colours = pair.colour_matches(transform, surface, points, noise, forward=sign > 0.0)
         for part, used, pattern in zip(parts, (surface, colours), (directed.pattern, FixedPattern()), strict=True):
             at, moved = arms[: len(used)], moves[: len(used)]  # all or none
             focal = [np.sum(used[:, k] * moved, axis=1) for k in (point_to_plane.OWN, point_to_plane.OTHER)]
@@ -283,16 +283,16 @@ def _position_jacobians(arms: Array) -> Array:
     return np.concatenate([se3.hat(arms), np.broadcast_to(np.eye(3), (len(arms), 3, 3))], axis=1)
 
 
-def focal_motion(carried: Array, positions: Array) -> Array:
+def focal_motion(transform: Array, positions: Array) -> Array:
     """Return m (n, 3) of eq. 25: the motion of surface relative to points, by the logarithm of the focal length.
 
     A longer focal length moves measurements towards the axis of their camera, at the same depth: the surface in its own
     camera, and the points in theirs.
 
     Args:
-        carried: (4, 4) transform of the points into the other camera.
+        transform: (4, 4) transform of the points into the other camera.
         positions: (n, 3) of the transformed points in m.
     """
     scaling = np.diag([-1.0, -1.0, 0.0])
-    own = se3.transform(se3.inverse(carried), positions) @ scaling @ carried[:3, :3].T
+    own = se3.transform(se3.inverse(transform), positions) @ scaling @ transform[:3, :3].T
     return np.asarray(positions @ scaling - own, dtype=np.float64)
