@@ -364,7 +364,7 @@ class Run:
     def _step(self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge]) -> Step:
         """Return the event of a processed frame."""
         views, solution, ready = self.state.views, self.state.solution, self.state.ready
-        # What the pairs were registered with is at hand: who draws a pair need not make it again.
+        # The views that were registered are passed on, so that they need not be recomputed to draw a pair.
         compared = {posterior.target: ready[posterior.target] for posterior in posteriors if posterior.target in ready}
         return Step(
             frame=prepared.frame,

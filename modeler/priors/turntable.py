@@ -115,7 +115,7 @@ class AxisTurn:
 
     @cached_property
     def _turns(self) -> tuple[Array, float, Array]:
-        """Offsets (k,) of the turn from its mean, the normalisation that wobble leaves, and their CDF (k,)."""
+        """Offsets (k,) of the turn from its mean, the normaliser due to wobble, and their CDF (k,)."""
         offsets = np.linspace(-_REACH, _REACH, _NODES) * self.sigma_turn_rad
         measure = spread(self.turn_rad + offsets)
         density = np.exp(-0.5 * (offsets / self.sigma_turn_rad) ** 2) * measure / (measure + self.sigma_wobble_rad**2)
