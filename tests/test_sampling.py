@@ -12,6 +12,7 @@ from modeler.evaluation import rotation_error_deg
 from modeler.kernels.mixture import separate_two
 from modeler.priors.general import GeneralDensity
 from modeler.registration.posterior import effective_samples, pareto_tail, weighted_gaussian
+from modeler.registration.visibility.registrar import overlapping
 from modeler.registration.visibility.sampling import (
     AdaptiveSampler,
     GaussianMixture,
@@ -182,6 +183,19 @@ def mixture(rng):
     spreads = np.linalg.cholesky(np.stack([np.cov(rng.normal(size=(6, 20))) for _ in range(3)]))
     spreads *= np.repeat([0.1, 0.005], 3)[:, None]
     return MixtureProposal(known, GaussianMixture(means, spreads, np.log([0.5, 0.3, 0.2]), centre_m))
+
+
+def test_without_limits_the_volume_of_motions_without_overlap_does_not_outweigh_a_likelier_match() -> None:
+    match, nothing = mode(turned(0.1)[None], 0.0), mode(turned(2.0)[None], 20.0)
+    shown = {0.1: 0.9, 2.0: 0.1}
+
+    def overlap(pose):
+        return shown[round(float(se3.rotation_angle(pose)), 6)]
+
+    likelier = replace(match, log_likelihoods=np.array([5.0]))
+    assert overlapping([nothing, likelier], overlap, 0.5) == [likelier]
+    assert overlapping([nothing, replace(match, log_likelihoods=np.array([-5.0]))], overlap, 0.5)[0] is nothing
+    assert overlapping([nothing, likelier], overlap, 0.95) == [nothing, likelier]
 
 
 def test_a_mixture_has_the_density_of_its_samples(rng):

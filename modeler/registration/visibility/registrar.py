@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -22,6 +23,7 @@ from modeler.registration.visibility.search import Candidates, Search
 from modeler.types import (
     AbstractPoseDensity,
     AbstractRegistrar,
+    Array,
     Mode,
     Outcome,
     PoseGaussian,
@@ -94,6 +96,8 @@ class VisibilityRegistrar(AbstractRegistrar):
         sampled = [self._sampled(pair, density, mode, rng) for mode in modes_found]
         reference = min(sampled, key=lambda mode: mode.noise_m)
         compared = [mode.compared(pair, reference) for mode in sampled]
+        if found.open_rotation:
+            compared = overlapping(compared, pair.overlap, self.min_overlap)
         dense = self.likelihood.denser(pair, rng)
         modes = [(share, self._refined(pair, dense, density, mode, rng)) for share, mode in weigh_modes(compared)]
         at_limit = self._share_at_limit(pair, density, found, modes[0][1], rng)
@@ -194,6 +198,27 @@ class VisibilityRegistrar(AbstractRegistrar):
             return Outcome.DEGENERATE
         sigma_rad = np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])
         return Outcome.AMBIGUOUS if sigma_rad > np.deg2rad(self.max_sigma_deg) else Outcome.CONVERGED
+
+
+def overlapping(
+    modes: list[WeightedSamples], overlap: Callable[[Array], float], min_overlap: float
+) -> list[WeightedSamples]:
+    """Return the modes in which the views overlap, if the likeliest pose is in one of them; otherwise all modes.
+
+    Without limits, views have nothing in common under most motions. The images cannot distinguish these, and their
+    volume would outweigh a precise match (method.md, "Search").
+
+    Args:
+        modes: samples of each mode.
+        overlap: returns the share of matches under a pose (4, 4).
+        min_overlap: least share of an overlap.
+    """
+    best = [int(np.argmax(mode.log_likelihoods)) for mode in modes]
+    likelihoods = np.array([mode.log_likelihoods[k] for mode, k in zip(modes, best, strict=True)])
+    overlaps = np.array([overlap(mode.poses[k]) >= min_overlap for mode, k in zip(modes, best, strict=True)])
+    if not overlaps[np.argmax(likelihoods)]:
+        return modes
+    return [mode for mode, shown in zip(modes, overlaps, strict=True) if shown]
 
 
 def _leads_beyond(found: Candidates) -> bool:
