@@ -516,6 +516,18 @@ def test_priors_that_contradict_each_other_are_refused() -> None:
         ProductPrior(turntable(HERE), GeneralPrior(max_rotation_deg=5.0)).between(SOURCE, TARGET)
 
 
+def test_a_product_leaves_the_limits_that_either_part_assumed() -> None:
+    table, grip = TablePrior(limits_assumed=True), held(HERE)
+    either = ProductPrior(grip, table).unlimited()
+    assert either is not None
+    assert either.second == table.unlimited()
+    assert either.first == grip.unlimited()
+    one = ProductPrior(TablePrior(), GeneralPrior(limits_assumed=True)).unlimited()
+    assert one is not None
+    assert one.first == TablePrior()
+    assert ProductPrior(TablePrior(), GeneralPrior()).unlimited() is None
+
+
 def test_a_guess_that_lies_outside_what_is_known_is_dropped() -> None:
     tight = VelocityPrior(GeneralPrior(max_rotation_deg=2.0)).learned(solution(HERE, 3), ())
     assert tight.between(SOURCE, TARGET).evidence

@@ -64,6 +64,13 @@ class ProductPrior(AbstractPrior):
         """Return the product with limits for several steps."""
         return replace(self, first=self.first.relaxed(steps), second=self.second.relaxed(steps))
 
+    def unlimited(self) -> ProductPrior | None:
+        """Return the product without the limits that are defaults, None if neither part has any."""
+        first, second = self.first.unlimited(), self.second.unlimited()
+        if first is None and second is None:
+            return None
+        return replace(self, first=first or self.first, second=second or self.second)
+
 
 @dataclass(frozen=True, eq=False)
 class Product(AbstractPoseDensity):
