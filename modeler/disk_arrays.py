@@ -12,7 +12,7 @@ from typing import IO, TypeVar, final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.types import RayImage
+from modeler.types import Frame, RayImage
 
 _Number = TypeVar("_Number", bound=np.generic)
 _ALIGNMENT = 64  # bytes, for every type of number
@@ -83,9 +83,9 @@ def release(array: npt.NDArray[np.generic]) -> None:
 
 @final
 class ViewStore:
-    """Keeps views without the images that a likelihood looks up, which are ten times as large as the frame.
+    """Keeps frames, and views without the images that a likelihood looks up, ten times as large as the frame.
 
-    The first views stay in memory. Once they fill `memory_bytes`, the arrays of further ones go to disk. Where they
+    The first stay in memory. Once they fill `memory_bytes`, the arrays of further ones go to disk. Where they
     cannot be written, they stay in memory too.
     """
 
@@ -100,25 +100,13 @@ class ViewStore:
 
     def keep(self, view: RayImage) -> RayImage:
         """Return a view without layers, its arrays in memory or on disk."""
-        light, frame = replace(view, layers={}), view.frame
-        arrays = (frame.depth_m, frame.mask, frame.colour, frame.occluder, view.points_m, view.normals, view.pixels)
-        size = sum(array.nbytes for array in arrays if array is not None)
-        if size <= self._left_bytes:
-            self._left_bytes -= size
+        light = replace(view, layers={})
+        if self._fits(_images(view.frame), view.points_m, view.normals, view.pixels):
             return light
         try:
-            mask = None if frame.mask is None else self._disk.written(frame.mask)
-            colour = None if frame.colour is None else self._disk.written(frame.colour)
-            occluder = None if frame.occluder is None else self._disk.written(frame.occluder)
             return replace(
                 light,
-                frame=replace(
-                    frame,
-                    depth_m=self._disk.written(frame.depth_m),
-                    mask=mask,
-                    colour=colour,
-                    occluder=occluder,
-                ),
+                frame=self._written(view.frame),
                 points_m=self._disk.written(view.points_m),
                 normals=self._disk.written(view.normals),
                 pixels=self._disk.written(view.pixels),
@@ -126,6 +114,37 @@ class ViewStore:
         except OSError:
             return light
 
+    def keep_frame(self, frame: Frame) -> Frame:
+        """Return a frame, its images in memory or on disk."""
+        if self._fits(_images(frame)):
+            return frame
+        try:
+            return self._written(frame)
+        except OSError:
+            return frame
+
+    def _fits(self, images: list[npt.NDArray[np.generic]], *arrays: npt.NDArray[np.generic]) -> bool:
+        """Return whether arrays may stay in memory, and count them if so."""
+        size = sum(array.nbytes for array in (*images, *arrays))
+        fits = size <= self._left_bytes
+        self._left_bytes -= size if fits else 0
+        return fits
+
+    def _written(self, frame: Frame) -> Frame:
+        """Return a frame whose images are on disk."""
+        return replace(
+            frame,
+            mask=None if frame.mask is None else self._disk.written(frame.mask),
+            colour=None if frame.colour is None else self._disk.written(frame.colour),
+            occluder=None if frame.occluder is None else self._disk.written(frame.occluder),
+            depth_m=self._disk.written(frame.depth_m),
+        )
+
     def release(self) -> None:
         """Drop from memory what was read of the views on disk; where it is used again, it is read again."""
         self._disk.release()
+
+
+def _images(frame: Frame) -> list[npt.NDArray[np.generic]]:
+    """Return the images of a frame."""
+    return [image for image in (frame.depth_m, frame.mask, frame.colour, frame.occluder) if image is not None]

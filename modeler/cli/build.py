@@ -245,7 +245,8 @@ def _run(
                     # point of later ones, and so their last digits.
                     event.solution.covariances.values()
                     draw(event)
-                    if followed and not event.last:
+                    # Frames that were skipped are added once it is too late for advice.
+                    if followed and not event.last and event.frame.index >= max(event.views, default=0):
                         advise(event)
     finally:
         stream.close()
@@ -255,8 +256,17 @@ def _run(
 
 
 def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt, *, live: bool) -> Iterator[Event]:
-    """Yield the events of a run; Ctrl-C skips the stages after its frames."""
-    yield from run.track(frames, live=live)
+    """Yield the events of a run; Ctrl-C skips the stages after its frames, a second one the skipped frames, if any."""
+    from modeler.pipeline import NewestFrames
+
+    if live:
+        newest = NewestFrames(frames, run.state.store.keep_frame)
+        yield from run.track(newest, live=True)
+        if newest.skipped:
+            say(f"adding {len(newest.skipped)} frames that were skipped to keep up; Ctrl-C leaves them out")
+        yield from run.fill(interrupt.until_next(newest.skipped))
+    else:
+        yield from run.track(frames)
     yield from run.revisit()
     for event in itertools.chain(run.rejoin(), run.refine()):
         yield event

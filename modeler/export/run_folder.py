@@ -219,7 +219,7 @@ class RunFolder:
         if not step.last and (len(self.frames) < self.already or self.pace.rests):
             return self.newest
         began_s = time.monotonic()
-        report = report_of(step, list(self.frames.values()), meta)
+        report = report_of(step, [self.frames[frame] for frame in sorted(self.frames)], meta)
         times_s = {frame: view.frame.time_s for frame, view in step.views.items()}
         contents: dict[str, str | bytes] = {
             "trajectory.txt": tum_text(step.solution.trajectory, times_s),

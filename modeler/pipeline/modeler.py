@@ -169,9 +169,10 @@ class Modeler:
 @final
 @dataclass(eq=False)
 class Run:
-    """One run and the only owner of its state: five phases in order, each a stream of events.
+    """One run and the only owner of its state: six phases in order, each a stream of events.
 
-    To save time, `revisit`, `rejoin` and `refine` may be omitted or stopped at any event; `finish` uses what is there.
+    `fill` is for frames that were skipped. To save time, `revisit`, `rejoin` and `refine` may be omitted or stopped at
+    any event; `finish` uses what is there.
     """
 
     modeler: Modeler
@@ -202,6 +203,23 @@ class Run:
                 found = prepared()
                 self.state = self.state.read(found)
                 yield from self._place(found, self.state.latest, last=last)
+
+    def fill(self, frames: Iterable[Frame]) -> Iterator[Step]:
+        """Add frames that were skipped while tracking, each registered against the nearest in time; yield their steps.
+
+        Args:
+            frames: in order of time.
+
+        Raises:
+            InputError: if two frames have the same number.
+        """
+        with ahead(partial(self.modeler.prepare, scene=self.scene)) as preparing:
+            for preparation in map(preparing, frames):
+                prepared = preparation()
+                self.state = self.state.read(prepared)
+                tracker = self.modeler.tracker(self.state)
+                posteriors = () if prepared.view is None else tracker.between(prepared.view)
+                yield from self._add(prepared, tracker, posteriors, steps=1)
 
     def revisit(self) -> Iterator[Step | Searching]:
         """Retry lost frames, newest first, against the views that followed them; yield steps of those placed."""
@@ -311,6 +329,26 @@ class Run:
             posteriors = yield from tracker.locate(prepared.view, previous, retry=retry)
             posteriors += tracker.closures(prepared.view, posteriors, last=last, retry=retry)
         steps = self.state.steps(prepared.frame.index, previous)
+        yield from self._add(prepared, tracker, posteriors, steps=steps, retry=retry)
+
+    def _add(
+        self,
+        prepared: Prepared,
+        tracker: Tracker,
+        posteriors: tuple[Posterior, ...],
+        *,
+        steps: int,
+        retry: bool = False,
+    ) -> Iterator[Step]:
+        """Add a frame with its registrations to the graph and to the model, and yield its step.
+
+        Args:
+            prepared: the frame.
+            tracker: which registered it.
+            posteriors: the registrations.
+            steps: number of frames from the first one's target.
+            retry: whether it was lost before: then it has a step only if it is placed.
+        """
         compact = [posterior.without_samples() for posterior in posteriors]
         edges = tracker.explained(self.modeler.closer.judge(compact, self.state.map_view, steps=steps))
         prepared = replace(prepared, left_out=_reason_left_out(prepared, edges, first=not self.state.views))

@@ -69,7 +69,7 @@ class State:
         return 1 if other is None else abs(self.places[frame] - self.places[other])
 
     def read(self, prepared: Prepared) -> State:
-        """Return the state after reading one more frame.
+        """Return the state after reading one more frame, possibly one between earlier ones.
 
         Raises:
             InputError: if its number is that of an earlier one.
@@ -77,13 +77,16 @@ class State:
         frame = prepared.frame.index
         if frame in self.places:
             raise InputError(f"frame {frame} comes twice; give each frame of the sequence a number of its own")
-        return replace(self, places={**self.places, frame: len(self.places)})
+        if frame > max(self.places, default=-1):
+            return replace(self, places={**self.places, frame: len(self.places)})
+        return replace(self, places={read: place for place, read in enumerate(sorted([*self.places, frame]))})
 
     def joined(self, prepared: Prepared, edges: Sequence[Edge]) -> State:
         """Return the state after a frame with its edges, whether it was accepted or not."""
         number, graph = prepared.frame.index, self.graph.plus(edges)
         stored = self._with_stored_images(prepared)
-        newest = self.newest if number in self.lost else stored
+        earlier = self.newest is not None and number < self.newest.frame.index
+        newest = self.newest if earlier or number in self.lost else stored
         if stored.view is None:
             return replace(self, graph=graph, newest=newest)
         if not prepared.accepted:

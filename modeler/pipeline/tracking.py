@@ -114,6 +114,31 @@ class Tracker:
         yield Searching(view.index)
         return self._relocalised(view, odometry, retry=retry)
 
+    def between(self, view: RayImage) -> tuple[Posterior, ...]:
+        """Register a view against the nearest in time; its motion is expected where neighbours in time put it.
+
+        Args:
+            view: of a frame between, before or after those of the graph.
+
+        Returns:
+            The posterior; none without views in the graph.
+        """
+        frames = np.array(sorted(self.state.solution.trajectory))
+        if not len(frames):
+            return ()
+        target = int(frames[np.argmin(np.abs(frames - view.index))])
+        motion = se3.inverse(self.state.solution.trajectory[target]) @ self.state.map_view.extrapolated(view.index)
+        around = frames[np.argsort(np.abs(frames - view.index), kind="stable")[:2]]
+        step = self.state.solution.relative(int(around[0]), int(around[-1]))
+        way = (
+            float(se3.rotation_angle(step)),
+            float(np.linalg.norm(se3.transform(step, view.centroid_m) - view.centroid_m)),
+        )
+        # In the middle between two views, the standard deviation is a quarter of the way, if the speed is uneven.
+        spread = np.diag(np.repeat(0.25 * np.array(way), 3) ** 2)
+        expected = PoseGaussian(motion, se3.covariance_about(spread, -view.centroid_m))
+        return (self._pair(view, target, self._predicted(expected)),)
+
     def closures(
         self, view: RayImage, posteriors: Sequence[Posterior], *, last: bool, retry: bool
     ) -> tuple[Posterior, ...]:

@@ -1,0 +1,79 @@
+"""Frames of a source that is faster than the registration: the newest is tracked, those skipped are filled in later."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import final
+
+from modeler.types import Frame
+
+
+@final
+@dataclass(eq=False)
+class NewestFrames:
+    """Reads frames in a thread of its own, yields the newest each time, and keeps the frames skipped (`skipped`).
+
+    A source that is no faster than its consumer is yielded frame by frame. The first frame and the last are never
+    skipped. No two frames are farther apart in time than `max_gap_s` because of skipping, so that the motion between
+    them stays small: a consumer that is slower still lags behind.
+    """
+
+    frames: Iterable[Frame]
+    """The source, in order of time. If it raises, the error follows its frames."""
+    keep: Callable[[Frame], Frame]
+    """Moves the images of a frame that has to wait out of memory."""
+    max_gap_s: float = 0.25
+    """Longest time between two frames with skipped ones in between: 15° of an object turned at 60° a second."""
+    skipped: list[Frame] = field(default_factory=list)
+    """The skipped frames so far, in order of time."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the first frame, and then the newest each time until the source ends.
+
+        Raises:
+            Exception: that of the source.
+        """
+        waiting: deque[Frame] = deque()
+        errors: list[BaseException] = []
+        state = threading.Condition()
+        ended = stopped = False
+
+        def read() -> None:
+            nonlocal ended
+            try:
+                for frame in self.frames:
+                    with state:
+                        if stopped:
+                            return
+                        waiting.append(self.keep(frame) if waiting else frame)
+                        state.notify()
+            except BaseException as error:  # raised again by the consumer's thread
+                errors.append(error)
+            finally:
+                with state:
+                    ended = True
+                    state.notify()
+
+        reader = threading.Thread(target=read, name="frames", daemon=True)  # may wait for a camera forever
+        reader.start()
+        last_s = None
+        try:
+            while True:
+                with state:
+                    state.wait_for(lambda: waiting or ended)
+                    if not waiting:
+                        break
+                    frame = waiting.popleft()
+                    while waiting and last_s is not None and waiting[0].time_s - last_s <= self.max_gap_s:
+                        self.skipped.append(frame)
+                        frame = waiting.popleft()
+                last_s = frame.time_s
+                yield frame
+        finally:
+            with state:
+                stopped = True
+        if errors:
+            raise errors[0]
