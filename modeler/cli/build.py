@@ -71,11 +71,11 @@ class Build:
         Raises:
             InputError: if the input or the folder cannot be used.
         """
-        from modeler.beside import both
         from modeler.cli import compose
         from modeler.cli.advice import comes_back
         from modeler.cli.inputs import estimated_camera
         from modeler.cli.outputs import check_run_folder
+        from modeler.concurrency import in_parallel
         from modeler.export import Remembered, RunFolder, RunMeta, alone
         from viz.stream import ends_whole, load
 
@@ -101,7 +101,7 @@ class Build:
             say("the run is already complete; give --overwrite to build it again")
             return _summarise(RunFolder(self.out).report(), self, modeler.prior)
         compile_kernels()
-        scene, _ = both(partial(compose.scene, modeler, whole), load)
+        scene, _ = in_parallel(partial(compose.scene, modeler, whole), load)
         with alone(self.out):
             before = RunFolder(self.out).changed_versions(meta) if self.resume else ()
             folder = RunFolder.open(self.out, overwrite=self.overwrite, resume=self.resume)
@@ -206,9 +206,9 @@ def _run(
         InputError: if a frame cannot be read or a file cannot be written.
         KeyboardInterrupt: if the user interrupted before the first frame.
     """
-    from modeler.beside import behind
     from modeler.cli.inputs import while_it_lasts
     from modeler.cli.live_advice import advising
+    from modeler.concurrency import in_background
     from modeler.types import Step
     from viz.stream import open_stream
 
@@ -226,7 +226,7 @@ def _run(
     report: Mapping[str, Any] = {}
     try:
         with (
-            behind(stream) as draw,
+            in_background(stream) as draw,
             Interrupt() as interrupt,
             Console(len(frames), stream.address, modeler.prior) as console,
             advising(modeler, console.advise, stream.advise) as advise,

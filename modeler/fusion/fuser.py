@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.beside import both
+from modeler.concurrency import in_parallel
 from modeler.fusion import meshing, watertight
 from modeler.fusion.depth_views import (
     SMOOTHED,
@@ -161,7 +161,7 @@ class FusionVolume:
         Args:
             watertight: close the mesh with surface that no view saw; the standard deviation of its vertices is inf.
         """
-        mesh, (points, point_normals, colours) = both(lambda: self._mesh(watertight=watertight), self._cloud)
+        mesh, (points, point_normals, colours) = in_parallel(lambda: self._mesh(watertight=watertight), self._cloud)
         vertices, triangles, seen = mesh
         normals = meshing.normals_of(vertices, triangles)
         at_vertices = self.support(vertices, normals)

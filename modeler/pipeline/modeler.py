@@ -9,8 +9,8 @@ from typing import TypeVar, final
 
 import numpy as np
 
-from modeler.beside import ahead
 from modeler.closure import Closer
+from modeler.concurrency import prefetching
 from modeler.fusion import Fuser, Preview, conditional_covariances, widened
 from modeler.graph import CommonAxis, MovingGraph, estimate_focal_length, shared_noise
 from modeler.pipeline.joining import MIN_JOINS, Joiner, Segment
@@ -197,7 +197,7 @@ class Run:
         Raises:
             InputError: if two frames have the same number.
         """
-        with ahead(partial(self.modeler.prepare, scene=self.scene)) as preparing:
+        with prefetching(partial(self.modeler.prepare, scene=self.scene)) as preparing:
             coming = map(preparing, frames)
             for prepared, last in ((one, False) for one in coming) if live else _with_last(coming):
                 found = prepared()
@@ -213,7 +213,7 @@ class Run:
         Raises:
             InputError: if two frames have the same number.
         """
-        with ahead(partial(self.modeler.prepare, scene=self.scene)) as preparing:
+        with prefetching(partial(self.modeler.prepare, scene=self.scene)) as preparing:
             for preparation in map(preparing, frames):
                 prepared = preparation()
                 self.state = self.state.read(prepared)

@@ -16,8 +16,8 @@ from typing import final
 import numpy as np
 
 from modeler import se3
-from modeler.beside import each
 from modeler.closure import Closer
+from modeler.concurrency import parallel_map
 from modeler.pipeline.pairs import retry_unlimited
 from modeler.pipeline.state import State, newest_ready
 from modeler.priors import PredictedProposal
@@ -253,7 +253,7 @@ class Tracker:
 
     def _pairs(self, pairs: Sequence[tuple[RayImage, int]], priors: Sequence[AbstractPrior]) -> Iterator[Posterior]:
         """Yield the posteriors of pairs, in order."""
-        yield from each(lambda pair: self._pair(*pair[0], pair[1]), zip(pairs, priors, strict=True))
+        yield from parallel_map(lambda pair: self._pair(*pair[0], pair[1]), zip(pairs, priors, strict=True))
 
     def _pair(self, source: RayImage, target: int, prior: AbstractPrior, *, quick: bool = False) -> Posterior:
         """Register a view against an accepted one; the outcome is `NOT_KNOWN` if the prior does not apply."""

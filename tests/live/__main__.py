@@ -21,9 +21,9 @@ from in_hand.study import stage
 from trust.stage import Recorded
 
 from modeler import se3
-from modeler.beside import behind
 from modeler.cli import compose
 from modeler.cli.options import MethodOptions, ObjectOptions
+from modeler.concurrency import in_background
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.pipeline import NewestFrames
 from modeler.types import Frame, Step
@@ -67,7 +67,7 @@ def followed(shape: str) -> int:
     lags_s, first_model_s, last = [], np.inf, None
     with tempfile.TemporaryDirectory() as folder:
         stream = open_stream(shape, save=Path(folder) / "recording.rrd")
-        with behind(stream) as draw:
+        with in_background(stream) as draw:
             began_s = time.monotonic()
             for event in run.track(newest, live=True):
                 if isinstance(event, Step):

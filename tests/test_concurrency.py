@@ -1,10 +1,10 @@
-"""Work beside other work: the same results in the same order, whatever the number of threads."""
+"""Concurrent work gives the same results in the same order, whatever the number of threads."""
 
 import threading
 
 import pytest
 
-from modeler.beside import ahead, behind, both, each
+from modeler.concurrency import in_background, in_parallel, parallel_map, prefetching
 
 
 @pytest.fixture(params=[1, 2])
@@ -14,22 +14,22 @@ def threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     return request.param
 
 
-def test_two_results_come_in_their_order(threads: int) -> None:
-    where = both(threading.get_ident, threading.get_ident)
+def test_two_results_are_in_order(threads: int) -> None:
+    where = in_parallel(threading.get_ident, threading.get_ident)
     assert where[0] == threading.get_ident()
     assert (where[1] == where[0]) == (threads == 1)
     with pytest.raises(ZeroDivisionError):
-        both(lambda: 1, lambda: 1 / 0)
+        in_parallel(lambda: 1, lambda: 1 / 0)
 
 
-def test_what_is_used_behind_is_one_late_at_most(threads: int) -> None:
+def test_items_are_consumed_in_the_background_one_late_at_most(threads: int) -> None:
     go, used = threading.Event(), list[int]()
 
     def use(item: int) -> None:
         assert threads == 1 or go.wait(5.0)
         used.append(item)
 
-    with behind(use) as put:
+    with in_background(use) as put:
         put(0)
         assert used == ([0] if threads == 1 else [])
         go.set()
@@ -39,22 +39,22 @@ def test_what_is_used_behind_is_one_late_at_most(threads: int) -> None:
 
 
 @pytest.mark.usefixtures("threads")
-def test_what_fails_behind_is_raised_at_the_end_at_the_latest() -> None:
+def test_an_error_in_the_background_is_raised_at_the_end_at_the_latest() -> None:
     def use(item: int) -> None:
         raise OSError(f"{item} cannot be drawn")
 
-    with pytest.raises(OSError, match="1 cannot"), behind(use) as put:
+    with pytest.raises(OSError, match="1 cannot"), in_background(use) as put:
         put(1)
 
 
-def test_what_is_made_ahead_is_made_in_order_and_fails_where_it_is_asked_for(threads: int) -> None:
+def test_prefetched_results_are_made_in_order_and_errors_are_raised_when_waited_for(threads: int) -> None:
     made = list[int]()
 
     def make(item: int) -> float:
         made.append(item)
         return 1.0 / item
 
-    with ahead(make) as making:
+    with prefetching(make) as making:
         waiting = [making(item) for item in (2, 0, 4)]
         assert threads > 1 or made == []
         assert waiting[0]() == 0.5
@@ -64,7 +64,7 @@ def test_what_is_made_ahead_is_made_in_order_and_fails_where_it_is_asked_for(thr
     assert made == [2, 0, 4]
 
 
-def test_each_of_several_comes_in_its_order_and_what_nobody_waits_for_is_not_begun(threads: int) -> None:
+def test_a_parallel_map_keeps_the_order_and_does_not_start_the_rest_once_closed(threads: int) -> None:
     go, made = threading.Event(), list[int]()
 
     def make(item: int) -> int:
@@ -72,10 +72,10 @@ def test_each_of_several_comes_in_its_order_and_what_nobody_waits_for_is_not_beg
         made.append(item)
         return -item
 
-    results = each(make, range(9))
+    results = parallel_map(make, range(9))
     assert next(results) == 0
     threading.Timer(0.1, go.set).start()
     results.close()
     assert made[0] == 0
     assert len(made) <= (1 if threads == 1 else 3)
-    assert list(each(make, range(4))) == [0, -1, -2, -3]
+    assert list(parallel_map(make, range(4))) == [0, -1, -2, -3]

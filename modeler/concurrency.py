@@ -1,0 +1,72 @@
+"""Concurrent work in threads, if there is more than one; the results do not depend on it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+S = TypeVar("S")
+T = TypeVar("T")
+
+
+def is_parallel() -> bool:
+    """Return whether more than one thread may compute: as NUMBA_NUM_THREADS says, or else the number of cores."""
+    return int(os.environ.get("NUMBA_NUM_THREADS") or len(os.sched_getaffinity(0))) > 1
+
+
+def in_parallel(first: Callable[[], S], second: Callable[[], T]) -> tuple[S, T]:
+    """Return the results of two functions, computed at the same time."""
+    if not is_parallel():
+        return first(), second()
+    with ThreadPoolExecutor(1, thread_name_prefix="parallel") as thread:
+        other = thread.submit(second)
+        return first(), other.result()
+
+
+def parallel_map(function: Callable[[S], T], items: Iterable[S]) -> Generator[T, None, None]:
+    """Yield the results of a function of each item, in order, computed two at a time.
+
+    While one runs Python, the other may compute. If the generator is closed early, the rest is not started.
+    """
+    if not is_parallel():
+        yield from map(function, items)
+        return
+    with ThreadPoolExecutor(2, thread_name_prefix="map") as threads:
+        yield from threads.map(function, items)
+
+
+@contextmanager
+def in_background(consume: Callable[[T], None]) -> Iterator[Callable[[T], None]]:
+    """Return a function that passes an item to another thread, after waiting until the one before is consumed.
+
+    An error of `consume` is raised with the next item, or at the end.
+    """
+    if not is_parallel():
+        yield consume
+        return
+    with ThreadPoolExecutor(1, thread_name_prefix="background") as thread:
+        consumed = thread.submit(lambda: None)
+
+        def put(item: T) -> None:
+            nonlocal consumed
+            consumed.result()
+            consumed = thread.submit(consume, item)
+
+        yield put
+        consumed.result()
+
+
+@contextmanager
+def prefetching(make: Callable[[S], T]) -> Iterator[Callable[[S], Callable[[], T]]]:
+    """Return a function that starts `make` of an item in another thread and returns a function that waits for it.
+
+    Results are made in the order in which they are started; with a single thread, when they are waited for.
+    """
+    if not is_parallel():
+        yield lambda item: lambda: make(item)
+        return
+    with ThreadPoolExecutor(1, thread_name_prefix="prefetch") as thread:
+        yield lambda item: thread.submit(make, item).result
