@@ -39,10 +39,16 @@ def parallel_map(function: Callable[[S], T], items: Iterable[S]) -> Generator[T,
 
 
 @contextmanager
-def in_background(consume: Callable[[T], None]) -> Iterator[Callable[[T], None]]:
+def in_background(
+    consume: Callable[[T], None], may_drop: Callable[[T], bool] = lambda item: False
+) -> Iterator[Callable[[T], None]]:
     """Return a function that passes an item to another thread, after waiting until the one before is consumed.
 
     An error of `consume` is raised with the next item, or at the end.
+
+    Args:
+        consume: what is done with an item.
+        may_drop: whether an item may be dropped instead of waiting.
     """
     if not is_parallel():
         yield consume
@@ -52,6 +58,8 @@ def in_background(consume: Callable[[T], None]) -> Iterator[Callable[[T], None]]
 
         def put(item: T) -> None:
             nonlocal consumed
+            if not consumed.done() and may_drop(item):
+                return
             consumed.result()
             consumed = thread.submit(consume, item)
 

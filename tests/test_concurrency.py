@@ -38,6 +38,24 @@ def test_items_are_consumed_in_the_background_one_late_at_most(threads: int) -> 
     assert used == [0, 1]
 
 
+def test_an_item_that_may_be_dropped_is_not_waited_for(threads: int) -> None:
+    go, begun, used = threading.Event(), threading.Event(), list[int]()
+
+    def use(item: int) -> None:
+        begun.set()
+        assert threads == 1 or go.wait(5.0)
+        used.append(item)
+
+    with in_background(use, lambda item: item != 3) as put:
+        put(0)
+        assert begun.wait(5.0)
+        put(1)
+        put(2)
+        go.set()
+        put(3)
+    assert used == ([0, 1, 2, 3] if threads == 1 else [0, 3])
+
+
 @pytest.mark.usefixtures("threads")
 def test_an_error_in_the_background_is_raised_at_the_end_at_the_latest() -> None:
     def use(item: int) -> None:

@@ -226,7 +226,8 @@ def _run(
     report: Mapping[str, Any] = {}
     try:
         with (
-            in_background(stream) as draw,
+            # A live run does not wait for the drawing; the last step draws all poses and the model.
+            in_background(stream, lambda step: frames.live and not step.last) as draw,
             Interrupt() as interrupt,
             Console(len(frames), stream.address, modeler.prior) as console,
             advising(modeler, console.advise, stream.advise) as advise,

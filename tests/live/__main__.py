@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--shapes", nargs="+", default=["telephone", "drill", "figurine"], help="names of recipes")
     options = parser.parse_args(arguments)
-    heads = ("tracked", "Hz", "lag s", "model s", "filled", "fill s", "lost", "median", "worst")
+    heads = ("tracked", "Hz", "lag s", "largest", "model s", "filled", "fill s", "lost", "median", "worst")
     print(" " * 12 + "".join(f"{head:>9}" for head in heads))
     lost = 0
     for shape in options.shapes:
@@ -67,7 +67,7 @@ def followed(shape: str) -> int:
     lags_s, first_model_s, last = [], np.inf, None
     with tempfile.TemporaryDirectory() as folder:
         stream = open_stream(shape, save=Path(folder) / "recording.rrd")
-        with in_background(stream) as draw:
+        with in_background(stream, lambda step: not step.last) as draw:
             began_s = time.monotonic()
             for event in run.track(newest, live=True):
                 if isinstance(event, Step):
@@ -91,7 +91,8 @@ def followed(shape: str) -> int:
         for frame in others
     ]
     gone = len(frames) - len(trajectory)
-    cells = f"{len(lags_s)}", f"{len(lags_s) / tracked_s:.1f}", f"{max(lags_s):.2f}", f"{first_model_s:.2f}"
+    cells = f"{len(lags_s)}", f"{len(lags_s) / tracked_s:.1f}", f"{np.median(lags_s):.2f}"
+    cells += f"{max(lags_s):.2f}", f"{first_model_s:.2f}"
     cells += f"{len(newest.skipped)}", f"{filled_s:.1f}", f"{gone}"
     cells += f"{np.median(errors_deg):.2f}°", f"{np.max(errors_deg):.2f}°"
     print(f"{shape:12}" + "".join(f"{cell:>9}" for cell in cells), flush=True)
