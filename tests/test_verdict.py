@@ -336,6 +336,11 @@ def test_a_limit_holds_for_all_axes_of_a_rotation_together(
     assert found > 0.999 * max(sigmas_deg)
 
 
+def test_where_nearly_every_pose_is_wrong_the_root_mean_square_counts() -> None:
+    assert one_axis_sd(np.diag(np.square([60.0, 50.0, 40.0])), 3.0) == pytest.approx(np.sqrt(7700.0))
+    assert one_axis_sd(np.diag(np.square([1e6, 1e6, 1e6])), 3.0) == pytest.approx(np.sqrt(3e12))
+
+
 def whole_run(
     angles_deg: list[float],
     *,

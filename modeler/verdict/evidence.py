@@ -313,7 +313,8 @@ def spread_by_focal_length(views: Mapping[int, RayImage], solution: Solution, fr
 def one_axis_sd(covariance: Array, wrong: float) -> float:
     """Return the standard deviation of an error along one axis that is wrong as often as a vector (3,).
 
-    It is at least that of the least certain axis; other uncertain axes increase it.
+    It is at least that of the least certain axis; other uncertain axes increase it, at most to the root mean square
+    length, which counts where nearly every error is wrong.
 
     Args:
         covariance: (3, 3) of the vector.
@@ -325,7 +326,8 @@ def one_axis_sd(covariance: Array, wrong: float) -> float:
     rest = wrong**2 - small * nodes[:, None] ** 2 - middle * nodes**2
     beyond = 2.0 * ndtr(-np.sqrt(np.maximum(rest, 0.0) / large))
     share = float(weights @ beyond @ weights / weights.sum() ** 2)
-    return max(float(np.sqrt(large)), wrong / float(-ndtri(0.5 * share)) if share > 0.0 else 0.0)
+    equivalent = wrong / max(float(-ndtri(0.5 * share)), 1e-12) if share > 0.0 else 0.0
+    return float(np.clip(equivalent, np.sqrt(large), np.sqrt(small + middle + large)))
 
 
 def _widest(sigmas: Mapping[int, float], wrong: float) -> Spread | None:
