@@ -1,6 +1,7 @@
 """Every kernel of the registration against its readable twin, on random inputs."""
 
 import os
+from pathlib import Path
 
 import naive
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from modeler import kernels, se3
+from modeler.cli import compiling
 from modeler.kernels import gauss_newton, mixture, paper, photometric, planes, point_likelihood, point_to_plane, scores
 from modeler.kernels.point_likelihood import Projection
 from modeler.registration.visibility.sampling import GaussianMixture
@@ -294,3 +296,10 @@ def test_patches_come_from_recursive_bisection(rng, count):
 def test_kernels_know_that_they_are_compiled():
     point_likelihood.classify(rows(np.eye(4)[None])[0], random_projection(np.random.default_rng(0)), parameters())
     assert kernels.compiled("point_likelihood", "classify")
+
+
+def test_the_count_of_kernels_compiled_ahead_is_that_of_all_that_a_run_uses() -> None:
+    folder = Path(kernels.__file__).parent
+    compiled = {path.stem for path in folder.glob("*.py") if "njit(" in path.read_text()}
+    elsewhere = {"occupancy", "paper"}  # of other commands and methods
+    assert sorted((*compiling._USED, *compiling._USED_TO_FUSE)) == sorted(compiled - elsewhere)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from modeler.types import Array, RayImage
 
 _USED = (
+    "bands",
     "planes",
     "lie_group",
     "point_likelihood",
@@ -23,8 +24,9 @@ _USED = (
     "scores",
     "gauss_newton",
     "mixture",
+    "shading",
 )
-_USED_TO_FUSE = ("tsdf", "shading", "marching_cubes", "point_clouds")
+_USED_TO_FUSE = ("tsdf", "marching_cubes", "point_clouds")
 
 
 def compile_kernels() -> None:
