@@ -258,10 +258,10 @@ def _run(
 
 def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt, *, live: bool) -> Iterator[Event]:
     """Yield the events of a run; Ctrl-C skips the stages after its frames, a second one the skipped frames, if any."""
-    from modeler.pipeline import NewestFrames
-
     if live:
-        newest = NewestFrames(frames, run.state.store.keep_frame)
+        from modeler.pipeline import NewestFrames
+
+        newest = NewestFrames(frames)
         yield from run.track(newest, live=True)
         if newest.skipped:
             say(f"adding {len(newest.skipped)} frames that were skipped to keep up; Ctrl-C leaves them out")

@@ -85,7 +85,7 @@ class Interrupt:
     def __init__(self) -> None:
         self.ended_early = False
         """Whether there were more items."""
-        self._asked, self._presses = False, 0
+        self._presses = 0
         self._listening = _handled(signal.SIGINT, self._note)
 
     def __enter__(self) -> Interrupt:
@@ -102,12 +102,12 @@ class Interrupt:
     @property
     def asked(self) -> bool:
         """Whether Ctrl-C was pressed."""
-        return self._asked
+        return self._presses > 0
 
     def until(self, items: Iterable[T]) -> Iterator[T]:
         """Yield items until Ctrl-C."""
         for item in items:
-            if self._asked:
+            if self.asked:
                 self.ended_early = True
                 return
             yield item
@@ -115,14 +115,13 @@ class Interrupt:
     def until_next(self, items: Iterable[T]) -> Iterator[T]:
         """Yield items until Ctrl-C is pressed, if it was before, again; after that, another one ends the program."""
         before = self._presses
-        with _handled(signal.SIGINT, self._note) if self._asked else contextlib.nullcontext():
+        with _handled(signal.SIGINT, self._note) if self.asked else contextlib.nullcontext():
             for item in items:
                 if self._presses > before:
                     return
                 yield item
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        self._asked = True
         self._presses += 1
         signal.signal(signal.SIGINT, signal.default_int_handler)
         say("finishing with the frames so far; Ctrl-C again stops at once")

@@ -53,12 +53,16 @@ class MapView:
         """Return the paths of least rotation variance from a frame to all others."""
         return self.network.shortest_paths(start)
 
+    def nearest_in_time(self, frame: int) -> list[int]:
+        """Return the numbers of the two views nearest in time to a frame, nearest first, or of one if there is one."""
+        return heapq.nsmallest(2, self.frames, key=lambda view: abs(view - frame))
+
     def extrapolated(self, frame: int) -> Array:
         """Return object_from_camera (4, 4) of a frame, extrapolated from the two views nearest in time (eq. C8).
 
         For a new frame these are the last two; a lost frame lies between two, or before the first.
         """
-        near, *other = heapq.nsmallest(2, self.frames, key=lambda view: abs(view - frame))
+        near, *other = self.nearest_in_time(frame)
         if not other:
             return self.solution.trajectory[near]
         pace = (frame - near) / (near - other[0])  # method.md, eq. C8

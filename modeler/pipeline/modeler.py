@@ -214,9 +214,9 @@ class Run:
             InputError: if two frames have the same number.
         """
         with prefetching(partial(self.modeler.prepare, scene=self.scene)) as preparing:
-            for preparation in map(preparing, frames):
+            for preparation, _ in _with_last(map(preparing, frames)):
                 prepared = preparation()
-                self.state = self.state.read(prepared)
+                self.state = self.state.inserted(prepared)
                 tracker = self.modeler.tracker(self.state)
                 posteriors = () if prepared.view is None else tracker.between(prepared.view)
                 yield from self._add(prepared, tracker, posteriors, steps=1)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import final
 
+from modeler.disk_arrays import ViewStore
 from modeler.types import Frame
 
 
@@ -23,8 +24,8 @@ class NewestFrames:
 
     frames: Iterable[Frame]
     """The source, in order of time. If it raises, the error follows its frames."""
-    keep: Callable[[Frame], Frame]
-    """Moves the images of a frame that has to wait out of memory."""
+    keep: Callable[[Frame], Frame] = field(default_factory=lambda: ViewStore().keep_frame)
+    """Moves the images of a frame that has to wait out of memory; called by the reading thread."""
     max_gap_s: float = 0.25
     """Longest time between two frames with skipped ones in between: 15° of an object turned at 60° a second."""
     skipped: list[Frame] = field(default_factory=list)
@@ -45,10 +46,11 @@ class NewestFrames:
             nonlocal ended
             try:
                 for frame in self.frames:
+                    if stopped:
+                        return
+                    kept = self.keep(frame) if waiting else frame
                     with state:
-                        if stopped:
-                            return
-                        waiting.append(self.keep(frame) if waiting else frame)
+                        waiting.append(kept)
                         state.notify()
             except BaseException as error:  # raised again by the consumer's thread
                 errors.append(error)
@@ -73,7 +75,6 @@ class NewestFrames:
                 last_s = frame.time_s
                 yield frame
         finally:
-            with state:
-                stopped = True
+            stopped = True
         if errors:
             raise errors[0]

@@ -69,23 +69,27 @@ class State:
         return 1 if other is None else abs(self.places[frame] - self.places[other])
 
     def read(self, prepared: Prepared) -> State:
-        """Return the state after reading one more frame, possibly one between earlier ones.
+        """Return the state after reading one more frame.
 
         Raises:
             InputError: if its number is that of an earlier one.
         """
-        frame = prepared.frame.index
-        if frame in self.places:
-            raise InputError(f"frame {frame} comes twice; give each frame of the sequence a number of its own")
-        if frame > max(self.places, default=-1):
-            return replace(self, places={**self.places, frame: len(self.places)})
-        return replace(self, places={read: place for place, read in enumerate(sorted([*self.places, frame]))})
+        return replace(self, places={**self.places, self._new(prepared): len(self.places)})
+
+    def inserted(self, prepared: Prepared) -> State:
+        """Return the state after reading a frame that was skipped: its number decides its place among the others.
+
+        Raises:
+            InputError: if its number is that of an earlier one.
+        """
+        frames = sorted([*self.places, self._new(prepared)])
+        return replace(self, places={frame: place for place, frame in enumerate(frames)})
 
     def joined(self, prepared: Prepared, edges: Sequence[Edge]) -> State:
         """Return the state after a frame with its edges, whether it was accepted or not."""
         number, graph = prepared.frame.index, self.graph.plus(edges)
         stored = self._with_stored_images(prepared)
-        earlier = self.newest is not None and number < self.newest.frame.index
+        earlier = self.newest is not None and self.places[number] < self.places[self.newest.frame.index]
         newest = self.newest if earlier or number in self.lost else stored
         if stored.view is None:
             return replace(self, graph=graph, newest=newest)
@@ -202,6 +206,13 @@ class State:
             after = [view for view in self.views if 0 < self.places[view] - self.places[frame] <= _REVISITED]
             if after:
                 yield frame, min(after, key=lambda view: self.places[view])
+
+    def _new(self, prepared: Prepared) -> int:
+        """Return the number of a frame that was not read before."""
+        frame = prepared.frame.index
+        if frame in self.places:
+            raise InputError(f"frame {frame} comes twice; give each frame of the sequence a number of its own")
+        return frame
 
     def _with_stored_images(self, prepared: Prepared) -> Prepared:
         """Return a frame with its images in the store."""

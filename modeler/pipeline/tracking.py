@@ -115,7 +115,7 @@ class Tracker:
         return self._relocalised(view, odometry, retry=retry)
 
     def between(self, view: RayImage) -> tuple[Posterior, ...]:
-        """Register a view against the nearest in time; its motion is expected where neighbours in time put it.
+        """Register a view against the nearest in time; the motion is predicted from the poses of its two neighbours.
 
         Args:
             view: of a frame between, before or after those of the graph.
@@ -123,13 +123,13 @@ class Tracker:
         Returns:
             The posterior; none without views in the graph.
         """
-        frames = np.array(sorted(self.state.solution.trajectory))
-        if not len(frames):
+        known, solution = self.state.map_view, self.state.solution
+        nearest = known.nearest_in_time(view.index)
+        if not nearest:
             return ()
-        target = int(frames[np.argmin(np.abs(frames - view.index))])
-        motion = se3.inverse(self.state.solution.trajectory[target]) @ self.state.map_view.extrapolated(view.index)
-        around = frames[np.argsort(np.abs(frames - view.index), kind="stable")[:2]]
-        step = self.state.solution.relative(int(around[0]), int(around[-1]))
+        target = nearest[0]
+        motion = se3.inverse(solution.trajectory[target]) @ known.extrapolated(view.index)
+        step = solution.relative(target, nearest[-1])
         way = (
             float(se3.rotation_angle(step)),
             float(np.linalg.norm(se3.transform(step, view.centroid_m) - view.centroid_m)),

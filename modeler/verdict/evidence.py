@@ -326,7 +326,8 @@ def one_axis_sd(covariance: Array, wrong: float) -> float:
     rest = wrong**2 - small * nodes[:, None] ** 2 - middle * nodes**2
     beyond = 2.0 * ndtr(-np.sqrt(np.maximum(rest, 0.0) / large))
     share = float(weights @ beyond @ weights / weights.sum() ** 2)
-    equivalent = wrong / max(float(-ndtri(0.5 * share)), 1e-12) if share > 0.0 else 0.0
+    quantile = float(-ndtri(0.5 * share))  # infinite if no error is wrong, 0 if every error is
+    equivalent = wrong / quantile if quantile > 0.0 else np.inf
     return float(np.clip(equivalent, np.sqrt(large), np.sqrt(small + middle + large)))
 
 

@@ -84,10 +84,12 @@ def stage(shape: str, holder: Holder, told: Told = "masks", *, motion: Hand | No
     recipe = viewed(load_specimen(shape), rng, seed)
     view = replace(recipe.view, look_height_m=_HEIGHT_M, elevation_deg=20.0)
     recipe = replace(recipe, table=None, view=view)
-    if motion is None and holder != "person":
-        motion = Hand(ROBOT_FRAMES, ROBOT_STEP_DEG, 3.0, 0.01, height_m=0.0)
-    elif motion is None:
-        motion = Hand(PERSON_FRAMES, PERSON_STEP_DEG, 0.5, 0.002, wander=0.05, height_m=0.0)
+    if motion is None:
+        motion = (
+            Hand(PERSON_FRAMES, PERSON_STEP_DEG, 0.5, 0.002, wander=0.05, height_m=0.0)
+            if holder == "person"
+            else Hand(ROBOT_FRAMES, ROBOT_STEP_DEG, 3.0, 0.01, height_m=0.0)
+        )
     height_m = reach_m(recipe)[2]
     raised = se3.translation(np.array([0.0, 0.0, _HEIGHT_M - 0.5 * height_m]))
     about = se3.translation(np.array([0.0, 0.0, 0.5 * height_m]))

@@ -63,7 +63,7 @@ def followed(shape: str) -> int:
             time.sleep(max(0.0, began_s + number / RATE_HZ - time.monotonic()))
             yield frame
 
-    newest = NewestFrames(camera(), run.state.store.keep_frame)
+    newest = NewestFrames(camera())
     lags_s, first_model_s, last = [], np.inf, None
     with tempfile.TemporaryDirectory() as folder:
         stream = open_stream(shape, save=Path(folder) / "recording.rrd")

@@ -206,7 +206,7 @@ def overlapping(
     """Return the modes in which the views overlap, if the likeliest pose is in one of them; otherwise all modes.
 
     Without limits, views have nothing in common under most motions. The images cannot distinguish these, and their
-    volume would outweigh a precise match (method.md, "Search").
+    volume would outweigh a precise match (method.md, "Weights of modes").
 
     Args:
         modes: samples of each mode.
