@@ -29,6 +29,8 @@ class RangeNoise(NamedTuple):
 
     area_px: float
     """Integral of the autocorrelation of inverse depth over the image: 1 px² for independent pixels."""
+    sigma_inverse: float = 0.0
+    """Standard deviation of inverse depth in 1/m of errors averaged as smoothing does."""
     pattern_share: float | None = None
     """Share of the variance of errors, averaged as smoothing does, that repeats from frame to frame; None if no two
     frames show the same plane."""
@@ -50,7 +52,9 @@ def range_noise(looks: Sequence[tuple[Frame, BoolArray]]) -> RangeNoise | None:
             continue
         noise = np.concatenate([left[kept] for left, kept in zip(residuals, calm, strict=True)])
         area_px = _correlated_area(noise.reshape(-1, tile_px, tile_px))
-        return RangeNoise(area_px, _pattern_share(residuals, calm, tile_px))
+        smoothed = [_averaged(left, tile_px) for left in residuals]
+        sigma = float(np.sqrt(np.mean(np.concatenate([s[kept] for s, kept in zip(smoothed, calm, strict=True)]) ** 2)))
+        return RangeNoise(area_px, sigma, _pattern_share(smoothed, calm))
     return None
 
 
@@ -81,15 +85,15 @@ def _median_variance(residuals: Sequence[Array]) -> float:
     return float(np.median(whole)) if len(whole) else 0.0
 
 
-def _pattern_share(residuals: Sequence[Array], calm: Sequence[BoolArray], tile_px: int) -> float | None:
-    """Return the share of the variance that repeats from frame to frame, of errors averaged over squares."""
+def _averaged(residuals: Array, tile_px: int) -> Array:
+    """Return residuals (n, tile²) averaged over squares, without the plane that is left in these."""
     squares = tile_px // _BALL_PX
-    means = [
-        _without_plane(
-            left.reshape(-1, squares, _BALL_PX, squares, _BALL_PX).mean(axis=(2, 4)).reshape(len(left), -1), squares
-        )
-        for left in residuals
-    ]
+    means = residuals.reshape(-1, squares, _BALL_PX, squares, _BALL_PX).mean(axis=(2, 4))
+    return _without_plane(means.reshape(len(residuals), -1), squares)
+
+
+def _pattern_share(means: Sequence[Array], calm: Sequence[BoolArray]) -> float | None:
+    """Return the share of the variance of averaged errors that repeats from frame to frame."""
     common, whole, count = 0.0, 0.0, 0
     for one, other in combinations(range(len(means)), 2):
         if len(means[one]) != len(means[other]):

@@ -42,6 +42,8 @@ class Sensor:
 
     The default is that of noise smoothed over 1 px, as our renderer's. `measured` has that of a scene.
     """
+    sigma_inverse: float = 0.0
+    """Standard deviation of inverse depth in 1/m of the errors of smoothed surface; `measured` has that of a scene."""
     pattern_share: float = 0.0
     """Share of the variance of errors that is fixed-pattern noise: a pixel repeats it from frame to frame.
 
@@ -57,7 +59,7 @@ class Sensor:
         if noise is None:
             return self
         share = self.pattern_share if noise.pattern_share is None else noise.pattern_share
-        return replace(self, noise_area_px=noise.area_px, pattern_share=share)
+        return replace(self, noise_area_px=noise.area_px, sigma_inverse=noise.sigma_inverse, pattern_share=share)
 
     def refocused(self, view: RayImage, log_factor: float) -> RayImage:
         """Return a view as it is under another focal length: x and y of every point shrink as it grows.
@@ -128,6 +130,7 @@ class Sensor:
             layers={"cells": cells, "variance_m2": variance_m2},
             sharing=sharing,
             error_area_px=area_px,
+            range_noise_m=self.sigma_inverse * float(np.median(points_m[:, 2])) ** 2 if len(points_m) else 0.0,
             pattern_share=self.pattern_share,
         )
 

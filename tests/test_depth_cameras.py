@@ -1,5 +1,7 @@
 """The depth cameras of the study by camera, against what they are said to be, and the study itself."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from calibration.by_camera import CameraStudy, Trial, equal_volume, main, summary, text
 from calibration.depth_cameras import CAMERAS, TimeOfFlight, World
 from calibration.specimens import Specimen
+from loops import cameras
 
 from modeler.range_noise import range_noise
 from modeler.types import Frame
@@ -85,3 +88,26 @@ def test_the_study_by_camera_runs_and_repeats_itself(tmp_path: Path, capsys: pyt
     with pytest.raises(SystemExit):
         main(["--frames", "1", "--out", str(tmp_path)])
     assert "no pair is left" in capsys.readouterr().err
+
+
+def test_whole_runs_of_a_camera_are_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = cameras.run("independent pixels", "figurine", seed=0, frames=3, step_deg=24.0)
+    assert (found.placed, found.wrong) == (3, False)
+    assert found.error_deg < 1.0
+    assert found.f_score > 0.95
+    assert 0.0 < abs(found.given - 1.0) < 0.1
+    table = cameras.summary([replace(found, status=3), replace(found, wrong=True, status=0)])
+    assert table.splitlines()[1].split()[2:8] == ["2", "6", "0", "1", "1", "0"]
+    shown = [
+        "--shapes",
+        "figurine",
+        "--frames",
+        "2",
+        "--cameras",
+        "D435",
+        "--out",
+        str(tmp_path / "runs" / "found.json"),
+    ]
+    assert cameras.main(shown) == 0
+    assert "D435" in capsys.readouterr().out
+    assert len(json.loads((tmp_path / "runs" / "found.json").read_text())) == 1

@@ -112,10 +112,10 @@ TRUTH = {k: se3.inverse(spin([0.0, 2.0 * np.pi * k / COUNT, 0.0])) for k in rang
 PAIRS = [(k - step, k) for step in (1, 2, 3) for k in range(step, COUNT)] + [(0, COUNT - 1), (0, COUNT - 2)]
 
 
-def _graph(rng: np.random.Generator, share: float, common: float = 0.0) -> PoseGraph:
+def _graph(rng: np.random.Generator, share: float, common: float = 0.0, distance_sigma: float = 0.0) -> PoseGraph:
     """Every frame has a noise of its own, in all its edges, and every edge another; shares of WHOLE, ends counted.
 
-    Beside that all frames err alike, by a share of WHOLE.
+    Beside that all frames err alike, by a share of WHOLE, and in the distance of the object.
     """
 
     def noise(variance: float) -> Array:
@@ -123,7 +123,7 @@ def _graph(rng: np.random.Generator, share: float, common: float = 0.0) -> PoseG
 
     seen = {k: pose @ se3.exp(noise(0.5 * share)) for k, pose in TRUTH.items()}
     rest = [se3.exp(noise(1.0 - share)) for _ in PAIRS]
-    alike = se3.exp(noise(common))
+    alike = se3.exp(noise(common)) @ se3.translation(distance_sigma * rng.normal() * OBJECT_M)
     edges = []
     for (target, source), own in zip(PAIRS, rest, strict=True):
         mean = se3.inverse(seen[target] @ alike) @ seen[source] @ alike @ own
@@ -161,6 +161,17 @@ def test_poses_and_motions_are_calibrated_where_all_views_err_alike(share: float
         assert mean == pytest.approx(6.0, abs=TOLERANCE)
     poses, _, far = _mean_nees(share, lambda graph: solve(graph, {}, shared=share), common=common)
     assert min(poses, far) > 6.0 + 2.0 * TOLERANCE
+
+
+def test_a_biased_distance_of_all_views_is_part_of_the_covariances() -> None:
+    sigma = 0.01
+    shift = sigma**2 * np.outer(OBJECT_M, OBJECT_M)
+    values = []
+    for seed in range(100):
+        solution = solve(_graph(np.random.default_rng(seed), 0.0, 0.0, sigma), {}, common_shift=shift)
+        k = 1 + seed % (COUNT - 1)
+        values.append(nees(PoseGaussian(solution.trajectory[k], solution.covariances[k]), TRUTH[k]))
+    assert np.mean(values) == pytest.approx(6.0, abs=TOLERANCE)
 
 
 def test_no_loop_tells_what_all_views_err_by() -> None:

@@ -122,8 +122,8 @@ class Oracle(AbstractRegistrar):
 
 
 def modeler(**changes: object) -> Modeler:
-    parts: dict[str, object] = {"prior": AnyPrior(), "registrar": Oracle(), "closer": Closer(), "seed": 0} | changes
-    return Modeler(segmenter=Segmenter(), sensor=Sensor(), fuser=Fuser(voxel_m=0.01), **parts)  # pyright: ignore[reportArgumentType]
+    parts: dict[str, object] = {"prior": AnyPrior(), "registrar": Oracle(), "closer": Closer(), "sensor": Sensor()}
+    return Modeler(segmenter=Segmenter(), fuser=Fuser(voxel_m=0.01), **(parts | changes))  # pyright: ignore[reportArgumentType]
 
 
 def run(frames: list[Frame] = FRAMES, **changes: object) -> list[Step]:
@@ -295,6 +295,19 @@ def test_covariances_account_for_the_noise_of_a_frame_in_all_its_edges() -> None
         found, wanted = (solution.covariances[frame] for solution in (last.solution, shared))
         np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-10)
         assert not np.allclose(found, alone.covariances[frame], rtol=1e-2)
+
+
+def test_covariances_include_a_bias_of_all_distances_unless_the_focal_length_is_exact() -> None:
+    noisy = {"registrar": Oracle(noise=0.3), "sensor": Sensor(sigma_focal=0.02)}
+    last, without = (run(**noisy, common_distance=sigma)[-1] for sigma in (0.01, 0.0))
+    shift_m = 0.01 * np.mean([view.centroid_m for view in last.views.values()], axis=0)
+    for frame in range(1, 9):
+        left = np.eye(6) - se3.adjoint(last.solution.relative(frame, 0))
+        wider = last.solution.relative_covariance(0, frame) - without.solution.relative_covariance(0, frame)
+        moved = left @ np.append(np.zeros(3), shift_m)
+        np.testing.assert_allclose(wider, np.outer(moved, moved), atol=1e-10)
+    exact = [run(registrar=Oracle(noise=0.3), common_distance=sigma)[-1].solution for sigma in (0.01, 0.0)]
+    np.testing.assert_array_equal(exact[0].covariances[4], exact[1].covariances[4])
 
 
 def test_the_first_good_view_makes_the_object_frame() -> None:

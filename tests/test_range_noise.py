@@ -1,11 +1,16 @@
-"""Over how many pixels a depth camera errs alike, from what surrounds the object."""
+"""Noise statistics of a depth camera, from what surrounds the object."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import tabletop
 from scipy.ndimage import gaussian_filter
 
+from modeler import se3
 from modeler.range_noise import range_noise
 from modeler.rays import Sensor
+from modeler.registration import VisibilityLikelihood
 from modeler.segmentation import Segmenter
 from modeler.types import Camera, Frame
 
@@ -35,6 +40,10 @@ def test_the_correlated_area_is_found_whatever_the_strength(sigma_inverse: float
     assert noise is not None
     # Of a Gaussian mean of width s the autocorrelation is one of width √2 s. Wide errors pass for the plane's in part.
     assert noise.area_px == pytest.approx(max(4.0 * np.pi * width_px**2, 1.0), rel=0.1 if width_px < 3.0 else 0.35)
+    # Averaged over 6 × 6 px: the variance of independent errors falls to a 36th, that of wide ones hardly.
+    lags = np.abs(np.subtract.outer(np.arange(6), np.arange(6)))
+    correlation = np.exp(-((lags / (2.0 * width_px)) ** 2)) if width_px else np.eye(6)
+    assert noise.sigma_inverse == pytest.approx(sigma_inverse * correlation.mean(), rel=0.1)
 
 
 def test_edges_and_the_object_do_not_count() -> None:
@@ -74,7 +83,11 @@ def test_a_scene_tells_the_sensor() -> None:
     assert noise is not None
     assert noise.pattern_share is not None
     assert Sensor(0.001, 0.0007).measured(noise) == Sensor(
-        0.001, 0.0007, noise_area_px=noise.area_px, pattern_share=noise.pattern_share
+        0.001,
+        0.0007,
+        noise_area_px=noise.area_px,
+        sigma_inverse=noise.sigma_inverse,
+        pattern_share=noise.pattern_share,
     )
     assert Sensor().measured(noise._replace(pattern_share=None)).pattern_share == Sensor().pattern_share
     assert Sensor().measured(Segmenter().scene([]).range_noise) == Sensor()
@@ -88,3 +101,24 @@ def test_the_more_pixels_err_alike_the_fewer_patches_a_view_has() -> None:
     # Three correlated areas each beside the ball: method.md, eq. 23.
     sharing = [view.sharing for view in views]
     assert (sharing[2] - sharing[1]) / (sharing[1] - sharing[0]) == pytest.approx(10.0, rel=1e-6)
+
+
+def test_views_of_a_noisy_camera_overlap_where_they_fit() -> None:
+    sigma_m, width_px = 0.003, 3.0
+    poses = tabletop.turntable(24)[:2]
+    shared = {}
+    for told in (0.0, sigma_m / 0.76**2):
+        sensor = Sensor(0.001, 0.001, noise_area_px=4.0 * np.pi * width_px**2, sigma_inverse=told)
+        views = []
+        for index, pose in enumerate(poses):
+            frame = tabletop.view(tabletop.BRICK, pose, index).frame
+            noise = gaussian_filter(np.random.default_rng(index).normal(size=frame.depth_m.shape), width_px)
+            depth_m = (frame.depth_m + sigma_m * noise / noise.std()).astype(np.float32)
+            views.append(sensor.ray_image(replace(frame, depth_m=depth_m, colour=None)))
+        assert views[0].range_noise_m == pytest.approx(sigma_m if told else 0.0, rel=0.05)
+        pair = VisibilityLikelihood().between(views[1], views[0], np.random.default_rng(0))
+        truth = poses[0] @ se3.inverse(poses[1])
+        shared[told] = pair.overlap(truth), pair.overlap(se3.translation(np.array([0.0, 0.0, 0.03])) @ truth)
+    (untold, _), (told_right, told_wrong) = shared.values()
+    assert untold < 0.5 < told_right
+    assert told_wrong < 0.5

@@ -8,7 +8,8 @@ several edges of a frame make it no smaller than the images allow, and along a c
 
 All views may also have a common error: one camera sees one object from one height, and its distance may be biased.
 Every frame then appears at T_k exp(β), with one β ~ N(0, B) in camera coordinates (eq. G10). All loops still close, and
-β is not observable; it cancels between frames that see the same side of the object.
+β is not observable; it cancels between frames that see the same side of the object. It includes a shift of all measured
+surface, as by a biased distance.
 
 The error of the focal length moves all edges together; each motion's covariance grows by its derivative (eq. G14).
 """
@@ -44,6 +45,8 @@ class SharedCovariance:
     """B, as a fraction of the harmonic mean of all edges' covariances."""
     focal: FocalLength | None = None
     """Estimate of the focal length; None: exact."""
+    common_shift: Array | None = None
+    """(3, 3) covariance in m², in camera coordinates, of a shift of the surface in all views, added to B; None: 0."""
 
     def __call__(self, target: int, source: int) -> Array:
         """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
@@ -73,7 +76,7 @@ class SharedCovariance:
             apart = self.focal.by_focal.get(source, zero) - self.focal.by_focal.get(target, zero)
             moved = self.focal.sigma * se3.adjoint(se3.inverse(self.independent.trajectory[source])) @ apart
             covariance = covariance + np.outer(moved, moved)  # eq. G14
-        if self.common:
+        if self.common or self.common_shift is not None:
             left = np.eye(6) - se3.adjoint(source_from_target)
             covariance = covariance + left @ self._common_covariance @ left.T  # eq. G10
         return 0.5 * (covariance + covariance.T)
@@ -95,8 +98,13 @@ class SharedCovariance:
     @cached_property
     def _common_covariance(self) -> Array:
         """B (6, 6)."""
-        informations = [factor.root_information.T @ factor.root_information for factor in self.factors]
-        return np.asarray(self.common * np.linalg.inv(np.mean(informations, axis=0)), dtype=np.float64)
+        covariance = np.zeros((6, 6))
+        if self.common:
+            informations = [factor.root_information.T @ factor.root_information for factor in self.factors]
+            covariance += self.common * np.linalg.inv(np.mean(informations, axis=0))
+        if self.common_shift is not None:
+            covariance[3:, 3:] += self.common_shift
+        return covariance
 
 
 def shared_noise(graph: PoseGraph, solution: Solution) -> float:

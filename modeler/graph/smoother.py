@@ -59,6 +59,8 @@ class Smoother:
     """The turntable, if any; not together with shared noise. Each solution is then a batch solution."""
     focal: FocalLength | None = None
     """Estimate of the focal length, whose uncertainty is added to the covariances; None: exact."""
+    common_shift: Array | None = None
+    """(3, 3) covariance in m² of a shift of the surface common to all views; see `SharedCovariance`. None: 0."""
     graph: PoseGraph = field(default_factory=PoseGraph)
     """The graph."""
     solution: Solution = field(default_factory=Solution)
@@ -192,9 +194,9 @@ class Smoother:
             found = before.at(trajectory, factors)
         else:
             found = RelativeCovariance(trajectory, root, factors, () if with_axis is None else with_axis.rows)
-        if not (factors and (self.shared or self.common or self.focal)):
+        if not (factors and (self.shared or self.common or self.focal or self.common_shift is not None)):
             return found
-        return SharedCovariance(found, factors, self.shared, self.common, self.focal)
+        return SharedCovariance(found, factors, self.shared, self.common, self.focal, self.common_shift)
 
     def _with_axis(
         self,
@@ -251,6 +253,7 @@ def solve(
     common: float = 0.0,
     axis: CommonAxis | None = None,
     focal: FocalLength | None = None,
+    common_shift: Array | None = None,
 ) -> Solution:
     """Optimise the poses of all frames that accepted edges connect with the first.
 
@@ -266,8 +269,10 @@ def solve(
         common: see `Smoother`.
         axis: the turntable, if any.
         focal: see `Smoother`; of a solution of the same graph.
+        common_shift: see `Smoother`.
 
     Raises:
         ValueError: if an accepted edge's covariance is not positive definite.
     """
-    return Smoother(outlier_distance, shared, common, axis, focal, solution=Solution(guess)).to(graph).solution
+    parts = outlier_distance, shared, common, axis, focal, common_shift
+    return Smoother(*parts, solution=Solution(guess)).to(graph).solution

@@ -72,6 +72,9 @@ class Modeler:
     common_noise: float = 0.1
     """Covariance of the error common to all views of a run, as a fraction of an edge's. Loops do not observe it; with
     this value, covariances of poses are calibrated over many rendered runs, whose ground truth is known."""
+    common_distance: float = 0.001
+    """Standard deviation of a bias of all distances, as a share of them, unless the focal length is exact. Loops do not
+    observe it, and a larger value does not improve the calibration for cameras other than the renderer's."""
     quick: AbstractRegistrar | None = None
     """A cheap registrar for frames in which the object is probably hidden: the full search follows only if it finds a
     match (see `quick_registrar`). None: full searches only."""
@@ -370,13 +373,15 @@ class Run:
         state, focal = self.state.with_spans(), None
         if (sigma := self.modeler.sensor.sigma_focal) > 0.0 and len(state.solution.trajectory) > 1:
             state, focal = self._with_focal_length(state, sigma)
+        distance_sigma = self.modeler.common_distance if sigma > 0.0 else 0.0
+        solved = partial(state.solved, focal=focal, distance_sigma=distance_sigma)
         axis = self.modeler.prior.shared_axis(list(state.views.values()))
         if axis is None:
             shared = shared_noise(state.graph, state.solution)
-            self.state = state.solved(axis=None, shared=shared, common=self.modeler.common_noise, focal=focal)
+            self.state = solved(axis=None, shared=shared, common=self.modeler.common_noise)
         else:
             tilt_rad, shift_m = axis.sigma_tilt_rad, axis.sigma_shift_m
-            self.state = state.solved(axis=CommonAxis(tilt_rad, shift_m, sigma_lift_m=np.inf), focal=focal)
+            self.state = solved(axis=CommonAxis(tilt_rad, shift_m, sigma_lift_m=np.inf))
 
     def _with_focal_length(self, state: State, sigma: float) -> tuple[State, FocalLength]:
         """Return a state under the focal length estimated from its loops, and the estimate.

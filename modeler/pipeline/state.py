@@ -195,9 +195,17 @@ class State:
         shared: float = 0.0,
         common: float = 0.0,
         focal: FocalLength | None = None,
+        distance_sigma: float = 0.0,
     ) -> State:
-        """Return the state solved with a common axis or shared noise, and a focal length; see `Smoother`."""
-        smoother = replace(self.smoother, axis=axis, shared=shared, common=common, focal=focal)
+        """Return the state solved with a common axis or shared noise, and a focal length; see `Smoother`.
+
+        `distance_sigma` is the standard deviation of the error of all distances, as a share of that of the surface.
+        """
+        shift = None
+        if distance_sigma > 0.0 and self.views:
+            middle_m = np.mean([view.centroid_m for view in self.views.values()], axis=0)
+            shift = distance_sigma**2 * np.outer(middle_m, middle_m)
+        smoother = replace(self.smoother, axis=axis, shared=shared, common=common, focal=focal, common_shift=shift)
         return replace(self, smoother=smoother.to(self.graph))
 
     def retries(self) -> Iterator[tuple[int, int]]:

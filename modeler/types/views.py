@@ -155,6 +155,8 @@ class RayImage:
     """Number of surface points that share the noise of a pixel, in the sensor and by smoothing."""
     error_area_px: float = 1.0
     """Integral of the autocorrelation of the errors of surface points over the image in px."""
+    range_noise_m: float = 0.0
+    """Standard deviation of these errors along the ray, as planes around the object show it; 0 = unknown."""
     pattern_share: float = 0.0
     """Share of the variance of these errors that is fixed-pattern noise: a pixel repeats it from frame to frame."""
 

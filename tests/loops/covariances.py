@@ -28,7 +28,6 @@ from modeler.export import write_atomically
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.segmentation import scene_frames
 from modeler.types import Array, Solution, Step
-from sequences import AbstractSequence
 from sequences.rendering.renderer import RenderedSequence
 from sequences.rendering.trajectory import Tabletop
 
@@ -36,7 +35,7 @@ _FAR = 5  # frames
 _KINDS = ("pose", "near", "far")
 
 
-def pushed(shape: str, seed: int, frames: int, step_deg: float) -> AbstractSequence:
+def pushed(shape: str, seed: int, frames: int, step_deg: float) -> RenderedSequence:
     """Return a rendered sequence of a shape that stands on the table as the seed has it."""
     recipe = load_specimen(shape)
     x_deg, y_deg, z_deg = recipe.rest_rotation_deg

@@ -5,17 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Final, final
+from typing import Any, Final, Protocol, final
 
 import numpy as np
 
 from modeler import se3
 from modeler.cli import compose
 from modeler.cli.advice import comes_back
-from modeler.cli.options import MethodOptions, ObjectOptions
+from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import TrueSurface, align_to_model, rotation_error_deg, surface_errors, true_motion
 from modeler.export.report import RunMeta, frame_record, report_of
 from modeler.types import Array, BoolArray, Frame, InputError, ObjectModel, Step
+from sequences import AbstractSequence
+from sequences.rendering.meshes import Mesh
 from trust.plan import Half, Plan
 from trust.stage import Recorded
 
@@ -81,6 +83,26 @@ class Outcome:
         return Outcome(**{field.name: values[field.name] for field in fields(Outcome)})
 
 
+class WithTruth(Protocol):
+    """What was recorded, and what is true of it."""
+
+    def frame(self, index: int) -> Frame:
+        """Return a frame as the user has it."""
+        ...
+
+    def true_frame(self, index: int) -> Frame:
+        """Return it without errors, with the object's mask."""
+        ...
+
+    def truth(self) -> dict[int, Array]:
+        """Return the true camera_from_model (4, 4) by frame number."""
+        ...
+
+    def model(self) -> Mesh:
+        """Return the true surface."""
+        ...
+
+
 Look = Callable[[Plan, Recorded, Step | None], None]
 
 
@@ -97,7 +119,7 @@ def outcome(plan: Plan, look: Look = lambda plan, recorded, step: None) -> Outco
     began = time.perf_counter()
     step, report = None, {}
     try:
-        step, report = _built(plan, recorded)
+        step, report = built(recorded, options, plan.seed)
     except InputError as error:
         report = {"trustworthy": False, "reason_codes": [f"refused: {error}"], "evidence": {}}
     seconds = time.perf_counter() - began
@@ -122,14 +144,13 @@ def outcome(plan: Plan, look: Look = lambda plan, recorded, step: None) -> Outco
     )
 
 
-def _built(plan: Plan, recorded: Recorded) -> tuple[Step, dict[str, Any]]:
-    """Return the last step of a run and its report.
+def built(recorded: AbstractSequence, options: PriorOptions, seed: int) -> tuple[Step, dict[str, Any]]:
+    """Build a model as `modeler build` does, without recording, and return the last step and the report.
 
     Raises:
         InputError: if the input cannot be used.
     """
-    options = recorded.stage.options
-    modeler = compose.modeler(recorded, options, MethodOptions(seed=plan.seed), ObjectOptions())
+    modeler = compose.modeler(recorded, options, MethodOptions(seed=seed), ObjectOptions())
     scene = compose.scene(modeler, recorded)
     records, last = {}, None
     for event in modeler.run(recorded, scene):
@@ -139,7 +160,7 @@ def _built(plan: Plan, recorded: Recorded) -> tuple[Step, dict[str, Any]]:
     assert last is not None
     meta = RunMeta(
         sequence=recorded.name,
-        seed=plan.seed,
+        seed=seed,
         prior=str(options.prior),
         known=modeler.prior,
         closure_expected=comes_back(recorded, modeler.prior, modeler.closer.max_angle_deg),
@@ -147,7 +168,7 @@ def _built(plan: Plan, recorded: Recorded) -> tuple[Step, dict[str, Any]]:
     return last, report_of(last, list(records.values()), meta)
 
 
-def pose_errors(recorded: Recorded, step: Step) -> tuple[float | None, float | None]:
+def pose_errors(recorded: WithTruth, step: Step) -> tuple[float | None, float | None]:
     """Return the largest errors of a run's poses relative to the first: rotation in degrees, position in m.
 
     The position is that of a frame's surface in the object: measured with the given depth scale and intrinsics,
@@ -188,7 +209,7 @@ def _centroid_m(frame: Frame, mask: BoolArray) -> Array:
 
 
 def f_score(
-    recorded: Recorded, model: ObjectModel, trajectory: Mapping[int, Array], within_m: float = MAX_M
+    recorded: WithTruth, model: ObjectModel, trajectory: Mapping[int, Array], within_m: float = MAX_M
 ) -> float | None:
     """Return the F-score at a distance of a mesh against what the frames saw of the object.
 

@@ -123,9 +123,9 @@ class DirectedLikelihood:
     pattern: FixedPattern
     """Errors common to both views."""
 
-    def classify(self, pose: Array) -> np.ndarray:
+    def classify(self, pose: Array, blur_m: float = 0.0) -> np.ndarray:
         """Return the class (n,) of each point under one pose (12,): `point_likelihood.classify`."""
-        return point_likelihood.classify(pose, self.projection(1), self.parameters(0.0))
+        return point_likelihood.classify(pose, self.projection(1), self.parameters(blur_m))
 
     def residual_excess(self, pose: Array, blur_m: float) -> tuple[float, float]:
         """Return numerator and denominator of b² in eq. 8 of method.md, sums over the matches under a pose (12,)."""
@@ -254,6 +254,11 @@ class PairLikelihood:
         return self.backward.image.centroid_m
 
     @property
+    def range_noise_m(self) -> float:
+        """Standard deviation of distances between smoothed surfaces of both views, as planes show it; 0 = unknown."""
+        return float(np.hypot(self.forward.image.range_noise_m, self.backward.image.range_noise_m))
+
+    @property
     def points(self) -> int:
         """Number of points of both views."""
         return len(self.forward.points) + len(self.backward.points)
@@ -371,10 +376,11 @@ class PairLikelihood:
 
     def overlap(self, target_from_source: Array) -> float:
         """Return the fraction of matches among the points that both cameras should see."""
+        noise_m = self.range_noise_m
         classes = np.concatenate(
             [
-                self.forward.classify(rows(target_from_source)),
-                self.backward.classify(rows(se3.inverse(target_from_source))),
+                self.forward.classify(rows(target_from_source), noise_m),
+                self.backward.classify(rows(se3.inverse(target_from_source)), noise_m),
             ]
         )
         contradicting = (
