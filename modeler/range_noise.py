@@ -28,7 +28,10 @@ class RangeNoise(NamedTuple):
     """Noise statistics of a depth camera."""
 
     area_px: float
-    """Integral of the autocorrelation of inverse depth over the image: 1 px² for independent pixels."""
+    """Integral of the autocorrelation of smooth errors of inverse depth over the image: 1 px² for independent pixels.
+
+    Errors that averaging removes, such as the steps of a disparity, do not count beside smooth ones.
+    """
     sigma_inverse: float = 0.0
     """Standard deviation of inverse depth in 1/m of errors averaged as smoothing does."""
     pattern_share: float | None = None
@@ -51,9 +54,14 @@ def range_noise(looks: Sequence[tuple[Frame, BoolArray]]) -> RangeNoise | None:
         if sum(np.count_nonzero(kept) for kept in calm) < _MIN_TILES or limit == 0.0:
             continue
         noise = np.concatenate([left[kept] for left, kept in zip(residuals, calm, strict=True)])
-        area_px = _correlated_area(noise.reshape(-1, tile_px, tile_px))
         smoothed = [_averaged(left, tile_px) for left in residuals]
-        sigma = float(np.sqrt(np.mean(np.concatenate([s[kept] for s, kept in zip(smoothed, calm, strict=True)]) ** 2)))
+        averages = np.concatenate([left[kept] for left, kept in zip(smoothed, calm, strict=True)])
+        sigma = float(np.sqrt(np.mean(averages**2)))
+        if sigma == 0.0:
+            continue
+        # Averaging changes the variance, but not the integral of the autocovariance.
+        integral_px = float(np.mean(noise**2)) * _correlated_area(noise.reshape(-1, tile_px, tile_px))
+        area_px = _area_before_averaging(integral_px / sigma**2)
         return RangeNoise(area_px, sigma, _pattern_share(smoothed, calm))
     return None
 
@@ -104,6 +112,27 @@ def _pattern_share(means: Sequence[Array], calm: Sequence[BoolArray]) -> float |
         whole += 0.5 * float(np.sum(a**2) + np.sum(b**2))
         count += int(np.count_nonzero(both))
     return float(np.clip(common / whole, 0.0, 1.0)) if count >= _MIN_TILES and whole > 0.0 else None
+
+
+def _area_before_averaging(averaged_px: float) -> float:
+    """Return the correlated area in px of errors whose averages over squares have the given one.
+
+    The errors are taken for smooth: their autocorrelation is a Gaussian of some width. What averaging removes, such as
+    the steps of a disparity, does not count.
+    """
+    low, high = 0.1, float(_TILES_PX[0])
+    for _ in range(30):  # bisection
+        width = 0.5 * (low + high)
+        low, high = (width, high) if _gaussian_areas(width)[1] < averaged_px else (low, width)
+    return _gaussian_areas(low)[0]
+
+
+def _gaussian_areas(width_px: float) -> tuple[float, float]:
+    """Return the correlated areas in px of errors of Gaussian autocorrelation, and of their averages over squares."""
+    lags = np.arange(-6 * _TILES_PX[0], 6 * _TILES_PX[0] + 1)
+    correlation = np.exp(-0.5 * (lags / width_px) ** 2)
+    pairs = np.maximum(_BALL_PX - np.abs(lags), 0)
+    return float(np.sum(correlation)) ** 2, float(np.sum(correlation) / np.sum(pairs * correlation) * _BALL_PX**2) ** 2
 
 
 def _correlated_area(noise: Array) -> float:

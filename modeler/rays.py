@@ -12,7 +12,7 @@ from modeler.range_noise import RangeNoise
 from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
 from modeler.types import COLOUR_SHIFT_PX, BoolArray, Frame, Plane, RayImage
 
-_ALIKE = 3.0  # areas of correlated noise that err alike: measured, see method.md
+_ALIKE = 2.0  # areas of correlated noise that err alike: measured, see method.md
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,11 @@ from slow import sampled
 from modeler import se3
 from modeler.graph import PoseGraph, Smoother, shared_noise, solve
 from modeler.graph.covariance import chi_square_quantile
-from modeler.types import Array, Edge, PoseGaussian, Solution
+from modeler.types import Array, Camera, Edge, Frame, PoseGaussian, RayImage, Solution
+from modeler.verdict.evidence import spread_of_positions
 
 SEEDS = 120
+CAMERA = Camera(1, 1, 1.0, 1.0, 0.0, 0.0)
 
 
 def _assert_chi2(values: np.ndarray) -> None:
@@ -172,6 +174,19 @@ def test_a_biased_distance_of_all_views_is_part_of_the_covariances() -> None:
         k = 1 + seed % (COUNT - 1)
         values.append(nees(PoseGaussian(solution.trajectory[k], solution.covariances[k]), TRUTH[k]))
     assert np.mean(values) == pytest.approx(6.0, abs=TOLERANCE)
+
+
+def test_a_biased_distance_of_all_views_does_not_speak_against_a_model() -> None:
+    graph = _graph(np.random.default_rng(0), 0.0)
+    shift = 0.1**2 * np.outer(OBJECT_M, OBJECT_M)
+    alone, shifted = solve(graph, {}), solve(graph, {}, common_shift=shift)
+    seen = RayImage(Frame(0, 0.0, np.zeros((1, 1), np.float32), CAMERA), None, 0.0, 0.0, OBJECT_M[None], OBJECT_M[None],
+                    np.zeros((1, 2), np.int64))  # fmt: skip
+    spreads = [spread_of_positions(dict.fromkeys(TRUTH, seen), solution) for solution in (alone, shifted)]
+    assert spreads[0] is not None
+    assert spreads[1] is not None
+    assert spreads[1].figure.value == pytest.approx(spreads[0].figure.value, rel=1e-6)
+    assert np.trace(shifted.covariances[COUNT // 2][3:, 3:]) > 2.0 * np.trace(alone.covariances[COUNT // 2][3:, 3:])
 
 
 def test_no_loop_tells_what_all_views_err_by() -> None:

@@ -156,6 +156,7 @@ class Smoother:
             edge_poses={(factor.source, factor.target): factor.pose for factor in several},
             mode_weights={(factor.source, factor.target): _weights(factor, state.weights) for factor in several},
             focal=self.focal,
+            common_shift=self.common_shift,
             camera_from_axis=None if with_axis is None else with_axis.camera_from_axis,
         )
 

@@ -109,6 +109,9 @@ class Solution:
     """Weights (m,) of the modes of a multimodal edge, given all edges together, by (source, target)."""
     focal: FocalLength | None = None
     """Estimate of the focal length, whose uncertainty is part of the covariances; None: exact."""
+    common_shift: Array | None = None
+    """(3, 3) covariance in m² of a shift of the surface in all views, part of the covariances; None: 0. It moves poses
+    relative to the camera, but does not deform the model."""
     camera_from_axis: Array | None = None
     """(4, 4), whose third direction is the axis of all steps; None if none was estimated, or it does not fit."""
 

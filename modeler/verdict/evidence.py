@@ -280,17 +280,27 @@ def spread_of_rotations(solution: Solution, factor: float = 1.0) -> Spread | Non
 def spread_of_positions(views: Mapping[int, RayImage], solution: Solution, factor: float = 1.0) -> Spread | None:
     """Return the largest uncertainty of the surface's position in a pose, in m; None without a pose.
 
+    A shift of the surface in all views is not included, because it does not deform the model.
+
     Args:
         views: by frame number; the position is that of a view's centroid.
         solution: the poses.
         factor: on the standard deviations: `misfit`.
     """
-    sigmas_m = {
-        frame: one_axis_sd(factor**2 * se3.covariance_about(covariance, views[frame].centroid_m)[3:, 3:], WRONG_M)
-        for frame, covariance in solution.covariances.items()
-        if frame in views and len(views[frame].points_m)
-    }
+    sigmas_m = {}
+    for frame, covariance in solution.covariances.items():
+        if frame in views and len(views[frame].points_m):
+            of_place = se3.covariance_about(covariance, views[frame].centroid_m)[3:, 3:]
+            sigmas_m[frame] = one_axis_sd(factor**2 * (of_place - _of_common_shift(solution, frame)), WRONG_M)
     return _widest(sigmas_m, WRONG_M)
+
+
+def _of_common_shift(solution: Solution, frame: int) -> Array:
+    """Return the covariance (3, 3) in m² of a frame's position due to a shift in all views (method.md, eq. G10)."""
+    if solution.common_shift is None:
+        return np.zeros((3, 3))
+    left = np.eye(3) - solution.trajectory[frame][:3, :3].T  # the first frame's pose is the identity
+    return np.asarray(left @ solution.common_shift @ left.T, dtype=np.float64)
 
 
 def spread_by_focal_length(views: Mapping[int, RayImage], solution: Solution, frame: int) -> tuple[float, float]:

@@ -87,8 +87,8 @@ class CameraStudy:
         """Yield what every method makes of the pairs of one shape with every camera."""
         specimen = self.specimens[number]
         recipe = load_specimen(specimen.recipe)
-        for place, name in enumerate(self.cameras):
-            camera = CAMERAS.get(name)
+        for name in self.cameras:
+            camera, place = CAMERAS.get(name), (_RENDERER, *CAMERAS).index(name)
             seed = int(np.random.SeedSequence([self.seed, recipe.seed, place]).generate_state(1)[0])
             rng = np.random.default_rng(seed)
             distances = (0.6, 0.8, 1.1) if camera is None else camera.distances_m

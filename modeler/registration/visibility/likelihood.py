@@ -376,13 +376,10 @@ class PairLikelihood:
 
     def overlap(self, target_from_source: Array) -> float:
         """Return the fraction of matches among the points that both cameras should see."""
-        noise_m = self.range_noise_m
-        classes = np.concatenate(
-            [
-                self.forward.classify(rows(target_from_source), noise_m),
-                self.backward.classify(rows(se3.inverse(target_from_source)), noise_m),
-            ]
-        )
+        # Within one standard deviation of the noise are two thirds under the true pose, and fewer under wrong ones.
+        noise_m = self.range_noise_m / point_likelihood.LOOSE_SIGMAS
+        forward = self.forward.classify(rows(target_from_source), noise_m)
+        classes = np.append(forward, self.backward.classify(rows(se3.inverse(target_from_source)), noise_m))
         contradicting = (
             point_likelihood.BEHIND,
             point_likelihood.IN_FRONT,
