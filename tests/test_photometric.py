@@ -119,14 +119,15 @@ def test_few_spots_are_limited_and_prints_are_not(rng):
     np.testing.assert_allclose(print_, want, atol=0.02)
 
 
-def test_curvatures_are_those_of_the_likelihood(printed):
+@pytest.mark.parametrize("seed", range(3))
+def test_curvatures_are_those_of_the_likelihood(printed, seed: int):
     """Averaged over their axes: poses by one standard deviation from the true one are half a nat worse.
 
     Along a single axis it is 0.1 to 1.4 of that, depending on the points. They are of squared distances and differences
     of features, without what the fixed pattern takes off them.
     """
     views = [replace(view, pattern_share=0.0) for view in printed[0]]
-    pair = VisibilityLikelihood().between(views[0], views[1], np.random.default_rng(0))
+    pair = VisibilityLikelihood().between(views[0], views[1], np.random.default_rng(seed))
     fine_m = 0.015 * pair.size_m
     best = printed[1]
     noise_m = pair.surface_noise_m(best, fine_m)

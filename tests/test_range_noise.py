@@ -111,7 +111,7 @@ def test_the_more_pixels_err_alike_the_fewer_patches_a_view_has() -> None:
     views = [Sensor(0.001, 0.0007, noise_area_px=area_px).ray_image(frame) for area_px in (1.0, 10.0, 100.0)]
     counts = [view.patches for view in views]
     assert counts[0] > counts[1] > counts[2]
-    # Three correlated areas each beside the ball: method.md, eq. 23.
+    # Two correlated areas each beside the ball: method.md, eq. 23.
     sharing = [view.sharing for view in views]
     assert (sharing[2] - sharing[1]) / (sharing[1] - sharing[0]) == pytest.approx(10.0, rel=1e-6)
 

@@ -217,7 +217,7 @@ class Run:
             InputError: if two frames have the same number.
         """
         with prefetching(partial(self.modeler.prepare, scene=self.scene)) as preparing:
-            for preparation, _ in _with_last(map(preparing, frames)):
+            for preparation, _ in _with_last(map(preparing, frames)):  # reads one ahead, which is prepared meanwhile
                 prepared = preparation()
                 self.state = self.state.inserted(prepared)
                 tracker = self.modeler.tracker(self.state)

@@ -299,7 +299,7 @@ def _of_common_shift(solution: Solution, frame: int) -> Array:
     """Return the covariance (3, 3) in m² of a frame's position due to a shift in all views (method.md, eq. G10)."""
     if solution.common_shift is None:
         return np.zeros((3, 3))
-    left = np.eye(3) - solution.trajectory[frame][:3, :3].T  # the first frame's pose is the identity
+    left = np.eye(3) - solution.trajectory[frame][:3, :3].T  # the pose of the graph's root is the identity
     return np.asarray(left @ solution.common_shift @ left.T, dtype=np.float64)
 
 

@@ -102,7 +102,7 @@ class CameraStudy:
             blank = Trial(name, "true", specimen.symmetry, specimen.recipe, condition.distance_m, condition.step_deg,
                           "", "")  # fmt: skip
             for stated, factor in (("true", 1.0), ("nominal", error)):
-                views = viewed([replace(frame, camera=_refocused(frame.camera, factor)) for frame in frames], stated)
+                views = viewed([replace(frame, camera=refocused(frame.camera, factor)) for frame in frames], stated)
                 for target, source in pairwise(views):
                     motion = true_motion(truth, target.index, source.index)
                     yield from _pair(replace(blank, stated=stated), source, target, motion, seed)
@@ -112,16 +112,20 @@ def shown(sequence: RenderedSequence, camera: DepthCamera | None, rng: np.random
     """Return the frames of a sequence as a camera sees it, None for the renderer's own, masked by the truth."""
     if camera is None:
         return [sequence.frame(index) for index in sequence.indices]
-    recipe = sequence.recipe
-    around = surroundings(recipe)
-    beside = placed(around.vertices_m, around.triangles, recipe.view.camera_from_table())
-    thing = recipe.object.mesh()
     found = []
-    for index, camera_from_model in sequence.truth().items():
-        world = World(placed(thing.vertices_m, thing.triangles, camera_from_model), beside)
+    for index in sequence.truth():
+        world = world_of(sequence, index)
         depth_m = camera.measure(world, rng, seed).astype(np.float32)
         found.append(Frame(index, float(index), depth_m, camera.camera, camera.look(world).on_object))
     return found
+
+
+def world_of(sequence: RenderedSequence, index: int) -> World:
+    """Return what is before the camera at a frame."""
+    recipe = sequence.recipe
+    thing, around = recipe.object.mesh(), surroundings(recipe)
+    beside = placed(around.vertices_m, around.triangles, recipe.view.camera_from_table())
+    return World(placed(thing.vertices_m, thing.triangles, sequence.truth()[index]), beside)
 
 
 def viewed(frames: Sequence[Frame], stated: str) -> list[RayImage]:
@@ -132,7 +136,8 @@ def viewed(frames: Sequence[Frame], stated: str) -> list[RayImage]:
     return [sensor.ray_image(frame, segmenter.segment(frame, scene).plane) for frame in frames]
 
 
-def _refocused(camera: Camera, factor: float) -> Camera:
+def refocused(camera: Camera, factor: float) -> Camera:
+    """Return intrinsics with focal lengths multiplied by a factor."""
     return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 

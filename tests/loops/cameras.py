@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Final, final
 
 import numpy as np
-from calibration.by_camera import NOMINAL, chosen
-from calibration.depth_cameras import CAMERAS, DepthCamera, World, placed
+from calibration.by_camera import NOMINAL, chosen, refocused, shown, world_of
+from calibration.depth_cameras import CAMERAS, DepthCamera
 from scipy import stats
 from trust.study import MAX_DEG, MAX_M, MIN_F, built, f_score, pose_errors
 
@@ -30,7 +30,7 @@ from modeler.export import write_atomically
 from modeler.types import Array, Frame
 from sequences import AbstractSequence
 from sequences.rendering.meshes import Mesh
-from sequences.rendering.renderer import RenderedSequence, surroundings
+from sequences.rendering.renderer import RenderedSequence
 
 _RADIUS: Final = float(stats.chi2(6).ppf(0.95))
 _ENDS: Final = ((False, 0), (False, 3), (True, 0), (True, 3))
@@ -67,8 +67,7 @@ class Filmed(AbstractSequence):
 
     def true_frame(self, index: int) -> Frame:
         """Return a frame without errors of depth and focal length, with the object's mask."""
-        world = self._world(index)
-        seen = self.camera.look(world)
+        seen = self.camera.look(world_of(self.rendered, index))
         depth_m = np.where(np.isfinite(seen.depth_m), seen.depth_m, np.nan).astype(np.float32)
         return Frame(index, float(index), depth_m, self.camera.camera, seen.on_object)
 
@@ -90,23 +89,17 @@ class Filmed(AbstractSequence):
 
     @cached_property
     def _given(self) -> dict[int, Frame]:
-        rng = np.random.default_rng([self.seed, 2])
-        true = self.camera.camera
-        camera = replace(true, fx=true.fx * self.focal_factor, fy=true.fy * self.focal_factor)
-        given = {}
-        for index in self.indices:
-            frame = self.true_frame(index)
-            if not self.exact:
-                depth_m = self.camera.measure(self._world(index), rng, self.seed).astype(np.float32)
-                frame = replace(frame, depth_m=np.where(depth_m > 0.0, depth_m, np.nan))
-            given[index] = replace(frame, camera=camera, mask=None)
-        return given
-
-    def _world(self, index: int) -> World:
-        recipe, thing = self.rendered.recipe, self.rendered.recipe.object.mesh()
-        around = surroundings(recipe)
-        beside = placed(around.vertices_m, around.triangles, recipe.view.camera_from_table())
-        return World(placed(thing.vertices_m, thing.triangles, self.truth()[index]), beside)
+        if self.exact:
+            frames = [self.true_frame(index) for index in self.indices]
+        else:
+            frames = shown(self.rendered, self.camera, np.random.default_rng([self.seed, 2]), self.seed)
+        camera = refocused(self.camera.camera, self.focal_factor)
+        return {
+            frame.index: replace(
+                frame, depth_m=np.where(frame.depth_m > 0.0, frame.depth_m, np.nan), camera=camera, mask=None
+            )
+            for frame in frames
+        }
 
 
 @final
