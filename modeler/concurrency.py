@@ -3,13 +3,37 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TypeVar
 
 S = TypeVar("S")
 T = TypeVar("T")
+
+_NO_TIME_S = 0.01
+
+
+@dataclass
+class Pace:
+    """Limits repeated work to a share of the time."""
+
+    share: float = 0.1
+    """At most this share of the time is spent."""
+    resting_until_s: float = 0.0
+    """By `time.monotonic`."""
+
+    @property
+    def rests(self) -> bool:
+        """Whether it is too early to do it again."""
+        return time.monotonic() < self.resting_until_s
+
+    def took(self, seconds: float) -> None:
+        """Record that it was done and its duration; fast work is always allowed."""
+        if seconds > _NO_TIME_S:
+            self.resting_until_s = time.monotonic() + (1.0 / self.share - 1.0) * seconds
 
 
 def is_parallel() -> bool:
@@ -40,7 +64,7 @@ def parallel_map(function: Callable[[S], T], items: Iterable[S]) -> Generator[T,
 
 @contextmanager
 def in_background(
-    consume: Callable[[T], None], may_drop: Callable[[T], bool] = lambda item: False
+    consume: Callable[[T], None], may_drop: Callable[[T], bool] = lambda item: False, share: float = 1.0
 ) -> Iterator[Callable[[T], None]]:
     """Return a function that passes an item to another thread, after waiting until the one before is consumed.
 
@@ -49,19 +73,28 @@ def in_background(
     Args:
         consume: what is done with an item.
         may_drop: whether an item may be dropped instead of waiting.
+        share: of the time that consuming takes at most, as long as items may be dropped. Threads take turns in running
+            Python, so that it delays what runs beside it.
     """
+    pace = Pace(share)
+
+    def timed(item: T) -> None:
+        began_s = time.monotonic()
+        consume(item)
+        pace.took(time.monotonic() - began_s)
+
     if not is_parallel():
-        yield consume
+        yield lambda item: None if pace.rests and may_drop(item) else timed(item)
         return
     with ThreadPoolExecutor(1, thread_name_prefix="background") as thread:
         consumed = thread.submit(lambda: None)
 
         def put(item: T) -> None:
             nonlocal consumed
-            if not consumed.done() and may_drop(item):
+            if (pace.rests or not consumed.done()) and may_drop(item):
                 return
             consumed.result()
-            consumed = thread.submit(consume, item)
+            consumed = thread.submit(timed, item)
 
         yield put
         consumed.result()

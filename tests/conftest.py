@@ -18,8 +18,8 @@ from commanded import QUICK, Run, runner
 from recordings import small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
 from turning_box import COUNT, LOST, steps
 
+from modeler import concurrency
 from modeler.cli import main
-from modeler.export import run_folder
 from modeler.types import Frame, Step
 from sequences import bundled, write_bop
 
@@ -32,8 +32,8 @@ def rng():
 
 @pytest.fixture(autouse=True)
 def no_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have reports written after every step, however slow the disk is."""
-    monkeypatch.setattr(run_folder, "_NO_TIME_S", np.inf)
+    """Have reports written and live steps drawn every time, however slow disk and processor are."""
+    monkeypatch.setattr(concurrency, "_NO_TIME_S", np.inf)
 
 
 @pytest.fixture

@@ -1,9 +1,11 @@
 """Concurrent work gives the same results in the same order, whatever the number of threads."""
 
 import threading
+import time
 
 import pytest
 
+from modeler import concurrency
 from modeler.concurrency import in_background, in_parallel, parallel_map, prefetching
 
 
@@ -54,6 +56,24 @@ def test_an_item_that_may_be_dropped_is_not_waited_for(threads: int) -> None:
         go.set()
         put(3)
     assert used == ([0, 1, 2, 3] if threads == 1 else [0, 3])
+
+
+def test_items_that_may_be_dropped_take_a_share_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
+    monkeypatch.setattr(concurrency, "_NO_TIME_S", 0.0)
+    now_s, used = 0.0, list[int]()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+
+    def use(item: int) -> None:
+        nonlocal now_s
+        now_s += 1.0
+        used.append(item)
+
+    with in_background(use, lambda item: item != 20, share=0.25) as put:
+        for item in range(21):
+            put(item)
+            now_s += 0.5
+    assert used == [0, 6, 12, 18, 20]  # a second in four, and the last
 
 
 @pytest.mark.usefixtures("threads")

@@ -17,11 +17,11 @@ from commanded import Run, runner
 from fuzz.special import replace_by
 from made_up import META, made_up_steps
 
+from modeler import concurrency
 from modeler.export import (
     RunFolder,
     RunMeta,
     report_of,
-    run_folder,
     write_atomically,
 )
 from modeler.types import (
@@ -135,7 +135,7 @@ def test_run_has_finished_when_its_registrations_are_forgotten(tmp_path: Path) -
 def test_a_folder_that_takes_long_to_write_is_written_less_often(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_folder, "_NO_TIME_S", 0.01)
+    monkeypatch.setattr(concurrency, "_NO_TIME_S", 0.01)
     now_s, written = 0.0, []
     run, steps = RunFolder.open(tmp_path), made_up_steps(40)
 
@@ -145,7 +145,7 @@ def test_a_folder_that_takes_long_to_write_is_written_less_often(
         written.append(step.frame.index)
         return report_of(step, frames, meta)
 
-    monkeypatch.setattr("modeler.export.run_folder.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("modeler.concurrency.time.monotonic", lambda: now_s)
     monkeypatch.setattr("modeler.export.run_folder.report_of", slow)
     report = run.newest
     for step in steps:

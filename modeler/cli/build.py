@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     from modeler.types import AbstractPrior, Event, Frame
     from sequences import AbstractSequence
 
+DRAWING_SHARE = 0.25
+"""Of the time of a live run: drawing a step takes about as long as registering one, and so it delays a step by a
+quarter at most."""
+
 
 @dataclass(frozen=True)
 class Build:
@@ -227,7 +231,7 @@ def _run(
     try:
         with (
             # A live run does not wait for the drawing; the last step draws all poses and the model.
-            in_background(stream, lambda step: frames.live and not step.last) as draw,
+            in_background(stream, lambda step: frames.live and not step.last, share=DRAWING_SHARE) as draw,
             Interrupt() as interrupt,
             Console(len(frames), stream.address, modeler.prior) as console,
             advising(modeler, console.advise, stream.advise) as advise,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from modeler.concurrency import Pace
 from modeler.export.files import PART, settle, settle_soon, write_atomically
 from modeler.export.formats import cloud_ply, g2o_text, mesh_ply, tum_text
 from modeler.export.pairs import Pairs
@@ -23,25 +24,6 @@ _OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "g
 """The report, without which nothing is resumed, goes first."""
 PAGE = "report.html"
 """Page of `modeler report`; removed together with the run."""
-_NO_TIME_S = 0.01
-
-
-@dataclass
-class Pace:
-    """Limits repeated work of growing cost to a tenth of the time."""
-
-    resting_until_s: float = 0.0
-    """By `time.monotonic`."""
-
-    @property
-    def rests(self) -> bool:
-        """Whether it is too early to do it again."""
-        return time.monotonic() < self.resting_until_s
-
-    def took(self, seconds: float) -> None:
-        """Record that it was done and its duration; fast work is always allowed."""
-        if seconds > _NO_TIME_S:
-            self.resting_until_s = time.monotonic() + 9.0 * seconds
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Follow an object that a person turns before a camera of 30 Hz, in real time: `PYTHONPATH=tests python -m live`.
 
 Rendered frames (320 × 240 px, masks of object and hand, a full turn at 60° a second, prior `velocity`) are handed out
-one every 33 ms, as a camera does, and recorded as by `modeler build`. The status is 1 if a frame is lost.
+one every 33 ms, as a camera does, and recorded and written as by `modeler build`. The status is 1 if a frame is lost.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ from trust.stage import Recorded
 
 from modeler import se3
 from modeler.cli import compose
+from modeler.cli.build import DRAWING_SHARE
 from modeler.cli.options import MethodOptions, ObjectOptions
 from modeler.concurrency import in_background
 from modeler.evaluation import rotation_error_deg, true_motion
+from modeler.export import RunFolder, RunMeta
 from modeler.pipeline import NewestFrames
 from modeler.types import Frame, Step
 from sequences.rendering.trajectory import Hand
@@ -65,20 +67,24 @@ def followed(shape: str) -> int:
 
     newest = NewestFrames(camera())
     lags_s, first_model_s, last = [], np.inf, None
-    with tempfile.TemporaryDirectory() as folder:
-        stream = open_stream(shape, save=Path(folder) / "recording.rrd")
-        with in_background(stream, lambda step: not step.last) as draw:
+    with tempfile.TemporaryDirectory() as place:
+        stream = open_stream(shape, save=Path(place) / "recording.rrd")
+        folder, meta = RunFolder.open(Path(place) / "run"), RunMeta(shape, 0, "velocity", known=modeler.prior)
+        with in_background(stream, lambda step: not step.last, share=DRAWING_SHARE) as draw:
             began_s = time.monotonic()
             for event in run.track(newest, live=True):
                 if isinstance(event, Step):
                     now_s = time.monotonic() - began_s
                     lags_s.append(now_s - event.frame.time_s)
+                    folder.write(event, meta)
+                    event.solution.covariances.values()
                     draw(event)
                     if first_model_s == np.inf and event.model is not None:
                         first_model_s = time.monotonic() - began_s
             tracked_s = time.monotonic() - began_s
             for event in chain(run.fill(newest.skipped), run.revisit(), run.rejoin(), run.refine(), run.finish()):
                 if isinstance(event, Step):
+                    folder.write(event, meta)
                     draw(event)
                     last = event
             filled_s = time.monotonic() - began_s - tracked_s
