@@ -15,7 +15,7 @@ from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
 from modeler.priors import AnyMotion, AutoPrior, GeneralPrior, TablePrior
 from modeler.rays import Sensor
-from modeler.types import Solution
+from modeler.types import PoseGaussian, Solution
 
 
 def test_it_is_an_even_mixture_of_free_motion_and_motion_on_the_table(rng: np.random.Generator) -> None:
@@ -50,7 +50,7 @@ def test_limits_are_left_only_where_both_were_assumed() -> None:
 @pytest.mark.parametrize(
     ("turn_deg", "assumed", "kept"), [(60.0, True, True), (90.0, True, False), (90.0, False, True)]
 )
-def test_pairs_are_registered_again_within_limits_that_hold_their_motion(
+def test_pairs_are_registered_within_limits_that_hold_their_predicted_motion(
     turn_deg: float, assumed: bool, kept: bool
 ) -> None:
     body = tabletop.Box((0.06, 0.045, 0.08))
@@ -61,5 +61,6 @@ def test_pairs_are_registered_again_within_limits_that_hold_their_motion(
     solution = Solution({target.index: np.eye(4), source.index: poses[0] @ se3.inverse(poses[int(turn_deg)])})
     state = State(smoother=Smoother(solution=solution), views={target.index: target, source.index: source})
     tracker = Tracker(state, prior, Closer(), Sensor(), Modeler().register)
-    found = tracker._applicable(prior.relaxed(1.5), prior.unlimited(), source.index, target.index)
-    assert isinstance(found, GeneralPrior if kept else AnyMotion)
+    motion = PoseGaussian(solution.relative(target.index, source.index), np.eye(6))
+    found = tracker._predicted(source, target.index, motion)
+    assert isinstance(found.known, GeneralPrior if kept else AnyMotion)

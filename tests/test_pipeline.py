@@ -52,19 +52,21 @@ SIGMAS = np.repeat([0.002, 0.0005], 3)
 @dataclass(frozen=True)
 class AnyDensity(AbstractPoseDensity):
     steps: float = 1.0
+    possible: bool = True
     evidence = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         return np.broadcast_to(np.eye(4), (count, 4, 4))
 
     def log_density(self, target_from_source: Array) -> Array:
-        return np.zeros(len(target_from_source))
+        return np.full(len(target_from_source), 0.0 if self.possible else -np.inf)
 
 
 @final
 @dataclass(frozen=True)
 class AnyPrior(AbstractPrior):
     refused: frozenset[tuple[int, int]] = frozenset()
+    beyond: frozenset[tuple[int, int]] = frozenset()
     steps: float = 1.0
     axis: SharedAxis | None = None
     lessons: list[tuple[list[int], int]] = field(default_factory=list)
@@ -72,10 +74,13 @@ class AnyPrior(AbstractPrior):
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         if (source.index, target.index) in self.refused:
             raise InputError(f"frames {source.index} and {target.index}: no plane")
-        return AnyDensity(self.steps)
+        return AnyDensity(self.steps, (source.index, target.index) not in self.beyond)
 
     def relaxed(self, steps: float) -> AbstractPrior:
         return replace(self, steps=steps)
+
+    def unlimited(self) -> AbstractPrior | None:
+        return replace(self, beyond=frozenset(), steps=np.inf) if self.beyond else None
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
         self.lessons.append((list(solution.trajectory), len(edges)))
@@ -237,6 +242,14 @@ def test_a_previous_view_to_which_the_prior_does_not_apply_gives_way_to_others()
     assert trajectory_error(steps[-1]) < 1e-6
 
 
+def test_limits_that_are_defaults_do_not_exclude_what_the_graph_predicts() -> None:
+    registrar = Oracle()
+    closer = Closer(max_span_deg=85.0, min_span_gain_nats=0.0, thresholds=Thresholds(min_overlap=0.2))
+    last = run(registrar=registrar, closer=closer, prior=AnyPrior(beyond=frozenset({(8, 0), (5, 3)})))[-1]
+    assert {(8, 0), (5, 3)} <= {(edge.source, edge.target) for edge in last.edges_so_far}
+    assert {(s, t) for s, t, steps in registrar.priors if steps == np.inf} == {(8, 0), (5, 3)}
+
+
 def test_at_the_end_views_two_steps_apart_are_registered_too_and_judged() -> None:
     registrar, closer = (
         Oracle(noise=1.0),
@@ -381,7 +394,7 @@ def test_same_seed_same_bits_side_by_side_or_one_after_the_other(monkeypatch: py
 def test_the_prior_learns_from_all_that_came_before_a_frame() -> None:
     prior = AnyPrior()
     steps = run(FRAMES[:4], prior=prior)
-    assert prior.lessons == [([0], 0), ([0, 1], 1), ([0, 1, 2], 2), ([0, 1, 2, 3], 3)]  # the last, of pairs to span
+    assert prior.lessons == [([0], 0), ([0, 1], 1), ([0, 1, 2], 2)]
     assert len(steps[-1].edges_so_far) == 3
 
 

@@ -137,7 +137,7 @@ class Tracker:
         # In the middle between two views, the standard deviation is a quarter of the way, if the speed is uneven.
         spread = np.diag(np.repeat(0.25 * np.array(way), 3) ** 2)
         expected = PoseGaussian(motion, se3.covariance_about(spread, -view.centroid_m))
-        return (self._pair(view, target, self._predicted(expected)),)
+        return (self._pair(view, target, self._predicted(view, target, expected)),)
 
     def closures(
         self, view: RayImage, posteriors: Sequence[Posterior], *, last: bool, retry: bool
@@ -159,34 +159,35 @@ class Tracker:
         targets = self.closer.closure_targets(base, self.state.map_view, last=last)
         targets = [target for target in targets if target not in tried]
         predicted = [
-            self._predicted(self.closer.predicted_motion(base, target, self.state.solution)) for target in targets
+            self._predicted(view, target, self.closer.predicted_motion(base, target, self.state.solution))
+            for target in targets
         ]
         return tuple(self._pairs([(view, target) for target in targets], predicted))
 
-    def _predicted(self, motion: PoseGaussian) -> PredictedProposal:
-        """Return the prior of a closure whose motion the graph predicts."""
-        far = np.degrees(se3.rotation_angle(motion.mean)) > self.closer.max_angle_deg
-        return PredictedProposal(self.known.relaxed(_SPAN_STEPS) if far else self.known, motion)
-
     def spans(self, pairs: Sequence[tuple[int, int]]) -> Iterator[Posterior]:
         """Yield posteriors of pairs (source, target) of views of the graph that were not registered yet."""
-        priors = self.known.relaxed(_SPAN_STEPS), self.known.unlimited()
-        predicted = [
-            PredictedProposal(self._applicable(*priors, s, t), self.state.solution.relative_gaussian(t, s))
-            for s, t in pairs
-        ]
-        yield from self._pairs([(self.state.views[source], target) for source, target in pairs], predicted)
+        views, relative = self.state.views, self.state.solution.relative_gaussian
+        predicted = [self._predicted(views[s], t, relative(t, s), span=True) for s, t in pairs]
+        yield from self._pairs([(views[source], target) for source, target in pairs], predicted)
 
-    def _applicable(
-        self, prior: AbstractPrior, unlimited: AbstractPrior | None, source: int, target: int
-    ) -> AbstractPrior:
-        """Return the prior of a pair of the graph, without its limits if they are defaults and exclude the motion."""
-        if unlimited is not None:
-            with suppress(InputError):
-                known = prior.between(self.state.views[source], self.state.views[target])
-                motion = self.state.solution.relative(target, source)
-                return prior if _inside(known, motion[None])[0] else unlimited
-        return prior
+    def _predicted(
+        self, source: RayImage, target: int, motion: PoseGaussian, *, span: bool = False
+    ) -> PredictedProposal:
+        """Return the prior of a pair whose motion the graph predicts: without its limits if they exclude it.
+
+        Args:
+            source: a view.
+            target: number of a view of the graph.
+            motion: target_from_source.
+            span: whether limits are those of several steps also for small rotations.
+        """
+        far = span or np.degrees(se3.rotation_angle(motion.mean)) > self.closer.max_angle_deg
+        prior, unlimited = self.known.relaxed(_SPAN_STEPS) if far else self.known, self.known.unlimited()
+        if unlimited is not None:  # limits that are defaults
+            with suppress(InputError):  # registering says so
+                if not _inside(prior.between(source, self.state.views[target]), motion.mean[None])[0]:
+                    prior = unlimited
+        return PredictedProposal(prior, motion)
 
     def explained(self, edges: Iterable[Edge]) -> tuple[Edge, ...]:
         """Return edges, with the reason for those to which the prior does not apply."""
