@@ -154,10 +154,16 @@ def _sorted(depths_m: Sequence[Float32Array], stride: int) -> tuple[Float32Array
     return stack, np.isfinite(stack).sum(axis=0)
 
 
-def pieces(depth_m: Float32Array, within: BoolArray) -> Labels:
-    """Label the connected pieces (h, w) of a region, split at depth jumps; 0 = outside it or at a jump."""
+def pieces(depth_m: Float32Array, within: BoolArray, jump_m: float | None = None) -> Labels:
+    """Label the connected pieces (h, w) of a region, split at depth jumps; 0 = outside it or at a jump.
+
+    Args:
+        depth_m: (h, w).
+        within: (h, w) the region.
+        jump_m: the least jump; None: a share of the depth.
+    """
     kept = within.copy()
-    limit = np.float32(_JUMP_SHARE) * depth_m
+    limit = np.float32(_JUMP_SHARE) * depth_m if jump_m is None else np.full_like(depth_m, jump_m)
     kept[:-1] &= ~(np.abs(depth_m[1:] - depth_m[:-1]) > limit[1:])
     kept[:, :-1] &= ~(np.abs(depth_m[:, 1:] - depth_m[:, :-1]) > limit[:, 1:])
     return _label(kept)
@@ -242,3 +248,14 @@ def _label(mask: BoolArray, structure: BoolArray | None = None) -> Labels:
     labels = np.zeros(mask.shape, dtype=np.int32)
     ndimage.label(mask, structure=structure, output=labels)
     return labels
+
+
+def window_of(mask: BoolArray, *, margin: int) -> tuple[slice, slice]:
+    """Return the part of an image that holds a mask (h, w) and a margin."""
+    if not mask.any():
+        return slice(0, 0), slice(0, 0)
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(0, int(rows[0]) - margin), min(mask.shape[0], int(rows[-1]) + 1 + margin)),
+        slice(max(0, int(columns[0]) - margin), min(mask.shape[1], int(columns[-1]) + 1 + margin)),
+    )

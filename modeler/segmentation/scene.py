@@ -61,6 +61,8 @@ class Scene:
     """(h, w), downsampled: depth of walls and static things, at and beyond which there is no object; else infinite."""
     zone_m: Array | None = None
     """(2, 3) low and high corner, in camera coordinates, of the box in which the object was seen."""
+    nearest_m: Float32Array | None = None
+    """(h, w), downsampled: the least depth at which the object was seen, infinite where it never was; None: unknown."""
     areas_m2: tuple[float, float] | None = None
     """Least and greatest area that the object showed to the camera."""
     sure: bool = True

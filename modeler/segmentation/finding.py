@@ -1,0 +1,308 @@
+"""Search for the object in one depth image of a known scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+from scipy import ndimage
+
+from modeler.segmentation.depth_images import (
+    DepthNoise,
+    Labels,
+    edge_of,
+    mixed_pixels,
+    pieces,
+    planning_stride,
+    point_image,
+    voxel_clusters,
+    window_of,
+    without_specks,
+)
+from modeler.segmentation.scene import Scene
+from modeler.types import Array, BoolArray, Camera, Float32Array, Frame
+
+Window = tuple[slice, slice]
+_ZONE_MARGIN_M = 0.1  # distance from the object's zone at which it may still be
+_ZONE_MARGIN_SHARE = 0.3  # share of the zone's size, if that is more
+_MOSTLY_IN_ZONE = 0.5  # share of a piece next to the object that must be in the zone for it to be part of the object
+_LEAST_PIECE = 0.07  # of the object; false depth filled in around a figure's limbs has pieces of up to 6 %
+_STRAY_WEIGHT = 0.2  # weight of pixels outside the zone, and of pieces that extend from the image's edge as arms do
+_FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
+_CLEARANCE_M = 0.001
+_MOVED_M = 0.02  # of an object's outline between the frames from which its scene is learned
+_LOW_M = 0.01  # creases of the support are at most so high, and apart from the object
+_LOW_SHARE = 0.3  # share of the object's height, for flat objects
+_LOW_REACH_M = 0.01
+_SPECK_SHARE = 0.003
+_CUT_SHARE = 0.1  # share of the mask's width on the image's edge from which the object is truncated
+AREA_FACTOR = 2.5  # factor by which the visible area may leave its range in the scene
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The object in one frame."""
+
+    mask: BoolArray
+    """(h, w) True = object."""
+    area_m2: float = 0.0
+    """Area visible to the camera."""
+    rival: float = 0.0
+    """Score of the second-best cluster relative to the best."""
+    goes_on: bool = False
+    """Whether it continues beyond the object's region, like an arm that touches the object."""
+
+
+def find(
+    depth_m: Float32Array,
+    camera: Camera,
+    scene: Scene,
+    noise: DepthNoise,
+    *,
+    gap_m: float,
+    occluder: BoolArray | None = None,
+) -> Found:
+    """Find the object in a depth image, NaN where nothing was measured or no object may be.
+
+    Points above the support and in front of the background are clustered at low resolution. The cluster with the
+    largest area in the object's zone is chosen, with those that an occluder separates from it, and refined.
+    """
+    if scene.zone_m is None:
+        return Found(np.zeros(depth_m.shape, dtype=np.bool_))
+    chosen = _choose(depth_m, camera, scene, noise, zone_m=scene.zone_m, gap_m=gap_m, occluder=occluder)
+    mask = _refine(depth_m, camera, scene, noise, chosen=chosen.mask, reach_m=_reach_m(scene.zone_m), gap_m=gap_m)
+    return replace(chosen, mask=mask)
+
+
+def _choose(
+    depth_m: Float32Array,
+    camera: Camera,
+    scene: Scene,
+    noise: DepthNoise,
+    *,
+    zone_m: Array,
+    gap_m: float,
+    occluder: BoolArray | None,
+) -> Found:
+    """Return the object in the downsampled image."""
+    stride = planning_stride(camera)
+    thin = np.ascontiguousarray(depth_m[::stride, ::stride])
+    chosen = np.zeros(thin.shape, dtype=np.bool_)
+    low, high = _reach_m(zone_m)
+    window = window_of((thin > low[2]) & (thin < high[2]), margin=0)
+    row, column = window[0].start * stride, window[1].start * stride
+    points = point_image(thin[window], camera, stride=stride, row=row, column=column)
+    depth, (above, _) = points[..., 2], _foreground(points, window, scene, noise, thinning=1)
+    inside, on_edge = _inside(points, low, high), edge_of(np.isfinite(thin))[window]
+    goes_on, fore = _goes_on(depth, above, inside, gap_m), above & inside
+    if not fore.any():
+        return Found(chosen)
+    pixel_m2 = depth**2 * (stride**2 / (camera.fx * camera.fy))
+    ends = fore & (goes_on | on_edge)
+    if scene.nearest_m is not None and scene.areas_m2 is not None and ends.any():
+        labels = voxel_clusters(points[fore], low_m=low, high_m=high, gap_m=gap_m)
+        arm = np.zeros_like(fore)
+        arm[fore] = (np.bincount(labels, ends[fore]) > _CUT_SHARE * np.sqrt(np.bincount(labels)))[labels]
+        rest = fore & ~_in_front(depth, arm, scene.nearest_m[window] - gap_m, gap_m)
+        # If less than the object is left, all of it looks like an arm, and the frame is unsure.
+        if pixel_m2[rest & _inside(points, *zone_m)].sum() > scene.areas_m2[0] / AREA_FACTOR:
+            goes_on, fore = _goes_on(depth, above, rest, gap_m), rest
+    labels = voxel_clusters(points[fore], low_m=low, high_m=high, gap_m=gap_m)
+    candidates = points[fore]
+    in_zone = _inside(candidates, *zone_m)
+    strays = np.bincount(labels, in_zone) < _MOSTLY_IN_ZONE * np.bincount(labels)
+    labels = _split(labels, strays, depth, fore)
+    area = pixel_m2[fore]
+    merit = np.bincount(labels, area * np.where(in_zone, 1.0, _STRAY_WEIGHT))
+    merit[np.bincount(labels, on_edge[fore]) > _CUT_SHARE * np.sqrt(np.bincount(labels))] *= _STRAY_WEIGHT
+    best = int(merit.argmax())
+    chosen[window][fore] = labels == best
+    blocking = chosen if occluder is None else chosen | occluder[::stride, ::stride]
+    own = _joined(best, labels, in_zone, _beside(blocking)[window][fore])
+    chosen[window][fore] = own[labels]
+    rival = float(merit[~own].max(initial=0.0) / merit[best])
+    leads_on = np.count_nonzero(goes_on[fore] & own[labels]) > _CUT_SHARE * np.sqrt(np.count_nonzero(own[labels]))
+    return Found(chosen, float(area[own[labels]].sum()), rival, goes_on=bool(leads_on))
+
+
+def _goes_on(depth_m: Float32Array, fore: BoolArray, inside: BoolArray, gap_m: float) -> BoolArray:
+    """Return the pixels (h, w) at which the foreground continues from the inside of a box to its outside.
+
+    Args:
+        depth_m: (h, w).
+        fore: (h, w) the foreground.
+        inside: (h, w) what is in the box.
+        gap_m: largest difference of depth between neighbours that are one thing.
+    """
+    outside = fore & ~inside
+    low_m = ndimage.minimum_filter(np.where(outside, depth_m, np.float32(np.inf)), 3)
+    high_m = ndimage.maximum_filter(np.where(outside, depth_m, np.float32(-np.inf)), 3)
+    found: BoolArray = fore & inside & (depth_m > low_m - gap_m) & (depth_m < high_m + gap_m)
+    return found
+
+
+def _in_front(depth_m: Float32Array, suspect: BoolArray, nearest_m: Float32Array, gap_m: float) -> BoolArray:
+    """Return the suspect pixels (h, w) nearer than the object ever was, and pieces of surface that mostly are.
+
+    Args:
+        depth_m: (h, w).
+        suspect: (h, w) pixels of something that leads on to where the object cannot be.
+        nearest_m: (h, w) least depth of the object.
+        gap_m: difference of depth between neighbours beyond which they are of two pieces.
+    """
+    nearer = suspect & (depth_m < nearest_m)
+    parts = pieces(depth_m, suspect, gap_m)
+    mostly = np.bincount(parts.ravel(), nearer.ravel()) > _MOSTLY_IN_ZONE * np.bincount(parts.ravel())
+    mostly[0] = False
+    return nearer | mostly[parts]
+
+
+def _split(labels: Labels, chosen: BoolArray, depth_m: Float32Array, fore: BoolArray) -> Labels:
+    """Return labels (n,) with the chosen clusters split at depth jumps: an arm may touch the object.
+
+    Args:
+        labels: (n,) of the pixels in `fore`.
+        chosen: (k,) which clusters.
+        depth_m: (h, w).
+        fore: (h, w) which pixels are labelled.
+    """
+    if not chosen.any():
+        return labels
+    within = np.zeros_like(fore)
+    within[fore] = chosen[labels]
+    parts = pieces(depth_m, within)[fore]
+    return np.where(parts > 0, len(chosen) + parts, labels).astype(np.int32)
+
+
+def _beside(region: BoolArray) -> Labels:
+    """Label the pieces (h, w) of a region, and the pixels within 2 px of them; 0 elsewhere."""
+    near = np.asarray(ndimage.binary_dilation(region, np.ones((3, 3)), iterations=2), dtype=np.bool_)
+    labels = np.zeros(near.shape, dtype=np.int32)
+    ndimage.label(near, output=labels)
+    return labels
+
+
+def _joined(best: int, labels: Labels, in_zone: BoolArray, neighbours: Labels) -> BoolArray:
+    """Return the object's clusters (k,): the best, and those next to it or an occluder that are mostly in its zone.
+
+    Args:
+        best: number of a cluster.
+        labels: (n,) of points.
+        in_zone: (n,) whether they are where the object is in other frames.
+        neighbours: (n,) piece of best cluster and occluder next to them; 0 = none.
+    """
+    own_pieces = np.unique(neighbours[labels == best])
+    touching = np.bincount(labels[np.isin(neighbours, own_pieces)], minlength=int(labels.max()) + 1) > 0
+    sizes = np.bincount(labels)
+    own: BoolArray = touching & (np.bincount(labels, in_zone) > _MOSTLY_IN_ZONE * sizes)
+    own &= sizes > _LEAST_PIECE * sizes[best]
+    own[best] = True
+    return own
+
+
+def _refine(
+    depth_m: Float32Array,
+    camera: Camera,
+    scene: Scene,
+    noise: DepthNoise,
+    *,
+    chosen: BoolArray,
+    reach_m: Array,
+    gap_m: float,
+) -> BoolArray:
+    """Return the object's pixels at full resolution: those near the downsampled ones at a similar depth."""
+    stride = planning_stride(camera)
+    mask = np.zeros(depth_m.shape, dtype=np.bool_)
+    rows, columns = window_of(chosen, margin=2)
+    own_m = np.where(chosen, depth_m[::stride, ::stride], np.float32(np.nan))[rows, columns]
+    low_m = ndimage.minimum_filter(np.nan_to_num(own_m, nan=np.inf), 3) - np.float32(gap_m)
+    high_m = ndimage.maximum_filter(np.nan_to_num(own_m, nan=-np.inf), 3) + np.float32(gap_m)
+    height, width = depth_m.shape
+    window = (
+        slice(rows.start * stride, min(rows.stop * stride, height)),
+        slice(columns.start * stride, min(columns.stop * stride, width)),
+    )
+    depth: Float32Array = depth_m[window]
+    points = point_image(depth, camera, row=window[0].start, column=window[1].start)
+    fore, above_m = _foreground(points, window, scene, noise, thinning=stride)
+    low_m, high_m = (
+        np.repeat(np.repeat(limit_m, stride, axis=0), stride, axis=1)[: depth.shape[0], : depth.shape[1]]
+        for limit_m in (low_m, high_m)
+    )
+    fore &= (depth > low_m) & (depth < high_m)
+    fore &= (depth > reach_m[0, 2]) & (depth < reach_m[1, 2])
+    if not fore.any():
+        return mask
+    if above_m is not None:
+        fore &= _not_a_crease(above_m, fore, _LOW_REACH_M * camera.fx / float(np.median(depth[fore])))
+    pixel = depth / np.float32(camera.fx)
+    fore &= ~mixed_pixels(depth, tolerance_m=noise.tolerance_m(depth), pixel_m=pixel)
+    mask[window] = without_specks(fore, _SPECK_SHARE)
+    return mask
+
+
+def _inside(points: Float32Array, low: Array, high: Array) -> BoolArray:
+    """Return which points (..., 3) lie in a box."""
+    inside = np.ones(points.shape[:-1], dtype=np.bool_)
+    for axis in range(3):
+        inside &= (points[..., axis] > np.float32(low[axis])) & (points[..., axis] < np.float32(high[axis]))
+    return inside
+
+
+def _reach_m(zone_m: Array) -> Array:
+    """Return the zone (2, 3), low and high corner, extended by how far the object may have left it."""
+    low, high = zone_m
+    margin = max(_ZONE_MARGIN_M, _ZONE_MARGIN_SHARE * float((high - low).max()))
+    return np.array([low - margin, high + margin])
+
+
+def _foreground(
+    points: Float32Array, window: Window, scene: Scene, noise: DepthNoise, *, thinning: int
+) -> tuple[BoolArray, Float32Array | None]:
+    """Return what is above the support and in front of the background (h, w), and heights (h, w) if there is a support.
+
+    Args:
+        points: (h, w, 3) part of an image of points.
+        window: which part.
+        scene: the scene.
+        noise: of the depth camera.
+        thinning: downsampling of the scene's images relative to the points.
+    """
+    depth = points[..., 2]
+    tolerance = noise.tolerance_m(depth)
+    fore, height = np.isfinite(depth), None
+    if scene.plane is not None:
+        rise = points @ scene.plane.normal.astype(np.float32)
+        height = rise + np.float32(scene.plane.offset_m)
+        slope = np.maximum(np.abs(rise / depth), np.float32(_FLATTEST_SLOPE))
+        fore &= height > tolerance * slope + np.float32(_CLEARANCE_M)
+    if scene.scenery_m is not None:
+        rows, columns = (np.arange(part.start, part.stop) // thinning for part in window)
+        fore &= depth < scene.scenery_m[rows[:, None], columns] - tolerance
+    return fore, height
+
+
+def _not_a_crease(height_m: Float32Array, fore: BoolArray, reach_px: float) -> BoolArray:
+    """Return the pixels (h, w) that are high above the support or near some that are."""
+    low = min(_LOW_M, _LOW_SHARE * float(np.percentile(height_m[fore], 95)))
+    high = (fore & (height_m > low)).astype(np.uint8)
+    return ndimage.maximum_filter(high, 2 * max(1, round(reach_px)) + 1) > 0
+
+
+def is_cut(mask: BoolArray, frame: Frame) -> bool:
+    """Return whether a mask (h, w) extends beyond the field of view."""
+    on_edge = np.count_nonzero(mask & edge_of(frame.depth_m > 0.0))
+    return bool(on_edge >= _CUT_SHARE * np.sqrt(np.count_nonzero(mask)))
+
+
+def nearest_seen_m(frames: Sequence[Frame], masks: Sequence[BoolArray]) -> Float32Array:
+    """Return the least depth (h, w), downsampled, at which the object was near a pixel; infinite where it never was."""
+    stride = planning_stride(frames[0].camera)
+    seen = [mask & (frame.depth_m > 0.0) for frame, mask in zip(frames, masks, strict=True)]
+    depths_m = [np.where(own, frame.depth_m, np.float32(np.inf)) for frame, own in zip(frames, seen, strict=True)]
+    nearest = np.stack([depth_m[::stride, ::stride] for depth_m in depths_m]).min(axis=0).astype(np.float32)
+    pixel_m = float(np.median(nearest[np.isfinite(nearest)])) * stride / frames[0].camera.fx
+    return np.asarray(ndimage.minimum_filter(nearest, 2 * round(_MOVED_M / pixel_m) + 1), dtype=np.float32)
