@@ -106,10 +106,12 @@ def _choose(
         labels = voxel_clusters(points[fore], low_m=low, high_m=high, gap_m=gap_m)
         arm = np.zeros_like(fore)
         arm[fore] = (np.bincount(labels, ends[fore]) > _CUT_SHARE * np.sqrt(np.bincount(labels)))[labels]
-        rest = fore & ~_in_front(depth, arm, scene.nearest_m[window] - gap_m, gap_m)
-        # If less than the object is left, all of it looks like an arm, and the frame is unsure.
-        if pixel_m2[rest & _inside(points, *zone_m)].sum() > scene.areas_m2[0] / AREA_FACTOR:
-            goes_on, fore = _goes_on(depth, above, rest, gap_m), rest
+        in_zone = _inside(points, *zone_m)
+        for removed in _in_front(depth, arm, scene.nearest_m[window] - gap_m, above & ~inside, gap_m):
+            # If less than the object is left, it was removed as well.
+            if pixel_m2[fore & in_zone & ~removed].sum() > scene.areas_m2[0] / AREA_FACTOR:
+                goes_on, fore = _goes_on(depth, above, fore & ~removed, gap_m), fore & ~removed
+                break
     labels = voxel_clusters(points[fore], low_m=low, high_m=high, gap_m=gap_m)
     candidates = points[fore]
     in_zone = _inside(candidates, *zone_m)
@@ -144,20 +146,23 @@ def _goes_on(depth_m: Float32Array, fore: BoolArray, inside: BoolArray, gap_m: f
     return found
 
 
-def _in_front(depth_m: Float32Array, suspect: BoolArray, nearest_m: Float32Array, gap_m: float) -> BoolArray:
-    """Return the suspect pixels (h, w) nearer than the object ever was, and pieces of surface that mostly are.
+def _in_front(
+    depth_m: Float32Array, suspect: BoolArray, nearest_m: Float32Array, outside: BoolArray, gap_m: float
+) -> tuple[BoolArray, BoolArray]:
+    """Return the suspect pixels (h, w) nearer than the object ever was: with pieces that mostly are, and alone.
 
     Args:
         depth_m: (h, w).
         suspect: (h, w) pixels of something that leads on to where the object cannot be.
         nearest_m: (h, w) least depth of the object.
+        outside: (h, w) where the object cannot be.
         gap_m: difference of depth between neighbours beyond which they are of two pieces.
     """
     nearer = suspect & (depth_m < nearest_m)
-    parts = pieces(depth_m, suspect, gap_m)
-    mostly = np.bincount(parts.ravel(), nearer.ravel()) > _MOSTLY_IN_ZONE * np.bincount(parts.ravel())
+    parts = pieces(depth_m, suspect | outside, gap_m)
+    mostly = np.bincount(parts.ravel(), (nearer | outside).ravel()) > _MOSTLY_IN_ZONE * np.bincount(parts.ravel())
     mostly[0] = False
-    return nearer | mostly[parts]
+    return nearer | (suspect & mostly[parts]), nearer
 
 
 def _split(labels: Labels, chosen: BoolArray, depth_m: Float32Array, fore: BoolArray) -> Labels:
@@ -174,6 +179,8 @@ def _split(labels: Labels, chosen: BoolArray, depth_m: Float32Array, fore: BoolA
     within = np.zeros_like(fore)
     within[fore] = chosen[labels]
     parts = pieces(depth_m, within)[fore]
+    at_jump = chosen[labels] & (parts == 0)  # of either piece; each is left to itself
+    parts[at_jump] = parts.max() + 1 + np.arange(np.count_nonzero(at_jump))
     return np.where(parts > 0, len(chosen) + parts, labels).astype(np.int32)
 
 

@@ -28,22 +28,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/scenes"), help="folder of the results")
     parser.add_argument("--half", choices=HALVES, default="tuning", help="of masks: which shapes and draws")
     parser.add_argument("--scenes", type=int, default=masks.SCENES, metavar="N", help="of masks: how many of the half")
+    parser.add_argument("--start", type=int, default=0, metavar="K", help="of masks: number of the first one")
     parser.add_argument(
         "--told", nargs="+", choices=occluded.TOLD, default=occluded.TOLD, help="of occluded: given masks"
     )
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     if options.study == "masks":
-        print(_masks(options.out, options.half, options.scenes))
+        print(_masks(options.out, options.half, range(options.start, options.start + options.scenes)))
     else:
         print(_occluded(options.out / "occluded.jsonl", options.told))
     return 0
 
 
-def _masks(folder: Path, half: Half, count: int) -> str:
+def _masks(folder: Path, half: Half, numbers: range) -> str:
     """Return the table of masks, and write a picture of every scene."""
     results = []
-    for number in range(count):
+    for number in numbers:
         plan = Plan(half, number)
         result, shown, found = masks.find(plan, folder / "rendered")
         write_image(folder / f"{half}-{number}.png", masks.picture(shown, found))
