@@ -60,6 +60,40 @@ def test_wall_clutter_and_a_passer_by_are_not_the_object(rng):
     judge(*turned(8, rng, surround))
 
 
+def test_a_low_part_that_the_object_encloses_is_part_of_it(rng):
+    """Like the brim of a hat."""
+    frames, masks = [], []
+    for k in range(6):
+        world = World().table()
+        world.box((0.0, 0.0, 0.0025), (0.09, 0.09, 0.0025), turn_deg=25.0 * k, label=OBJECT)
+        world.box((0.0, 0.0, 0.03), (0.03, 0.03, 0.03), turn_deg=25.0 * k, label=OBJECT)
+        for x, y, half_x, half_y in ((0.08, 0.0, 0.01, 0.09), (0.0, 0.08, 0.09, 0.01)):
+            for sign in (-1.0, 1.0):
+                turn = np.radians(25.0 * k)
+                at = sign * np.array([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn), 0.0])
+                half_m = (half_x, half_y, 0.008)
+                world.box((at[0], at[1], 0.008), half_m, turn_deg=25.0 * k, label=OBJECT)
+        frame, mask = world.frame(k, rng, sigma_m=0.0004)
+        frames.append(frame)
+        masks.append(mask)
+    judge(frames, masks, least=0.96)
+
+
+def test_what_stands_still_where_the_object_may_be_is_not_taken_for_it(rng):
+    frames, masks = [], []
+    for k in range(6):
+        world = World().table().box((0.1, -0.08, 0.06), (0.05, 0.05, 0.06))
+        along_m = -0.1 + 0.03 * k
+        world.box((along_m, along_m, 0.03), (0.03, 0.03, 0.03), turn_deg=25.0 * k, label=OBJECT)
+        frame, mask = world.frame(k, rng)
+        frames.append(frame)
+        masks.append(mask)
+    segmenter = Segmenter()
+    scene = segmenter.scene(frames)
+    for frame, mask in zip(frames, masks, strict=True):
+        assert iou(segmenter.segment(frame, scene).mask, mask) > 0.95
+
+
 def test_a_part_is_found_whose_connection_the_object_hides(rng):
     """Seen from before, the front of a dumbbell hides its bar, and its two ends are far apart in depth."""
     frames, masks = [], []

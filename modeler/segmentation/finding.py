@@ -28,6 +28,7 @@ Window = tuple[slice, slice]
 _ZONE_MARGIN_M = 0.1  # distance from the object's zone at which it may still be
 _ZONE_MARGIN_SHARE = 0.3  # share of the zone's size, if that is more
 _MOSTLY_IN_ZONE = 0.5  # share of a piece next to the object that must be in the zone for it to be part of the object
+_MOSTLY_STATIC = 0.5  # share of a cluster that all frames show from which it is background
 _LEAST_PIECE = 0.07  # of the object; false depth filled in around a figure's limbs has pieces of up to 6 %
 _STRAY_WEIGHT = 0.2  # weight of pixels outside the zone, and of pieces that extend from the image's edge as arms do
 _FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
@@ -120,14 +121,26 @@ def _choose(
     area = pixel_m2[fore]
     merit = np.bincount(labels, area * np.where(in_zone, 1.0, _STRAY_WEIGHT))
     merit[np.bincount(labels, on_edge[fore]) > _CUT_SHARE * np.sqrt(np.bincount(labels))] *= _STRAY_WEIGHT
+    static = _is_static(depth, scene, window, noise)[fore]
+    merit[np.bincount(labels, static) > _MOSTLY_STATIC * np.bincount(labels)] *= _STRAY_WEIGHT
     best = int(merit.argmax())
     chosen[window][fore] = labels == best
     blocking = chosen if occluder is None else chosen | occluder[::stride, ::stride]
+    if scene.areas_m2 is None:  # what moves shows the zone only roughly
+        margin_m = _ZONE_MARGIN_SHARE * float(np.ptp(zone_m, axis=0).max())
+        in_zone = _inside(candidates, zone_m[0] - margin_m, zone_m[1] + margin_m) & ~static
     own = _joined(best, labels, in_zone, _beside(blocking)[window][fore])
     chosen[window][fore] = own[labels]
     rival = float(merit[~own].max(initial=0.0) / merit[best])
     leads_on = np.count_nonzero(goes_on[fore] & own[labels]) > _CUT_SHARE * np.sqrt(np.count_nonzero(own[labels]))
     return Found(chosen, float(area[own[labels]].sum()), rival, goes_on=bool(leads_on))
+
+
+def _is_static(depth_m: Float32Array, scene: Scene, window: Window, noise: DepthNoise) -> BoolArray:
+    """Return which pixels (h, w) of a part of the downsampled image show what all frames show."""
+    if scene.still_m is None:
+        return np.zeros(depth_m.shape, dtype=np.bool_)
+    return np.abs(depth_m - scene.still_m[window]) < noise.tolerance_m(depth_m)
 
 
 def _goes_on(depth_m: Float32Array, fore: BoolArray, inside: BoolArray, gap_m: float) -> BoolArray:
@@ -296,7 +309,8 @@ def _not_a_crease(height_m: Float32Array, fore: BoolArray, reach_px: float) -> B
     """Return the pixels (h, w) that are high above the support or near some that are."""
     low = min(_LOW_M, _LOW_SHARE * float(np.percentile(height_m[fore], 95)))
     high = (fore & (height_m > low)).astype(np.uint8)
-    return ndimage.maximum_filter(high, 2 * max(1, round(reach_px)) + 1) > 0
+    near: BoolArray = ndimage.maximum_filter(high, 2 * max(1, round(reach_px)) + 1) > 0
+    return np.asarray(ndimage.binary_fill_holes(near), dtype=np.bool_)  # a crease surrounds the object
 
 
 def is_cut(mask: BoolArray, frame: Frame) -> bool:

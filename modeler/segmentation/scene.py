@@ -36,6 +36,7 @@ from modeler.types import Array, BoolArray, Camera, Float32Array, Plane
 
 _CARRIED_SHARE = 0.2  # share of a pile that stands on its upper plane, for that to be a support and not a lid
 _NEIGHBOUR_SIZES = 0.5  # distance, in sizes of the largest moving piece, within which its other parts move
+_LEAST_PIECE = 0.1  # of the largest moving piece; noise along the edges of static things has up to 0.06
 _ELSEWHERE = 0.3  # share of the moving pieces' score elsewhere from which the object is ambiguous
 _WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
 _IN_FRONT_SHARE = 0.9  # share of the object that is in front of a wall
@@ -132,7 +133,8 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     margin = _NEIGHBOUR_SIZES * float(np.linalg.norm(high - low))
     near = ((layers.front_m > low - margin) & (layers.front_m < high + margin)).all(axis=-1)
     elsewhere = _central(np.where(near, 0, labels), depth, layers.front_share).sum()
-    return layers.moved & allowed & near, bool(elsewhere < _ELSEWHERE * merit.sum())
+    large = merit > _LEAST_PIECE * merit.max()
+    return large[labels] & near, bool(elsewhere < _ELSEWHERE * merit.sum())
 
 
 def _standing_object(

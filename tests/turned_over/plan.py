@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final, Literal, final
 
 import numpy as np
@@ -19,6 +20,7 @@ from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.types import Array
 from sequences.rendering.recipe import Recipe, TurnedOver
 from sequences.rendering.renderer import RenderedSequence
+from sequences.rendering.shapes import MeshFile
 from sequences.rendering.trajectory import Place, Places, Tabletop, Turntable
 
 Gap = Literal["jump", "nothing", "hand"]
@@ -46,11 +48,14 @@ class Plan:
     """Whether methods may be tuned on it."""
     number: int
     """Within its half."""
+    models: tuple[Path, ...] = ()
+    """Mesh files to render instead of shapes: models of captures."""
 
     @property
     def shape(self) -> str:
-        """Name of the object's recipe."""
-        return SHAPES[self.half][self.number % len(SHAPES[self.half])]
+        """Name of the object's recipe, or of its file."""
+        names = tuple(path.stem for path in self.models) or SHAPES[self.half]
+        return names[self.number % len(names)]
 
     @property
     def gap(self) -> Gap:
@@ -74,7 +79,11 @@ class Plan:
 
     def stage(self) -> Stage:
         """Return the recording and its metadata."""
-        return turned_over(viewed(load_specimen(self.shape), np.random.default_rng(self.seed), self.seed), self)
+        recipe = load_specimen(SHAPES[self.half][0] if self.models else self.shape)
+        if self.models:
+            model = MeshFile(self.models[self.number % len(self.models)])
+            recipe = replace(recipe, object=model, rest_rotation_deg=(0.0, 0.0, 0.0))
+        return turned_over(viewed(recipe, np.random.default_rng(self.seed), self.seed), self)
 
 
 def turned_over(recipe: Recipe, plan: Plan) -> Stage:
