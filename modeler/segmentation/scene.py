@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from modeler.range_noise import RangeNoise
 from modeler.segmentation.background_colour import BackgroundColour
@@ -36,7 +37,7 @@ from modeler.types import Array, BoolArray, Camera, Float32Array, Plane
 
 _CARRIED_SHARE = 0.2  # share of a pile that stands on its upper plane, for that to be a support and not a lid
 _NEIGHBOUR_SIZES = 0.5  # distance, in sizes of the largest moving piece, within which its other parts move
-_LEAST_PIECE = 0.1  # of the largest moving piece; noise along the edges of static things has up to 0.06
+_LEAST_REGION = 0.1  # of the largest moving region; noise along the edges of static things has up to 0.06
 _ELSEWHERE = 0.3  # share of the moving pieces' score elsewhere from which the object is ambiguous
 _WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
 _IN_FRONT_SHARE = 0.9  # share of the object that is in front of a wall
@@ -133,8 +134,11 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     margin = _NEIGHBOUR_SIZES * float(np.linalg.norm(high - low))
     near = ((layers.front_m > low - margin) & (layers.front_m < high + margin)).all(axis=-1)
     elsewhere = _central(np.where(near, 0, labels), depth, layers.front_share).sum()
-    large = merit > _LEAST_PIECE * merit.max()
-    return large[labels] & near, bool(elsewhere < _ELSEWHERE * merit.sum())
+    regions = np.zeros(depth.shape, dtype=np.int32)
+    ndimage.label(layers.moved & allowed & near, output=regions)
+    merit_of = _central(regions, depth, layers.front_share)
+    large = merit_of > _LEAST_REGION * merit_of.max()
+    return large[regions], bool(elsewhere < _ELSEWHERE * merit.sum())
 
 
 def _standing_object(
@@ -216,8 +220,8 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
     outside[0] = False
     depth = np.where(outside[labels], back, np.float32(np.inf))
     for plane in planes:
-        is_support = support is not None and bool((plane == support).all())
-        if is_support or np.mean(heights(body, plane) > -body_tolerance_m) < _IN_FRONT_SHARE:
+        level = support is not None and bool(parallel(plane[None], support)[0])  # the support, or the top of a box
+        if level or np.mean(heights(body, plane) > -body_tolerance_m) < _IN_FRONT_SHARE:
             continue
         in_front_m = heights(layers.back_m, plane)
         on = around & (np.abs(in_front_m) < tolerance_m)
