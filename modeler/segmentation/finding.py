@@ -27,8 +27,6 @@ from modeler.types import Array, BoolArray, Camera, Float32Array, Frame
 Window = tuple[slice, slice]
 _ZONE_MARGIN_M = 0.1  # distance from the object's zone at which it may still be
 _ZONE_MARGIN_SHARE = 0.3  # share of the zone's size, if that is more
-_MOSTLY_IN_ZONE = 0.5  # share of a piece next to the object that must be in the zone for it to be part of the object
-_MOSTLY_STATIC = 0.5  # share of a cluster that all frames show from which it is background
 _LEAST_PIECE = 0.07  # of the object; false depth filled in around a figure's limbs has pieces of up to 6 %
 _STRAY_WEIGHT = 0.2  # weight of pixels outside the zone, and of pieces that extend from the image's edge as arms do
 _FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
@@ -78,6 +76,68 @@ def find(
     return replace(chosen, mask=mask)
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """The part of a downsampled depth image whose depths the object may have."""
+
+    window: Window
+    """Which part."""
+    points: Float32Array
+    """(h, w, 3)."""
+    above: BoolArray
+    """(h, w) what is above the support and in front of the background."""
+    inside: BoolArray
+    """(h, w) what is where the object may be."""
+    on_edge: BoolArray
+    """(h, w) the edge of the field of view."""
+    pixel_m2: Float32Array
+    """(h, w) area of a pixel."""
+    reach_m: Array
+    """(2, 3) low and high corner of where the object may be."""
+    gap_m: float
+    """Largest gap between parts of one thing."""
+
+    @property
+    def depth_m(self) -> Float32Array:
+        """(h, w)."""
+        return self.points[..., 2]
+
+    def clusters(self, fore: BoolArray) -> Labels:
+        """Label the pixels of a region (h, w) by what is one thing in space, (n,)."""
+        return voxel_clusters(self.points[fore], low_m=self.reach_m[0], high_m=self.reach_m[1], gap_m=self.gap_m)
+
+    def goes_on(self, fore: BoolArray) -> BoolArray:
+        """Return the pixels (h, w) of a region at which the foreground continues outside of it."""
+        outside, depth_m = self.above & ~fore, self.depth_m
+        low_m = ndimage.minimum_filter(np.where(outside, depth_m, np.float32(np.inf)), 3)
+        high_m = ndimage.maximum_filter(np.where(outside, depth_m, np.float32(-np.inf)), 3)
+        found: BoolArray = fore & (depth_m > low_m - self.gap_m) & (depth_m < high_m + self.gap_m)
+        return found
+
+    def static(self, scene: Scene, noise: DepthNoise) -> BoolArray:
+        """Return the pixels (h, w) that show what all frames show."""
+        if scene.still_m is None:
+            return np.zeros(self.above.shape, dtype=np.bool_)
+        return np.abs(self.depth_m - scene.still_m[self.window]) < noise.tolerance_m(self.depth_m)
+
+
+def _part(
+    depth_m: Float32Array, camera: Camera, scene: Scene, noise: DepthNoise, *, zone_m: Array, gap_m: float
+) -> _Part:
+    """Return the part of a depth image (h, w) at the depths at which the object may be."""
+    stride = planning_stride(camera)
+    thin = np.ascontiguousarray(depth_m[::stride, ::stride])
+    reach_m = _reach_m(zone_m)
+    window = window_of((thin > reach_m[0, 2]) & (thin < reach_m[1, 2]), margin=0)
+    row, column = window[0].start * stride, window[1].start * stride
+    points = point_image(thin[window], camera, stride=stride, row=row, column=column)
+    above, _ = _foreground(points, window, scene, noise, thinning=1)
+    pixel_m2 = points[..., 2] ** 2 * (stride**2 / (camera.fx * camera.fy))
+    on_edge = edge_of(np.isfinite(thin))[window]
+    return _Part(window, points, above, _inside(points, *reach_m), on_edge, pixel_m2, reach_m, gap_m)
+
+
 def _choose(
     depth_m: Float32Array,
     camera: Camera,
@@ -90,73 +150,58 @@ def _choose(
 ) -> Found:
     """Return the object in the downsampled image."""
     stride = planning_stride(camera)
-    thin = np.ascontiguousarray(depth_m[::stride, ::stride])
-    chosen = np.zeros(thin.shape, dtype=np.bool_)
-    low, high = _reach_m(zone_m)
-    window = window_of((thin > low[2]) & (thin < high[2]), margin=0)
-    row, column = window[0].start * stride, window[1].start * stride
-    points = point_image(thin[window], camera, stride=stride, row=row, column=column)
-    depth, (above, _) = points[..., 2], _foreground(points, window, scene, noise, thinning=1)
-    inside, on_edge = _inside(points, low, high), edge_of(np.isfinite(thin))[window]
-    goes_on, fore = _goes_on(depth, above, inside, gap_m), above & inside
+    chosen = np.zeros(depth_m[::stride, ::stride].shape, dtype=np.bool_)
+    part = _part(depth_m, camera, scene, noise, zone_m=zone_m, gap_m=gap_m)
+    fore = part.above & part.inside
     if not fore.any():
         return Found(chosen)
-    pixel_m2 = depth**2 * (stride**2 / (camera.fx * camera.fy))
-    ends = fore & (goes_on | on_edge)
-    if scene.nearest_m is not None and scene.areas_m2 is not None and ends.any():
-        labels = voxel_clusters(points[fore], low_m=low, high_m=high, gap_m=gap_m)
-        arm = np.zeros_like(fore)
-        arm[fore] = (np.bincount(labels, ends[fore]) > _CUT_SHARE * np.sqrt(np.bincount(labels)))[labels]
-        in_zone = _inside(points, *zone_m)
-        for removed in _in_front(depth, arm, scene.nearest_m[window] - gap_m, above & ~inside, gap_m):
-            # If less than the object is left, it was removed as well.
-            if pixel_m2[fore & in_zone & ~removed].sum() > scene.areas_m2[0] / AREA_FACTOR:
-                goes_on, fore = _goes_on(depth, above, fore & ~removed, gap_m), fore & ~removed
-                break
-    labels = voxel_clusters(points[fore], low_m=low, high_m=high, gap_m=gap_m)
-    candidates = points[fore]
-    in_zone = _inside(candidates, *zone_m)
-    strays = np.bincount(labels, in_zone) < _MOSTLY_IN_ZONE * np.bincount(labels)
-    labels = _split(labels, strays, depth, fore)
-    area = pixel_m2[fore]
-    merit = np.bincount(labels, area * np.where(in_zone, 1.0, _STRAY_WEIGHT))
-    merit[np.bincount(labels, on_edge[fore]) > _CUT_SHARE * np.sqrt(np.bincount(labels))] *= _STRAY_WEIGHT
-    static = _is_static(depth, scene, window, noise)[fore]
-    merit[np.bincount(labels, static) > _MOSTLY_STATIC * np.bincount(labels)] *= _STRAY_WEIGHT
+    fore &= ~_arm(part, scene, zone_m)
+    labels, in_zone = part.clusters(fore), _inside(part.points[fore], *zone_m)
+    labels = _split(labels, _mostly(~in_zone, labels), part.depth_m, fore)
+    area_m2, static = part.pixel_m2[fore], part.static(scene, noise)[fore]
+    merit = np.bincount(labels, area_m2 * np.where(in_zone, 1.0, _STRAY_WEIGHT))
+    merit[_many(part.on_edge[fore], labels)] *= _STRAY_WEIGHT
+    merit[_mostly(static, labels)] *= _STRAY_WEIGHT
     best = int(merit.argmax())
-    chosen[window][fore] = labels == best
+    chosen[part.window][fore] = labels == best
     blocking = chosen if occluder is None else chosen | occluder[::stride, ::stride]
     if scene.areas_m2 is None:  # what moves shows the zone only roughly
         margin_m = _ZONE_MARGIN_SHARE * float(np.ptp(zone_m, axis=0).max())
-        in_zone = _inside(candidates, zone_m[0] - margin_m, zone_m[1] + margin_m) & ~static
-    own = _joined(best, labels, in_zone, _beside(blocking)[window][fore])
-    chosen[window][fore] = own[labels]
+        in_zone = _inside(part.points[fore], zone_m[0] - margin_m, zone_m[1] + margin_m) & ~static
+    own = _joined(best, labels, in_zone, _beside(blocking)[part.window][fore])
+    chosen[part.window][fore] = own[labels]
     rival = float(merit[~own].max(initial=0.0) / merit[best])
-    leads_on = np.count_nonzero(goes_on[fore] & own[labels]) > _CUT_SHARE * np.sqrt(np.count_nonzero(own[labels]))
-    return Found(chosen, float(area[own[labels]].sum()), rival, goes_on=bool(leads_on))
+    goes_on = _many(part.goes_on(fore)[fore], (~own[labels]).astype(np.int32))[0]
+    return Found(chosen, float(area_m2[own[labels]].sum()), rival, goes_on=bool(goes_on))
 
 
-def _is_static(depth_m: Float32Array, scene: Scene, window: Window, noise: DepthNoise) -> BoolArray:
-    """Return which pixels (h, w) of a part of the downsampled image show what all frames show."""
-    if scene.still_m is None:
-        return np.zeros(depth_m.shape, dtype=np.bool_)
-    return np.abs(depth_m - scene.still_m[window]) < noise.tolerance_m(depth_m)
+def _mostly(chosen: BoolArray, labels: Labels) -> BoolArray:
+    """Return which labels (k,) most of whose pixels (n,) are chosen."""
+    return np.bincount(labels, chosen) > 0.5 * np.bincount(labels)
 
 
-def _goes_on(depth_m: Float32Array, fore: BoolArray, inside: BoolArray, gap_m: float) -> BoolArray:
-    """Return the pixels (h, w) at which the foreground continues from the inside of a box to its outside.
+def _many(ends: BoolArray, labels: Labels) -> BoolArray:
+    """Return which labels (k,) so many of whose pixels (n,) are at an end that they continue there."""
+    return np.bincount(labels, ends) > _CUT_SHARE * np.sqrt(np.bincount(labels))
 
-    Args:
-        depth_m: (h, w).
-        fore: (h, w) the foreground.
-        inside: (h, w) what is in the box.
-        gap_m: largest difference of depth between neighbours that are one thing.
+
+def _arm(part: _Part, scene: Scene, zone_m: Array) -> BoolArray:
+    """Return the pixels (h, w) of an arm that may touch the object (method.md, "Occluders").
+
+    It leads out of view, or out of where the object may be, and is nearer than the object ever was.
     """
-    outside = fore & ~inside
-    low_m = ndimage.minimum_filter(np.where(outside, depth_m, np.float32(np.inf)), 3)
-    high_m = ndimage.maximum_filter(np.where(outside, depth_m, np.float32(-np.inf)), 3)
-    found: BoolArray = fore & inside & (depth_m > low_m - gap_m) & (depth_m < high_m + gap_m)
-    return found
+    fore, suspect = part.above & part.inside, np.zeros_like(part.above)
+    ends = fore & (part.goes_on(fore) | part.on_edge)
+    if scene.nearest_m is None or scene.areas_m2 is None or not ends.any():
+        return suspect
+    labels, in_zone = part.clusters(fore), fore & _inside(part.points, *zone_m)
+    suspect[fore] = _many(ends[fore], labels)[labels]
+    nearest_m, outside = scene.nearest_m[part.window] - part.gap_m, part.above & ~part.inside
+    for arm in _in_front(part.depth_m, suspect, nearest_m, outside, part.gap_m):
+        # If less than the object is left, it was removed as well.
+        if part.pixel_m2[in_zone & ~arm].sum() > scene.areas_m2[0] / AREA_FACTOR:
+            return arm
+    return np.zeros_like(suspect)
 
 
 def _in_front(
@@ -173,7 +218,7 @@ def _in_front(
     """
     nearer = suspect & (depth_m < nearest_m)
     parts = pieces(depth_m, suspect | outside, gap_m)
-    mostly = np.bincount(parts.ravel(), (nearer | outside).ravel()) > _MOSTLY_IN_ZONE * np.bincount(parts.ravel())
+    mostly = _mostly((nearer | outside).ravel(), parts.ravel())
     mostly[0] = False
     return nearer | (suspect & mostly[parts]), nearer
 
@@ -217,7 +262,7 @@ def _joined(best: int, labels: Labels, in_zone: BoolArray, neighbours: Labels) -
     own_pieces = np.unique(neighbours[labels == best])
     touching = np.bincount(labels[np.isin(neighbours, own_pieces)], minlength=int(labels.max()) + 1) > 0
     sizes = np.bincount(labels)
-    own: BoolArray = touching & (np.bincount(labels, in_zone) > _MOSTLY_IN_ZONE * sizes)
+    own: BoolArray = touching & _mostly(in_zone, labels)
     own &= sizes > _LEAST_PIECE * sizes[best]
     own[best] = True
     return own
