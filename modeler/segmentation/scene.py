@@ -133,12 +133,13 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     low, high = np.percentile(layers.front_m[labels == int(merit.argmax())], [2.0, 98.0], axis=0)
     margin = _NEIGHBOUR_SIZES * float(np.linalg.norm(high - low))
     near = ((layers.front_m > low - margin) & (layers.front_m < high + margin)).all(axis=-1)
-    elsewhere = _central(np.where(near, 0, labels), depth, layers.front_share).sum()
+    elsewhere = _central(np.where(near, 0, labels), depth, layers.front_share)
+    elsewhere[cut[: len(elsewhere)]] *= _CUT_WEIGHT
     regions = np.zeros(depth.shape, dtype=np.int32)
     ndimage.label(layers.moved & allowed & near, output=regions)
     merit_of = _central(regions, depth, layers.front_share)
     large = merit_of > _LEAST_REGION * merit_of.max()
-    return large[regions], bool(elsewhere < _ELSEWHERE * merit.sum())
+    return large[regions], bool(elsewhere.sum() < _ELSEWHERE * merit.sum())
 
 
 def _standing_object(
