@@ -53,7 +53,7 @@ class Register:
                 failure = prepared.failure
                 raise InputError(f"{self.sequence}: frame {index} has {failure.label}. {outcome_advice(failure)}")
             views.append(prepared.view)
-        posterior = modeler.register(*views).widened(modeler.sensor.sigma_focal, views[0].centroid_m)
+        posterior = modeler.register(*views).widened(modeler.sensor.sigma_focal)
         what_to_do = outcome_advice(posterior.outcome, modeler.prior, posterior)
         edge = Edge(posterior, "odometry", posterior.usable, Stated(what_to_do))
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}

@@ -11,7 +11,6 @@ import numpy as np
 from modeler import se3
 from modeler.types.base import Array, Outcome
 
-_FOCAL_ERROR = 0.1  # of a derivative by the focal length relative to its size, root mean square (method.md, eq. 25)
 _APART = 2.0  # standard deviations: the sum of two equal Gaussians whose means are nearer has one peak
 
 
@@ -36,20 +35,9 @@ class PoseGaussian:
         """Return the Gaussian under a focal length, given as the logarithm of its factor."""
         return replace(self, mean=self.mean @ se3.exp(log_factor * self.by_focal))
 
-    def widened(self, sigma_focal: float, about_m: Array | None = None) -> PoseGaussian:
-        """Return the Gaussian for a focal length whose logarithm has a standard deviation.
-
-        Args:
-            sigma_focal: the standard deviation.
-            about_m: (3,) what of the moved surface the derivative's error turns about and shifts; None: without error.
-        """
-        squares = np.outer(self.by_focal, self.by_focal)
-        if about_m is not None:  # as large in all directions
-            about = se3.covariance_about(squares, about_m)
-            sizes = [np.trace(about[:3, :3]), np.trace(about[3:, 3:])]
-            error = _FOCAL_ERROR**2 / 3.0 * np.diag(np.repeat(sizes, 3))
-            squares = squares + se3.covariance_about(error, -np.asarray(about_m))
-        return replace(self, covariance=self.covariance + sigma_focal**2 * squares)
+    def widened(self, sigma_focal: float) -> PoseGaussian:
+        """Return the Gaussian for a focal length whose logarithm has a standard deviation."""
+        return replace(self, covariance=self.covariance + sigma_focal**2 * np.outer(self.by_focal, self.by_focal))
 
     @cached_property
     def rotation_variance_rad2(self) -> float:
@@ -122,15 +110,10 @@ class Posterior:
         modes = tuple(replace(mode, pose=mode.pose.under(log_factor)) for mode in self.modes)
         return replace(self.without_samples(), pose=self.pose.under(log_factor), modes=modes)
 
-    def widened(self, sigma_focal: float, centroid_m: Array) -> Posterior:
-        """Return the posterior of a single pair where the logarithm of the focal length has this sd.
-
-        Args:
-            sigma_focal: the standard deviation.
-            centroid_m: (3,) of the source's surface.
-        """
-        modes = tuple(replace(mode, pose=mode.pose.widened(sigma_focal, centroid_m)) for mode in self.modes)
-        return replace(self, pose=self.pose.widened(sigma_focal, centroid_m), modes=modes)
+    def widened(self, sigma_focal: float) -> Posterior:
+        """Return the posterior of a single pair where the logarithm of the focal length has this sd."""
+        modes = tuple(replace(mode, pose=mode.pose.widened(sigma_focal)) for mode in self.modes)
+        return replace(self, pose=self.pose.widened(sigma_focal), modes=modes)
 
     def without_samples(self) -> Posterior:
         """Return the posterior without its samples, most of its memory, which are not needed after acceptance tests."""

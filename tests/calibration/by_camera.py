@@ -163,7 +163,7 @@ def _pair(blank: Trial, source: RayImage, target: RayImage, truth: Array, seed: 
 def judged(trial: Trial, posterior: Posterior, truth: Array, source: RayImage, target: RayImage) -> Trial:
     """Return a trial with its errors; the uncertainty of a nominal focal length is given."""
     there = truth @ se3.translation(source.centroid_m)
-    pose = posterior.pose.widened(NOMINAL if trial.stated == "nominal" else 0.0, source.centroid_m)
+    pose = posterior.pose.widened(NOMINAL if trial.stated == "nominal" else 0.0)
     estimate = about_point(pose, source.centroid_m)
     squares = [nees(estimate, there, part) for part in (slice(0, 6), slice(0, 3), slice(3, 6))]
     return replace(
