@@ -32,9 +32,8 @@ if TYPE_CHECKING:
     from modeler.types import AbstractPrior, Event, Frame
     from sequences import AbstractSequence
 
-DRAWING_SHARE = 0.25
-"""Of the time of a live run: drawing a step takes about as long as registering one, and so it delays a step by a
-quarter at most."""
+DRAWING_SHARE = 0.15
+"""Of the time of a live run. Drawing a step takes about as long as registering one; so it delays steps by a fifth."""
 
 
 @dataclass(frozen=True)
