@@ -16,6 +16,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from calibration.specimens import SPECIMENS, Symmetry
+from kept import kept_lines
 
 from active.tables import printed
 from active.trial import Trial, ran
@@ -62,7 +63,7 @@ def main() -> None:
 
 
 def records(path: Path) -> list[dict]:
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    return [json.loads(line) for line in kept_lines(path)]
 
 
 if __name__ == "__main__":

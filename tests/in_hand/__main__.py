@@ -14,6 +14,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from kept import kept_lines
+
 from in_hand.study import HOLDERS, SHAPES, TOLD, Outcome, outcome, table
 
 
@@ -27,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "in_hand.jsonl"
-    lines = path.read_text().splitlines() if path.exists() else []
+    lines = kept_lines(path)
     found = [Outcome(**{**json.loads(line), "reasons": tuple(json.loads(line)["reasons"])}) for line in lines]
     for holder in options.holder:
         for shape in options.shape:

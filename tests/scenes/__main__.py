@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from kept import kept_lines
 from trust.plan import HALVES, Half
 
 from scenes import masks, occluded
@@ -56,7 +57,7 @@ def _masks(folder: Path, half: Half, numbers: range) -> str:
 
 def _occluded(path: Path, wanted: Sequence[occluded.Told]) -> str:
     """Return the table of models behind hands and grippers."""
-    outcomes = [occluded.Outcome(**json.loads(line)) for line in path.read_text().splitlines()] if path.exists() else []
+    outcomes = [occluded.Outcome(**json.loads(line)) for line in kept_lines(path)]
     done = {(one.shape, one.holder, one.told) for one in outcomes}
     for told in wanted:
         for holder in occluded.HOLDERS if told != "no hand" else occluded.HOLDERS[:1]:

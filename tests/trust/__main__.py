@@ -17,6 +17,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import numba
+from kept import kept_lines
 
 from trust.plan import HALVES, Half, Plan
 from trust.study import Outcome, outcome
@@ -41,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(half: Half, runs: int, jobs: int, path: Path) -> list[Outcome]:
     """Build what has not been built yet, append it to a file, and return all outcomes by number."""
-    lines = path.read_text().splitlines() if path.exists() else []
+    lines = kept_lines(path)
     done = {one.number: one for one in (Outcome.of(json.loads(line)) for line in lines) if one.number < runs}
     began = time.perf_counter()
     with path.open("a") as stream:

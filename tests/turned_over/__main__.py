@@ -17,6 +17,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from kept import kept_lines
 from trust.plan import HALVES
 
 from turned_over.plan import RECORDINGS, Plan
@@ -37,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / f"{'models' if options.models else options.half}.jsonl"
-    known = [Outcome.of(json.loads(line)) for line in path.read_text().splitlines()] if path.exists() else []
+    known = [Outcome.of(json.loads(line)) for line in kept_lines(path)]
     for number in options.only:
         if all(one.number != number for one in known):
             known.append(outcome(Plan(options.half, number, tuple(options.models)), options.out))
