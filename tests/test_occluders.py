@@ -24,7 +24,7 @@ from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.segmentation import Scene, Segmenter
-from modeler.types import BoolArray, Frame, InputError
+from modeler.types import BoolArray, Frame, InputError, Outcome
 from sequences import BopSequence, open_sequence, write_bop
 
 
@@ -136,6 +136,23 @@ def test_an_arm_that_comes_before_the_object_now_and_then_is_no_part_of_it() -> 
     scene = segmenter.scene(frames)
     for frame, mask in zip(frames, masks, strict=True):
         assert iou(segmenter.segment(frame, scene).mask, mask) > 0.94
+
+
+def test_an_arm_in_every_frame_is_no_part_of_the_object(rng) -> None:
+    """It reaches over the table and hides another part in every frame, some in two; nobody says where it is."""
+    for lowest_m, highest_m in ((0.05, 0.09), (0.09, 0.11)):
+        frames, masks = [], []
+        for k, arm_m in enumerate(rng.uniform(lowest_m, highest_m, 8)):
+            world = World().table().box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
+            world.box((0.17 + 0.01 * (k % 3), -0.12, arm_m), (0.2, 0.02, 0.02))
+            frame, mask = world.frame(k, rng)
+            frames.append(frame)
+            masks.append(mask)
+        segmenter = Segmenter()
+        scene = segmenter.scene(frames)
+        found = [segmenter.segment(frame, scene) for frame in frames]
+        assert [one.outcome for one in found] == [Outcome.CONVERGED] * len(frames)
+        assert min(iou(one.mask, mask) for one, mask in zip(found, masks, strict=True)) > 0.9
 
 
 def test_a_hand_that_touches_the_object_is_no_part_of_it_where_it_is_marked(rng) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -12,7 +13,6 @@ from scipy import ndimage
 from modeler.segmentation.depth_images import (
     DepthNoise,
     Labels,
-    edge_of,
     mixed_pixels,
     pieces,
     planning_stride,
@@ -22,7 +22,7 @@ from modeler.segmentation.depth_images import (
     without_specks,
 )
 from modeler.segmentation.scene import Scene
-from modeler.types import Array, BoolArray, Camera, Float32Array, Frame
+from modeler.types import Array, BoolArray, Camera, Float32Array, Frame, Plane
 
 Window = tuple[slice, slice]
 _ZONE_MARGIN_M = 0.1  # distance from the object's zone at which it may still be
@@ -107,12 +107,17 @@ class _Part:
         """Label the pixels of a region (h, w) by what is one thing in space, (n,)."""
         return voxel_clusters(self.points[fore], low_m=self.reach_m[0], high_m=self.reach_m[1], gap_m=self.gap_m)
 
-    def goes_on(self, fore: BoolArray) -> BoolArray:
-        """Return the pixels (h, w) of a region at which the foreground continues outside of it."""
-        outside, depth_m = self.above & ~fore, self.depth_m
-        low_m = ndimage.minimum_filter(np.where(outside, depth_m, np.float32(np.inf)), 3)
-        high_m = ndimage.maximum_filter(np.where(outside, depth_m, np.float32(-np.inf)), 3)
-        found: BoolArray = fore & (depth_m > low_m - self.gap_m) & (depth_m < high_m + self.gap_m)
+    @cached_property
+    def outside(self) -> BoolArray:
+        """(h, w) what is above the support where the object cannot be, without mixed pixels along outlines."""
+        return np.asarray(ndimage.binary_opening(self.above & ~self.inside, np.ones((2, 2))), dtype=np.bool_)
+
+    def next_to(self, region: BoolArray) -> BoolArray:
+        """Return the pixels (h, w) next to those of a region, without a depth jump between them."""
+        depth_m = self.depth_m
+        low_m = ndimage.minimum_filter(np.where(region, depth_m, np.float32(np.inf)), 3)
+        high_m = ndimage.maximum_filter(np.where(region, depth_m, np.float32(-np.inf)), 3)
+        found: BoolArray = (depth_m > low_m - self.gap_m) & (depth_m < high_m + self.gap_m)
         return found
 
     def static(self, scene: Scene, noise: DepthNoise) -> BoolArray:
@@ -134,7 +139,7 @@ def _part(
     points = point_image(thin[window], camera, stride=stride, row=row, column=column)
     above, _ = _foreground(points, window, scene, noise, thinning=1)
     pixel_m2 = points[..., 2] ** 2 * (stride**2 / (camera.fx * camera.fy))
-    on_edge = edge_of(np.isfinite(thin))[window]
+    on_edge = scene.edge[window] if scene.edge is not None else np.zeros_like(above)
     return _Part(window, points, above, _inside(points, *reach_m), on_edge, pixel_m2, reach_m, gap_m)
 
 
@@ -155,7 +160,8 @@ def _choose(
     fore = part.above & part.inside
     if not fore.any():
         return Found(chosen)
-    fore &= ~_arm(part, scene, zone_m)
+    arm = _arm(part, scene, zone_m)
+    fore &= ~arm
     labels, in_zone = part.clusters(fore), _inside(part.points[fore], *zone_m)
     labels = _split(labels, _mostly(~in_zone, labels), part.depth_m, fore)
     area_m2, static = part.pixel_m2[fore], part.static(scene, noise)[fore]
@@ -164,14 +170,15 @@ def _choose(
     merit[_mostly(static, labels)] *= _STRAY_WEIGHT
     best = int(merit.argmax())
     chosen[part.window][fore] = labels == best
-    blocking = chosen if occluder is None else chosen | occluder[::stride, ::stride]
+    blocking = chosen.copy() if occluder is None else chosen | occluder[::stride, ::stride]
+    blocking[part.window] |= arm
     if scene.areas_m2 is None:  # what moves shows the zone only roughly
         margin_m = _ZONE_MARGIN_SHARE * float(np.ptp(zone_m, axis=0).max())
         in_zone = _inside(part.points[fore], zone_m[0] - margin_m, zone_m[1] + margin_m) & ~static
     own = _joined(best, labels, in_zone, _beside(blocking)[part.window][fore])
     chosen[part.window][fore] = own[labels]
     rival = float(merit[~own].max(initial=0.0) / merit[best])
-    goes_on = _many(part.goes_on(fore)[fore], (~own[labels]).astype(np.int32))[0]
+    goes_on = _many(part.next_to(part.above & ~fore)[fore], (~own[labels]).astype(np.int32))[0]
     return Found(chosen, float(area_m2[own[labels]].sum()), rival, goes_on=bool(goes_on))
 
 
@@ -188,37 +195,50 @@ def _many(ends: BoolArray, labels: Labels) -> BoolArray:
 def _arm(part: _Part, scene: Scene, zone_m: Array) -> BoolArray:
     """Return the pixels (h, w) of an arm that may touch the object (method.md, "Occluders").
 
-    It leads out of view, or out of where the object may be, and is nearer than the object ever was.
+    It leads out of view, or out of where the object may be, and is nearer than the object ever was; where arms are in
+    most frames, it may also be what leads out of view above the support.
     """
-    fore, suspect = part.above & part.inside, np.zeros_like(part.above)
-    ends = fore & (part.goes_on(fore) | part.on_edge)
-    if scene.nearest_m is None or scene.areas_m2 is None or not ends.any():
-        return suspect
-    labels, in_zone = part.clusters(fore), fore & _inside(part.points, *zone_m)
+    fore, none = part.above & part.inside, np.zeros_like(part.above)
+    ends = fore & (part.next_to(part.outside) | part.on_edge)
+    if not ends.any():
+        return none
+    labels, in_zone, suspect = part.clusters(fore), fore & _inside(part.points, *zone_m), none.copy()
     suspect[fore] = _many(ends[fore], labels)[labels]
-    nearest_m, outside = scene.nearest_m[part.window] - part.gap_m, part.above & ~part.inside
-    for arm in _in_front(part.depth_m, suspect, nearest_m, outside, part.gap_m):
-        # If less than the object is left, it was removed as well.
-        if part.pixel_m2[in_zone & ~arm].sum() > scene.areas_m2[0] / AREA_FACTOR:
-            return arm
-    return np.zeros_like(suspect)
+    hovering = _hovering(part, suspect, ends, scene.plane) if scene.arms and scene.plane else none
+    if scene.nearest_m is None or scene.areas_m2 is None:
+        return hovering
+    nearest_m = scene.nearest_m[part.window] - part.gap_m
+    for without in (hovering, none):
+        for nearer in _in_front(part, suspect & ~without, nearest_m):
+            arm = without | nearer
+            # If less than the object is left, it was removed as well.
+            if part.pixel_m2[in_zone & ~arm].sum() > scene.areas_m2[0] / AREA_FACTOR:
+                return arm
+    return none
 
 
-def _in_front(
-    depth_m: Float32Array, suspect: BoolArray, nearest_m: Float32Array, outside: BoolArray, gap_m: float
-) -> tuple[BoolArray, BoolArray]:
+def _hovering(part: _Part, suspect: BoolArray, ends: BoolArray, support: Plane) -> BoolArray:
+    """Return the suspect pixels (h, w) of pieces that lead out of view and do not reach down to the support."""
+    parts = pieces(part.depth_m, suspect | part.outside, part.gap_m)
+    leads_out = _many((ends | part.outside).ravel(), parts.ravel())
+    lowest_m = ndimage.minimum(support.height_m(part.points.astype(np.float64)), parts, np.arange(len(leads_out)))
+    arms = leads_out & (np.asarray(lowest_m) > part.gap_m)
+    arms[0] = False
+    arm: BoolArray = suspect & arms[parts]
+    return arm | (suspect & (parts == 0) & part.next_to(arm))
+
+
+def _in_front(part: _Part, suspect: BoolArray, nearest_m: Float32Array) -> tuple[BoolArray, BoolArray]:
     """Return the suspect pixels (h, w) nearer than the object ever was: with pieces that mostly are, and alone.
 
     Args:
-        depth_m: (h, w).
+        part: of a depth image.
         suspect: (h, w) pixels of something that leads on to where the object cannot be.
         nearest_m: (h, w) least depth of the object.
-        outside: (h, w) where the object cannot be.
-        gap_m: difference of depth between neighbours beyond which they are of two pieces.
     """
-    nearer = suspect & (depth_m < nearest_m)
-    parts = pieces(depth_m, suspect | outside, gap_m)
-    mostly = _mostly((nearer | outside).ravel(), parts.ravel())
+    nearer = suspect & (part.depth_m < nearest_m)
+    parts = pieces(part.depth_m, suspect | part.outside, part.gap_m)
+    mostly = _mostly((nearer | part.outside).ravel(), parts.ravel())
     mostly[0] = False
     return nearer | (suspect & mostly[parts]), nearer
 
@@ -358,10 +378,13 @@ def _not_a_crease(height_m: Float32Array, fore: BoolArray, reach_px: float) -> B
     return np.asarray(ndimage.binary_fill_holes(near), dtype=np.bool_)  # a crease surrounds the object
 
 
-def is_cut(mask: BoolArray, frame: Frame) -> bool:
+def is_cut(mask: BoolArray, scene: Scene) -> bool:
     """Return whether a mask (h, w) extends beyond the field of view."""
-    on_edge = np.count_nonzero(mask & edge_of(frame.depth_m > 0.0))
-    return bool(on_edge >= _CUT_SHARE * np.sqrt(np.count_nonzero(mask)))
+    if scene.edge is None:
+        return False
+    stride = round(len(mask) / len(scene.edge))
+    thin = mask[::stride, ::stride]
+    return bool(np.count_nonzero(thin & scene.edge) >= _CUT_SHARE * np.sqrt(np.count_nonzero(thin)))
 
 
 def nearest_seen_m(frames: Sequence[Frame], masks: Sequence[BoolArray]) -> Float32Array:

@@ -65,6 +65,10 @@ class Scene:
     """(2, 3) low and high corner, in camera coordinates, of the box in which the object was seen."""
     nearest_m: Float32Array | None = None
     """(h, w), downsampled: the least depth at which the object was seen, infinite where it never was; None: unknown."""
+    edge: BoolArray | None = None
+    """(h, w), downsampled: the edge of the field of view, where objects may be truncated."""
+    arms: bool = False
+    """Whether arms that touch the object are in most frames."""
     areas_m2: tuple[float, float] | None = None
     """Least and greatest area that the object showed to the camera."""
     sure: bool = True
@@ -108,13 +112,14 @@ def learn(layers: Layers, allowed: BoolArray, noise: DepthNoise, *, least_points
     still = np.where(layers.still, layers.back_m[..., 2], np.float32(np.nan))
     if not found.any():
         return Scene(still_m=still)
+    edge = edge_of(np.isfinite(layers.front_m[..., 2]))
     zone = np.percentile(layers.front_m[found], [1.0, 99.0], axis=0).astype(np.float64)
     plane = None
     if guess is not None:
         ground = layers.back_m[layers.still & surroundings(layers.front_m, found)]
         plane = fit_beside(ground, layers.front_m[found], guess=guess, noise=noise)
     guess = None if plane is None else guess
-    return Scene(plane, still, _scenery(layers, found, planes, guess, noise), zone, sure=sure)
+    return Scene(plane, still, _scenery(layers, found, planes, guess, noise), zone, edge=edge, sure=sure)
 
 
 def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]:

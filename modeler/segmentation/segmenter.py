@@ -34,6 +34,8 @@ _RING_PX = (1.5, 2.5)  # distance from a mask at which nothing of the object is 
 _THIN_SHARE = 0.5  # share of that ring on the object's surface: beyond, most of the rim is missing
 _STEEPEST_SLOPE = np.tan(np.radians(70.0))  # of surfaces that depth cameras measure
 
+_Look = tuple[Frame, Found]
+
 
 @final
 @dataclass(frozen=True)
@@ -83,14 +85,13 @@ class Segmenter:
         if scene.zone_m is None or not scene.still:
             return scene
         # A second pass: whole masks determine zone and visible area better than the moving pixels.
-        looks = [(frame, self._find(frame, scene)) for frame in shown]
-        looks = [(frame, look) for frame, look in looks if np.count_nonzero(look.mask) >= self.min_points]
+        looks, whole = self._looks(shown, scene)
+        if not whole and looks:
+            scene = replace(scene, arms=True)
+            looks, whole = self._looks(shown, scene)
         if not looks:
             return scene
-        # An arm that touches the object in some frames makes it larger there, and leads out of view.
-        whole = [(frame, look) for frame, look in looks if not (look.goes_on or is_cut(look.mask, frame))]
-        alone = 2 * len(whole) >= len(looks)
-        looks = whole if alone else looks
+        looks = whole or looks
         usual_m2 = float(np.median([look.area_m2 for _, look in looks]))
         looks = [(frame, look) for frame, look in looks if look.area_m2 < AREA_FACTOR * usual_m2]
         boxes = np.array([np.percentile(_points(frame)[look.mask], [0.5, 99.5], axis=0) for frame, look in looks])
@@ -100,7 +101,8 @@ class Segmenter:
         frames, masks = [frame for frame, _ in looks], [look.mask for _, look in looks]
         return replace(
             scene,
-            nearest_m=nearest_seen_m(frames, masks) if alone else None,
+            nearest_m=nearest_seen_m(frames, masks) if whole else None,
+            arms=scene.arms and bool(whole),
             zone_m=zone,
             areas_m2=(min(areas), max(areas)),
             sure=sure,
@@ -140,8 +142,18 @@ class Segmenter:
         sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < _RIVAL and not found.goes_on
         if scene.areas_m2 is not None:
             sure &= scene.areas_m2[0] / AREA_FACTOR < found.area_m2 < scene.areas_m2[1] * AREA_FACTOR
-        sure &= not is_cut(mask, frame)
+        sure &= not is_cut(mask, scene)
         return Segmentation(mask, scene.plane, Outcome.CONVERGED if sure else Outcome.UNSURE_MASK)
+
+    def _looks(self, frames: Sequence[Frame], scene: Scene) -> tuple[list[_Look], list[_Look]]:
+        """Return frames with the object found in them; and those where it does not lead out of view, if at least half.
+
+        An arm that touches the object makes it larger, and leads out of view.
+        """
+        looks = [(frame, self._find(frame, scene)) for frame in frames]
+        looks = [(frame, look) for frame, look in looks if np.count_nonzero(look.mask) >= self.min_points]
+        whole = [(frame, look) for frame, look in looks if not (look.goes_on or is_cut(look.mask, scene))]
+        return looks, whole if 2 * len(whole) >= len(looks) else []
 
     def _learn(self, frames: Sequence[Frame]) -> Scene:
         """Return the scene that frames without masks show, if their camera is static."""
