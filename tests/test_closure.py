@@ -89,6 +89,9 @@ def test_last_frame_is_tried_on_the_first_unless_the_graph_is_sure_that_it_is_el
     run.run(Closer(), spoil)
     closed = [edge.accepted for edge in run.judged[13] if edge.target == 0]
     assert closed == ([True] if sigma_deg > 10.0 else [])
+    open_turn = Run(list(REGULAR_DEG))
+    open_turn.run(Closer(max_closures=0), spoil)  # as in a recording that goes on with the object on its side
+    assert ((13, 0) in Closer().span_pairs(open_turn.map_view)) == (sigma_deg > 10.0)
 
 
 def test_previous_view_comes_first_and_recent_neighbours_are_no_closures() -> None:

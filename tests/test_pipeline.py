@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import final
 
 import numpy as np
@@ -15,6 +16,7 @@ from modeler.closure import Closer, Thresholds
 from modeler.fusion import Fuser
 from modeler.graph import CommonAxis, PoseGraph, shared_noise, solve
 from modeler.pipeline import Modeler, Prepared
+from modeler.pipeline.joining import Alignment, Joiner, Segment
 from modeler.pipeline.state import State
 from modeler.priors.mixtures import DefensiveMixture, KernelMixture
 from modeler.rays import Sensor
@@ -451,6 +453,23 @@ def test_a_lost_frame_far_back_joins_across_another_that_is_lost_for_good() -> N
     *_, last = run([*FRAMES[:3], blank(3), *FRAMES[4:]], registrar=registrar)
     assert sorted(last.solution.trajectory) == [0, 1, 2, 4, 5, 6, 7, 8]
     assert trajectory_error(last) < 1e-6
+
+
+def test_frames_held_in_the_air_do_not_keep_those_after_them_from_being_a_segment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    groups = {frame: group for group, frames in enumerate(((0, 1, 2), (3, 4), (5, 6, 7, 8))) for frame in frames}
+    apart = frozenset(pair for pair in product(groups, groups) if groups[pair[0]] != groups[pair[1]])
+    joined: list[list[int]] = []
+
+    def join(self: Joiner, target: Segment, source: Segment) -> list[Alignment]:
+        joined.append(source.frames)
+        return []
+
+    monkeypatch.setattr(Joiner, "join", join)
+    steps = run(FRAMES, registrar=Oracle(apart=apart, reach=9.0))
+    assert joined == [[5, 6, 7, 8]]
+    assert sorted(steps[-1].solution.trajectory) == [0, 1, 2]
 
 
 def test_frames_tried_once_more_in_vain_are_told_of_too() -> None:

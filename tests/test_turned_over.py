@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import tabletop
 from scipy.spatial.transform import Rotation
 from trust.plan import coarser
@@ -28,6 +29,7 @@ from modeler.types import (
     Edge,
     EdgeKind,
     JoinsSegments,
+    OpenRotation,
     Outcome,
     PoseGaussian,
     Posterior,
@@ -119,6 +121,18 @@ def test_a_brick_may_lie_either_way_round_and_that_is_said() -> None:
     why = JoinsSegments(found[0].share, 180.0)
     joins = [replace(edge(6, 0, "join"), reason=why), replace(edge(7, 1, "join"), reason=why)]
     assert not other_modes(joins, Solution(), {}).holds
+
+
+@pytest.mark.parametrize(("sigma_deg", "accepted"), [(1.0, True), (5.0, False)])
+def test_a_rotation_that_the_alignment_alone_bounds_joins_nothing(sigma_deg: float, accepted: bool) -> None:
+    """A mug whose handle is hidden: the pair would repeat whatever the alignment of the models said."""
+    pose = tabletop.turntable(6)[0]
+    view = Sensor(1e-3, 1e-3).ray_image(tabletop.view(tabletop.BRICK, pose, 0).frame)
+    spread = np.diag([1e-6, np.radians(sigma_deg) ** 2, *np.full(4, 1e-6)])
+    found = Posterior(0, 0, PoseGaussian(np.eye(4), spread), Outcome.CONVERGED, overlap=0.9)
+    judged = Joiner()._judged(found, (view, view), np.eye(4))
+    assert judged.accepted is accepted
+    assert isinstance(judged.reason, OpenRotation) is not accepted
 
 
 def shifted(view: RayImage, index: int) -> RayImage:

@@ -93,15 +93,15 @@ class Closer:
                     chosen.append(candidate.frame)
                 spanned = spanned or not closes
         first = frames[0]  # a closure with the first view is preferred
-        wanted = last and first != base.target and self._returns(gain, float(angle_deg[0]))
+        wanted = last and first != base.target and self._returns(gain, first, float(angle_deg[0]))
         wanted = wanted and map_view.came_back(first, base.source, gain.paths, away_deg=self.away_deg)
         if wanted or first in chosen:
             chosen = [first, *(frame for frame in chosen if frame != first)]
         return tuple(chosen[: self.max_closures])
 
-    def _returns(self, gain: InformationGain, angle_deg: float) -> bool:
+    def _returns(self, gain: InformationGain, first: int, angle_deg: float) -> bool:
         """Return whether the last frame is within reach of the first view, at a predicted rotation `angle_deg`."""
-        known, first = gain.map_view, gain.map_view.frames[0]
+        known = gain.map_view
         closed = loops_closed([edge for edge in known.edges if known.solution.takes_part(edge)])
         reach_deg = self.max_angle_deg if closed else max(self.max_angle_deg, self.max_return_deg)
         probability = replace(gain, max_angle_deg=reach_deg).probability_within([first], np.array([angle_deg]))
@@ -110,24 +110,33 @@ class Closer:
     def span_pairs(self, map_view: MapView) -> tuple[tuple[int, int], ...]:
         """Return the most informative pairs (source, target) of each view to register once all are in.
 
-        Both are of one segment, as there is no motion prior between segments.
+        Both are of one segment, as there is no motion prior between segments. The last view of a segment is paired with
+        the first if that is within reach.
         """
         segment_of = segments([edge for edge in map_view.edges if map_view.solution.takes_part(edge)])
         frames, targets = sorted(map_view.frames), np.array(sorted(map_view.targets))
         poses = map_view.poses(targets.tolist())
         tried = {frozenset((edge.source, edge.target)) for edge in map_view.edges}
+        last_of = {segment_of.get(frame): frame for frame in frames}
         pairs: list[tuple[int, int]] = []
-        limit_deg = self.max_span_deg
         for source in frames if self.max_spans else ():
             pose, number = map_view.solution.trajectory[source], int(np.searchsorted(targets, source))
-            angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses[:number]) @ pose))
-            near = [k for k in np.flatnonzero(angle_deg <= limit_deg) if {source, int(targets[k])} not in tried]
-            near = [k for k in near if segment_of.get(source) == segment_of.get(int(targets[k]))]
+            own = [k for k in range(number) if segment_of.get(source) == segment_of.get(int(targets[k]))]
+            earlier = targets[own].tolist()
+            angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses[own]) @ pose))
             systematic = self.consistency.systematic(1, map_view.views[source].centroid_m)
-            gain = InformationGain(map_view, source, pose, systematic, limit_deg, has_own_edge=False, power=_SPAN_POWER)
-            found = gain.candidates(targets[near].tolist(), angle_deg[near], self.min_span_gain_nats)
-            overlapping = [candidate for candidate in found if candidate.overlap >= self.thresholds.min_overlap]
-            pairs += [(source, candidate.frame) for candidate in overlapping[: self.max_spans]]
+            gain = InformationGain(
+                map_view, source, pose, systematic, self.max_span_deg, has_own_edge=False, power=_SPAN_POWER
+            )
+            untried = np.array([{source, target} not in tried for target in earlier], dtype=np.bool_)
+            near = np.flatnonzero(untried & (gain.probability_within(earlier, angle_deg) >= _MIN_PROBABILITY))
+            found = gain.candidates([earlier[k] for k in near], angle_deg[near], self.min_span_gain_nats)
+            chosen = [one.frame for one in found if one.overlap >= self.thresholds.min_overlap]
+            ends = source in last_of.values() and bool(untried[:1].any())
+            if ends and self._returns(gain, earlier[0], float(angle_deg[0])):
+                came_back = map_view.came_back(earlier[0], source, gain.paths, away_deg=self.away_deg)
+                chosen = [earlier[0], *chosen] if came_back else chosen
+            pairs += [(source, target) for target in chosen[: self.max_spans]]
         return tuple(pairs)
 
     def is_keyframe(self, frame: int, map_view: MapView) -> bool:

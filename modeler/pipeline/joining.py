@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from modeler import se3
+from modeler.closure.consistency import widest_rotation
 from modeler.fusion import Fuser, FusionVolume, Matcher, conditional_covariances
 from modeler.pipeline.pairs import register
 from modeler.pipeline.tracking import quick_registrar
@@ -31,6 +32,7 @@ from modeler.types import (
     ElsewhereThanSegments,
     Failed,
     JoinsSegments,
+    OpenRotation,
     Outcome,
     Posterior,
     RayImage,
@@ -38,6 +40,7 @@ from modeler.types import (
 )
 
 _ALIGNMENT_SIGMA_RAD, _ALIGNMENT_SIGMA_M = 0.12, 0.01  # standard deviations of the models' alignment
+_OPEN_SHARE = 0.5  # of the first: with more, the images add less than three times the information of the alignment
 _MAX_DEVIATION_RAD = 0.5  # of a posterior from the alignment; beyond, it is at another mode
 _MAX_VIEWS: Final = 20  # of a segment, compared with as many of the other
 _COARSE_VOXELS: Final = 64**3  # of models to align
@@ -226,6 +229,9 @@ class Joiner:
         if away_rad > _MAX_DEVIATION_RAD:
             return Edge(posterior, "join", False, ElsewhereThanSegments(float(np.degrees(away_rad))))
         pair = self._pair(*views)
+        sigma_rad, _ = widest_rotation(posterior)
+        if sigma_rad > _OPEN_SHARE * _ALIGNMENT_SIGMA_RAD:
+            return Edge(posterior, "join", False, OpenRotation(float(np.degrees(sigma_rad))))
         if not pair.fits(posterior.pose.mean, self._search.fine_m(pair)):  # method.md, eq. 22
             return Edge(posterior, "join", False, Failed(Outcome.NO_OVERLAP))
         return Edge(posterior, "join", True, JoinsSegments(1.0, 0.0))

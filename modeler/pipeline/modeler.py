@@ -236,17 +236,20 @@ class Run:
             view = self.modeler.tracker(self.state).ready(lost.view)
             yield from self._place(replace(lost, view=view), neighbour, retry=True)
 
-    def rejoin(self) -> Iterator[Step | Searching]:
+    def rejoin(self) -> Iterator[Step | Searching | Refining]:
         """Build segments of lost frames and join them with the rest; yield steps of their frames.
 
         If the object was laid down differently or regrasped, the motion prior does not hold between the frames before
         and after, and all frames after are lost; among these it holds.
         """
         tried: set[int] = set()
+        if any(len(frames) >= _MIN_SEGMENT for frames in self.state.lost_intervals()):  # loops first, within segments
+            yield from self.refine()
+            self.state = self.state.with_spans()
         while intervals := [some for some in self.state.lost_intervals() if len({*some} - tried) >= _MIN_SEGMENT]:
             frames = [frame for frame in max(intervals, key=len) if frame not in tried]
             segment = yield from self._segment(frames)
-            tried |= {*segment.views} if len(segment.views) >= _MIN_SEGMENT else {*frames}
+            tried |= {*segment.views} if len(segment.views) > 1 else {*frames}  # two that match may be held in the air
             if len(segment.views) >= _MIN_SEGMENT:
                 yield from self._joined(segment)
 
@@ -259,12 +262,13 @@ class Run:
             return
         yield Refining(0, None)
         tracker, known = self.modeler.tracker(self.state), self.state.map_view
-        pairs = self.modeler.closer.span_pairs(known)
+        refined = {edge.source for edge in self.state.spans}
+        pairs = [pair for pair in self.modeler.closer.span_pairs(known) if pair[0] not in refined]
         yield Refining(0, len(pairs))
-        for posterior in tracker.spans(pairs):
+        for done, posterior in enumerate(tracker.spans(pairs), 1):
             edge = self.modeler.closer.judge_span(posterior.without_samples(), known)
             self.state = self.state.refined(tracker.explained([edge]))
-            yield Refining(len(self.state.spans), len(pairs))
+            yield Refining(done, len(pairs))
 
     def finish(self) -> Iterator[Step | Fusing]:
         """Solve the graph with the noise that its edges share, fuse the final model and yield the last step."""
@@ -296,7 +300,9 @@ class Run:
                 part.state = subset
                 for _ in part._place(lost, None):
                     pass
-        return part.state
+        for _ in part.refine():
+            pass
+        return part.state.with_spans()
 
     def _joined(self, segment: State) -> Iterator[Step]:
         """Join a segment with the views so far, if possible; yield steps of its frames."""

@@ -45,7 +45,7 @@ class State:
     failed_searches: int = 0
     """Number of frames lost since a search last placed one."""
     spans: tuple[Edge, ...] = ()
-    """Edges of the refinement, which are not in the graph yet."""
+    """Edges of the refinement, of which the newest are not in the graph yet."""
     store: ViewStore = field(default_factory=ViewStore)
     """Storage of the views and the lost frames."""
 
@@ -122,7 +122,8 @@ class State:
 
     def with_spans(self) -> State:
         """Return the state with the edges of the refinement in its graph."""
-        graph = self.graph.plus(self.spans)
+        known = set(self.graph.edges)
+        graph = self.graph.plus([edge for edge in self.spans if edge not in known])
         return replace(self, graph=graph, smoother=self.smoother.to(graph))
 
     def lost_intervals(self) -> list[list[int]]:
@@ -147,6 +148,7 @@ class State:
             smoother=self.smoother.to(graph),
             views={**self.views, **segment.views},
             keyframes=(*self.keyframes, *segment.keyframes),
+            spans=(*self.spans, *segment.spans),
             lost={frame: lost for frame, lost in self.lost.items() if frame not in segment.views},
         )
 

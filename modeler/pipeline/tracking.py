@@ -173,7 +173,7 @@ class Tracker:
     def _predicted(
         self, source: RayImage, target: int, motion: PoseGaussian, *, span: bool = False
     ) -> PredictedProposal:
-        """Return the prior of a pair whose motion the graph predicts: without its limits if they exclude it.
+        """Return the prior of a pair whose motion the graph predicts: without its limits if they may exclude it.
 
         Args:
             source: a view.
@@ -185,7 +185,7 @@ class Tracker:
         prior, unlimited = self.known.relaxed(_SPAN_STEPS) if far else self.known, self.known.unlimited()
         if unlimited is not None:  # limits that are defaults
             with suppress(InputError):  # registering says so
-                if not _inside(prior.between(source, self.state.views[target]), motion.mean[None])[0]:
+                if not _inside(prior.between(source, self.state.views[target]), _sigma_points(motion)).all():
                     prior = unlimited
         return PredictedProposal(prior, motion)
 
@@ -323,6 +323,12 @@ def _discounted(posterior: Posterior, known: AbstractPoseDensity) -> Posterior:
         samples=posterior.samples[kept],
         weights=shares / shares.sum() if shares.sum() > 0.0 else shares,
     )
+
+
+def _sigma_points(motion: PoseGaussian) -> Array:
+    """Return motions (13, 4, 4) that have the mean and the covariance of a Gaussian (Julier and Uhlmann 1997)."""
+    columns = np.sqrt(6.0) * np.linalg.cholesky(motion.covariance).T
+    return motion.mean @ se3.exp(np.concatenate([np.zeros((1, 6)), columns, -columns]))
 
 
 def _inside(known: AbstractPoseDensity, motions: Array) -> BoolArray:
