@@ -124,6 +124,7 @@ class Sensor:
             sigma_wh=self.sigma_wh,
             sigma_r_m=self.sigma_r_m,
             sigma_colour_px=self.sigma_colour_px,
+            sigma_focal=self.sigma_focal,
             points_m=points_m,
             normals=normals,
             pixels=pixels,

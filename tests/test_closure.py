@@ -273,6 +273,14 @@ def test_once_all_frames_are_in_each_is_tried_over_two_steps() -> None:
         assert Closer().judge_span(witnessed(true, -1e9), run.map_view).accepted
 
 
+def test_frames_lost_at_the_end_do_not_keep_spans_from_being_tried() -> None:
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(max_closures=0))
+    lost = [replace(run.graph.edges[0], accepted=False) for _ in range(20)]
+    pairs = Closer().span_pairs(replace(run.map_view, edges=(*run.graph.edges, *lost)))
+    assert pairs == Closer().span_pairs(run.map_view) != ()
+
+
 def test_of_small_steps_the_most_informative_span_is_tried() -> None:
     run = Run(list(3.0 * np.arange(30)))
     run.run(Closer(max_closures=0))

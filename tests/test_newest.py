@@ -113,6 +113,12 @@ def test_skipped_frames_are_filled_in_where_they_belong(tmp_path) -> None:
     assert neighbours == {0}  # the nearest in time
 
 
+def test_skipped_frames_are_filled_in_where_a_single_one_was_tracked() -> None:
+    run = modeler().start(Scene())
+    assert list(run.track(FRAMES[:1], live=True))
+    assert [step.accepted for step in run.fill(FRAMES[1:3])] == [True, True]
+
+
 def test_a_frame_that_was_read_is_not_filled_in_again() -> None:
     run = modeler().start(Scene())
     assert list(run.track(FRAMES[:2], live=True))

@@ -155,6 +155,19 @@ def test_an_arm_in_every_frame_is_no_part_of_the_object(rng) -> None:
         assert min(iou(one.mask, mask) for one, mask in zip(found, masks, strict=True)) > 0.9
 
 
+def test_a_frame_that_shows_only_an_arm_shows_no_object(rng) -> None:
+    frames = []
+    for k in range(8):
+        world = World().table()
+        if k != 3:
+            world.box((0.0, 0.0, 0.05), (0.05, 0.035, 0.05), turn_deg=25.0 * k, label=OBJECT)
+        world.box((0.17, -0.08, 0.05 + 0.01 * (k % 4)), (0.2, 0.02, 0.02))
+        frames.append(world.frame(k, rng)[0])
+    segmenter = Segmenter()
+    found = segmenter.segment(frames[3], segmenter.scene(frames))
+    assert found.outcome is not Outcome.CONVERGED
+
+
 def test_a_hand_that_touches_the_object_is_no_part_of_it_where_it_is_marked(rng) -> None:
     frames, masks, hands = [], [], []
     for k in range(6):

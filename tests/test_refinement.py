@@ -178,14 +178,15 @@ def test_an_uncertain_focal_length_spreads_poses_that_are_far_apart(name, sigma_
         replace(one, camera=replace(one.camera, fx=1.04 * one.camera.fx, fy=1.04 * one.camera.fy)) for one in frames
     ]
     target, source = (Sensor(*noise).ray_image(one) for one in frames)
-    pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
     sigmas = np.repeat([np.radians(sigma_deg), 0.002], 3)
     poses = scattered(true_motion(truth, target=0, source=1), source.centroid_m, sigmas, rng)
     spreads = []
     for sigma_focal in (0.0, 0.04):
         weighted = poses, np.full(len(poses), 1.0 / len(poses))
         rng_of_both = np.random.default_rng(1)
-        refined = Refiner(sigma_focal=sigma_focal).refine(pair, pair, weighted, rng_of_both, fine_m=0.003)
+        target, source = (Sensor(*noise[:3], sigma_focal=sigma_focal).ray_image(one) for one in frames)
+        pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
+        refined = Refiner().refine(pair, pair, weighted, rng_of_both, fine_m=0.003)
         spreads.append(sigmas_about(refined.poses, source.centroid_m)[1])
     assert (spreads[1] > 1.05 * spreads[0]) == wider
     assert spreads[1] >= spreads[0]

@@ -124,3 +124,12 @@ def test_the_choice_of_points_moves_an_answer_by_less_than_half_its_standard_dev
     moved -= moved.mean(axis=0)
     stated = np.mean([pose.covariance for pose in found], axis=0)
     assert np.sum(moved * np.linalg.solve(stated, moved.T).T) / 5 / 6 < 0.5**2
+
+
+def test_limits_narrower_than_the_search_are_an_outcome(flashlight, rng):
+    frames, plane, sensor, _ = flashlight
+    target, source = (sensor.ray_image(frame, plane) for frame in frames)
+    density = GeneralPrior(0.001, 1e-5).between(source, target)
+    posterior = VisibilityRegistrar().register(source, target, density, rng=rng)
+    assert not posterior.usable
+    assert np.isfinite(posterior.pose.covariance).all()

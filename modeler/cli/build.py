@@ -225,6 +225,7 @@ def _run(
         facts={"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings},
         advised=frames.live,
     )
+    run = modeler.start(scene)
     seconds = {"scene": time.perf_counter() - began_s, "registration": 0.0, "total": 0.0}
     report: Mapping[str, Any] = {}
     try:
@@ -233,12 +234,12 @@ def _run(
             in_background(stream, lambda step: frames.live and not step.last, share=DRAWING_SHARE) as draw,
             Interrupt() as interrupt,
             Console(len(frames), stream.address, modeler.prior) as console,
-            advising(modeler, console.advise, stream.advise) as advise,
+            advising(run.modeler, console.advise, stream.advise) as advise,
         ):
             followed = frames.live and (console.watched or stream.watched)
             wanted = frames.until(lambda: interrupt.asked)
             coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
-            for event in _events(modeler.start(scene), coming, interrupt, live=frames.live):
+            for event in _events(run, coming, interrupt, live=frames.live):
                 console(event)
                 if isinstance(event, Step):
                     seconds["registration"] += sum(posterior.seconds for posterior in event.posteriors)

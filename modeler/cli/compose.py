@@ -74,8 +74,6 @@ def modeler(
     check_region(where, sequence)
     noise, chosen = sequence.sensor(), registrar(method.method, colour=method.colour, device=method.device)
     sensor = Sensor(sigma_focal=NOMINAL_FOCAL) if noise is None else Sensor(*noise)
-    if isinstance(chosen, registration.VisibilityRegistrar):
-        chosen = replace(chosen, refiner=replace(chosen.refiner, sigma_focal=sensor.sigma_focal))
     return Modeler(
         segmenter=segmenter(where),
         sensor=sensor,

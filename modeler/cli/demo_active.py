@@ -127,7 +127,7 @@ class _Demo:
             self.stream(step)
             if count == 0 and step.view is not None:
                 self.stream.recording.send_blueprint(next_view.layout(step.view))
-            belief = self.modeler.belief(step.views, step.solution, step.edges_so_far)
+            belief = run.modeler.belief(step.views, step.solution, step.edges_so_far)
             found = suggest(belief, None, self.goal)
             for path, drawing in next_view.draw_next(belief, found, done):
                 self.stream.recording.log(path, drawing)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 from scipy.special import ndtr
@@ -106,8 +107,8 @@ class InformationGain:
     def _one_edge(self) -> Array | None:
         """Mean covariance (6, 6) of the newest edges; None if there are none."""
         solution = self.map_view.solution
-        edges = [edge for edge in self.map_view.edges[-_RECENT_EDGES:] if solution.takes_part(edge)]
-        recent = [solution.pose_of(edge).covariance for edge in edges]
+        edges = (edge for edge in reversed(self.map_view.edges) if solution.takes_part(edge))
+        recent = [solution.pose_of(edge).covariance for edge in islice(edges, _RECENT_EDGES)]
         return np.asarray(np.mean(recent, axis=0) + self.systematic) if recent else None
 
     def _overlap(self, frame: int) -> float:

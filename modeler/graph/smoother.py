@@ -208,16 +208,16 @@ class Smoother:
         state: _State,
     ) -> tuple[tuple[bool, ...], AxisSolution | None]:
         """Return which loops are inliers, and the solution with a common axis; None if there is none."""
-        inlier, with_axis = state.inlier, None
+        agreeing, inlier, found = state.inlier, state.inlier, None
         for _ in range(_MAX_ROUNDS):
+            inlier = agreeing
             found = axis.solve([*tree, *selected(loops, inlier)], trajectory, state.root or 0)
             if found is None:
                 return state.inlier, None
-            agreeing, with_axis = inliers(loops, values_of(found.poses), self._threshold), found
+            agreeing = inliers(loops, values_of(found.poses), self._threshold)
             if agreeing == inlier:
                 break
-            inlier = agreeing
-        return inlier, with_axis
+        return inlier, found
 
     def _decided(
         self, tree: Sequence[Factor], loops: Sequence[Factor], root: int, *, grew: bool

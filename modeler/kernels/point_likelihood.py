@@ -50,7 +50,6 @@ ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)  # a plain 0
 
 # Rows of the points, and of `transform_points`.
 VARIANCE_M2, COLUMN, ROW = 6, 7, 8
-POINT_ROWS = 9
 X, Y, Z, POINT_NORMAL_X, POINT_NORMAL_Y, POINT_NORMAL_Z, FACING, COVERAGE, PATTERN = 0, 1, 2, 3, 4, 5, 6, 7, 8
 TRANSFORMED_ROWS = 9
 

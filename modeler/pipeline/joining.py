@@ -115,11 +115,9 @@ class Joiner:
         consistent, also from registering pairs of views without limits. If still none is, the edges of the first are
         rejected.
         """
-        proposed: list[Array] = []
         found: list[Alignment] = []
         for propose in (self._by_models, self._by_views):
-            proposed += propose(target, source)
-            found = self._refined(target, source, proposed)
+            found = self._refined(target, source, propose(target, source), found)
             if found and found[0].accepted >= MIN_JOINS and self.is_consistent(target, source, found[0]):
                 return found
         return [replace(found[0], edges=tuple(map(_rejected, found[0].edges))), *found[1:]] if found else []
@@ -161,11 +159,16 @@ class Joiner:
         order = np.argsort(-scores, kind="stable")
         return [replace(alignments[k], log_likelihood=float(scores[k]), share=float(shares[k])) for k in order]
 
-    def _refined(self, target: Segment, source: Segment, proposed: Sequence[Array]) -> list[Alignment]:
-        """Return the likeliest of some alignments (4, 4), refined by registering pairs of views about each."""
-        found: list[Alignment] = []
+    def _refined(
+        self, target: Segment, source: Segment, proposed: Sequence[Array], known: Sequence[Alignment]
+    ) -> list[Alignment]:
+        """Return the known alignments and the likeliest of the proposed (4, 4), refined by registering pairs of views.
+
+        Proposals near known alignments are not registered again.
+        """
+        found = [*known]
         for alignment in self.weighted(target, source, [Alignment(pose) for pose in proposed]):
-            if len(found) < _MAX_ALIGNMENTS and not any(_near(alignment, other) for other in found):
+            if len(found) < len(known) + _MAX_ALIGNMENTS and not any(_near(alignment, other) for other in found):
                 edges = self._edges(target, source, alignment.target_from_source)
                 found.append(Alignment(_mean_pose(target, source, edges, alignment.target_from_source), edges=edges))
         distinct: list[Alignment] = []
@@ -295,11 +298,14 @@ def facing(target: Segment, source: Segment, target_from_source: Array, count: i
         sides.append(rays / np.linalg.norm(rays, axis=1, keepdims=True))
     cosines = sides[0] @ sides[1].T
     pairs: list[tuple[int, int]] = []
+    targets, sources = target.frames, source.frames
     for flat in np.argsort(-cosines, axis=None, kind="stable"):
         row, column = np.unravel_index(flat, cosines.shape)
-        t, s = target.frames[int(row)], source.frames[int(column)]
-        if len(pairs) < count and all(t != pair[0] and s != pair[1] for pair in pairs):
+        t, s = targets[int(row)], sources[int(column)]
+        if all(t != pair[0] and s != pair[1] for pair in pairs):
             pairs.append((t, s))
+        if len(pairs) == count:
+            break
     return pairs
 
 

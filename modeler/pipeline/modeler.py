@@ -222,7 +222,8 @@ class Run:
                 self.state = self.state.inserted(prepared)
                 tracker = self.modeler.tracker(self.state)
                 posteriors = () if prepared.view is None else tracker.between(prepared.view)
-                yield from self._add(prepared, tracker, posteriors, steps=1)
+                steps = self.state.steps(prepared.frame.index, posteriors[0].target) if posteriors else 1
+                yield from self._add(prepared, tracker, posteriors, steps=steps)
 
     def revisit(self) -> Iterator[Step | Searching]:
         """Retry lost frames, newest first, against the views that followed them; yield steps of those placed."""

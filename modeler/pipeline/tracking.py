@@ -44,7 +44,7 @@ from modeler.types import (
 )
 
 _LIMIT_OUTCOMES = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # possible for motions beyond the limits
-_MAX_FAILED_SEARCHES = 1  # from which on further frames get a quick registration first
+_QUICK_AFTER = 1  # failed searches; further frames then get a quick registration first
 _SPAN_STEPS = 2.0  # steps of the limits if the graph predicts the motion, so that they do not truncate it
 _QUICK_FRACTION = 0.25  # of the starts of a search and of the largest number of samples
 _BEYOND_LIMITS_NATS = 7.0  # one motion in a thousand exceeds the prior's limits
@@ -99,7 +99,7 @@ class Tracker:
         """
         steps = self.state.steps(view.index, previous)
         prior = self.known
-        quick_first = self.quick_register is not None and self.state.failed_searches >= _MAX_FAILED_SEARCHES
+        quick_first = self.quick_register is not None and self.state.failed_searches >= _QUICK_AFTER
         if quick_first and (steps > 1 or retry):
             attempts = yield from self._quick_attempts(view, previous, retry=retry)
             if not _promising(attempts[-1]):
@@ -128,6 +128,9 @@ class Tracker:
         if not nearest:
             return ()
         target = nearest[0]
+        if len(nearest) == 1:
+            steps = self.state.steps(view.index, target)
+            return (self._pair(view, target, self.known.relaxed(steps) if steps > 1 else self.known),)
         motion = se3.inverse(solution.trajectory[target]) @ known.extrapolated(view.index)
         step = solution.relative(target, nearest[-1])
         way = (
@@ -202,10 +205,9 @@ class Tracker:
         """Return a view with the images that a likelihood looks up."""
         known = view if view.layers else self.state.ready.get(view.index)
         if known is None:
+            known = self.cache.get(view.index) or self.sensor.ray_image(view.frame, view.plane)
             with self._lock:
-                known = self.cache.pop(view.index, None)
-            known = known or self.sensor.ray_image(view.frame, view.plane)
-            with self._lock:
+                self.cache.pop(view.index, None)  # inserted anew, as the newest
                 self.cache[view.index] = known
                 for frame in set(self.cache) - set(newest_ready(self.cache)):
                     del self.cache[frame]

@@ -162,6 +162,8 @@ def _choose(
         return Found(chosen)
     arm = _arm(part, scene, zone_m)
     fore &= ~arm
+    if not fore.any():
+        return Found(chosen)
     labels, in_zone = part.clusters(fore), _inside(part.points[fore], *zone_m)
     labels = _split(labels, _mostly(~in_zone, labels), part.depth_m, fore)
     area_m2, static = part.pixel_m2[fore], part.static(scene, noise)[fore]

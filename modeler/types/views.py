@@ -151,6 +151,8 @@ class RayImage:
     """Images a likelihood looks up, made by `rays`."""
     sigma_colour_px: float = COLOUR_SHIFT_PX
     """Standard deviation in px of the shift of colours against depth from one image to the next."""
+    sigma_focal: float = 0.0
+    """Standard deviation of the logarithm of the camera's focal length."""
     sharing: float = 1.0
     """Number of surface points that share the noise of a pixel, in the sensor and by smoothing."""
     error_area_px: float = 1.0

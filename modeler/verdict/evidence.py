@@ -107,7 +107,7 @@ class Contradiction:
 
 
 def prior_distances(
-    edges: Sequence[Edge], views: Mapping[int, RayImage], prior: AbstractPrior
+    edges: Sequence[Edge], views: Mapping[int, RayImage], prior: AbstractPrior, places: Mapping[int, int] | None = None
 ) -> list[tuple[Edge, float]]:
     """Return edges with the distances Δ, in nats, from the prior's mode to the means of their posteriors.
 
@@ -118,6 +118,7 @@ def prior_distances(
         edges: those that take part.
         views: by frame number.
         prior: of the motions.
+        places: by frame number, how many frames were read before; None: the number itself.
     """
     found = []
     for edge in edges:
@@ -125,7 +126,8 @@ def prior_distances(
             continue
         source, target = views[edge.source], views[edge.target]
         try:
-            density = prior.relaxed(max(abs(edge.source - edge.target), 2)).between(source, target)
+            steps = abs(places[edge.source] - places[edge.target]) if places else abs(edge.source - edge.target)
+            density = prior.relaxed(max(steps, 2)).between(source, target)
         except InputError:  # the prior does not apply: it was not used either
             continue
         posterior = edge.posterior

@@ -185,7 +185,8 @@ def _found(
             f"the camera's noise hides up to {1000.0 * moved_m.limit:.1f} mm"
         )
         found.append(_Finding("motion_m", moved_m, "no_motion", words))
-    distances = [] if prior is None else prior_distances(edges, views, prior)
+    places = {frame: place for place, frame in enumerate(sorted(frame.id for frame in frames))}
+    distances = [] if prior is None else prior_distances(edges, views, prior, places)
     if (against := contradiction(distances)) is not None:
         words = (
             f"the images contradict the prior: from frame {against.target} to {against.source} the object moved "

@@ -32,7 +32,6 @@ from modeler.export import write_atomically
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
-from modeler.registration.visibility.refinement import Refiner
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Camera, Frame, Posterior, RayImage
 from sequences.rendering.renderer import RenderedSequence, surroundings
@@ -147,13 +146,13 @@ PRIORS: Final[dict[str, AbstractPrior]] = {"general": GeneralPrior(), "table": T
 
 
 def _pair(blank: Trial, source: RayImage, target: RayImage, truth: Array, seed: int) -> Iterator[Trial]:
+    sigma_focal = NOMINAL if blank.stated == "nominal" else 0.0
+    source, target = (replace(view, sigma_focal=sigma_focal) for view in (source, target))
     for prior_name, prior in PRIORS.items():
         density = prior.between(source, target)
         possible = bool(np.isfinite(density.log_density(truth[None])[0]))
         for method_name, method in METHODS.items():
             trial = replace(blank, prior=prior_name, method=method_name)
-            if blank.stated == "nominal" and isinstance(method, VisibilityRegistrar):
-                method = replace(method, refiner=Refiner(sigma_focal=NOMINAL))
             if possible:
                 rng = np.random.default_rng([seed, source.index, target.index])
                 trial = judged(trial, method.register(source, target, density, rng=rng), truth, source, target)

@@ -35,9 +35,6 @@ class Refiner:
     """Number of bisections of the surface: 2⁵ patches, whose errors are assumed independent."""
     min_matches: float = 6.0
     """Least mean number of matches in a patch; with fewer in all, there are fewer patches."""
-    sigma_focal: float = 0.0
-    """Standard deviation of the logarithm of the focal length. The derivative by it differs between poses that are far
-    apart, which spreads the samples (method.md, eq. 29)."""
 
     def refine(
         self,
@@ -76,10 +73,12 @@ class Refiner:
         step = steps @ to_basis.T @ information
         scatter = rng.normal(size=(len(poses), 6)) @ root.T
         moved = (step + scatter) @ narrowed.T @ basis.T  # method.md, eq. 16
-        if self.sigma_focal > 0.0 and np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > _FAR_RAD:
+        # The derivative by the focal length differs between poses far apart, which spreads the samples.
+        sigma_focal = pair.forward.image.sigma_focal
+        if sigma_focal > 0.0 and np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > _FAR_RAD:
             followed = basis @ (np.eye(6) - narrowed @ narrowed) @ to_basis
             local = _by_focal_at(pair, mode, poses, noise, spread) @ followed.T
-            moved += self.sigma_focal * rng.normal(size=(len(poses), 1)) * (local - by_focal)  # method.md, eq. 29
+            moved += sigma_focal * rng.normal(size=(len(poses), 1)) * (local - by_focal)  # method.md, eq. 29
         from_centre = se3.adjoint(se3.translation(centre_m))
         return Refined(se3.moved(poses, moved, centre_m), np.asarray(from_centre @ by_focal, dtype=np.float64))
 

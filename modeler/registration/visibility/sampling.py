@@ -136,9 +136,7 @@ class WeightedSamples:
 
 def weigh_modes(modes: Sequence[WeightedSamples]) -> list[tuple[float, WeightedSamples]]:
     """Return the modes with their posterior probabilities, heaviest first, without negligible ones."""
-    log_mass = np.array([mode.log_evidence for mode in modes])
-    mass = np.exp(log_mass - log_mass.max())
-    mass /= mass.sum()
+    mass = normalised(np.array([mode.log_evidence for mode in modes]))
     kept = [number for number in np.argsort(-mass, kind="stable") if mass[number] >= MIN_MODE_SHARE]
     return [(float(mass[number] / mass[kept].sum()), modes[number]) for number in kept]
 
