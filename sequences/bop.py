@@ -176,7 +176,8 @@ class BopSequence(AbstractRecording):
         notes = []
         left = [index for index in self._colour_paths if index not in self._depth_paths]
         if left:
-            notes.append(f"{len(left)} colour images have no depth image and are left out")
+            some = "1 colour image has" if len(left) == 1 else f"{len(left)} colour images have"
+            notes.append(f"{some} no depth image, left out")
         stems = {path.stem for path in self._depth_paths.values()}
         masks = [path for path in entries(self.path / MASKS) if path.suffix.lower() == ".png"]
         strange = [path.name for path in masks if re.sub(r"_\d+$", "", path.stem) not in stems]

@@ -59,7 +59,7 @@ def _open(path: Path | EmbeddedImage, formats: tuple[str, ...]) -> Image.Image:
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise InputError(f"{path}: has more than {MAX_PIXELS // 1_000_000} million pixels; scale it down.") from None
     except Exception as error:  # a broken image can make the library raise anything
-        why = re.sub(r"<_io\.[^>]*>", "it", " ".join(str(error).split())) or type(error).__name__
+        why = re.sub(r" file <_io\.[^>]*>| file '[^']*'", "", " ".join(str(error).split())) or type(error).__name__
         raise InputError(f"{path}: is not a readable {wanted} image ({why}); replace it.") from None
 
 

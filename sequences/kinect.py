@@ -104,7 +104,7 @@ def _camera(calibration: Node, purpose: str) -> Node:
     raise InputError(f"{calibration.path}: its calibration knows no {purpose}; record it again.")
 
 
-ADVICE = "pip install 'modeler[kinect]'"
+ADVICE = "pip install -c constraints.txt -e '.[kinect]'"
 _AGAIN = "record or copy it again"
 
 

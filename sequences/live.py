@@ -166,7 +166,7 @@ def _next(camera: AbstractCamera, number: int, after_s: float | None) -> Frame:
 
 SCHEME = "realsense:"
 """Prefix of a path that selects a camera; its serial number may follow."""
-ADVICE = "a RealSense camera is read by its maker's library; pip install 'modeler[realsense]'"
+ADVICE = "a RealSense camera is read by its maker's library; pip install -c constraints.txt -e '.[realsense]'"
 WARM_UP = 30
 """Images after which exposure has settled."""
 TIMEOUT_MS = 5000

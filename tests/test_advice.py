@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from modeler import priors, se3
-from modeler.cli.advice import remedy, unchecked_focal_length, visible_frames
+from modeler.cli.advice import remedies, unchecked_focal_length, visible_frames
 from modeler.cli.build import Build
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.types import AbstractPrior, Outcome
@@ -71,11 +71,11 @@ def untrusted(
 def test_what_to_do_next_is_the_limit_that_was_hit_or_what_is_missing(
     report: dict[str, Any], prior: AbstractPrior, options: Any
 ) -> None:
-    found = remedy(report, prior)
+    every = remedies(report, prior)
     if options is None:
-        assert found is None
+        assert every == []
     else:
-        assert found is not None
+        (found,) = every
         assert set(options) <= set(found.options)
         assert ("max-rotation-deg" in found.options) is ("max-rotation-deg" in options)
         if isinstance(options, dict):
@@ -101,17 +101,24 @@ def test_a_turn_without_a_loop_tells_what_hangs_on_the_focal_length(
 
 @pytest.mark.parametrize(("closed", "first"), [(True, "modeler report"), (False, "")])
 def test_surface_that_is_not_there_leads_to_the_masks_where_a_loop_confirms_the_poses(closed: bool, first: str) -> None:
-    found = remedy(untrusted("seen_through", "absent", closed=closed, up=[0.0, -1.0, 0.0]), priors.GeneralPrior())
-    assert found is not None
+    report = untrusted("seen_through", "absent", closed=closed, up=[0.0, -1.0, 0.0])
+    (found,) = remedies(report, priors.GeneralPrior())
     assert found.first.startswith(first)
     assert bool(found.options) is not closed
+
+
+def test_a_size_that_is_not_known_has_a_remedy_of_its_own() -> None:
+    report = untrusted("absent", "unsure_size", closed=True)
+    masks, size = remedies(report, priors.GeneralPrior())
+    assert masks.first.startswith("modeler report")
+    assert "--known focal-length" in size.first
+    assert [one.first for one in remedies(untrusted("unsure_size"), priors.GeneralPrior())] == [size.first]
 
 
 def test_a_loop_that_is_open_leads_to_the_focal_length() -> None:
     report = untrusted("loop_open", "edges_disagree")
     report["edges"].append(report["edges"][0] | {"kind": "closure"})
-    found = remedy(report, priors.GeneralPrior())
-    assert found is not None
+    (found,) = remedies(report, priors.GeneralPrior())
     assert found.first.startswith("modeler calibrate-camera")
     assert found.options == {"camera": "camera.json"}
 

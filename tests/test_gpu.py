@@ -166,7 +166,10 @@ def test_a_device_is_chosen_for_large_work_only(monkeypatch):
 
 @pytest.mark.parametrize(
     ("absent", "line"),
-    [("warp", "warp-lang is not installed; pip install 'modeler[gpu]'"), ("driver", "there is no NVIDIA driver")],
+    [
+        ("warp", "warp-lang is not installed; pip install -c constraints.txt -e '.[gpu]'"),
+        ("driver", "there is no NVIDIA driver"),
+    ],
 )
 def test_a_device_that_is_not_there_is_refused_in_one_line(cli, monkeypatch, absent, line):
     load = ctypes.CDLL

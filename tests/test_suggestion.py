@@ -219,7 +219,7 @@ def test_laying_it_down_shows_what_it_stood_on_with_the_odds_of_joining(box: Bel
     assert found.new_surface > 0.0
     assert found.pose_nats == 0.0
     assert 0.5 < found.right < 1.0
-    assert "placed correctly with" in suggest(box, [Candidate("lay")]).ranked[0].words
+    assert "placed correctly with probability" in suggest(box, [Candidate("lay")]).ranked[0].words
 
 
 def test_a_turn_beyond_the_prior_is_no_candidate(box: Belief) -> None:

@@ -126,7 +126,7 @@ def step_angles_deg(edges: Sequence[Mapping[str, Any]]) -> list[float]:
 
 
 def estimated_focal_length(camera: Mapping[str, Any]) -> str:
-    """Return in words the focal length estimated from loops, else "".
+    """Return in words the focal length estimated from the graph's cycles, else "".
 
     Args:
         camera: as in report.json.
@@ -134,10 +134,10 @@ def estimated_focal_length(camera: Mapping[str, Any]) -> str:
     fx_px, factor, sigma = camera.get("fx_px"), camera.get("factor_in_run", 1.0), camera["focal_factor_sigma"]
     if fx_px is None or not camera.get("loops"):
         return ""
-    loops, given_px = "1 loop" if camera["loops"] == 1 else f"{camera['loops']} loops", fx_px / factor
+    cycles, given_px = "1 graph cycle" if camera["loops"] == 1 else f"{camera['loops']} graph cycles", fx_px / factor
     return (
         f"the focal length is {fx_px:.1f} ± {sigma * fx_px:.1f} px, {given_px:.1f} px was given; closure error of "
-        f"{loops}: {camera['sigmas_after']:.1f} sd with it, {camera['sigmas_before']:.1f} sd as given"
+        f"{cycles}: {camera['sigmas_after']:.1f} sd with it, {camera['sigmas_before']:.1f} sd as given"
     )
 
 
@@ -171,8 +171,8 @@ class Remedy:
     """A command to run first; "" = none."""
 
 
-def remedy(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
-    """Return what to do next about the first reason not to trust a model; None if there is nothing to try.
+def remedies(report: Mapping[str, Any], prior: AbstractPrior) -> list[Remedy]:
+    """Return what to do next about the first reason not to trust a model, and about its size if that is another.
 
     Args:
         report: of the run.
@@ -191,8 +191,10 @@ def remedy(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
         "unsure_focal": _full_turn,
         "unsure_size": _known_camera,
     }
-    found = (by_code[code](report, prior) for code in codes if code in by_code)
-    return next((each for each in found if each is not None), None)
+    found = ((code, by_code[code](report, prior)) for code in codes if code in by_code)
+    first = [(code, each) for code, each in found if each is not None][:1]
+    size = [_known_camera(report, prior)] if "unsure_size" in codes and first and first[0][0] != "unsure_size" else []
+    return [each for _, each in first] + size
 
 
 def _region(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
@@ -250,6 +252,8 @@ def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | Non
         wide = max(turns, default=0.0) >= free.max_rotation_deg - _NEAR_LIMIT_DEG
         options = {"max-rotation-deg": _twice_deg(free.max_rotation_deg)} if wide else {}
         return Remedy("use the prior that the object stays on its table", {"prior": "table", **options})
+    if "closures_refused" in report["reason_codes"]:  # the object came back, and the chain of steps missed it
+        return _camera(report, prior)
     words, step, sigma = "give the rotation from frame to frame and its standard deviation", "DEG", "DEG"
     turned_deg = float(np.median(turns)) if turns else 0.0
     if turns and _sigma_deg(report["edges"]) > max(_ROUGH * turned_deg, 1.0):

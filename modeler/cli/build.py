@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 DRAWING_SHARE = 0.15
 """Of the time of a live run. Drawing a step takes about as long as registering one; so it delays steps by a fifth."""
+_SHOWN_REASONS = 3  # not to trust a model; the report has all
 
 
 @dataclass(frozen=True)
@@ -285,7 +286,7 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
     from modeler.cli.advice import (
         estimated_focal_length,
         measured_step,
-        remedy,
+        remedies,
         sign_in_doubt,
         unchecked_focal_length,
         visible_frames,
@@ -307,11 +308,12 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
         say(words)
     if report["reasons"]:
         coded = list(zip(report.get("reason_codes") or report["reasons"], report["reasons"], strict=False))
-        first, *others = [
-            words for _, words in sorted(coded, key=lambda reason: reason[0] == "left_out")
-        ]  # those were reported above
-        more = f" (and {len(others)} more in {options.out / 'report.json'})" if others else ""
-        say(f"not to be trusted: {first}{more}")
+        # Frames left out were reported above.
+        reasons = [words for _, words in sorted(coded, key=lambda reason: reason[0] == "left_out")]
+        for words in reasons[:_SHOWN_REASONS]:
+            say(f"not to be trusted: {words}")
+        if len(reasons) > _SHOWN_REASONS:
+            say(f"{len(reasons) - _SHOWN_REASONS} more reasons are in {options.out / 'report.json'}")
         if sign_in_doubt(report, prior):
             say("the given direction of rotation is assumed; if it may be the opposite, give --step-sign unknown")
     for remark in (
@@ -321,8 +323,7 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
     ):
         if remark:
             say(remark)
-    next_step = None if report["trustworthy"] else remedy(report, prior)
-    if next_step is not None:
+    for next_step in [] if report["trustworthy"] else remedies(report, prior):
         commands = [next_step.first.format(run=shlex.quote(str(options.out)))] if next_step.first else []
         commands += [options.command(next_step.options)] if next_step.options else []
         say(f"{next_step.words}: {' && '.join(commands)}")

@@ -25,8 +25,8 @@ class CalibrateCamera:
 
     A wrong focal length makes all rotations too small or too large, so that a full turn does not close. Depth with too
     flat a relief, as from smoothing and hole filling, has the same effect: loops cannot separate the two, and the size
-    of the model depends on which it is. `modeler build SEQUENCE --camera FILE` uses the result for any sequence of the
-    same camera.
+    of the model depends on which it is. Steps and spans of a partial turn determine the focal length, too, but less.
+    `modeler build SEQUENCE --camera FILE` uses the result for any sequence of the same camera.
     """
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
@@ -71,7 +71,7 @@ class CalibrateCamera:
         open_sds = {"sigmas_before": found.sigmas_before, "sigmas_after": found.sigmas_after} if found.loops else {}
         facts = {"sigmas_before": None, "sigmas_after": None, **open_sds, "loops": found.loops}
         write_atomically(self.out, result.text({**facts, "fx_px": found.factor * used_px, "run": str(self.run_folder)}))
-        say(f"{_said(found, used_px)}: {self.out}")
+        say(f"{_said(found, used_px, given_px)}: {self.out}")
         if found.told_by == "loop" and result.depth_scale_sigma >= _OPEN:
             say(
                 f"or the relief of the depth is wrong by {100.0 * open_by:.0f} %; sizes are known only to "
@@ -80,8 +80,8 @@ class CalibrateCamera:
         return 0 if found.told_by == "loop" else 3
 
 
-def _said(found: FocalLength, used_px: float) -> str:
-    loops = "1 loop" if found.loops == 1 else f"{found.loops} loops"
+def _said(found: FocalLength, used_px: float, given_px: float) -> str:
+    loops = "1 graph cycle" if found.loops == 1 else f"{found.loops} graph cycles"
     if found.told_by == "prior" and found.loops:
         return (
             f"{loops} do not determine the focal length: closure error of {found.sigmas_before:.1f} sd as given, "
@@ -94,7 +94,9 @@ def _said(found: FocalLength, used_px: float) -> str:
             "prior (--prior table)"
         )
     focal_px, sigma_px = used_px * found.factor, used_px * found.factor * found.sigma
+    by_run = abs(used_px / given_px - 1.0) > 1e-3
+    before = f"with the run's {used_px:.1f} px" if by_run else "as given"
     return (
-        f"the focal length is {focal_px:.1f} ± {sigma_px:.1f} px, {used_px:.1f} px was given; "
-        f"closure error of {loops}: {found.sigmas_after:.1f} sd with it, {found.sigmas_before:.1f} sd as given"
+        f"the focal length is {focal_px:.1f} ± {sigma_px:.1f} px, {given_px:.1f} px was given; "
+        f"closure error of {loops}: {found.sigmas_after:.1f} sd with it, {found.sigmas_before:.1f} sd {before}"
     )

@@ -56,8 +56,8 @@ class Export:
     bop: bool = False
     """Write a BOP model: PLY in mm, origin in the centre of its box, and its entry in models_info.json."""
     tint: Annotated[Literal["views", "sigma"] | None, default("none")] = None
-    """Colour vertices by the number of views that saw them or by their standard deviation; interpolated surface is "
-    "pink."""
+    """Colour vertices by the number of views that saw them or by their standard deviation; interpolated surface is
+    pink."""
     voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("from the data")] = None
     """Side of a voxel."""
     density_kg_m3: Annotated[float | None, default("1000, that of water")] = None

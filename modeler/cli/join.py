@@ -65,13 +65,13 @@ class Join:
         if not alignments:
             raise InputError("the models cannot be aligned; build both runs from more views")
         edges, ways = alignments[0].edges, len(alignments)
-        say(f"models aligned: {100.0 * alignments[0].share:.3g} % likely" + (f", of {ways} ways" if ways > 1 else ""))
         count = alignments[0].accepted
         if not count:
             raise InputError(
                 f"{self.run_a} and {self.run_b}: no alignment of the models fits their views; check "
                 "that they show the same object and share enough surface"
             )
+        say(f"models aligned: {100.0 * alignments[0].share:.3g} % likely" + (f", of {ways} ways" if ways > 1 else ""))
         graph = PoseGraph(edges=(*first.edges, *second.edges, *edges), first=min(first.solution.trajectory))
         guess = dict(first.solution.trajectory) | {
             frame: alignments[0].target_from_source @ pose for frame, pose in second.solution.trajectory.items()

@@ -84,7 +84,7 @@ class FrameOptions:
 
 @dataclass(frozen=True)
 class ObjectOptions:
-    """Where the object is, in sequences without masks."""
+    """Where the object is. Masks of the sequence, if there are any, are cropped to it."""
 
     roi: Annotated[tuple[int, int, int, int] | None, tyro.conf.arg(metavar="X0 Y0 X1 Y1"), default("whole image")] = (
         None

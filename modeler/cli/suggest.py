@@ -70,6 +70,9 @@ class Suggest:
         if given is not None and found.excluded:
             say(f"{found.excluded} of {len(given)} candidates are excluded by the run's prior, or show nothing")
         trusted = bool(run.report["trustworthy"])
+        if not trusted:
+            reason = next(iter(run.report.get("reasons") or ()), "see its report.json")
+            say(f"the run is not to be trusted, and so neither are these predictions: {reason}")
         if not asked:
             say(found.summary)
             return 0

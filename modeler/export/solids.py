@@ -85,7 +85,8 @@ def convex_parts(model: ObjectModel, seed: int = 0) -> ConvexParts:
     """
     if importlib.util.find_spec("coacd") is None:
         hull = _hull(model.vertices_m)
-        return ConvexParts((hull,), "one convex hull, as CoACD is not installed (pip install 'modeler[physics]')")
+        how = "pip install -c constraints.txt -e '.[physics]'"
+        return ConvexParts((hull,), f"one convex hull, as CoACD is not installed ({how})")
     import coacd  # pyright: ignore[reportMissingImports]
 
     coacd.set_log_level("error")

@@ -178,7 +178,8 @@ def _action(candidate: Candidate, *, either: bool) -> str:
         return f"turn {turn} ({way})"
     assert candidate.poke is not None
     x, y, z = (round(1000.0 * value) for value in candidate.poke.point_m)
-    return f"poke at ({x}, {y}, {z}) mm, {1000.0 * candidate.poke.length_m:.0f} mm far (turns it {turn}, {way})"
+    push = f"push by {1000.0 * candidate.poke.length_m:.0f} mm"
+    return f"poke at ({x}, {y}, {z}) mm in the camera, {push} (turns it {turn}, {way})"
 
 
 def _effect(belief: Belief, found: Prediction) -> str:
@@ -190,7 +191,7 @@ def _effect(belief: Belief, found: Prediction) -> str:
         parts.append(f"spin known to {_degrees(after_deg)}")
     parts.append(f"{100.0 * found.new_surface:.0f} % new surface")
     if found.right < 0.9:
-        parts.append(f"placed correctly with {100.0 * found.right:.0f} %")
+        parts.append(f"placed correctly with probability {100.0 * found.right:.0f} %")
     return ", ".join(parts)
 
 

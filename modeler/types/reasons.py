@@ -213,9 +213,8 @@ def summary(reason: Reason) -> str:
             rival = f", otherwise turned by {rival_deg:.0f}°" if share < 1.0 else ""
             return f"joins two segments, with a probability of {100.0 * share:.3g} %{rival}"
         case NotJoined(views):
-            return (
-                f"fits {views - 1} other frames that were left out, but their alignment with the rest is undetermined"
-            )
+            others = f"registered with {views - 1} other frames that were left out"
+            return f"{others}, but their alignment with the rest is undetermined"
         case ElsewhereThanSegments(angle_deg):
             return f"contradicts the alignment of the two segments by {angle_deg:.0f}°"
         case Failed(outcome):

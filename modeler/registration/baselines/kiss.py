@@ -16,7 +16,7 @@ from modeler.registration.baselines.clouds import AbstractCloudRegistrar, Cloud,
 from modeler.registration.baselines.icp import IcpRegistrar
 from modeler.types import Array, InputError, RayImage
 
-MISSING = "KISS-Matcher is not installed; install it with: pip install 'modeler[peers]'"
+MISSING = "KISS-Matcher is not installed; install it with: pip install -c constraints.txt -e '.[peers]'"
 
 
 def installed() -> bool:
