@@ -203,12 +203,12 @@ CASES: dict[str, Case] = {
         lambda camera: turntable(camera, step_sign="unknown", sense=1), proposes=True
     ),
     "turntable come round": Case(lambda camera: turntable(camera, step_deg=360.0, step_sigma_deg=5.0)),
-    "turntable to an earlier view": Case(lambda camera: turntable(camera, newest=9), proposes=True, shaken=0.03),
+    "turntable to an earlier view": Case(lambda camera: turntable(camera, previous=9), proposes=True, shaken=0.03),
     "turntable to an earlier view, no table": Case(
-        lambda camera: turntable(camera, newest=9), table=False, proposes=True, shaken=0.03
+        lambda camera: turntable(camera, previous=9), table=False, proposes=True, shaken=0.03
     ),
     "held": Case(held, proposes=True),
-    "held to an earlier view": Case(lambda camera: replace(held(camera), newest=9), proposes=True, shaken=0.03),
+    "held to an earlier view": Case(lambda camera: replace(held(camera), previous=9), proposes=True, shaken=0.03),
     "poke": Case(poke),
     "velocity": Case(velocity, proposes=True),
     "velocity on a table": Case(

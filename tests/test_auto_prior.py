@@ -64,5 +64,5 @@ def test_pairs_are_registered_within_limits_that_hold_their_predicted_motion(
     tracker = Tracker(state, prior, Closer(), Sensor(), Modeler().register)
     spread = se3.covariance_about(np.diag(np.repeat([np.radians(sigma_deg), 0.001], 3) ** 2), -source.centroid_m)
     motion = PoseGaussian(solution.relative(target.index, source.index), spread)
-    found = tracker._predicted(source, target.index, motion)
+    found = tracker._predicted(source, target.index, motion, prior)
     assert isinstance(found.known, GeneralPrior if kept else AnyMotion)

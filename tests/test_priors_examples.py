@@ -278,6 +278,9 @@ def test_steps_count_once_however_many_edges_follow_from_them(prior: TurntablePr
     assert np.isfinite(evidence).all()
     assert earlier.known.sample(1, np.random.default_rng(0)).shape == (1, 4, 4)
     assert not isinstance(earlier.known, DefensiveMixture)
+    placed = taught.following(1).between(SOURCE, at(1, TARGET))  # a frame that was skipped, or lost and found again
+    first = prior.between(SOURCE, at(1, TARGET))
+    np.testing.assert_allclose(placed.log_evidence(samples), first.log_evidence(samples))
 
 
 # A robot's hand
@@ -341,7 +344,7 @@ def test_a_hand_that_turned_far_leaves_room_for_what_is_seen(steps: int) -> None
     """What is seen lies before the middle of the object, so that a true motion parts the centroids of two views."""
     upright = np.array([0.0, 1.0, 0.0])
     poses = np.array([turned(k * STEP, upright) for k in range(6)])
-    prior = HeldPrior(HandPoses(0.5 * np.arange(6.0), poses), newest=9)
+    prior = HeldPrior(HandPoses(0.5 * np.arange(6.0), poses), previous=9)
     source, target = (seen_before(k) for k in (steps, 0))
     true = poses[0] @ se3.inverse(poses[steps])
     apart_m = np.linalg.norm(se3.transform(true, source.centroid_m[None])[0] - target.centroid_m)
@@ -350,7 +353,7 @@ def test_a_hand_that_turned_far_leaves_room_for_what_is_seen(steps: int) -> None
 
 
 def test_a_hand_whose_prior_grows_leaves_more_room() -> None:
-    taught = replace(held(HERE), newest=9)
+    taught = replace(held(HERE), previous=9)
     for prior in (taught, taught.relaxed(2.0)):
         density = prior.between(SOURCE, TARGET)
         assert isinstance(density, DefensiveMixture)

@@ -98,7 +98,7 @@ class Tracker:
             The posteriors, that of the previous view first.
         """
         steps = self.state.steps(view.index, previous)
-        prior = self.known
+        prior = self.known.following(previous)
         quick_first = self.quick_register is not None and self.state.failed_searches >= _QUICK_AFTER
         if quick_first and (steps > 1 or retry):
             attempts = yield from self._quick_attempts(view, previous, retry=retry)
@@ -130,7 +130,8 @@ class Tracker:
         target = nearest[0]
         if len(nearest) == 1:
             steps = self.state.steps(view.index, target)
-            return (self._pair(view, target, self.known.relaxed(steps) if steps > 1 else self.known),)
+            first = self.known.following(target)
+            return (self._pair(view, target, first.relaxed(steps) if steps > 1 else first),)
         motion = se3.inverse(solution.trajectory[target]) @ known.extrapolated(view.index)
         step = solution.relative(target, nearest[-1])
         way = (
@@ -140,7 +141,7 @@ class Tracker:
         # In the middle between two views, the standard deviation is a quarter of the way, if the speed is uneven.
         spread = np.diag(np.repeat(0.25 * np.array(way), 3) ** 2)
         expected = PoseGaussian(motion, se3.covariance_about(spread, -view.centroid_m))
-        return (self._pair(view, target, self._predicted(view, target, expected)),)
+        return (self._pair(view, target, self._predicted(view, target, expected, self.known.following(target))),)
 
     def closures(
         self, view: RayImage, posteriors: Sequence[Posterior], *, last: bool, retry: bool
@@ -161,8 +162,9 @@ class Tracker:
         tried |= {edge.target for edge in self.state.graph.edges if edge.source == view.index} if retry else set()
         targets = self.closer.closure_targets(base, self.state.map_view, last=last)
         targets = [target for target in targets if target not in tried]
+        known, solution = self.known.following(base.target), self.state.solution
         predicted = [
-            self._predicted(view, target, self.closer.predicted_motion(base, target, self.state.solution))
+            self._predicted(view, target, self.closer.predicted_motion(base, target, solution), known)
             for target in targets
         ]
         return tuple(self._pairs([(view, target) for target in targets], predicted))
@@ -170,11 +172,11 @@ class Tracker:
     def spans(self, pairs: Sequence[tuple[int, int]]) -> Iterator[Posterior]:
         """Yield posteriors of pairs (source, target) of views of the graph that were not registered yet."""
         views, relative = self.state.views, self.state.solution.relative_gaussian
-        predicted = [self._predicted(views[s], t, relative(t, s), span=True) for s, t in pairs]
+        predicted = [self._predicted(views[s], t, relative(t, s), self.known, span=True) for s, t in pairs]
         yield from self._pairs([(views[source], target) for source, target in pairs], predicted)
 
     def _predicted(
-        self, source: RayImage, target: int, motion: PoseGaussian, *, span: bool = False
+        self, source: RayImage, target: int, motion: PoseGaussian, known: AbstractPrior, *, span: bool = False
     ) -> PredictedProposal:
         """Return the prior of a pair whose motion the graph predicts: without its limits if they may exclude it.
 
@@ -182,10 +184,11 @@ class Tracker:
             source: a view.
             target: number of a view of the graph.
             motion: target_from_source.
+            known: prior of the pair.
             span: whether limits are those of several steps also for small rotations.
         """
         far = span or np.degrees(se3.rotation_angle(motion.mean)) > self.closer.max_angle_deg
-        prior, unlimited = self.known.relaxed(_SPAN_STEPS) if far else self.known, self.known.unlimited()
+        prior, unlimited = known.relaxed(_SPAN_STEPS) if far else known, known.unlimited()
         if unlimited is not None:  # limits that are defaults
             with suppress(InputError):  # registering says so
                 if not _inside(prior.between(source, self.state.views[target]), _sigma_points(motion)).all():
@@ -220,7 +223,7 @@ class Tracker:
 
         After failed searches (a hand hides the object), the object is probably hidden in the next frame too.
         """
-        relaxed = self.known.relaxed(max(self.state.steps(view.index, previous), 2))
+        relaxed = self.known.following(previous).relaxed(max(self.state.steps(view.index, previous), 2))
         attempts, target = (), previous
         while target is not None:
             attempts = (*attempts, self._pair(view, target, relaxed, quick=True))
@@ -232,7 +235,8 @@ class Tracker:
 
     def _relocalised(self, view: RayImage, odometry: Posterior, *, retry: bool) -> tuple[Posterior, ...]:
         """Return posteriors of a view that the previous one does not place: with wider limits, then of other views."""
-        steps, prior = self.state.steps(view.index, odometry.target), self.known
+        steps = self.state.steps(view.index, odometry.target)
+        prior = self.known.following(odometry.target)
         relaxed = prior.relaxed(max(steps, 2))
         if steps == 1 and odometry.outcome in _LIMIT_OUTCOMES:  # the motion may exceed the limits for one step
             wider = self._pair(view, odometry.target, relaxed)

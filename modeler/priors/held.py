@@ -43,8 +43,8 @@ class HeldPrior(AbstractPrior):
     max_offset_m: float = 0.04
     """Largest distance between the centroids if the hand is only a proposal (returns to earlier views); it grows with
     turns beyond 30 degrees."""
-    newest: int | None = None
-    """The last frame of a running sequence: motions to it are evidence; None: no sequence, all motions are."""
+    previous: int | None = None
+    """The frame relative to which a new one is placed: motions from it are evidence, others are not; None: all are."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -68,7 +68,7 @@ class HeldPrior(AbstractPrior):
             + error_at_target**2
         )
         moved = KernelMixture(motion[None], np.ones(1), hand_at_source[:3, 3], float(sigma_rad), float(sigma_m))
-        if self.newest is None or target.index == self.newest:
+        if self.previous is None or target.index == self.previous:
             regrasped = self.regrasped.between(source, target)
             probability = 1.0 - (1.0 - self.regrasp_probability) ** self.steps
             known = Alternatives((moved, regrasped), np.array([1.0 - probability, probability]))  # method.md, eq. 26
@@ -91,6 +91,10 @@ class HeldPrior(AbstractPrior):
         regrasped = self.regrasped.unlimited()
         return None if regrasped is None else replace(self, regrasped=regrasped)
 
+    def following(self, frame: int) -> HeldPrior:
+        """Return the prior for a frame placed relative to another."""
+        return replace(self, previous=frame)
+
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> HeldPrior:
         """Return the prior with the number of the last frame."""
-        return replace(self, newest=max(solution.trajectory, default=None))
+        return replace(self, previous=max(solution.trajectory, default=None))

@@ -56,6 +56,10 @@ class ProductPrior(AbstractPrior):
         """Return the product of both updated priors."""
         return replace(self, first=self.first.learned(solution, edges), second=self.second.learned(solution, edges))
 
+    def following(self, frame: int) -> ProductPrior:
+        """Return the product of both priors for a frame placed relative to another."""
+        return replace(self, first=self.first.following(frame), second=self.second.following(frame))
+
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
         """Return the axis that all steps share, if either part has one."""
         return self.first.shared_axis(views) or self.second.shared_axis(views)

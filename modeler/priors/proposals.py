@@ -51,6 +51,10 @@ class AbstractProposal(AbstractPrior):
         """Return the prior with its independent part updated."""
         return replace(self, known=self.known.learned(solution, edges))
 
+    def following(self, frame: int) -> AbstractPrior:
+        """Return the prior for a frame placed relative to another."""
+        return replace(self, known=self.known.following(frame))
+
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
         """Return the axis that all steps share, according to the independent knowledge."""
         return self.known.shared_axis(views)

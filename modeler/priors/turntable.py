@@ -285,8 +285,8 @@ class TurntablePrior(AbstractPrior):
     sense: int = 0
     """Sense of rotation of the pairs so far, +1 right-handed about the axis, if `step_sign` is unknown; used as a
     proposal. 0: undetermined."""
-    newest: int | None = None
-    """The last frame of a running sequence: steps to it are evidence; None: no sequence, all steps are."""
+    previous: int | None = None
+    """The frame relative to which a new one is placed: steps from it are evidence, others are not; None: all are."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -307,7 +307,7 @@ class TurntablePrior(AbstractPrior):
             step_deg = self.sense * abs(self.step_deg)
             directed = replace(self, step_sign="known", step_deg=step_deg) if self.sense else self
             density = defensive_mixture(density, [directed._density(source, target, self.learned_axis or axis)])
-        if self.newest is None or target.index == self.newest:
+        if self.previous is None or target.index == self.previous:
             return density
         # The steps to an earlier view are already part of the edges in between; here they are only a proposal.
         return defensive_mixture(self._limits(source, target), [density])
@@ -323,7 +323,11 @@ class TurntablePrior(AbstractPrior):
         motions = [solution.pose_of(edge) for edge in accepted]
         learned_axis = common_axis(motions, float(np.radians(self.wobble_deg)), self.wobble_m)
         sense = self._sense([edge.posterior for edge in accepted]) if self.step_sign == "unknown" else 0
-        return replace(self, learned_axis=learned_axis, sense=sense, newest=max(solution.trajectory, default=None))
+        return replace(self, learned_axis=learned_axis, sense=sense, previous=max(solution.trajectory, default=None))
+
+    def following(self, frame: int) -> TurntablePrior:
+        """Return the prior for a frame placed relative to another."""
+        return replace(self, previous=frame)
 
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
         """Return the axis that all steps share, beyond the information in each edge; None if the axis is given.

@@ -122,6 +122,13 @@ class AbstractPrior(ABC):
         """
         return self
 
+    def following(self, frame: int) -> AbstractPrior:
+        """Return the prior for a frame that is placed relative to another; by default the prior itself.
+
+        The motion from `frame` is evidence then, that from other frames is not: it is part of the edges in between.
+        """
+        return self
+
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
         """Return the axis that all steps between consecutive views share; by default None.
 
