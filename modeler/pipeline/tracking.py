@@ -178,7 +178,7 @@ class Tracker:
     def _predicted(
         self, source: RayImage, target: int, motion: PoseGaussian, known: AbstractPrior, *, span: bool = False
     ) -> PredictedProposal:
-        """Return the prior of a pair whose motion the graph predicts: without its limits if they may exclude it.
+        """Return the prior of a pair whose motion the graph predicts: without its limits if they exclude it.
 
         Args:
             source: a view.
@@ -191,7 +191,7 @@ class Tracker:
         prior, unlimited = known.relaxed(_SPAN_STEPS) if far else known, known.unlimited()
         if unlimited is not None:  # limits that are defaults
             with suppress(InputError):  # registering says so
-                if not _inside(prior.between(source, self.state.views[target]), _sigma_points(motion)).all():
+                if not _inside(prior.between(source, self.state.views[target]), motion.mean[None])[0]:
                     prior = unlimited
         return PredictedProposal(prior, motion)
 
@@ -329,12 +329,6 @@ def _discounted(posterior: Posterior, known: AbstractPoseDensity) -> Posterior:
         samples=posterior.samples[kept],
         weights=shares / shares.sum() if shares.sum() > 0.0 else shares,
     )
-
-
-def _sigma_points(motion: PoseGaussian) -> Array:
-    """Return motions (13, 4, 4) that have the mean and the covariance of a Gaussian (Julier and Uhlmann 1997)."""
-    columns = np.sqrt(6.0) * np.linalg.cholesky(motion.covariance).T
-    return motion.mean @ se3.exp(np.concatenate([np.zeros((1, 6)), columns, -columns]))
 
 
 def _inside(known: AbstractPoseDensity, motions: Array) -> BoolArray:
