@@ -340,6 +340,32 @@ def test_what_leaves_a_turn_open_places_frames_and_tells_nothing_more(sigma_deg:
         assert span.reason.sigma_deg == pytest.approx(20.0, abs=0.5)
 
 
+@pytest.mark.parametrize(("sigma_deg", "takes_part"), [(20.0, True), (40.0, False)])
+def test_turns_that_the_graph_knows_better_may_be_open_as_far_as_a_gaussian_holds(
+    sigma_deg: float, *, takes_part: bool
+) -> None:
+    run, closer = Run(list(REGULAR_DEG)), Closer()
+    run.run(closer)
+    span = closer.judge_span(_turn_open(posterior_of(3, 1, run.truth_between(1, 3)), sigma_deg), _map_view(run))
+    assert span.accepted is takes_part
+
+
+def test_a_view_that_never_determined_the_rotation_promises_little() -> None:
+    """The object comes back to views some of which left the turn open, and to others that did not."""
+
+    def first_open(posterior: Posterior) -> Posterior:
+        return _turn_open(posterior, 20.0) if posterior.target < 2 else posterior
+
+    tried = {}
+    for opened in (False, True):
+        run = Run(list(12.0 * np.arange(44)))
+        run.run(Closer(), first_open if opened else lambda posterior: posterior)
+        tried[opened] = {target for frame in run.numbers[24:-1] for target in run.tried[frame][1:]}
+    assert {0, 1, 3} <= tried[False]
+    assert {2, 3} <= tried[True]
+    assert not {0, 1} & tried[True]
+
+
 def test_vaguest_of_several_modes_tells_whether_a_turn_is_open() -> None:
     run, closer = Run(list(REGULAR_DEG)), Closer()
     run.run(closer, lambda posterior: _turn_open(posterior, 20.0))

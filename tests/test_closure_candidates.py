@@ -162,6 +162,13 @@ def test_there_is_no_path_between_frames_that_no_edges_connect() -> None:
     np.testing.assert_array_equal(found.to([1, 0])[0], [np.inf, 0.0])
 
 
+def test_the_least_variance_of_a_frame_is_that_of_its_best_edge() -> None:
+    variances = {(0, 1): 4.0, (1, 2): 1.0, (2, 3): 9.0}
+    edges = [edge(*ends, PoseGaussian(np.eye(4), scale * np.eye(6))) for ends, scale in variances.items()]
+    found = PathNetwork.of(edges, Solution()).least_variances_rad2([0, 1, 2, 3, 7])
+    np.testing.assert_allclose(found, [12.0, 3.0, 3.0, 27.0, np.inf])
+
+
 def test_a_network_that_grew_is_that_of_all_edges() -> None:
     """Also where an edge no longer takes part, or enters with another pose."""
     run = Run(list(20.0 * np.arange(24)))

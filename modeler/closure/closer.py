@@ -129,7 +129,7 @@ class Closer:
                 map_view, source, pose, systematic, self.max_span_deg, has_own_edge=False, power=_SPAN_POWER
             )
             untried = np.array([{source, target} not in tried for target in earlier], dtype=np.bool_)
-            near = np.flatnonzero(untried & (gain.probability_within(earlier, angle_deg) >= _MIN_PROBABILITY))
+            near = np.flatnonzero(untried & (angle_deg <= self.max_span_deg))
             found = gain.candidates([earlier[k] for k in near], angle_deg[near], self.min_span_gain_nats)
             chosen = [one.frame for one in found if one.overlap >= self.thresholds.min_overlap]
             ends = source in last_of.values() and bool(untried[:1].any())

@@ -47,6 +47,9 @@ class Thresholds:
     the edges that placed the frames; and as its axis is uncertain, wide rotations would contradict other edges."""
     known_share: float = 0.5
     """The graph knows a rotation better if its standard deviation is below this fraction of the edge's."""
+    max_gaussian_deg: float = 30.0
+    """Largest standard deviation of such a rotation: by then 1 − cos of it is 0.13, and a Gaussian about one mean, which
+    is sure of the other axes, is wrong of them."""
 
     def evidence_bound(self, edges: Sequence[Edge], solution: Solution) -> EvidenceBound:
         """Return the least log evidence of further edges, from a run's edges between neighbours so far.
@@ -78,7 +81,8 @@ class Thresholds:
         """Return the reason if a posterior leaves a rotation open that the prediction does not know better, or None."""
         sigma_rad, axis = widest_rotation(posterior)
         known_rad = float(np.sqrt(axis @ predicted.covariance[:3, :3] @ axis))
-        if np.degrees(sigma_rad) <= self.max_open_deg or known_rad <= self.known_share * sigma_rad:  # eq. C6
+        known = known_rad <= self.known_share * sigma_rad and np.degrees(sigma_rad) <= self.max_gaussian_deg
+        if np.degrees(sigma_rad) <= self.max_open_deg or known:  # eq. C6
             return None
         return OpenRotation(float(np.degrees(sigma_rad)))
 

@@ -89,7 +89,10 @@ class InformationGain:
         relative_information = np.cos(within_rad) ** self.power
         path_rad2, length = self.paths.to(frames)
         known_rad2 = np.where(found > 0.0, path_rad2 + length * _rotation_variance(self.systematic), 0.0)
-        ratio = float(self.has_own_edge) + known_rad2 / _rotation_variance(one_edge)
+        # A view none of whose edges determined the rotation, such as a mug's whose handle is hidden, will not do so now.
+        least_rad2 = self.map_view.network.least_variances_rad2(frames)
+        scale = np.maximum(least_rad2 / _rotation_variance(one_edge), 1.0)
+        ratio = float(self.has_own_edge) + known_rad2 / (scale * _rotation_variance(one_edge))
         bound_nats = 3.0 * found * np.log1p(relative_information * ratio)
         order = np.lexsort((np.array(frames), bound_nats))[::-1]
         candidates = []
@@ -97,7 +100,7 @@ class InformationGain:
             overlap = self._overlap(frames[k])
             covariance = self.map_view.solution.relative_covariance(frames[k], self.previous)
             covariance = covariance + float(self.has_own_edge) * one_edge + float(length[k]) * self.systematic
-            ratios = overlap * relative_information[k] * np.linalg.solve(one_edge, covariance)
+            ratios = overlap * relative_information[k] * np.linalg.solve(scale[k] * one_edge, covariance)
             gain_nats = 0.5 * float(found[k] * np.linalg.slogdet(np.eye(6) + ratios)[1])  # method.md, eq. C1
             if gain_nats >= min_gain_nats:
                 candidates.append(Candidate(frames[k], float(angle_deg[k]), overlap, gain_nats))

@@ -217,6 +217,12 @@ class PathNetwork:
         frames, indices = np.unique(self.ends, return_inverse=True)
         return frames, indices.reshape(-1, 2)
 
+    def least_variances_rad2(self, frames: Sequence[int]) -> Array:
+        """Return the least rotation variance (n,) of the edges of each frame; infinite without an edge."""
+        least = np.full(len(self._indexed[0]) + 1, np.inf)
+        np.minimum.at(least, self._indexed[1], self.edge_variances_rad2[:, None])
+        return least[[self.index.get(frame, -1) for frame in frames]]
+
     def shortest_paths(self, start: int) -> ShortestPaths:
         """Return the shortest paths from a frame to all connected ones (Dijkstra 1959)."""
         if start not in self.index:
