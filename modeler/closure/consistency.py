@@ -48,8 +48,8 @@ class Thresholds:
     known_share: float = 0.5
     """The graph knows a rotation better if its standard deviation is below this fraction of the edge's."""
     max_gaussian_deg: float = 30.0
-    """Largest standard deviation of such a rotation: by then 1 − cos of it is 0.13, and a Gaussian about one mean, which
-    is sure of the other axes, is wrong of them."""
+    """Largest standard deviation of such a rotation. Its cosine is then 0.87, so that a Gaussian about one mean is wrong
+    about the other axes, of which it is sure."""
 
     def evidence_bound(self, edges: Sequence[Edge], solution: Solution) -> EvidenceBound:
         """Return the least log evidence of further edges, from a run's edges between neighbours so far.

@@ -89,7 +89,7 @@ class InformationGain:
         relative_information = np.cos(within_rad) ** self.power
         path_rad2, length = self.paths.to(frames)
         known_rad2 = np.where(found > 0.0, path_rad2 + length * _rotation_variance(self.systematic), 0.0)
-        # A view none of whose edges determined the rotation, such as a mug's whose handle is hidden, will not do so now.
+        # A view none of whose edges determined the rotation, as of a mug with its handle hidden, will not do so now.
         least_rad2 = self.map_view.network.least_variances_rad2(frames)
         scale = np.maximum(least_rad2 / _rotation_variance(one_edge), 1.0)
         ratio = float(self.has_own_edge) + known_rad2 / (scale * _rotation_variance(one_edge))
