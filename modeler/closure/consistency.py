@@ -48,8 +48,8 @@ class Thresholds:
     known_share: float = 0.5
     """The graph knows a rotation better if its standard deviation is below this fraction of the edge's."""
     max_gaussian_deg: float = 30.0
-    """Largest standard deviation of such a rotation. Its cosine is then 0.87, so that a Gaussian about one mean is wrong
-    about the other axes, of which it is sure."""
+    """Largest standard deviation of such a rotation in degrees. The cosine of it is 0.87: a Gaussian about one mean is
+    then wrong about the other axes, of which it is sure."""
 
     def evidence_bound(self, edges: Sequence[Edge], solution: Solution) -> EvidenceBound:
         """Return the least log evidence of further edges, from a run's edges between neighbours so far.
