@@ -134,11 +134,31 @@ def estimated_focal_length(camera: Mapping[str, Any]) -> str:
     fx_px, factor, sigma = camera.get("fx_px"), camera.get("factor_in_run", 1.0), camera["focal_factor_sigma"]
     if fx_px is None or not camera.get("loops"):
         return ""
-    cycles, given_px = "1 graph cycle" if camera["loops"] == 1 else f"{camera['loops']} graph cycles", fx_px / factor
+    sds = camera["sigmas_after"], camera["sigmas_before"]
+    return focal_length_found((fx_px, sigma * fx_px), fx_px / factor, camera["loops"], sds, "as given")
+
+
+def focal_length_found(
+    found_px: tuple[float, float], given_px: float, cycles: int, sds: tuple[float, float], before: str
+) -> str:
+    """Return an estimate of the focal length in words.
+
+    Args:
+        found_px: the estimate and its standard deviation.
+        given_px: that of the camera as given.
+        cycles: number of the graph's cycles.
+        sds: their closure error in standard deviations with the estimate, and before.
+        before: what the second was computed with.
+    """
     return (
-        f"the focal length is {fx_px:.1f} ± {sigma * fx_px:.1f} px, {given_px:.1f} px was given; closure error of "
-        f"{cycles}: {camera['sigmas_after']:.1f} sd with it, {camera['sigmas_before']:.1f} sd as given"
+        f"the focal length is {found_px[0]:.1f} ± {found_px[1]:.1f} px, {given_px:.1f} px was given; closure error of "
+        f"{graph_cycles(cycles)}: {sds[0]:.1f} sd with it, {sds[1]:.1f} sd {before}"
     )
+
+
+def graph_cycles(count: int) -> str:
+    """Return a number of cycles in words."""
+    return "1 graph cycle" if count == 1 else f"{count} graph cycles"
 
 
 def unchecked_focal_length(report: Mapping[str, Any]) -> str:

@@ -313,7 +313,7 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
         for words in reasons[:_SHOWN_REASONS]:
             say(f"not to be trusted: {words}")
         if len(reasons) > _SHOWN_REASONS:
-            say(f"{len(reasons) - _SHOWN_REASONS} more reasons are in {options.out / 'report.json'}")
+            say(f"for {len(reasons) - _SHOWN_REASONS} more, see {options.out / 'report.json'}")
         if sign_in_doubt(report, prior):
             say("the given direction of rotation is assumed; if it may be the opposite, give --step-sign unknown")
     for remark in (

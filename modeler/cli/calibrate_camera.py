@@ -81,10 +81,12 @@ class CalibrateCamera:
 
 
 def _said(found: FocalLength, used_px: float, given_px: float) -> str:
-    loops = "1 graph cycle" if found.loops == 1 else f"{found.loops} graph cycles"
+    from modeler.cli.advice import focal_length_found, graph_cycles
+
     if found.told_by == "prior" and found.loops:
         return (
-            f"{loops} do not determine the focal length: closure error of {found.sigmas_before:.1f} sd as given, "
+            f"{graph_cycles(found.loops)} do not determine the focal length: closure error of "
+            f"{found.sigmas_before:.1f} sd as given, "
             f"{found.sigmas_after:.1f} sd with the best one; if this is large, an edge is wrong: see the worst pairs "
             "in the run's report"
         )
@@ -93,10 +95,7 @@ def _said(found: FocalLength, used_px: float, given_px: float) -> str:
             "no loop determines the focal length; turn the object fully, with overlapping steps, and use a motion "
             "prior (--prior table)"
         )
-    focal_px, sigma_px = used_px * found.factor, used_px * found.factor * found.sigma
-    by_run = abs(used_px / given_px - 1.0) > 1e-3
-    before = f"with the run's {used_px:.1f} px" if by_run else "as given"
-    return (
-        f"the focal length is {focal_px:.1f} ± {sigma_px:.1f} px, {given_px:.1f} px was given; "
-        f"closure error of {loops}: {found.sigmas_after:.1f} sd with it, {found.sigmas_before:.1f} sd {before}"
-    )
+    focal_px = used_px * found.factor
+    before = "as given" if f"{used_px:.1f}" == f"{given_px:.1f}" else f"with the run's {used_px:.1f} px"
+    sds = found.sigmas_after, found.sigmas_before
+    return focal_length_found((focal_px, focal_px * found.sigma), given_px, found.loops, sds, before)

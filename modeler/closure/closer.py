@@ -93,19 +93,19 @@ class Closer:
                     chosen.append(candidate.frame)
                 spanned = spanned or not closes
         first = frames[0]  # a closure with the first view is preferred
-        wanted = last and first != base.target and self._returns(gain, first, float(angle_deg[0]))
-        wanted = wanted and map_view.came_back(first, base.source, gain.paths, away_deg=self.away_deg)
+        wanted = last and first != base.target and self._returns(gain, base.source, first, float(angle_deg[0]))
         if wanted or first in chosen:
             chosen = [first, *(frame for frame in chosen if frame != first)]
         return tuple(chosen[: self.max_closures])
 
-    def _returns(self, gain: InformationGain, first: int, angle_deg: float) -> bool:
-        """Return whether the last frame is within reach of the first view, at a predicted rotation `angle_deg`."""
+    def _returns(self, gain: InformationGain, last: int, first: int, angle_deg: float) -> bool:
+        """Return whether the object came back to the first view, within reach, at a predicted rotation `angle_deg`."""
         known = gain.map_view
         closed = loops_closed([edge for edge in known.edges if known.solution.takes_part(edge)])
         reach_deg = self.max_angle_deg if closed else max(self.max_angle_deg, self.max_return_deg)
         probability = replace(gain, max_angle_deg=reach_deg).probability_within([first], np.array([angle_deg]))
-        return bool(probability[0] >= _MIN_PROBABILITY)
+        within = bool(probability[0] >= _MIN_PROBABILITY)
+        return within and known.came_back(first, last, gain.paths, away_deg=self.away_deg)
 
     def span_pairs(self, map_view: MapView) -> tuple[tuple[int, int], ...]:
         """Return the most informative pairs (source, target) of each view to register once all are in.
@@ -117,25 +117,24 @@ class Closer:
         frames, targets = sorted(map_view.frames), np.array(sorted(map_view.targets))
         poses = map_view.poses(targets.tolist())
         tried = {frozenset((edge.source, edge.target)) for edge in map_view.edges}
-        last_of = {segment_of.get(frame): frame for frame in frames}
+        ends = {*{segment_of.get(frame): frame for frame in frames}.values()}
+        segment = np.array([segment_of.get(int(target), -1) for target in targets], dtype=np.int64)
         pairs: list[tuple[int, int]] = []
         for source in frames if self.max_spans else ():
             pose, number = map_view.solution.trajectory[source], int(np.searchsorted(targets, source))
-            own = [k for k in range(number) if segment_of.get(source) == segment_of.get(int(targets[k]))]
+            own = np.flatnonzero(segment[:number] == segment_of.get(source, -1))
             earlier = targets[own].tolist()
             angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses[own]) @ pose))
             systematic = self.consistency.systematic(1, map_view.views[source].centroid_m)
             gain = InformationGain(
                 map_view, source, pose, systematic, self.max_span_deg, has_own_edge=False, power=_SPAN_POWER
             )
-            untried = np.array([{source, target} not in tried for target in earlier], dtype=np.bool_)
-            near = np.flatnonzero(untried & (angle_deg <= self.max_span_deg))
+            near = [k for k in np.flatnonzero(angle_deg <= self.max_span_deg) if {source, earlier[k]} not in tried]
             found = gain.candidates([earlier[k] for k in near], angle_deg[near], self.min_span_gain_nats)
             chosen = [one.frame for one in found if one.overlap >= self.thresholds.min_overlap]
-            ends = source in last_of.values() and bool(untried[:1].any())
-            if ends and self._returns(gain, earlier[0], float(angle_deg[0])):
-                came_back = map_view.came_back(earlier[0], source, gain.paths, away_deg=self.away_deg)
-                chosen = [earlier[0], *chosen] if came_back else chosen
+            untried = source in ends and len(earlier) > 0 and {source, earlier[0]} not in tried
+            if untried and self._returns(gain, source, earlier[0], float(angle_deg[0])):
+                chosen = [earlier[0], *chosen]
             pairs += [(source, target) for target in chosen[: self.max_spans]]
         return tuple(pairs)
 

@@ -219,9 +219,14 @@ class PathNetwork:
 
     def least_variances_rad2(self, frames: Sequence[int]) -> Array:
         """Return the least rotation variance (n,) of the edges of each frame; infinite without an edge."""
+        return self._least_rad2[[self.index.get(frame, -1) for frame in frames]]
+
+    @cached_property
+    def _least_rad2(self) -> Array:
+        """(n + 1,) by index of the frame; the last, infinite, is for frames without an edge."""
         least = np.full(len(self._indexed[0]) + 1, np.inf)
         np.minimum.at(least, self._indexed[1], self.edge_variances_rad2[:, None])
-        return least[[self.index.get(frame, -1) for frame in frames]]
+        return least
 
     def shortest_paths(self, start: int) -> ShortestPaths:
         """Return the shortest paths from a frame to all connected ones (Dijkstra 1959)."""

@@ -128,10 +128,9 @@ class Tracker:
         if not nearest:
             return ()
         target = nearest[0]
+        prior, steps = self.known.following(target), self.state.steps(view.index, target)
         if len(nearest) == 1:
-            steps = self.state.steps(view.index, target)
-            first = self.known.following(target)
-            return (self._pair(view, target, first.relaxed(steps) if steps > 1 else first),)
+            return (self._pair(view, target, prior.relaxed(steps) if steps > 1 else prior),)
         motion = se3.inverse(solution.trajectory[target]) @ known.extrapolated(view.index)
         step = solution.relative(target, nearest[-1])
         way = (
@@ -141,7 +140,7 @@ class Tracker:
         # In the middle between two views, the standard deviation is a quarter of the way, if the speed is uneven.
         spread = np.diag(np.repeat(0.25 * np.array(way), 3) ** 2)
         expected = PoseGaussian(motion, se3.covariance_about(spread, -view.centroid_m))
-        return (self._pair(view, target, self._predicted(view, target, expected, self.known.following(target))),)
+        return (self._pair(view, target, self._predicted(view, target, expected, prior)),)
 
     def closures(
         self, view: RayImage, posteriors: Sequence[Posterior], *, last: bool, retry: bool

@@ -210,7 +210,7 @@ def _arm(part: _Part, scene: Scene, zone_m: Array) -> BoolArray:
     if scene.nearest_m is None or scene.areas_m2 is None:
         return hovering
     nearest_m = scene.nearest_m[part.window] - part.gap_m
-    for without in (hovering, none):
+    for without in (hovering, none) if hovering.any() else (none,):
         for nearer in _in_front(part, suspect & ~without, nearest_m):
             arm = without | nearer
             # If less than the object is left, it was removed as well.
