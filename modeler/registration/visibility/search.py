@@ -87,10 +87,8 @@ class Search:
     """Samples of the prior per start, of which the best are used."""
     finest: float = 0.015
     """Blur of the surfaces in the last stage of the descent, as a fraction of the object's size."""
-    max_feature_starts: int = 400
-    """Largest number of starts from feature matches, if the prior has more basins than `max_starts` reach."""
     matcher: FeatureMatcher = field(default_factory=FeatureMatcher)
-    """Matches the features."""
+    """Matches features for further starts, if the prior has more basins than `max_starts` reach."""
     stages: int = 4
     """Stages of the descent, each with half the blur of the previous one."""
     steps: int = 4
@@ -185,7 +183,7 @@ class Search:
         motions, _ = self.matcher.motions(pair.backward.image, pair.forward.image)
         motions = motions[np.isfinite(density.log_density(motions))] if len(motions) else motions
         kept, remaining = [], np.ones(len(motions), dtype=bool)
-        while remaining.any() and len(kept) < self.max_feature_starts:
+        while remaining.any():
             kept.append(int(np.argmax(remaining)))
             distances = se3.difference(motions, motions[kept[-1]], pair.centre_m) / self.extent(pair)
             remaining &= np.linalg.norm(distances, axis=1) > 1.0
