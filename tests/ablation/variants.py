@@ -11,7 +11,7 @@ from unittest import mock
 import numpy as np
 
 from modeler.registration import VisibilityRegistrar
-from modeler.registration.visibility import likelihood
+from modeler.registration.visibility import likelihood, ridge
 from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.types import Array, RayImage
@@ -122,6 +122,7 @@ REMOVED: Final = (
     Variant("estimated misfit μ", "removed", _of(_StatedMisfit)),
     Variant("estimated noise b", "removed", _of(_StatedNoise)),
     Variant("patches (fewer independent points when small)", "removed", _of(_NoPatches)),
+    Variant("correction of chance along ridges", "removed", patched=_module(ridge, _MIN_POSES=_NEVER)),
     Variant("fixed pattern", "removed", replace(_DEFAULT, likelihood=_Other(change=_without_pattern))),
     Variant("cost of no overlap", "removed", _with(likelihood__no_overlap_cost=0.0)),
     Variant("cost of normals", "removed", _with(likelihood__normal_cost=0.0)),

@@ -12,6 +12,7 @@ import numpy as np
 from modeler.registration.posterior import MIN_MODE_SHARE, failed, share_at_limit, weighted_gaussian
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.registration.visibility.refinement import Refiner
+from modeler.registration.visibility.ridge import RidgeLikelihood
 from modeler.registration.visibility.sampling import (
     AdaptiveSampler,
     GaussianMixture,
@@ -52,11 +53,11 @@ class ModeSamples:
         if reference is self:
             return self.samples
         samples, best = self.samples, int(np.argmax(self.samples.log_likelihoods))
-        under_reference = pair.tempered(
-            samples.poses[best : best + 1], reference.noise_m, typical_misfit=reference.typical_misfit
+        own, referred = (
+            float(pair.tempered(samples.poses[best : best + 1], one.noise_m, typical_misfit=one.typical_misfit)[0])
+            for one in (self, reference)
         )
-        gain = float(under_reference[0] - samples.log_likelihoods[best])
-        return replace(samples, log_evidence=samples.log_evidence + gain)
+        return replace(samples, log_evidence=samples.log_evidence + referred - own)
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,9 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return samples of the mode that some candidates form."""
         noise_m = pair.surface_noise_m(found.poses[0], self.search.fine_m(pair))
         typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
-        likelihood = partial(pair.tempered, blur_m=noise_m, typical_misfit=typical_misfit)
+        noise = {"blur_m": noise_m, "typical_misfit": typical_misfit}
+        basin = self.search.extent(pair)
+        likelihood = RidgeLikelihood.of(pair, found.poses, partial(pair.tempered, **noise), **noise, basin=basin)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
         log_weights = likelihood(found.poses) + volumes
         if len(density.alternatives) > 1:

@@ -1,0 +1,83 @@
+"""Likelihood along ridges, without what is chance (method.md, eq. 30)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from modeler import se3
+from modeler.registration.visibility.likelihood import PairLikelihood
+from modeler.registration.visibility.sampling import LogLikelihood
+from modeler.types import Array
+
+_MIN_POSES = 5  # a correlation of fewer says little
+_WIDTH = 0.5  # sd of the smoothing kernel in basins: candidates on a ridge are about as far apart
+
+
+@dataclass(frozen=True, eq=False)
+class RidgeLikelihood:
+    """A tempered log-likelihood without the part of its differences along a ridge that is chance.
+
+    Where surface looks the same under all poses of a ridge, such as the spins of a can, noise prefers some of them.
+    Real differences appear in both halves of the points, chance in one.
+    """
+
+    likelihood: LogLikelihood
+    """Of poses (n, 4, 4), tempered."""
+    poses: Array
+    """(k, 4, 4) target_from_source, on the ridge."""
+    chance: Array
+    """(k,) what is to be subtracted there (nats)."""
+    centre_m: Array
+    """(3,) point of the source about which tangents are taken."""
+    width: Array
+    """(6,) sd of the kernel that smooths between poses: rotation in rad, translation in m."""
+
+    @staticmethod
+    def of(
+        pair: PairLikelihood,
+        poses: Array,
+        likelihood: LogLikelihood,
+        *,
+        blur_m: float,
+        typical_misfit: float,
+        basin: Array,
+    ) -> LogLikelihood:
+        """Return a log-likelihood without chance along a ridge; unchanged with too few poses.
+
+        Args:
+            pair: the two views.
+            poses: (k, 4, 4) target_from_source, separate optima that form a mode.
+            likelihood: of the pair, tempered.
+            blur_m: blur of the surfaces in m.
+            typical_misfit: misfit μ of a typical match (nats).
+            basin: (6,) extent of a basin in rad and m.
+        """
+        if len(poses) < _MIN_POSES:
+            return likelihood
+        share = reliability(pair.by_halves(poses, blur_m, typical_misfit=typical_misfit))
+        surface = replace(pair, colour=None).tempered(poses, blur_m, typical_misfit=typical_misfit)
+        mean = np.logaddexp.reduce(surface) - np.log(len(surface))  # so that the evidence of the mode stays
+        return RidgeLikelihood(likelihood, poses, (1.0 - share) * (surface - mean), pair.centre_m, _WIDTH * basin)
+
+    def __call__(self, target_from_source: Array) -> Array:
+        """Return the log-likelihoods (n,) of poses (n, 4, 4)."""
+        offsets = se3.difference(target_from_source[:, None], self.poses[None], self.centre_m) / self.width
+        squares = np.sum(offsets**2, axis=2)
+        weights = np.exp(-0.5 * (squares - squares.min(axis=1, keepdims=True)))
+        return self.likelihood(target_from_source) - weights @ self.chance / weights.sum(axis=1)
+
+
+def reliability(halves: Array) -> float:
+    """Return the share of the variance of sums that is no chance, from sums (m, 2, n) over halves (eq. 30).
+
+    With r the correlation of the halves, that of their sum with another such sum is 2 r / (1 + r) (Spearman 1910; Brown
+    1910).
+
+    Args:
+        halves: m kinds of sums, each over either half, under n poses.
+    """
+    apart = halves - halves.mean(axis=2, keepdims=True)
+    correlation = 2.0 * np.sum(apart[:, 0] * apart[:, 1]) / max(np.sum(apart**2), 1e-300)
+    return float(2.0 * max(correlation, 0.0) / (1.0 + max(correlation, 0.0)))
