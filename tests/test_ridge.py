@@ -13,6 +13,7 @@ from modeler.evaluation import nees, true_motion
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
+from modeler.registration.visibility import ridge
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.ridge import RidgeLikelihood, reliability
 from modeler.segmentation import Segmenter
@@ -47,13 +48,13 @@ def of(pair: PairLikelihood, poses: Array) -> tuple[Array, Array]:
     def plain(some: Array) -> Array:
         return pair.tempered(some, 0.002)
 
-    ridge = RidgeLikelihood.of(pair, poses, plain, blur_m=0.002, typical_misfit=0.5, basin=BASIN)
-    return plain(poses), ridge(poses)
+    without = RidgeLikelihood.of(pair, poses, plain, blur_m=0.002, typical_misfit=0.5, basin=BASIN)
+    return plain(poses), without(poses)
 
 
 def test_halves_are_parts_of_the_likelihood(tube: PairLikelihood) -> None:
     poses = spins(7, 0.05)
-    found = tube.by_halves(poses, 0.002)
+    found = ridge.by_halves(tube, poses, 0.002, typical_misfit=0.5)
     assert found.shape == (2, 2, 7)
     assert found.sum(axis=(0, 1)) == pytest.approx(tube.scores(poses, 0.002, stride=1).surface, abs=0.1)
     assert np.all(np.ptp(found, axis=2) > 0.0)
@@ -83,12 +84,12 @@ def test_few_poses_are_no_ridge(tube: PairLikelihood) -> None:
 def test_chance_goes_and_evidence_stays(tube: PairLikelihood, monkeypatch: pytest.MonkeyPatch) -> None:
     """If the halves do not agree, poses of the ridge are equally likely, their mean likelihood as before."""
     poses, half = spins(6), np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-    monkeypatch.setattr(PairLikelihood, "by_halves", lambda *_, **__: np.stack([[half, -half]] * 2))
+    monkeypatch.setattr(ridge, "by_halves", lambda *_, **__: np.stack([[half, -half]] * 2))
     plain, without = of(tube, poses)
     assert np.ptp(plain) > 1.0
     assert without == pytest.approx(np.full(6, without[0]), abs=1e-3)
     assert np.logaddexp.reduce(without) == pytest.approx(np.logaddexp.reduce(plain), abs=1e-3)
-    monkeypatch.setattr(PairLikelihood, "by_halves", lambda *_, **__: np.stack([[half, half]] * 2))
+    monkeypatch.setattr(ridge, "by_halves", lambda *_, **__: np.stack([[half, half]] * 2))
     plain, without = of(tube, poses)
     assert without == pytest.approx(plain)
 

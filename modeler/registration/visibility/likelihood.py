@@ -27,7 +27,6 @@ _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).a
 IntArray = npt.NDArray[np.int64]
 _DESCENT_STRIDE = 4  # every fourth point is used for descent
 _TAIL = 0.01  # probability of rejecting a true pose by eq. 22
-_BLOCKS = 32  # of neighbouring points, as many as patches in refinement; every other one belongs to the same half
 _MISFIT = 0.5  # mean of r² / 2τ² if variances are right
 
 
@@ -323,30 +322,6 @@ class PairLikelihood:
         found, model = self.scores(poses, blur_m, stride=stride, typical_misfit=typical_misfit), self.forward.model
         no_overlap = model.no_overlap_cost * np.exp(-found.explained / model.overlap_scale)
         return self.temper * found.surface - no_overlap + found.colours
-
-    def by_halves(self, poses: Array, blur_m: float, *, typical_misfit: float = _MISFIT) -> Array:
-        """Return log-likelihoods L (2, 2, n) of surface: of the points of either view, of either half of them.
-
-        Halves alternate in blocks, which share little noise. Not tempered.
-
-        Args:
-            poses: (n, 4, 4) target_from_source.
-            blur_m: blur of the surfaces in m.
-            typical_misfit: misfit μ of a typical match (nats).
-        """
-        parameters = (side.parameters(blur_m, typical_misfit) for side in (self.forward, self.backward))
-        whole, parameters = self.surfaces(1), tuple(parameters)
-        found = np.empty((2, 2, len(poses)))
-        for side, half in np.ndindex(2, 2):
-            chosen = [np.arange(0)] * 2  # of the other view, no point
-            count = whole[side].points.shape[1]
-            chosen[side] = np.flatnonzero(np.arange(count) * _BLOCKS // count % 2 == half)
-            parts = [
-                view._replace(points=np.ascontiguousarray(view.points[:, some]))
-                for view, some in zip(whole, chosen, strict=True)
-            ]
-            found[side, half] = scores.scores(rows(poses), *parts, *parameters)[:, scores.LOG_LIKELIHOOD]
-        return found
 
     def surfaces(self, stride: int) -> tuple[Projection, Projection]:
         """Return every `stride`-th point of both directions for kernels."""

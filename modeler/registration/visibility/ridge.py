@@ -7,10 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from modeler import se3
+from modeler.kernels import scores
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.sampling import LogLikelihood
+from modeler.se3 import rows
 from modeler.types import Array
 
+_BLOCKS = 32  # of neighbouring points, as many as patches in refinement; every other one belongs to the same half
 _MIN_POSES = 5  # a correlation of fewer says little
 _WIDTH = 0.5  # sd of the smoothing kernel in basins: candidates on a ridge are about as far apart
 
@@ -56,7 +59,7 @@ class RidgeLikelihood:
         """
         if len(poses) < _MIN_POSES:
             return likelihood
-        share = reliability(pair.by_halves(poses, blur_m, typical_misfit=typical_misfit))
+        share = reliability(by_halves(pair, poses, blur_m, typical_misfit=typical_misfit))
         surface = replace(pair, colour=None).tempered(poses, blur_m, typical_misfit=typical_misfit)
         mean = np.logaddexp.reduce(surface) - np.log(len(surface))  # so that the evidence of the mode stays
         return RidgeLikelihood(likelihood, poses, (1.0 - share) * (surface - mean), pair.centre_m, _WIDTH * basin)
@@ -67,6 +70,32 @@ class RidgeLikelihood:
         squares = np.sum(offsets**2, axis=2)
         weights = np.exp(-0.5 * (squares - squares.min(axis=1, keepdims=True)))
         return self.likelihood(target_from_source) - weights @ self.chance / weights.sum(axis=1)
+
+
+def by_halves(pair: PairLikelihood, poses: Array, blur_m: float, *, typical_misfit: float) -> Array:
+    """Return log-likelihoods L (2, 2, n) of surface: of the points of either view, of either half of them.
+
+    Halves alternate in blocks, which share little noise. Not tempered.
+
+    Args:
+        pair: the two views.
+        poses: (n, 4, 4) target_from_source.
+        blur_m: blur of the surfaces in m.
+        typical_misfit: misfit μ of a typical match (nats).
+    """
+    whole = pair.surfaces(1)
+    parameters = [side.parameters(blur_m, typical_misfit) for side in (pair.forward, pair.backward)]
+    found = np.empty((2, 2, len(poses)))
+    for side, half in np.ndindex(2, 2):
+        chosen = [np.arange(0)] * 2  # of the other view, no point
+        count = whole[side].points.shape[1]
+        chosen[side] = np.flatnonzero(np.arange(count) * _BLOCKS // count % 2 == half)
+        parts = [
+            view._replace(points=np.ascontiguousarray(view.points[:, some]))
+            for view, some in zip(whole, chosen, strict=True)
+        ]
+        found[side, half] = scores.scores(rows(poses), *parts, *parameters)[:, scores.LOG_LIKELIHOOD]
+    return found
 
 
 def reliability(halves: Array) -> float:
