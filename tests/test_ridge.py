@@ -15,7 +15,7 @@ from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility import ridge
 from modeler.registration.visibility.likelihood import PairLikelihood
-from modeler.registration.visibility.ridge import RidgeLikelihood, reliability
+from modeler.registration.visibility.ridge import reliability, without_chance
 from modeler.segmentation import Segmenter
 from modeler.types import Array, RayImage
 from sequences import bundled, open_sequence
@@ -48,7 +48,7 @@ def of(pair: PairLikelihood, poses: Array) -> tuple[Array, Array]:
     def plain(some: Array) -> Array:
         return pair.tempered(some, 0.002)
 
-    without = RidgeLikelihood.of(pair, poses, plain, blur_m=0.002, typical_misfit=0.5, basin=BASIN)
+    without = without_chance(pair, poses, plain, blur_m=0.002, typical_misfit=0.5, basin=BASIN)
     return plain(poses), without(poses)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from modeler.registration.posterior import MIN_MODE_SHARE, failed, share_at_limit, weighted_gaussian
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.registration.visibility.refinement import Refiner
-from modeler.registration.visibility.ridge import RidgeLikelihood
+from modeler.registration.visibility.ridge import without_chance
 from modeler.registration.visibility.sampling import (
     AdaptiveSampler,
     GaussianMixture,
@@ -113,7 +113,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
         noise = {"blur_m": noise_m, "typical_misfit": typical_misfit}
         basin = self.search.extent(pair)
-        likelihood = RidgeLikelihood.of(pair, found.poses, partial(pair.tempered, **noise), **noise, basin=basin)
+        likelihood = without_chance(pair, found.poses, partial(pair.tempered, **noise), **noise, basin=basin)
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
         log_weights = likelihood(found.poses) + volumes
         if len(density.alternatives) > 1:

@@ -30,46 +30,46 @@ class RidgeLikelihood:
     """Of poses (n, 4, 4), tempered."""
     poses: Array
     """(k, 4, 4) target_from_source, on the ridge."""
-    chance: Array
-    """(k,) what is to be subtracted there (nats)."""
+    chance_nats: Array
+    """(k,) what is to be subtracted there."""
     centre_m: Array
     """(3,) point of the source about which tangents are taken."""
     width: Array
     """(6,) sd of the kernel that smooths between poses: rotation in rad, translation in m."""
-
-    @staticmethod
-    def of(
-        pair: PairLikelihood,
-        poses: Array,
-        likelihood: LogLikelihood,
-        *,
-        blur_m: float,
-        typical_misfit: float,
-        basin: Array,
-    ) -> LogLikelihood:
-        """Return a log-likelihood without chance along a ridge; unchanged with too few poses.
-
-        Args:
-            pair: the two views.
-            poses: (k, 4, 4) target_from_source, separate optima that form a mode.
-            likelihood: of the pair, tempered.
-            blur_m: blur of the surfaces in m.
-            typical_misfit: misfit μ of a typical match (nats).
-            basin: (6,) extent of a basin in rad and m.
-        """
-        if len(poses) < _MIN_POSES:
-            return likelihood
-        share = reliability(by_halves(pair, poses, blur_m, typical_misfit=typical_misfit))
-        surface = replace(pair, colour=None).tempered(poses, blur_m, typical_misfit=typical_misfit)
-        mean = np.logaddexp.reduce(surface) - np.log(len(surface))  # so that the evidence of the mode stays
-        return RidgeLikelihood(likelihood, poses, (1.0 - share) * (surface - mean), pair.centre_m, _WIDTH * basin)
 
     def __call__(self, target_from_source: Array) -> Array:
         """Return the log-likelihoods (n,) of poses (n, 4, 4)."""
         offsets = se3.difference(target_from_source[:, None], self.poses[None], self.centre_m) / self.width
         squares = np.sum(offsets**2, axis=2)
         weights = np.exp(-0.5 * (squares - squares.min(axis=1, keepdims=True)))
-        return self.likelihood(target_from_source) - weights @ self.chance / weights.sum(axis=1)
+        return self.likelihood(target_from_source) - weights @ self.chance_nats / weights.sum(axis=1)
+
+
+def without_chance(
+    pair: PairLikelihood,
+    poses: Array,
+    likelihood: LogLikelihood,
+    *,
+    blur_m: float,
+    typical_misfit: float,
+    basin: Array,
+) -> LogLikelihood:
+    """Return a log-likelihood without chance along a ridge; unchanged with too few poses.
+
+    Args:
+        pair: the two views.
+        poses: (k, 4, 4) target_from_source, separate optima that form a mode.
+        likelihood: of the pair, tempered.
+        blur_m: blur of the surfaces in m.
+        typical_misfit: misfit μ of a typical match (nats).
+        basin: (6,) extent of a basin in rad and m.
+    """
+    if len(poses) < _MIN_POSES:
+        return likelihood
+    share = reliability(by_halves(pair, poses, blur_m, typical_misfit=typical_misfit))
+    surface = replace(pair, colour=None).tempered(poses, blur_m, typical_misfit=typical_misfit)
+    mean = np.logaddexp.reduce(surface) - np.log(len(surface))  # so that the evidence of the mode stays
+    return RidgeLikelihood(likelihood, poses, (1.0 - share) * (surface - mean), pair.centre_m, _WIDTH * basin)
 
 
 def by_halves(pair: PairLikelihood, poses: Array, blur_m: float, *, typical_misfit: float) -> Array:
