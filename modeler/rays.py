@@ -13,6 +13,7 @@ from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
 from modeler.types import COLOUR_SHIFT_PX, BoolArray, Frame, Plane, RayImage
 
 _ALIKE = 2.0  # areas of correlated noise that err alike: measured, see method.md
+_RIM_PX = 10.0  # distance from the silhouette at which errors there have fallen to 1/e: measured, see method.md
 
 
 @dataclass(frozen=True)
@@ -104,10 +105,13 @@ class Sensor:
         ball, sigma_inverse, (sharing, area_px) = self._smoothing(frame, mask, outline)
         # The object may go on behind what hides it, so its silhouette is known only beyond.
         covered = outline if frame.occluder is None else outline | frame.occluder
+        silhouette = planes.silhouette_distance(covered, self.max_silhouette_px)
+        window = _window(outline, 1)
+        silhouette[window] = np.where(outline[window], rim_weights(outline[window]), silhouette[window])
         cells = planes.local_planes(
             depth_m,
             surface,
-            planes.silhouette_distance(covered, self.max_silhouette_px),
+            silhouette,
             intrinsics,
             ball,
             sigma_inverse,
@@ -170,6 +174,16 @@ class Sensor:
         sharing = max(density * (ball_px + _ALIKE * self.noise_area_px), 1.0)
         # A tenth of the sensor's noise: neighbouring pixels err alike, so that residuals understate it.
         return ball, 0.1 * self.sigma_r_m / middle_m**2, (float(sharing), float(ball_px + self.noise_area_px))
+
+
+def rim_weights(outline: BoolArray) -> np.ndarray:
+    """Return the weights (h, w) float32, 0 to 1, of errors near the silhouette of an object (method.md, eq. 31).
+
+    Args:
+        outline: (h, w) bool, the object's pixels. The edge of the image is no silhouette.
+    """
+    inside_px = planes.silhouette_distance(~outline, 3.0 * _RIM_PX)
+    return np.asarray(np.exp(-((inside_px / np.float32(_RIM_PX)) ** 2)), dtype=np.float32)
 
 
 def _window(mask: BoolArray, margin: int) -> tuple[slice, slice]:

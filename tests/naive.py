@@ -78,7 +78,8 @@ def visibility(pose, projection, parameters):
             plane = cell[: planes.NORMAL_Z + 1]
             in_front = plane @ position + cell[planes.DISTANCE]
             agreement = normal @ plane
-            square = in_front**2 / (point[6] + cell[planes.VARIANCE] + blur**2)
+            other = cell[planes.VARIANCE] + float(projection.rim_m2) * cell[planes.RIM] ** 2
+            square = in_front**2 / (point[6] + other + blur**2)
             where = position[:2] / position[2] * (fx, fy) + (cx, cy)
             common = share * max(1 - per_square_px * np.sum((where - point[7:9]) ** 2), 0) ** 2
             match = typical_misfit - 0.5 * square - 0.5 * common - normal_cost * (1 - agreement)

@@ -22,7 +22,7 @@ WIDTH_PX, SIGMA_M = 3.0, 0.002
 
 
 def matches_at(positions: np.ndarray, own_px: np.ndarray) -> np.ndarray:
-    """Return matches (n, 14) at positions in the camera of `tabletop`, of points seen elsewhere in their own view."""
+    """Return matches (n, 15) at positions in the camera of `tabletop`, of points seen elsewhere in their own view."""
     camera = tabletop.CAMERA
     found = np.zeros((len(positions), point_to_plane.COLUMNS))
     found[:, point_to_plane.POSITION] = positions

@@ -98,6 +98,7 @@ def random_cells(rng):
 CAMERA = np.array([*INTRINSICS, SHAPE[1], SHAPE[0]], dtype=np.float32)
 FACING = np.array([0.1, 0.35, 0.3, 0.7], dtype=np.float32)
 PATTERN = np.array([0.7, 1 / 50], dtype=np.float32)
+RIM_M2 = np.float32(1e-5)
 HIDDEN = 0.3
 
 
@@ -115,7 +116,7 @@ def random_projection(rng, count=40):
     pixels = rng.uniform((0, 0), (SHAPE[1], SHAPE[0]), (count, 2))
     points = np.hstack([random_points(rng, count), normals, rng.uniform(1e-7, 1e-4, (count, 1)), pixels])
     cells = random_cells(rng).reshape(-1, planes.CELL_SIZE)
-    return Projection(np.ascontiguousarray(points.T, dtype=np.float32), cells, CAMERA, FACING, PATTERN)
+    return Projection(np.ascontiguousarray(points.T, dtype=np.float32), cells, CAMERA, FACING, PATTERN, RIM_M2)
 
 
 def far_from_borders(projection, poses):
@@ -193,7 +194,7 @@ def test_the_class_of_a_point_follows_from_where_it_lies():
         ([0.0, 0.2, 0.8], towards, point_likelihood.IN_SUPPORT),
     ]
     points = np.array([[*position, *normal, 1e-6, 0, 0] for position, normal, _ in cases], dtype=np.float32).T.copy()
-    projection = Projection(points, cells.reshape(-1, planes.CELL_SIZE), CAMERA, FACING, PATTERN)
+    projection = Projection(points, cells.reshape(-1, planes.CELL_SIZE), CAMERA, FACING, PATTERN, np.float32(0.0))
     table = (0.0, -1.0, 0.0, 0.15, 500.0)
     classes = point_likelihood.classify(rows(np.eye(4)), projection, parameters(0.001, table))
     assert classes.tolist() == [want for *_, want in cases]

@@ -86,7 +86,9 @@ def test_points_behind_an_occluder_count_nothing(flashlight) -> None:  # noqa: F
         assert len(behind) > 20
         points = replace(replace(pair.forward, image=replace(hidden, plane=None)), points=pair.forward.points[behind])
         assert (points.classify(se3.rows(pose)) == UNKNOWN).all()
-        averted = replace(points, points=np.array([[0.0, 0.0, -5.0, 0.0, 0.0, -1.0, 1e-6]]))  # counts 0, too
+        averted = replace(
+            points, points=np.array([[0.0, 0.0, -5.0, 0.0, 0.0, -1.0, 1e-6, 0.0, 0.0, 0.0]])
+        )  # counts 0, too
         one_way = replace(pair, forward=points, backward=averted)
         plain, explained, _ = one_way.scores(pose[None], 0.001, stride=1)
         assert plain[0] == 0.0

@@ -149,12 +149,12 @@ def remove_static(features, others, numbers, offsets, share, points_m, focal, va
 
 @numba.njit(cache=True, error_model="numpy")
 def compare_matches(matches, rotation, values, own_cells, cells, camera, numbers, weight):
-    """Return the equations of features of matches (n, 14), in the layout of `point_to_plane.matches`.
+    """Return the equations of features of matches (n, 15), in the layout of `point_to_plane.matches`.
 
     The gradient of a feature replaces the normal, the difference of features the distance.
 
     Args:
-        matches: (n, 14) of surface.
+        matches: (n, 15) of surface.
         rotation: (3, 3) of the points into the other camera.
         values: (n,) features of the points in their own view.
         own_cells: (n, 4) cells of the points in their own view.

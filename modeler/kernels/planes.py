@@ -14,6 +14,7 @@ VARIANCE = 4  # of that distance at the pixel, m²
 KIND = 5  # one of the four below
 DEPTH = 6  # measured z, m
 SILHOUETTE = 7  # distance of a pixel outside the object from its silhouette, px
+RIM = 7  # of a pixel of the object, in the same place: weight of errors near its silhouette (method.md, eq. 31)
 CELL_SIZE = 8
 
 _NOWHERE_M = 1e9  # outside every ball
@@ -111,7 +112,7 @@ def add_line(centres, points, row, shift, pad, radius_m2, step, sums):
             sums[5, j] += weighted * weighted
 
 
-def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse, measured=None):
+def local_planes(depth_m, mask, silhouette, intrinsics, ball, sigma_inverse, measured=None):
     """Fit a plane to every object pixel's neighbours within a ball.
 
     A plane is linear in inverse depth over the image (1/z = N · (w, h, 1)), where triangulating cameras have constant
@@ -121,7 +122,7 @@ def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse, 
     Args:
         depth_m: (h, w) z in m, NaN = missing.
         mask: (h, w) bool, object.
-        silhouette_px: (h, w) of `silhouette_distance`, copied into the cells.
+        silhouette: (h, w) copied into the cells: `silhouette_distance` outside the object, `rim_weights` on it.
         intrinsics: (4,) fx, fy, cx, cy in px.
         ball: radius in m; half-width of its window in px; stride between the pixels that are read.
         sigma_inverse: sensor noise of 1/z, in 1/m.
@@ -134,12 +135,12 @@ def local_planes(depth_m, mask, silhouette_px, intrinsics, ball, sigma_inverse, 
     window = bounds(mask)
     centres = padded(depth_m, mask, intrinsics, window, ball[1])
     points = centres if measured is None else padded(depth_m, measured, intrinsics, window, ball[1])
-    images = depth_m, mask, silhouette_px, centres, points
+    images = depth_m, mask, silhouette, centres, points
     return over_rows(_local_planes, np.arange(len(depth_m)), *images, window, intrinsics, ball, sigma_inverse)
 
 
 @numba.njit(cache=True, nogil=True)
-def _local_planes(rows, depth_m, mask, silhouette_px, centres, points, window, intrinsics, ball, sigma_inverse):
+def _local_planes(rows, depth_m, mask, silhouette, centres, points, window, intrinsics, ball, sigma_inverse):
     width = depth_m.shape[1]
     fx, fy, cx, cy = intrinsics
     radius_m, reach, stride = ball
@@ -149,7 +150,7 @@ def _local_planes(rows, depth_m, mask, silhouette_px, centres, points, window, i
     for row in rows:
         found = cells[row - rows[0]]
         for column in range(width):
-            found[column, SILHOUETTE] = silhouette_px[row, column]
+            found[column, SILHOUETTE] = silhouette[row, column]
             if depth_m[row, column] > 0.0:
                 found[column, DEPTH] = depth_m[row, column]
                 found[column, KIND] = RAGGED if mask[row, column] else BACKGROUND

@@ -20,6 +20,7 @@ from modeler.kernels.planes import (
     NORMAL_X,
     NORMAL_Y,
     NORMAL_Z,
+    RIM,
     SILHOUETTE,
     SURFACE,
     VARIANCE,
@@ -69,6 +70,8 @@ class Projection(NamedTuple):
     """(4,) cosines between which f rises from 0 to 1, and g (method.md, eq. 4)."""
     pattern: FloatArray
     """(2,) fraction χ of the variance common to both views at the same pixel, and 1/R² in 1/px² (eq. 27)."""
+    rim_m2: np.float32
+    """Variance in m² of errors near silhouettes (eq. 31); that of the points is part of their variances."""
 
 
 @numba.njit(cache=True, forceinline=True)
@@ -128,14 +131,20 @@ def transform_points(pose, projection, transformed, pixels):
 
 
 @numba.njit(cache=True, forceinline=True)
-def fetch_cells(count, pixels, cells, looked_up):
-    """Copy the cells at the first `pixels` (n,) into columns of `looked_up` (8, n); `MISSING` outside the image."""
+def fetch_cells(count, pixels, cells, rim_m2, looked_up):
+    """Copy the cells at the first `pixels` (n,) into columns of `looked_up` (8, n); `MISSING` outside the image.
+
+    Variances are copied with those of errors near the silhouette.
+    """
     for j in range(count):
         cell = np.uint32(max(pixels[j], np.int32(0)))
         for k in range(CELL_SIZE):
             looked_up[k, j] = cells[cell, k]
         if pixels[j] < 0:
             looked_up[KIND, j] = MISSING
+    for j in range(count):
+        rim = looked_up[RIM, j] if looked_up[KIND, j] == _OF_SURFACE else ZERO
+        looked_up[VARIANCE, j] += rim_m2 * rim * rim
 
 
 @numba.njit(cache=True, forceinline=True)
@@ -145,7 +154,7 @@ def project(pose, projection, transformed, pixels, looked_up):
     The buffers may be longer than there are points.
     """
     transform_points(pose, projection, transformed, pixels)
-    fetch_cells(projection.points.shape[1], pixels, projection.cells, looked_up)
+    fetch_cells(projection.points.shape[1], pixels, projection.cells, projection.rim_m2, looked_up)
 
 
 @numba.njit(cache=True, forceinline=True)
@@ -294,16 +303,24 @@ def classify(pose, projection, parameters):
 
 
 @numba.njit(cache=True)
-def residual_excess(pose, projection, blur_m):
-    """Return the excess of squared residuals over their variances under one pose (12,) (method.md, eq. 8).
+def residual_excess(pose, projection, rims, blur_m):
+    """Return the equations for the excess of squared residuals over their variances under one pose (12,).
+
+    Least squares for b² and the variance of errors near silhouettes (method.md, eq. 8 and 31), over the points that
+    face the camera and are within `LOOSE_SIGMAS` standard deviations.
+
+    Args:
+        pose: rows of the 3×4 matrix.
+        projection: the points and the other view.
+        rims: (n,) weights of errors near the silhouette of the points' own view.
+        blur_m: least noise of the surfaces with which points are selected.
 
     Returns:
-        Numerator in m² and denominator of b², over the points that face the camera and are within `LOOSE_SIGMAS`
-        standard deviations, `blur_m` included.
+        (2, 3): normal equations, matrix | right side in m².
     """
     transformed, pixels, looked_up = buffers(projection.points.shape[1])
     project(pose, projection, transformed, pixels, looked_up)
-    total, count = 0.0, 0.0
+    sums, rim_m2 = np.zeros((2, 3)), np.float64(projection.rim_m2)
     for j in range(pixels.shape[0]):
         if looked_up[KIND, j] != SURFACE or transformed[FACING, j] < 0.5:
             continue
@@ -311,6 +328,12 @@ def residual_excess(pose, projection, blur_m):
         known = np.float64(projection.points[VARIANCE_M2, j]) + np.float64(looked_up[VARIANCE, j])
         if square < LOOSE_SIGMAS * LOOSE_SIGMAS * (known + blur_m * blur_m):
             apart = 1.0 - np.float64(transformed[PATTERN, j])
-            total += square - apart * known
-            count += apart
-    return total, count
+            rim = rims[j] ** 2 + np.float64(looked_up[RIM, j]) ** 2
+            excess = square - apart * (known - rim_m2 * rim)
+            sums[0, 0] += apart * apart
+            sums[0, 1] += apart * rim
+            sums[1, 1] += rim * rim
+            sums[0, 2] += apart * excess
+            sums[1, 2] += rim * excess
+    sums[1, 0] = sums[0, 1]
+    return sums

@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from modeler.kernels.planes import KIND, NORMAL_X, NORMAL_Y, NORMAL_Z, SURFACE, VARIANCE
+from modeler.kernels.planes import KIND, NORMAL_X, NORMAL_Y, NORMAL_Z, RIM, SURFACE, VARIANCE
 from modeler.kernels.point_likelihood import (
     COLUMN,
     FACING,
@@ -26,9 +26,10 @@ from modeler.kernels.point_likelihood import (
     project,
 )
 
-# Columns of `matches`: transformed position, own normal, the surface's normal, distance from it, weight, f, and shift.
+# Columns of `matches`: transformed position, own normal, the surface's normal, distance from it, weight, f, shift, and
+# the weight of errors near the silhouette there.
 POSITION, OWN, OTHER, SHIFT = slice(0, 3), slice(3, 6), slice(6, 9), slice(12, 14)
-RESIDUAL, WEIGHT, FACING_WEIGHT, COLUMNS = 9, 10, 11, 14
+RESIDUAL, WEIGHT, FACING_WEIGHT, OTHER_RIM, COLUMNS = 9, 10, 11, 14, 15
 
 _OF_SURFACE = np.float32(SURFACE)
 
@@ -53,9 +54,9 @@ def matches(pose, projection, surface_m):
         surface_m: noise of the surfaces in m beyond that of points and planes.
 
     Returns:
-        (n, 14): position in m, own normal and normal of the surface there, all in the other camera's frame; distance
+        (n, 15): position in m, own normal and normal of the surface there, all in the other camera's frame; distance
         in m in front of that surface; weight in 1/m², 0 without a match; f (0..1); shift in px, columns and rows, from
-        the point's pixel in its own view.
+        the point's pixel in its own view; weight of errors near the other silhouette.
     """
     transformed, pixels, cells = buffers(projection.points.shape[1])
     project(pose, projection, transformed, pixels, cells)
@@ -69,6 +70,7 @@ def matches(pose, projection, surface_m):
             for k in range(3):
                 found[j, 6 + k] = cells[NORMAL_X + k, j]
             found[j, RESIDUAL], found[j, WEIGHT], found[j, FACING_WEIGHT] = residual, weight, transformed[FACING, j]
+            found[j, OTHER_RIM] = cells[RIM, j]
             x, y, z = transformed[X, j], transformed[Y, j], transformed[Z, j]
             found[j, SHIFT.start] = fx * x / z + cx - projection.points[COLUMN, j]
             found[j, SHIFT.start + 1] = fy * y / z + cy - projection.points[ROW, j]

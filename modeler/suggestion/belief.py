@@ -14,7 +14,7 @@ from modeler.closure import Closer, MapView
 from modeler.priors import turntable_in
 from modeler.priors.mixtures import Gaussian
 from modeler.registration import VisibilityLikelihood
-from modeler.registration.visibility.likelihood import point_rows
+from modeler.registration.visibility.points import point_rows
 from modeler.suggestion.candidates import Candidate
 from modeler.suggestion.edge_prediction import TURNS_RAD, USUAL_NOISE, EdgePredictor, PredictedEdge, PredictedView
 from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information

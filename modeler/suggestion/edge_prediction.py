@@ -64,7 +64,7 @@ class PredictedView:
     image: RayImage
     """Its visible known points; it has no images."""
     points: Array
-    """(n, 9), see `point_rows`."""
+    """(n, 10), see `point_rows`."""
     weight: float
     """Number of points of a real view that each of them represents."""
     unseen_m: Array

@@ -61,6 +61,13 @@ class _StatedNoise(PairLikelihood):
         return blur_m
 
 
+class _NoRims(PairLikelihood):
+    """Without errors near silhouettes."""
+
+    def with_rim_noise(self, pose: Array, blur_m: float) -> PairLikelihood:
+        return self
+
+
 def _without_pattern(pair: PairLikelihood) -> PairLikelihood:
     """Return a pair whose views have no errors in common."""
     forward, backward = (replace(side, pattern=FixedPattern()) for side in (pair.forward, pair.backward))
@@ -123,6 +130,7 @@ REMOVED: Final = (
     Variant("estimated noise b", "removed", _of(_StatedNoise)),
     Variant("patches (fewer independent points when small)", "removed", _of(_NoPatches)),
     Variant("correction of chance along ridges", "removed", patched=_module(ridge, _MIN_POSES=_NEVER)),
+    Variant("errors near silhouettes", "removed", _of(_NoRims)),
     Variant("fixed pattern", "removed", replace(_DEFAULT, likelihood=_Other(change=_without_pattern))),
     Variant("cost of no overlap", "removed", _with(likelihood__no_overlap_cost=0.0)),
     Variant("cost of normals", "removed", _with(likelihood__normal_cost=0.0)),

@@ -30,8 +30,8 @@ Cell = wp.types.vector(length=planes.CELL_SIZE, dtype=wp.float32)
 Support = wp.types.vector(length=5, dtype=wp.float32)
 
 SURFACE, BACKGROUND, MISSING = wp.constant(planes.SURFACE), wp.constant(planes.BACKGROUND), wp.constant(planes.MISSING)
-VARIANCE, KIND, DEPTH, SILHOUETTE = (
-    wp.constant(field) for field in (planes.VARIANCE, planes.KIND, planes.DEPTH, planes.SILHOUETTE)
+VARIANCE, KIND, DEPTH, SILHOUETTE, RIM = (
+    wp.constant(field) for field in (planes.VARIANCE, planes.KIND, planes.DEPTH, planes.SILHOUETTE, planes.RIM)
 )
 DISTANCE, POINT_VARIANCE = wp.constant(planes.DISTANCE), wp.constant(twin.VARIANCE_M2)
 COLUMN, ROW = wp.constant(twin.COLUMN), wp.constant(twin.ROW)
@@ -51,6 +51,7 @@ class Direction:
     camera: Camera
     cosines: wp.vec4
     pattern: wp.vec2
+    rim_m2: wp.float32
     blur_m: wp.float32
     silhouette_px: wp.float32
     clearance_m: wp.float32
@@ -76,7 +77,8 @@ def of_surface(
     plane = wp.vec3(cell[0], cell[1], cell[2])
     in_front = cell[DISTANCE] + wp.dot(plane, position)
     agreement = wp.dot(plane, normal)
-    half_square = 0.5 * in_front * in_front / (variance + cell[VARIANCE] + of.blur_m * of.blur_m)
+    other = cell[VARIANCE] + of.rim_m2 * cell[RIM] * cell[RIM]
+    half_square = 0.5 * in_front * in_front / (variance + other + of.blur_m * of.blur_m)
     match = of.typical_misfit - half_square - 0.5 * common - of.normal_cost * (1.0 - agreement)
     step = (wp.clamp(match, TABLE_LOW, TABLE_HIGH) - TABLE_LOW) * PER_STEP
     node = wp.min(wp.int32(step), LAST)
@@ -175,7 +177,7 @@ def _direction(projection: Projection, parameters: LikelihoodParameters, device:
     direction.cells = sent(projection.cells, device, Cell)
     direction.table = sent(parameters.table, device)
     direction.camera, direction.cosines = Camera(*projection.camera), wp.vec4(*projection.cosines)
-    direction.pattern = wp.vec2(*projection.pattern)
+    direction.pattern, direction.rim_m2 = wp.vec2(*projection.pattern), float(projection.rim_m2)
     direction.support = Support(*parameters.support)
     for name in LikelihoodParameters._fields[:7]:
         setattr(direction, name, float(getattr(parameters, name)))

@@ -41,14 +41,14 @@ class FixedPattern:
         return np.array([self.share, self.per_square_px], dtype=np.float32)
 
     def common(self, matches: Array) -> Array:
-        """Return c (n,), the fraction of the variance of matches (n, 14) that is common to both views."""
+        """Return c (n,), the fraction of the variance of matches (n, 15) that is common to both views."""
         return self.share * self._correlation(matches[:, point_to_plane.SHIFT]) ** 2
 
     def derivatives(self, matches: Array, camera: Camera) -> tuple[Array, Array]:
         """Return first and second derivatives of f c / 2 (eq. 27) by the positions of matches.
 
         Args:
-            matches: (n, 14) of `point_to_plane.matches`.
+            matches: (n, 15) of `point_to_plane.matches`.
             camera: in which they were looked up.
 
         Returns:

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from scipy.optimize import nnls
 from scipy.special import chdtri
 
 from modeler import se3
@@ -17,14 +17,14 @@ from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
 from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.photometric import ASSUMED_RHO, PairColour, correlations, weight_of, without_shift
+from modeler.registration.visibility.points import RIM, IntArray, points_of, spread_points
 from modeler.se3 import matrices, rows
-from modeler.types import Array, Camera, RayImage
+from modeler.types import Array, RayImage
 
 _MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
 _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a fraction of its pixels' lateral noise, which is independent
 _RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; width of the ramps of f and g
 _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).astype(np.float32)  # see `Projection`
-IntArray = npt.NDArray[np.int64]
 _DESCENT_STRIDE = 4  # every fourth point is used for descent
 _TAIL = 0.01  # probability of rejecting a true pose by eq. 22
 _MISFIT = 0.5  # mean of r² / 2τ² if variances are right
@@ -92,8 +92,8 @@ class VisibilityLikelihood:
         size_m = 0.5 * (source.size_m + target.size_m)
         chosen = spread_points(source, self.points, rng), spread_points(target, self.points, rng)
         pattern = FixedPattern.between(source, target)
-        forward = DirectedLikelihood(self, _points(source, chosen[0]), target, size_m, pattern)
-        backward = DirectedLikelihood(self, _points(target, chosen[1]), source, size_m, pattern)
+        forward = DirectedLikelihood(self, points_of(source, chosen[0]), target, size_m, pattern)
+        backward = DirectedLikelihood(self, points_of(target, chosen[1]), source, size_m, pattern)
         coloured = self.colour and source.frame.colour is not None and target.frame.colour is not None
         if not coloured:
             return PairLikelihood(forward, backward, size_m)
@@ -115,21 +115,25 @@ class DirectedLikelihood:
 
     model: VisibilityLikelihood
     points: Array
-    """(n, 9) position in m, unit normal, variance along the normal in m², column and row in px in its own view."""
+    """(n, 10), see `point_rows`: position in m, unit normal, variance along the normal in m², column and row in px in
+    its own view, and weight of errors near its silhouette."""
     image: RayImage
     """The view in which the points are looked up."""
     size_m: float
     """Size of the object, see `PairLikelihood`."""
     pattern: FixedPattern
     """Errors common to both views."""
+    rim_m: float = 0.0
+    """Standard deviation of depth errors near silhouettes in m (method.md, eq. 31)."""
 
     def classify(self, pose: Array, blur_m: float = 0.0) -> np.ndarray:
         """Return the class (n,) of each point under one pose (12,): `point_likelihood.classify`."""
         return point_likelihood.classify(pose, self.projection(1), self.parameters(blur_m))
 
-    def residual_excess(self, pose: Array, blur_m: float) -> tuple[float, float]:
-        """Return numerator and denominator of b² in eq. 8 of method.md, sums over the matches under a pose (12,)."""
-        return point_likelihood.residual_excess(pose, self.projection(1), float(np.hypot(blur_m, self._min_blur_m)))
+    def residual_excess(self, pose: Array, blur_m: float) -> Array:
+        """Return the sums (2, 3) for eq. 8 and 31 of method.md over matches under a pose (12,): matrix | right side."""
+        least_m = float(np.hypot(blur_m, self._min_blur_m))
+        return point_likelihood.residual_excess(pose, self.projection(1), self.points[:, RIM], least_m)
 
     def misfits(self, pose: Array, blur_m: float) -> Array:
         """Return the misfit (k,) in nats of each match under one pose (12,) in distance and normals."""
@@ -148,7 +152,9 @@ class DirectedLikelihood:
         """Return every `stride`-th point and the other view's cells for kernels."""
         if stride not in self._projections:
             columns = np.ascontiguousarray(self._columns[:, ::stride])
-            self._projections[stride] = Projection(columns, self._cells, self._camera, _COSINES, self.pattern.packed())
+            self._projections[stride] = Projection(
+                columns, self._cells, self._camera, _COSINES, self.pattern.packed(), np.float32(self.rim_m**2)
+            )
         return self._projections[stride]
 
     def parameters(self, blur_m: float, typical_misfit: float = _MISFIT) -> LikelihoodParameters:
@@ -174,7 +180,9 @@ class DirectedLikelihood:
 
     @cached_property
     def _columns(self) -> np.ndarray:
-        return np.ascontiguousarray(self.points.T, dtype=np.float32)
+        columns = np.ascontiguousarray(self.points.T[:RIM], dtype=np.float32)
+        columns[point_likelihood.VARIANCE_M2] += self.rim_m**2 * self.points[:, RIM] ** 2
+        return columns
 
     @cached_property
     def _cells(self) -> np.ndarray:
@@ -241,8 +249,8 @@ class PairLikelihood:
     def at(self, source_points: IntArray, target_points: IntArray) -> PairLikelihood:
         """Return the likelihood at other surface points of source and target, given by index."""
         target, source = self.forward.image, self.backward.image
-        forward = replace(self.forward, points=_points(source, source_points))
-        backward = replace(self.backward, points=_points(target, target_points))
+        forward = replace(self.forward, points=points_of(source, source_points))
+        backward = replace(self.backward, points=points_of(target, target_points))
         plain = replace(self, forward=forward, backward=backward, colour=None)
         if self.colour is None:
             return plain
@@ -368,11 +376,30 @@ class PairLikelihood:
         A nuisance parameter at its most likely value given a pose (4, 4): the effect of smoothing on curved surfaces,
         and sensor noise common to neighbours. `blur_m` is the value at which matches are selected.
         """
-        forward, matched = self.forward.residual_excess(rows(pose), blur_m)
-        backward, matched_backward = self.backward.residual_excess(rows(se3.inverse(pose)), blur_m)
-        if matched + matched_backward <= _MIN_MATCHES:
-            return blur_m
-        return float(np.sqrt(max((forward + backward) / (matched + matched_backward), 0.0)))
+        found = self._noises_m2(pose, blur_m)
+        return blur_m if found is None else float(np.sqrt(found[0]))
+
+    def with_rim_noise(self, pose: Array, blur_m: float) -> PairLikelihood:
+        """Return the pair with the depth errors near silhouettes that a pose (4, 4) shows (method.md, eq. 31).
+
+        `blur_m` is the blur at which matches are selected.
+        """
+        found = self._noises_m2(pose, blur_m)
+        return self if found is None else self.with_rim_m(float(np.sqrt(found[1])))
+
+    def with_rim_m(self, rim_m: float) -> PairLikelihood:
+        """Return the pair with another standard deviation of depth errors near silhouettes in m."""
+        forward, backward = (replace(side, rim_m=rim_m) for side in (self.forward, self.backward))
+        return replace(self, forward=forward, backward=backward)
+
+    def _noises_m2(self, pose: Array, blur_m: float) -> Array | None:
+        """Return the variances (2,) in m² of eq. 8 and 31 under a pose (4, 4); None with too few matches."""
+        sums = self.forward.residual_excess(rows(pose), blur_m)
+        sums += self.backward.residual_excess(rows(se3.inverse(pose)), blur_m)
+        if sums[0, 0] <= _MIN_MATCHES:
+            return None
+        root = np.linalg.cholesky(sums[:, :2] + 1e-9 * sums[0, 0] * np.eye(2))
+        return np.asarray(nnls(root.T, np.linalg.solve(root, sums[:, 2]))[0])
 
     def overlap(self, target_from_source: Array) -> float:
         """Return the fraction of matches among the points that both cameras should see."""
@@ -464,34 +491,3 @@ class PairLikelihood:
 def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:
     """Return the regulariser for equations of every `stride`-th point, without their weight `stride`."""
     return regulariser._replace(precision=regulariser.precision / stride, damping=regulariser.damping / stride)
-
-
-def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> IntArray:
-    """Return the indices of `count` surface points, or of all if fewer, evenly spread over the image.
-
-    They are taken along a space-filling curve, so that every stride through them is again evenly spread and results
-    depend little on the choice of points.
-    """
-    total = len(view.points_m)
-    stride = max(total / count, 1.0)
-    picks = np.arange(min(count, total)) * stride + rng.random() * stride
-    return view.along_curve[np.minimum(picks.astype(np.int64), total - 1)]
-
-
-def _points(view: RayImage, chosen: IntArray) -> Array:
-    """Return the `point_rows` of a view's surface points with these indices."""
-    variances_m2 = np.asarray(view.layers["variance_m2"], dtype=np.float64)[chosen]
-    return point_rows(view.points_m[chosen], view.normals[chosen], variances_m2, view.frame.camera)
-
-
-def point_rows(points_m: Array, normals: Array, variances_m2: Array, camera: Camera) -> Array:
-    """Return points (n, 9) for a `DirectedLikelihood`.
-
-    Args:
-        points_m: (n, 3) in the frame of the view that shows them.
-        normals: (n, 3) unit normals.
-        variances_m2: (n,) along the normals.
-        camera: of that view.
-    """
-    pixels = points_m[:, :2] / points_m[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    return np.hstack([points_m, normals, variances_m2[:, None], pixels])

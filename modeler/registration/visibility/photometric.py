@@ -121,7 +121,7 @@ class PairColour:
 
         Args:
             transform: (4, 4) transform of the points into the other camera.
-            matches: (n, 14) `point_to_plane.matches` of positive weight.
+            matches: (n, 15) `point_to_plane.matches` of positive weight.
             points: (n,) indices of their points.
             band: index of the band.
             weight: of squared differences of features.

@@ -19,6 +19,7 @@ from modeler.registration.posterior import FLOOR
 from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.likelihood import DirectedLikelihood, MatchNoise, PairLikelihood
 from modeler.registration.visibility.photometric import without_shift
+from modeler.registration.visibility.points import RIM
 from modeler.se3 import rows
 from modeler.types import Array, Camera
 
@@ -61,15 +62,18 @@ class Refiner:
         (poses, weights), centre_m = samples, pair.centre_m
         mean, covariance = se3.mean(poses, weights, about_m=centre_m)
         spread = np.asarray(np.linalg.cholesky(covariance + FLOOR), dtype=np.float64)
-        mode, noise = _mode(dense, mean, spread, centre_m, fine_m=fine_m)
-        basis, information, by_focal = self._information(dense, mode, noise, spread)
+        dense, mode, noise = _mode(dense, mean, spread, centre_m, fine_m=fine_m)
+        pair = pair.with_rim_m(dense.forward.rim_m)
+        surface, colours = _equations(dense, mode, noise)
+        basis, information, by_focal = self._information(dense, mode, noise, spread, (surface, colours))
         scales, axes = np.linalg.eigh(information)
         root = axes * np.sqrt(np.maximum(scales, 0.0))
         narrowed = np.linalg.inv(np.eye(6) + information)
         to_basis = np.linalg.inv(basis)
         steps = _steps(pair, poses, noise, spread, stride=2)
-        # To first order, the shift of all samples by the choice of few points.
-        steps += _steps(dense, mode[None], noise, spread, stride=1) - _steps(pair, mode[None], noise, spread, stride=2)
+        # To first order, the shift of all samples by the choice of few points, and by what both silhouettes hide.
+        there = _steps(dense, mode[None], noise, spread, stride=1, explained=surface.explained)
+        steps += there - _steps(pair, mode[None], noise, spread, stride=2)
         step = steps @ to_basis.T @ information
         scatter = rng.normal(size=(len(poses), 6)) @ root.T
         moved = (step + scatter) @ narrowed.T @ basis.T  # method.md, eq. 16
@@ -83,13 +87,18 @@ class Refiner:
         return Refined(se3.moved(poses, moved, centre_m), np.asarray(from_centre @ by_focal, dtype=np.float64))
 
     def _information(
-        self, pair: PairLikelihood, mode: Array, noise: MatchNoise, spread: Array
+        self,
+        pair: PairLikelihood,
+        mode: Array,
+        noise: MatchNoise,
+        spread: Array,
+        equations: tuple[Equations, Equations],
     ) -> tuple[Array, Array, Array]:
         """Return a basis (6, 6) of ξ about the centre, the information (6, 6) in it, and ∂ξ/∂γ (6,).
 
         Equations 14 and 25 of method.md.
         """
-        surface, colours = _equations(pair, mode, noise)
+        surface, colours = equations
         halvings = min(self.halvings, int(np.log2(max(len(surface.residuals) / self.min_matches, 1.0))))
         if 2**halvings <= len(spread):  # the scatter of six equations would be singular
             return spread, np.zeros((6, 6)), np.zeros(6)
@@ -180,26 +189,50 @@ def visible_share(size: float) -> float:
 
 def _mode(
     pair: PairLikelihood, start: Array, spread: Array, centre_m: Array, *, fine_m: float
-) -> tuple[Array, MatchNoise]:
-    """Return the mode of matching surface × a Gaussian about `start`, `spread` (6, 6) the root of its covariance."""
+) -> tuple[PairLikelihood, Array, MatchNoise]:
+    """Return the mode of matching surface × a Gaussian about `start`, `spread` (6, 6) the root of its covariance.
+
+    With it come the pair, with the noise near silhouettes there, and the noise of matches.
+    """
     precision = np.linalg.inv(spread @ spread.T)
+    pair = pair.with_rim_noise(start, fine_m)
     pose, noise = start, pair.match_noise(start, fine_m)
     for _ in range(8):
         gradient, matrix = (part[0] for part in pair.normal_equations(pose[None], noise, stride=1))
         offset = se3.difference(start, pose, centre_m)
         step = np.asarray(np.linalg.solve(matrix + precision, gradient - precision @ offset), dtype=np.float64)
         pose = se3.moved(pose, step, centre_m)
+        pair = pair.with_rim_noise(pose, fine_m)
         noise = noise._replace(surface_m=pair.surface_noise_m(pose, fine_m))
         if np.linalg.norm(np.linalg.solve(spread, step)) < 0.01:  # standard deviations
             break
-    return pose, pair.match_noise(pose, fine_m)
+    return pair, pose, pair.match_noise(pose, fine_m)
 
 
-def _steps(pair: PairLikelihood, poses: Array, noise: MatchNoise, spread: Array, *, stride: int) -> Array:
-    """Return Gauss-Newton steps (n, 6), regularised by the samples' spread."""
+def _steps(
+    pair: PairLikelihood,
+    poses: Array,
+    noise: MatchNoise,
+    spread: Array,
+    *,
+    stride: int,
+    explained: Explained | None = None,
+) -> Array:
+    """Return Gauss-Newton steps (n, 6), regularised by the samples' spread, without what a nuisance explains."""
     gradient, matrix = pair.normal_equations(poses, noise, stride=stride)
+    if explained is not None:
+        gradient, matrix = gradient - explained.gradient, matrix - explained.matrix
     regularised = matrix + np.linalg.inv(spread @ spread.T)
     return np.asarray(np.linalg.solve(regularised, gradient[:, :, None])[:, :, 0], dtype=np.float64)
+
+
+class Explained(NamedTuple):
+    """What a nuisance parameter explains of normal equations for ξ about the centre."""
+
+    gradient: Array
+    """(6,)."""
+    matrix: Array
+    """(6, 6)."""
 
 
 class Equations(NamedTuple):
@@ -223,6 +256,21 @@ class Equations(NamedTuple):
     """(n, 6) derivatives of f c / 2, the term of the fixed pattern."""
     pattern_curvatures: Array
     """(2, 6, 6) its second derivatives, summed over each direction."""
+    explained: Explained | None = None
+    """What an eliminated nuisance parameter explains."""
+
+    def without(self, by_nuisance: Array) -> Equations:
+        """Return the equations after elimination of a parameter β ~ N(0, 1) (method.md, eq. 31).
+
+        Args:
+            by_nuisance: (n,) derivatives of the residuals by β.
+        """
+        weighted = self.weights * by_nuisance
+        coupled = weighted @ (0.5 * (self.by_own + self.by_other))
+        share = coupled / (1.0 + weighted @ by_nuisance)
+        own, other = (by_motion - by_nuisance[:, None] * share for by_motion in (self.by_own, self.by_other))
+        explained = Explained(-(weighted @ self.residuals) * share, np.outer(coupled, share))
+        return self._replace(by_own=own, by_other=other, explained=explained)
 
     def focal_gradient(self, basis: Array) -> Array:
         """Return the derivative (6,) of the normal equations' right-hand side by the logarithm of the focal length.
@@ -255,6 +303,7 @@ class Equations(NamedTuple):
 def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Equations, Equations]:
     """Return the equations of matching points, and of their colours, in the source's frame, about the centre."""
     parts: list[list[tuple[Array, ...]]] = [[], []]
+    rims = []  # a surface too near its camera at the rim: its points are in front, or those of the other behind it
     directions: list[tuple[DirectedLikelihood, Array, float]] = [
         (pair.forward, pose, 1.0),
         (pair.backward, se3.inverse(pose), -1.0),
@@ -267,6 +316,7 @@ def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Eq
         to_source = np.eye(4) if sign < 0.0 else se3.inverse(pose)
         arms, moves = se3.transform(to_source, positions) - pair.centre_m, focal_motion(transform, positions)
         colours = pair.colour_matches(transform, surface, points, noise, forward=sign > 0.0)
+        rims.append(directed.rim_m * (directed.points[points, RIM] - surface[:, point_to_plane.OTHER_RIM]))
         for part, used, pattern in zip(parts, (surface, colours), (directed.pattern, FixedPattern()), strict=True):
             at, moved = arms[: len(used)], moves[: len(used)]  # all or none
             focal = [np.sum(used[:, k] * moved, axis=1) for k in (point_to_plane.OWN, point_to_plane.OTHER)]
@@ -275,8 +325,10 @@ def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Eq
             residuals, weights = used[:, point_to_plane.RESIDUAL], used[:, point_to_plane.WEIGHT]
             slopes, curvature = _pattern_derivatives(pattern, used, at, to_source[:3, :3], directed.image.frame.camera)
             part.append((at, *derivatives, residuals, weights, *focal, sign * slopes, curvature))
-    surface, colours = (Equations(*(np.concatenate(columns) for columns in zip(*part, strict=True))) for part in parts)
-    return surface, colours
+    joined = [[np.concatenate(columns) for columns in zip(*part, strict=True)] for part in parts]
+    surface, colours = (Equations(*columns, explained=None) for columns in joined)
+    by_rim = np.concatenate(rims)
+    return surface.without(by_rim) if by_rim.any() else surface, colours
 
 
 def _pattern_derivatives(
@@ -286,7 +338,7 @@ def _pattern_derivatives(
 
     Args:
         pattern: errors common to both views.
-        used: (n, 14) matches, see `point_to_plane.matches`.
+        used: (n, 15) matches, see `point_to_plane.matches`.
         arms: (n, 3) their positions in the source's frame, about the centre.
         to_source: (3, 3) rotation into that frame.
         camera: in which they were looked up.

@@ -93,6 +93,7 @@ class VisibilityRegistrar(AbstractRegistrar):
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         pair = self.likelihood.between(source, target, rng)
         found = self.search.run(pair, density, rng, min_overlap=self.min_overlap)
+        pair = pair.with_rim_noise(found.poses[0], self.search.fine_m(pair))
         modes_found = found.modes(pair.centre_m, self.search.extent(pair))[: self.max_modes]
         sampled = [self._sampled(pair, density, mode, rng) for mode in modes_found]
         reference = min(sampled, key=lambda mode: mode.noise_m)

@@ -1,0 +1,136 @@
+"""Depth errors near silhouettes: estimated from matches, and eliminated from their equations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from modeler.evaluation import nees, rotation_error_deg, true_motion
+from modeler.kernels import planes
+from modeler.priors import GeneralPrior
+from modeler.rays import Sensor, rim_weights
+from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
+from modeler.registration.visibility.likelihood import PairLikelihood
+from modeler.registration.visibility.refinement import Equations
+from modeler.se3 import rows
+from modeler.types import Array, RayImage
+from sequences import bundled, open_sequence
+
+BLUR_M: Final = 0.001
+
+
+class Unaware(PairLikelihood):
+    """Without errors near silhouettes."""
+
+    def with_rim_noise(self, pose: Array, blur_m: float) -> PairLikelihood:
+        return self
+
+
+class UnawareLikelihood(VisibilityLikelihood):
+    """The likelihood of such pairs."""
+
+    def between(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> PairLikelihood:
+        pair = super().between(source, target, rng)
+        return Unaware(pair.forward, pair.backward, pair.size_m)
+
+
+def boxes(target: int, nearer_m: float) -> tuple[RayImage, RayImage, Array]:
+    """Return two views of the bundled box, too near by up to `nearer_m` at the rim, and the true motion."""
+    sequence = open_sequence(bundled("box"))
+    truth, noise, views = sequence.truth(), sequence.sensor(), []
+    assert truth is not None
+    assert noise is not None
+    for index in (target, target + 1):
+        frame = sequence.frame(index)
+        assert frame.mask is not None
+        depth_m = frame.depth_m - nearer_m * np.where(frame.mask, rim_weights(frame.mask), 0.0)
+        views.append(Sensor(*noise).ray_image(replace(frame, depth_m=depth_m.astype(np.float32), colour=None)))
+    return views[1], views[0], true_motion(truth, target=target, source=target + 1)
+
+
+def test_weights_fall_with_the_distance_from_the_silhouette() -> None:
+    outline = np.zeros((80, 90), dtype=bool)
+    outline[10:70, 15:90] = True  # as far as the edge of the image, which is no silhouette
+    within_px = ndimage.distance_transform_edt(np.pad(outline, ((0, 0), (0, 99)), mode="edge"))
+    exact = np.exp(-((np.asarray(within_px, dtype=np.float64) / 10.0) ** 2))
+    found = rim_weights(outline)[outline]
+    assert found == pytest.approx(exact[:, :90][outline], abs=0.06)
+    assert found.max() > 0.98
+    assert rim_weights(np.ones((20, 20), dtype=bool)).max() < 1e-3
+
+
+def test_cells_and_points_hold_the_weights() -> None:
+    source, _, _ = boxes(2, 0.0)
+    pair = VisibilityLikelihood().between(source, source, np.random.default_rng(0))
+    mask = source.frame.mask
+    assert mask is not None
+    on_surface = source.layers["cells"][..., planes.KIND] == planes.SURFACE
+    weights = rim_weights(mask)
+    assert source.layers["cells"][on_surface, planes.RIM] == pytest.approx(weights[on_surface], abs=1e-6)
+    columns, lines = pair.forward.points[:, 7:9].round().astype(int).T
+    assert pair.forward.points[:, 9] == pytest.approx(weights[lines, columns], abs=1e-6)
+
+
+def test_errors_near_silhouettes_are_estimated() -> None:
+    found_m = []
+    for nearer_m in (0.0, 0.002, 0.004):
+        source, target, truth = boxes(3, nearer_m)
+        pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
+        found_m.append(pair.with_rim_noise(truth, BLUR_M).forward.rim_m)
+    assert np.all(np.diff(found_m) > 1e-4)
+    assert found_m[2] > 2.0 * found_m[0]
+
+
+def test_views_that_agree_have_none() -> None:
+    source, _, _ = boxes(2, 0.004)
+    pair = VisibilityLikelihood().between(source, source, np.random.default_rng(0))
+    assert pair.with_rim_noise(np.eye(4), BLUR_M).forward.rim_m < 1e-4
+
+
+def test_variances_grow_by_those_of_both_rims() -> None:
+    """A match at distance r has the weight f / (τ² + σ² (a² + a'²))."""
+    source, target, truth = boxes(2, 0.0)
+    pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
+    from_matches = [one.forward.matches(rows(truth), 0.01) for one in (pair, pair.with_rim_m(0.003))]
+    plain, wide = (found[from_matches[0][:, 10] > 0.0] for found in from_matches)
+    own = pair.forward.points[from_matches[0][:, 10] > 0.0, 9]
+    more_m2 = wide[:, 11] / wide[:, 10] - plain[:, 11] / plain[:, 10]
+    assert more_m2 == pytest.approx(9e-6 * (own**2 + plain[:, 14] ** 2), rel=2e-3, abs=1e-9)
+    assert np.ptp(own) > 0.5
+
+
+def test_elimination_is_the_schur_complement(rng: np.random.Generator) -> None:
+    """Least squares for ξ and β ~ N(0, 1) together give the same ξ."""
+    by_motion, by_nuisance = rng.normal(size=(40, 6)), rng.normal(size=40)
+    residuals, weights = rng.normal(size=40), rng.uniform(0.5, 2.0, 40)
+    nothing, zeros = np.zeros(40), np.zeros((40, 6))
+    equations = Equations(
+        zeros[:, :3], by_motion, by_motion, residuals, weights, nothing, nothing, zeros, np.zeros((2, 6, 6))
+    )
+    design = np.column_stack([by_motion, by_nuisance])
+    joint = (design.T * weights) @ design + np.diag([0.0] * 6 + [1.0])
+    want = np.linalg.solve(joint, -design.T @ (weights * residuals))[:6]
+    left = equations.without(by_nuisance)
+    assert left.explained is not None
+    gradient = -by_motion.T @ (weights * residuals) - left.explained.gradient
+    matrix = (by_motion.T * weights) @ by_motion - left.explained.matrix
+    assert np.linalg.solve(matrix, gradient) == pytest.approx(want)
+    assert left.by_own.T @ (weights * residuals) == pytest.approx(-gradient)
+
+
+def test_poses_are_nearer_and_not_overconfident_where_rims_are_too_near() -> None:
+    squares, errors_deg = [], []
+    for likelihood in (VisibilityLikelihood(), UnawareLikelihood()):
+        registrar = VisibilityRegistrar(likelihood=likelihood)
+        for frame in (2, 3):
+            source, target, truth = boxes(frame, 0.004)
+            density = GeneralPrior().between(source, target)
+            posterior = registrar.register(source, target, density, rng=np.random.default_rng(0))
+            squares.append(nees(posterior.pose, truth))
+            errors_deg.append(rotation_error_deg(posterior.pose.mean, truth))
+    assert sum(squares[:2]) < 0.5 * sum(squares[2:])
+    assert sum(errors_deg[:2]) < 0.75 * sum(errors_deg[2:])
