@@ -130,7 +130,7 @@ def test_curvatures_are_those_of_the_likelihood(printed, seed: int):
     pair = VisibilityLikelihood().between(views[0], views[1], np.random.default_rng(seed))
     fine_m = 0.015 * pair.size_m
     best = printed[1]
-    noise_m = pair.surface_noise_m(best, fine_m)
+    noise_m, _ = pair.noises_m(best, fine_m)
     found = pair.curvatures(best[None], noise_m, stride=1)[0]
     scales, axes = np.linalg.eigh(found)
     away, ratios = np.linspace(-2.0, 2.0, 41), []

@@ -7,14 +7,14 @@ from typing import Final
 
 import numpy as np
 import pytest
-from scipy import ndimage
+from scipy import ndimage, optimize
 
 from modeler.evaluation import nees, rotation_error_deg, true_motion
 from modeler.kernels import planes
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor, rim_weights
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
-from modeler.registration.visibility.likelihood import PairLikelihood
+from modeler.registration.visibility.likelihood import PairLikelihood, nonnegative_solution
 from modeler.registration.visibility.refinement import Equations
 from modeler.se3 import rows
 from modeler.types import Array, RayImage
@@ -26,7 +26,7 @@ BLUR_M: Final = 0.001
 class Unaware(PairLikelihood):
     """Without errors near silhouettes."""
 
-    def with_rim_noise(self, pose: Array, blur_m: float) -> PairLikelihood:
+    def with_rim_m(self, rim_m: float) -> PairLikelihood:
         return self
 
 
@@ -80,7 +80,7 @@ def test_errors_near_silhouettes_are_estimated() -> None:
     for nearer_m in (0.0, 0.002, 0.004):
         source, target, truth = boxes(3, nearer_m)
         pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
-        found_m.append(pair.with_rim_noise(truth, BLUR_M).forward.rim_m)
+        found_m.append(pair.noises_m(truth, BLUR_M)[1])
     assert np.all(np.diff(found_m) > 1e-4)
     assert found_m[2] > 2.0 * found_m[0]
 
@@ -88,7 +88,19 @@ def test_errors_near_silhouettes_are_estimated() -> None:
 def test_views_that_agree_have_none() -> None:
     source, _, _ = boxes(2, 0.004)
     pair = VisibilityLikelihood().between(source, source, np.random.default_rng(0))
-    assert pair.with_rim_noise(np.eye(4), BLUR_M).forward.rim_m < 1e-4
+    assert pair.noises_m(np.eye(4), BLUR_M)[1] < 1e-4
+
+
+def test_noises_are_the_nonnegative_least_squares(rng: np.random.Generator) -> None:
+    zeros = 0
+    for _ in range(200):
+        design, right = rng.uniform(size=(8, 2)), rng.normal(0.1, 1.0, 8)
+        want = optimize.nnls(design, right)[0]
+        sums = np.column_stack([design.T @ design, design.T @ right])
+        assert nonnegative_solution(*sums.ravel().tolist()) == pytest.approx(want, abs=1e-9)
+        zeros += int(np.count_nonzero(want == 0.0))
+    assert 50 < zeros < 350
+    assert nonnegative_solution(5.0, 0.0, 1.0, 0.0, 0.0, 0.0) == (0.2, 0.0)  # nothing near silhouettes
 
 
 def test_variances_grow_by_those_of_both_rims() -> None:

@@ -158,7 +158,8 @@ class EdgePredictor:
                 ready(views[edge.source]), ready(views[edge.target]), np.random.default_rng(0)
             )
             pose = edge.posterior.pose
-            noise = pair.match_noise(pose.mean, 0.015 * pair.size_m)  # as fine as the search
+            surface_m, _ = pair.noises_m(pose.mean, 0.015 * pair.size_m)  # as fine as the search
+            noise = pair.match_noise(pose.mean, surface_m)
             pairs.append((edge, pair, noise))
             noises_m.append(noise.surface_m)
         if not pairs:

@@ -189,6 +189,22 @@ class RayImage:
         return found
 
     @cached_property
+    def measured_share(self) -> float:
+        """Fraction (0..1) of measured pixels around the surface points: low for very sparse images.
+
+        Pixels of occluders are left out.
+        """
+        rows, columns = self.pixels[:: max(len(self.pixels) // 500, 1)].T
+        height, width = self.frame.depth_m.shape
+        steps = np.arange(-2, 3)
+        near_rows = np.clip(rows[:, None, None] + steps[:, None], 0, height - 1)
+        near_columns = np.clip(columns[:, None, None] + steps, 0, width - 1)
+        measured = self.frame.depth_m[near_rows, near_columns] > 0
+        if self.frame.occluder is None:
+            return float(np.mean(measured))
+        return float(np.mean(measured[~self.frame.occluder[near_rows, near_columns]]))
+
+    @cached_property
     def centroid_m(self) -> Array:
         """Mean (3,) of the surface points; the origin where there are none."""
         return np.array([axis_m.mean() for axis_m in self.points_m.T]) if len(self.points_m) else np.zeros(3)

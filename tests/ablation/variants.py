@@ -57,14 +57,14 @@ class _StatedMisfit(PairLikelihood):
 class _StatedNoise(PairLikelihood):
     """With the finest blur for the noise of matching surfaces."""
 
-    def surface_noise_m(self, pose: Array, blur_m: float) -> float:
-        return blur_m
+    def noises_m(self, pose: Array, blur_m: float) -> tuple[float, float]:
+        return blur_m, super().noises_m(pose, blur_m)[1]
 
 
 class _NoRims(PairLikelihood):
     """Without errors near silhouettes."""
 
-    def with_rim_noise(self, pose: Array, blur_m: float) -> PairLikelihood:
+    def with_rim_m(self, rim_m: float) -> PairLikelihood:
         return self
 
 

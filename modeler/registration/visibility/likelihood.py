@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
 from scipy.special import chdtri
 
 from modeler import se3
@@ -167,7 +167,7 @@ class DirectedLikelihood:
             clearance_m=np.float32(3.0 * self.image.sigma_r_m),
             max_point_cost=np.float32(self.model.max_point_cost),
             normal_cost=np.float32(self.model.normal_cost),
-            unmeasured_gain=np.float32(np.log(max(self.model.hidden_share, 1.0 - self._measured_share))),
+            unmeasured_gain=np.float32(np.log(max(self.model.hidden_share, 1.0 - self.image.measured_share))),
             typical_misfit=np.float32(typical_misfit),
             support=self._support(blur_m),
             table=self._table,
@@ -207,22 +207,6 @@ class DirectedLikelihood:
             return np.zeros(5, dtype=np.float32)
         sigma_m = np.linalg.norm([plane.sigma_offset_m, plane.sigma_tilt_rad * self.size_m, blur_m, self._min_blur_m])
         return np.array([*plane.normal, plane.offset_m, 1.0 / sigma_m], dtype=np.float32)
-
-    @cached_property
-    def _measured_share(self) -> float:
-        """Fraction π of measured pixels around the surface: low for very sparse images.
-
-        Pixels of occluders are left out, as points that fall there contribute 0.
-        """
-        rows_, columns = self.image.pixels[:: max(len(self.image.pixels) // 500, 1)].T
-        height, width = self.image.frame.depth_m.shape
-        steps = np.arange(-2, 3)
-        near_rows = np.clip(rows_[:, None, None] + steps[:, None], 0, height - 1)
-        near_columns = np.clip(columns[:, None, None] + steps, 0, width - 1)
-        measured = self.image.frame.depth_m[near_rows, near_columns] > 0
-        if self.image.frame.occluder is None:
-            return float(np.mean(measured))
-        return float(np.mean(measured[~self.image.frame.occluder[near_rows, near_columns]]))
 
     @cached_property
     def _distance_m(self) -> float:
@@ -339,9 +323,8 @@ class PairLikelihood:
         """Return the colours of both directions for kernels."""
         return (NO_COLOURS, NO_COLOURS) if self.colour is None else self.colour.colours(band, stride)
 
-    def match_noise(self, pose: Array, blur_m: float) -> MatchNoise:
-        """Return the noise of surfaces and colours under a pose (4, 4), see `surface_noise_m`."""
-        surface_m = self.surface_noise_m(pose, blur_m)
+    def match_noise(self, pose: Array, surface_m: float) -> MatchNoise:
+        """Return the noise of surfaces, which is given (`noises_m`), and of colours under a pose (4, 4)."""
         if self.colour is None:
             return MatchNoise(surface_m)
         band = self.colour.band(surface_m)
@@ -370,36 +353,24 @@ class PairLikelihood:
             low, high = (middle, high) if mean < 0.0 else (low, middle)
         return 0.5 * (low + high)
 
-    def surface_noise_m(self, pose: Array, blur_m: float) -> float:
-        """Return the noise b of matching surfaces in m, beyond that of points and planes (method.md, eq. 8).
+    def noises_m(self, pose: Array, blur_m: float) -> tuple[float, float]:
+        """Return the noise b of matching surfaces, beyond that of points and planes, and that near silhouettes, in m.
 
-        A nuisance parameter at its most likely value given a pose (4, 4): the effect of smoothing on curved surfaces,
-        and sensor noise common to neighbours. `blur_m` is the value at which matches are selected.
+        Nuisance parameters at their most likely values given a pose (4, 4) (method.md, eq. 8 and 31): the effect of
+        smoothing on curved surfaces, sensor noise common to neighbours, and depth flattened near outlines. `blur_m` is
+        the value of b at which matches are selected, and returned with too few of them.
         """
-        found = self._noises_m2(pose, blur_m)
-        return blur_m if found is None else float(np.sqrt(found[0]))
-
-    def with_rim_noise(self, pose: Array, blur_m: float) -> PairLikelihood:
-        """Return the pair with the depth errors near silhouettes that a pose (4, 4) shows (method.md, eq. 31).
-
-        `blur_m` is the blur at which matches are selected.
-        """
-        found = self._noises_m2(pose, blur_m)
-        return self if found is None else self.with_rim_m(float(np.sqrt(found[1])))
-
-    def with_rim_m(self, rim_m: float) -> PairLikelihood:
-        """Return the pair with another standard deviation of depth errors near silhouettes in m."""
-        forward, backward = (replace(side, rim_m=rim_m) for side in (self.forward, self.backward))
-        return replace(self, forward=forward, backward=backward)
-
-    def _noises_m2(self, pose: Array, blur_m: float) -> Array | None:
-        """Return the variances (2,) in m² of eq. 8 and 31 under a pose (4, 4); None with too few matches."""
         sums = self.forward.residual_excess(rows(pose), blur_m)
         sums += self.backward.residual_excess(rows(se3.inverse(pose)), blur_m)
         if sums[0, 0] <= _MIN_MATCHES:
-            return None
-        root = np.linalg.cholesky(sums[:, :2] + 1e-9 * sums[0, 0] * np.eye(2))
-        return np.asarray(nnls(root.T, np.linalg.solve(root, sums[:, 2]))[0])
+            return blur_m, self.forward.rim_m
+        surface_m2, rim_m2 = nonnegative_solution(*sums.ravel().tolist())
+        return math.sqrt(surface_m2), math.sqrt(rim_m2)
+
+    def with_rim_m(self, rim_m: float) -> PairLikelihood:
+        """Return the pair with another standard deviation of depth errors near silhouettes in m (eq. 31)."""
+        forward, backward = (replace(side, rim_m=rim_m) for side in (self.forward, self.backward))
+        return replace(self, forward=forward, backward=backward)
 
     def overlap(self, target_from_source: Array) -> float:
         """Return the fraction of matches among the points that both cameras should see."""
@@ -422,7 +393,7 @@ class PairLikelihood:
 
         `blur_m` is the blur at which matches are selected, and the least noise of surfaces.
         """
-        noise_m = max(self.surface_noise_m(target_from_source, blur_m), blur_m)
+        noise_m = max(self.noises_m(target_from_source, blur_m)[0], blur_m)
         surface = replace(self, colour=None).scores(target_from_source[None], noise_m, stride=1).surface
         independent = self.temper * self.points
         return bool(self.temper * surface[0] >= 0.5 * (independent - chdtri(independent, _TAIL)))
@@ -491,3 +462,14 @@ class PairLikelihood:
 def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:
     """Return the regulariser for equations of every `stride`-th point, without their weight `stride`."""
     return regulariser._replace(precision=regulariser.precision / stride, damping=regulariser.damping / stride)
+
+
+def nonnegative_solution(aa: float, ab: float, a: float, _: float, bb: float, b: float) -> tuple[float, float]:
+    """Return x, y ≥ 0 of least squares, from the rows (aa, ab | a) and (ab, bb | b) of the normal equations."""
+    determinant = aa * bb - ab * ab
+    if determinant > 1e-9 * aa * bb:
+        x, y = (bb * a - ab * b) / determinant, (aa * b - ab * a) / determinant
+        if x >= 0.0 and y >= 0.0:
+            return x, y
+    x, y = max(a, 0.0) / aa, max(b, 0.0) / max(bb, 1e-300)  # one of them is 0: that which explains less
+    return (x, 0.0) if a * x >= b * y else (0.0, y)

@@ -195,18 +195,19 @@ def _mode(
     With it come the pair, with the noise near silhouettes there, and the noise of matches.
     """
     precision = np.linalg.inv(spread @ spread.T)
-    pair = pair.with_rim_noise(start, fine_m)
-    pose, noise = start, pair.match_noise(start, fine_m)
+    surface_m, rim_m = pair.noises_m(start, fine_m)
+    pair, pose = pair.with_rim_m(rim_m), start
+    noise = pair.match_noise(start, surface_m)
     for _ in range(8):
         gradient, matrix = (part[0] for part in pair.normal_equations(pose[None], noise, stride=1))
         offset = se3.difference(start, pose, centre_m)
         step = np.asarray(np.linalg.solve(matrix + precision, gradient - precision @ offset), dtype=np.float64)
         pose = se3.moved(pose, step, centre_m)
-        pair = pair.with_rim_noise(pose, fine_m)
-        noise = noise._replace(surface_m=pair.surface_noise_m(pose, fine_m))
+        surface_m, rim_m = pair.noises_m(pose, fine_m)
+        pair, noise = pair.with_rim_m(rim_m), noise._replace(surface_m=surface_m)
         if np.linalg.norm(np.linalg.solve(spread, step)) < 0.01:  # standard deviations
             break
-    return pair, pose, pair.match_noise(pose, fine_m)
+    return pair, pose, pair.match_noise(pose, noise.surface_m)
 
 
 def _steps(

@@ -93,7 +93,7 @@ class VisibilityRegistrar(AbstractRegistrar):
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         pair = self.likelihood.between(source, target, rng)
         found = self.search.run(pair, density, rng, min_overlap=self.min_overlap)
-        pair = pair.with_rim_noise(found.poses[0], self.search.fine_m(pair))
+        pair = pair.with_rim_m(pair.noises_m(found.poses[0], self.search.fine_m(pair))[1])
         modes_found = found.modes(pair.centre_m, self.search.extent(pair))[: self.max_modes]
         sampled = [self._sampled(pair, density, mode, rng) for mode in modes_found]
         reference = min(sampled, key=lambda mode: mode.noise_m)
@@ -110,7 +110,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         self, pair: PairLikelihood, density: AbstractPoseDensity, found: Candidates, rng: np.random.Generator
     ) -> ModeSamples:
         """Return samples of the mode that some candidates form."""
-        noise_m = pair.surface_noise_m(found.poses[0], self.search.fine_m(pair))
+        noise_m, _ = pair.noises_m(found.poses[0], self.search.fine_m(pair))
         typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
         noise = {"blur_m": noise_m, "typical_misfit": typical_misfit}
         basin = self.search.extent(pair)
