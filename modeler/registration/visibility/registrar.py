@@ -93,15 +93,16 @@ class VisibilityRegistrar(AbstractRegistrar):
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         pair = self.likelihood.between(source, target, rng)
         found = self.search.run(pair, density, rng, min_overlap=self.min_overlap)
-        pair = pair.with_rim_m(pair.noises_m(found.poses[0], self.search.fine_m(pair))[1])
+        # Overlaps are judged without noise near silhouettes, which the misfit of a wrong pose increases.
+        noisy = pair.with_rim_m(pair.noises_m(found.poses[0], self.search.fine_m(pair))[1])
         modes_found = found.modes(pair.centre_m, self.search.extent(pair))[: self.max_modes]
-        sampled = [self._sampled(pair, density, mode, rng) for mode in modes_found]
+        sampled = [self._sampled(noisy, density, mode, rng) for mode in modes_found]
         reference = min(sampled, key=lambda mode: mode.noise_m)
-        compared = [mode.compared(pair, reference) for mode in sampled]
+        compared = [mode.compared(noisy, reference) for mode in sampled]
         if found.open_rotation:
             compared = overlapping(compared, pair.overlap, self.min_overlap)
-        dense = self.likelihood.denser(pair, rng)
-        modes = [(share, self._refined(pair, dense, density, mode, rng)) for share, mode in weigh_modes(compared)]
+        dense = self.likelihood.denser(noisy, rng)
+        modes = [(share, self._refined(noisy, dense, density, mode, rng)) for share, mode in weigh_modes(compared)]
         at_limit = self._share_at_limit(pair, density, found, modes[0][1], rng)
         posterior = self._posterior(pair, modes, found, at_limit=at_limit, seconds=time.perf_counter() - started)
         return replace(posterior, beyond=found.beyond) if _leads_beyond(found) else posterior
