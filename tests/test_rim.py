@@ -11,10 +11,12 @@ from scipy import ndimage, optimize
 
 from modeler.evaluation import nees, rotation_error_deg, true_motion
 from modeler.kernels import planes
+from modeler.kernels.point_to_plane import FACING_WEIGHT, OTHER_RIM, WEIGHT
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor, rim_weights
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility.likelihood import PairLikelihood, nonnegative_solution
+from modeler.registration.visibility.points import OWN_RIM
 from modeler.registration.visibility.refinement import Equations
 from modeler.se3 import rows
 from modeler.types import Array, RayImage
@@ -72,7 +74,7 @@ def test_cells_and_points_hold_the_weights() -> None:
     weights = rim_weights(mask)
     assert source.layers["cells"][on_surface, planes.RIM] == pytest.approx(weights[on_surface], abs=1e-6)
     columns, lines = pair.forward.points[:, 7:9].round().astype(int).T
-    assert pair.forward.points[:, 9] == pytest.approx(weights[lines, columns], abs=1e-6)
+    assert pair.forward.points[:, OWN_RIM] == pytest.approx(weights[lines, columns], abs=1e-6)
 
 
 def test_errors_near_silhouettes_are_estimated() -> None:
@@ -104,14 +106,15 @@ def test_noises_are_the_nonnegative_least_squares(rng: np.random.Generator) -> N
 
 
 def test_variances_grow_by_those_of_both_rims() -> None:
-    """A match at distance r has the weight f / (τ² + σ² (a² + a'²))."""
+    """A match at distance r has the weight f / (τ² + σ² (ϑ² + ϑ'²))."""
     source, target, truth = boxes(2, 0.0)
     pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
     from_matches = [one.forward.matches(rows(truth), 0.01) for one in (pair, pair.with_rim_m(0.003))]
-    plain, wide = (found[from_matches[0][:, 10] > 0.0] for found in from_matches)
-    own = pair.forward.points[from_matches[0][:, 10] > 0.0, 9]
-    more_m2 = wide[:, 11] / wide[:, 10] - plain[:, 11] / plain[:, 10]
-    assert more_m2 == pytest.approx(9e-6 * (own**2 + plain[:, 14] ** 2), rel=2e-3, abs=1e-9)
+    matched = from_matches[0][:, WEIGHT] > 0.0
+    plain, wide = (found[matched] for found in from_matches)
+    own = pair.forward.points[matched, OWN_RIM]
+    more_m2 = wide[:, FACING_WEIGHT] / wide[:, WEIGHT] - plain[:, FACING_WEIGHT] / plain[:, WEIGHT]
+    assert more_m2 == pytest.approx(9e-6 * (own**2 + plain[:, OTHER_RIM] ** 2), rel=2e-3, abs=1e-9)
     assert np.ptp(own) > 0.5
 
 

@@ -17,7 +17,7 @@ from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
 from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.photometric import ASSUMED_RHO, PairColour, correlations, weight_of, without_shift
-from modeler.registration.visibility.points import RIM, IntArray, points_of, spread_points
+from modeler.registration.visibility.points import OWN_RIM, IntArray, points_of, spread_points
 from modeler.se3 import matrices, rows
 from modeler.types import Array, RayImage
 
@@ -133,7 +133,7 @@ class DirectedLikelihood:
     def residual_excess(self, pose: Array, blur_m: float) -> Array:
         """Return the sums (2, 3) for eq. 8 and 31 of method.md over matches under a pose (12,): matrix | right side."""
         least_m = float(np.hypot(blur_m, self._min_blur_m))
-        return point_likelihood.residual_excess(pose, self.projection(1), self.points[:, RIM], least_m)
+        return point_likelihood.residual_excess(pose, self.projection(1), self.points[:, OWN_RIM], least_m)
 
     def misfits(self, pose: Array, blur_m: float) -> Array:
         """Return the misfit (k,) in nats of each match under one pose (12,) in distance and normals."""
@@ -180,8 +180,8 @@ class DirectedLikelihood:
 
     @cached_property
     def _columns(self) -> np.ndarray:
-        columns = np.ascontiguousarray(self.points.T[:RIM], dtype=np.float32)
-        columns[point_likelihood.VARIANCE_M2] += self.rim_m**2 * self.points[:, RIM] ** 2
+        columns = np.ascontiguousarray(self.points.T[:OWN_RIM], dtype=np.float32)
+        columns[point_likelihood.VARIANCE_M2] += self.rim_m**2 * self.points[:, OWN_RIM] ** 2
         return columns
 
     @cached_property

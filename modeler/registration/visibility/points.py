@@ -10,7 +10,7 @@ from modeler.types import Array, Camera, RayImage
 
 IntArray = npt.NDArray[np.int64]
 
-RIM = 9  # column of `point_rows`
+OWN_RIM = 9  # column of `point_rows`: the weight in the view of the points
 
 
 def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> IntArray:

@@ -19,7 +19,7 @@ from modeler.registration.posterior import FLOOR
 from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.likelihood import DirectedLikelihood, MatchNoise, PairLikelihood
 from modeler.registration.visibility.photometric import without_shift
-from modeler.registration.visibility.points import RIM
+from modeler.registration.visibility.points import OWN_RIM
 from modeler.se3 import rows
 from modeler.types import Array, Camera
 
@@ -71,7 +71,7 @@ class Refiner:
         narrowed = np.linalg.inv(np.eye(6) + information)
         to_basis = np.linalg.inv(basis)
         steps = _steps(pair, poses, noise, spread, stride=2)
-        # To first order, the shift of all samples by the choice of few points, and by what both silhouettes hide.
+        # To first order, the shift of all samples by the choice of few points, and by errors common to both rims.
         there = _steps(dense, mode[None], noise, spread, stride=1, explained=surface.explained)
         steps += there - _steps(pair, mode[None], noise, spread, stride=2)
         step = steps @ to_basis.T @ information
@@ -261,7 +261,7 @@ class Equations(NamedTuple):
     """What an eliminated nuisance parameter explains."""
 
     def without(self, by_nuisance: Array) -> Equations:
-        """Return the equations after elimination of a parameter β ~ N(0, 1) (method.md, eq. 31).
+        """Return the equations after elimination of a parameter β ~ N(0, 1) (method.md, eq. 32).
 
         Args:
             by_nuisance: (n,) derivatives of the residuals by β.
@@ -304,7 +304,7 @@ class Equations(NamedTuple):
 def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Equations, Equations]:
     """Return the equations of matching points, and of their colours, in the source's frame, about the centre."""
     parts: list[list[tuple[Array, ...]]] = [[], []]
-    rims = []  # a surface too near its camera at the rim: its points are in front, or those of the other behind it
+    rims = []  # derivatives by β: points too near their own camera are in front of the surface, or it of them
     directions: list[tuple[DirectedLikelihood, Array, float]] = [
         (pair.forward, pose, 1.0),
         (pair.backward, se3.inverse(pose), -1.0),
@@ -317,7 +317,7 @@ def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Eq
         to_source = np.eye(4) if sign < 0.0 else se3.inverse(pose)
         arms, moves = se3.transform(to_source, positions) - pair.centre_m, focal_motion(transform, positions)
         colours = pair.colour_matches(transform, surface, points, noise, forward=sign > 0.0)
-        rims.append(directed.rim_m * (directed.points[points, RIM] - surface[:, point_to_plane.OTHER_RIM]))
+        rims.append(directed.rim_m * (directed.points[points, OWN_RIM] - surface[:, point_to_plane.OTHER_RIM]))
         for part, used, pattern in zip(parts, (surface, colours), (directed.pattern, FixedPattern()), strict=True):
             at, moved = arms[: len(used)], moves[: len(used)]  # all or none
             focal = [np.sum(used[:, k] * moved, axis=1) for k in (point_to_plane.OWN, point_to_plane.OTHER)]
