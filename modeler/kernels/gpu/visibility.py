@@ -46,8 +46,11 @@ Pair = tuple[Projection, Projection, LikelihoodParameters, LikelihoodParameters]
 class Direction:
     """A `Projection` with its `LikelihoodParameters`."""
 
-    points: wp.array2d[wp.float32]
-    cells: wp.array[Cell]
+    first: wp.int32
+    """Column of its first point in the points of all directions."""
+    count: wp.int32
+    image: wp.int32
+    table: wp.int32
     camera: Camera
     cosines: wp.vec4
     pattern: wp.vec2
@@ -60,12 +63,19 @@ class Direction:
     unmeasured_gain: wp.float32
     typical_misfit: wp.float32
     support: Support
-    table: wp.array[wp.float32]
+
+
+@wp.struct
+class Image:
+    """The cells of a view."""
+
+    cells: wp.array[Cell]
 
 
 @wp.func
 def of_surface(
     of: Direction,
+    table: wp.array[wp.float32],
     cell: Cell,
     position: wp.vec3,
     normal: wp.vec3,
@@ -82,11 +92,11 @@ def of_surface(
     match = of.typical_misfit - half_square - 0.5 * common - of.normal_cost * (1.0 - agreement)
     step = (wp.clamp(match, TABLE_LOW, TABLE_HIGH) - TABLE_LOW) * PER_STEP
     node = wp.min(wp.int32(step), LAST)
-    seen = of.table[node] + (step - wp.float32(node)) * (of.table[node + 1] - of.table[node])
+    seen = table[node] + (step - wp.float32(node)) * (table[node + 1] - table[node])
     hidden = wp.float32(0.0)
     if in_front > 0.0:
         hidden = wp.min(half_square, of.max_point_cost)
-        if match < of.table[0]:
+        if match < table[0]:
             seen = wp.max(match, -of.max_point_cost)
     explained = wp.float32(0.0)
     if half_square < 0.5 * MAX_SIGMAS * MAX_SIGMAS and agreement > MIN_AGREEMENT:
@@ -96,7 +106,13 @@ def of_surface(
 
 @wp.kernel
 def sum_over_points(
-    poses: wp.array[Pose], pair_of: wp.array[wp.int32], directions: wp.array[Direction], found: wp.array2d[wp.vec2]
+    poses: wp.array[Pose],
+    pair_of: wp.array[wp.int32],
+    directions: wp.array[Direction],
+    points: wp.array2d[wp.float32],
+    images: wp.array[Image],
+    tables: wp.array2d[wp.float32],
+    found: wp.array2d[wp.vec2],
 ):
     """Write the log-likelihood of each pose's points in each direction, and the number explained, see the twin."""
     side, i = wp.tid()
@@ -109,9 +125,10 @@ def sum_over_points(
         shift = -(turn * shift)
     rotation, shift_m = wp.mat33(turn), wp.vec3(shift)
     total, explained = wp.float32(0.0), wp.float32(0.0)
-    for j in range(of.points.shape[1]):
-        position = rotation * wp.vec3(of.points[0, j], of.points[1, j], of.points[2, j]) + shift_m
-        normal = rotation * wp.vec3(of.points[3, j], of.points[4, j], of.points[5, j])
+    cells, table = images[of.image].cells, tables[of.table]
+    for j in range(of.first, of.first + of.count):
+        position = rotation * wp.vec3(points[0, j], points[1, j], points[2, j]) + shift_m
+        normal = rotation * wp.vec3(points[3, j], points[4, j], points[5, j])
         cosine = -wp.dot(normal, position) / wp.length(position)
         faces = wp.clamp((cosine - of.cosines[0]) / (of.cosines[1] - of.cosines[0]), 0.0, 1.0)
         column = of.camera[0] * position[0] / position[2] + of.camera[2] + 0.5
@@ -119,14 +136,15 @@ def sum_over_points(
         cell = Cell()
         kind = MISSING
         if position[2] > 0.0 and column >= 0.0 and column < of.camera[4] and row >= 0.0 and row < of.camera[5]:
-            cell = of.cells[wp.int32(row) * wp.int32(of.camera[4]) + wp.int32(column)]
+            cell = cells[wp.int32(row) * wp.int32(of.camera[4]) + wp.int32(column)]
             kind = cell[KIND]
         gain, by_surface = wp.float32(0.0), wp.float32(0.0)
         if kind == SURFACE:
-            across, down = column - 0.5 - of.points[COLUMN, j], row - 0.5 - of.points[ROW, j]
+            across, down = column - 0.5 - points[COLUMN, j], row - 0.5 - points[ROW, j]
             correlation = wp.max(1.0 - (across * across + down * down) * of.pattern[1], 0.0)
             common = of.pattern[0] * correlation * correlation
-            gain, by_surface = of_surface(of, cell, position, normal, of.points[POINT_VARIANCE, j], common, faces)
+            variance = points[POINT_VARIANCE, j]
+            gain, by_surface = of_surface(of, table, cell, position, normal, variance, common, faces)
         elif kind == BACKGROUND:
             if position[2] < cell[DEPTH] - of.clearance_m:
                 beyond = cell[SILHOUETTE] / of.silhouette_px
@@ -142,9 +160,16 @@ def sum_over_points(
     found[side, i] = wp.vec2(total, explained)
 
 
+@wp.kernel
+def add_directions(found: wp.array2d[wp.vec2], total: wp.array[wp.vec2]):
+    """Write the sum over both directions."""
+    i = wp.tid()
+    total[i] = found[0, i] + found[1, i]
+
+
 def log_likelihoods(
     poses: npt.NDArray[np.float64], pair_of: npt.NDArray[np.int32], pairs: Sequence[Pair], device: str
-) -> npt.NDArray[np.float64]:
+) -> npt.NDArray[np.float32]:
     """Return the first two columns of `scores.scores`, (m, 2), for poses of several pairs.
 
     The sums differ from the twin's only by rounding, unless a point falls within 1e-3 px of a pixel's border.
@@ -155,30 +180,55 @@ def log_likelihoods(
         pairs: the arguments of the twin after the poses.
         device: name of the Warp device.
     """
-    sides = [
-        _direction(projection, parameters, device)
-        for forward, backward, *both in pairs
-        for projection, parameters in zip((forward, backward), both, strict=True)
-    ]
     found = wp.empty((2, len(poses)), dtype=wp.vec2, device=device)
+    total = wp.empty(len(poses), dtype=wp.vec2, device=device)
     inputs = [
         wp.array(np.ascontiguousarray(poses), dtype=Pose, device=device),
         wp.array(pair_of, dtype=wp.int32, device=device),
-        wp.array(sides, dtype=Direction, device=device),
+        *_directions(pairs, device),
     ]
     wp.launch(sum_over_points, dim=found.shape, inputs=inputs, outputs=[found], device=device)
-    return found.numpy().astype(np.float64).sum(axis=0)
+    wp.launch(add_directions, dim=len(total), inputs=[found], outputs=[total], device=device)
+    return total.numpy()
 
 
-def _direction(projection: Projection, parameters: LikelihoodParameters, device: str) -> Any:
-    """Return the struct of one direction; points, cells and table are copied to the device once."""
-    direction = Direction()
-    direction.points = sent(projection.points, device)
-    direction.cells = sent(projection.cells, device, Cell)
-    direction.table = sent(parameters.table, device)
-    direction.camera, direction.cosines = Camera(*projection.camera), wp.vec4(*projection.cosines)
-    direction.pattern, direction.rim_m2 = wp.vec2(*projection.pattern), float(projection.rim_m2)
-    direction.support = Support(*parameters.support)
-    for name in LikelihoodParameters._fields[:7]:
-        setattr(direction, name, float(getattr(parameters, name)))
-    return direction
+def _directions(pairs: Sequence[Pair], device: str) -> list[wp.array]:
+    """Return the directions of pairs, two a pair, and the points, images and tables to which they refer, on a device.
+
+    Arrays of structs are slow to fill one by one (0.1 ms a direction), as are many small copies.
+    """
+    projections = [projection for pair in pairs for projection in pair[:2]]
+    parameters = [one for pair in pairs for one in pair[2:]]
+    counts = np.array([projection.points.shape[1] for projection in projections])
+    cells, image_of = _distinct([projection.cells for projection in projections])
+    tables, table_of = _distinct([one.table for one in parameters])
+    columns = {
+        "first": np.cumsum(counts) - counts,
+        "count": counts,
+        "image": image_of,
+        "table": table_of,
+        **{name: [getattr(projection, name) for projection in projections] for name in Projection._fields[2:]},
+        **{name: [getattr(one, name) for one in parameters] for name in LikelihoodParameters._fields[:8]},
+    }
+    directions: Any = np.zeros(len(projections), dtype=Direction.numpy_dtype())
+    for name, values in columns.items():
+        directions[name] = values
+    images = []
+    for one in cells:
+        image = Image()
+        image.cells = sent(one, device, Cell)
+        images.append(image)
+    return [
+        wp.array(directions, dtype=Direction, device=device),
+        wp.array(np.concatenate([projection.points for projection in projections], axis=1), device=device),
+        wp.array(images, dtype=Image, device=device),
+        wp.array(np.stack(tables), device=device),
+    ]
+
+
+def _distinct(arrays: Sequence[np.ndarray]) -> tuple[list[np.ndarray], list[int]]:
+    """Return arrays without those of the same memory, and the index of each among them."""
+    keys = [array.ctypes.data for array in arrays]
+    distinct = dict(zip(keys, arrays, strict=True))
+    numbers = {key: number for number, key in enumerate(distinct)}
+    return list(distinct.values()), [numbers[key] for key in keys]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -170,7 +170,7 @@ class DirectedLikelihood:
             unmeasured_gain=np.float32(np.log(max(self.model.hidden_share, 1.0 - self.image.measured_share))),
             typical_misfit=np.float32(typical_misfit),
             support=self._support(blur_m),
-            table=self._table,
+            table=_match_table(self.model.hidden_share),
         )
 
     @cached_property
@@ -211,10 +211,6 @@ class DirectedLikelihood:
     @cached_property
     def _distance_m(self) -> float:
         return max(float(np.median(self.points[:, 2])), 1e-3)
-
-    @cached_property
-    def _table(self) -> np.ndarray:
-        return point_likelihood.match_table(self.model.hidden_share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,7 +296,7 @@ class PairLikelihood:
         from modeler.kernels.gpu import visibility
 
         one = np.zeros(len(poses), dtype=np.int32)
-        return visibility.log_likelihoods(rows(poses), one, [sides], device)
+        return visibility.log_likelihoods(rows(poses), one, [sides], device).astype(float)
 
     def tempered(self, poses: Array, blur_m: float, *, typical_misfit: float = _MISFIT, stride: int = 1) -> Array:
         """Return tempered log-likelihoods (n,) of poses (n, 4, 4) (method.md, eq. 7).
@@ -457,6 +453,12 @@ class PairLikelihood:
         surfaces = self.surfaces(_DESCENT_STRIDE)
         moved = gauss_newton.descend(rows(poses), surfaces, colours, weight, self.centre_m, blur_m, regulariser, steps)
         return matrices(moved)
+
+
+@cache
+def _match_table(hidden_share: float) -> np.ndarray:
+    """Return `match_table`, the same array for all pairs, so that a GPU holds it once."""
+    return point_likelihood.match_table(hidden_share)
 
 
 def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:
