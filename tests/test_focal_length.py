@@ -16,12 +16,25 @@ from modeler.evaluation import nees, rotation_error_deg, true_motion
 from modeler.fusion import widened
 from modeler.graph import MovingGraph, PoseGraph, estimate_focal_length, solve
 from modeler.graph.focal import ROTATION_BIAS
+from modeler.kernels import planes
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.rays import Sensor
+from modeler.rays import Sensor, under_focal_length
 from modeler.registration import VisibilityRegistrar
+from modeler.registration.visibility.focal_length import averaged
 from modeler.registration.visibility.refinement import focal_motion
-from modeler.types import Array, Edge, FocalLength, ObjectModel, PoseGaussian, Solution, Step
+from modeler.types import (
+    Array,
+    Edge,
+    FocalLength,
+    Mode,
+    ObjectModel,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    Solution,
+    Step,
+)
 from sequences import FocalFactor, RefocusedSequence, bundled, open_sequence
 
 
@@ -70,6 +83,96 @@ def test_a_posterior_states_how_its_mean_follows_the_focal_length() -> None:
     assert np.linalg.norm(wanted[3:]) > 0.05
     np.testing.assert_allclose(about_centre[3:], wanted[3:], atol=0.02)  # at 2 %: a standard deviation
     np.testing.assert_allclose(about_centre[:3], wanted[:3], atol=0.3)
+
+
+def test_views_under_another_focal_length_are_those_measured_with_it() -> None:
+    sequence, step = open_sequence(bundled("box")), 0.05
+    sensor = Sensor(*(sequence.sensor() or ()))
+    view = sensor.ray_image(sequence.frame(1))
+    want, got = sensor.refocused(view, step), under_focal_length(view, step)
+    assert got.frame.camera == want.frame.camera
+    known, other = ({tuple(pixel): k for k, pixel in enumerate(one.pixels.tolist())} for one in (want, got))
+    shared = sorted(known.keys() & other.keys())
+    assert len(shared) > 0.9 * len(want.pixels)
+    mine, yours = ([numbers[pixel] for pixel in shared] for numbers in (other, known))
+    distances_m = np.sum((got.points_m[mine] - want.points_m[yours]) * want.normals[yours], axis=1)
+    assert np.sqrt(np.mean(distances_m**2)) < 0.1 * sensor.sigma_r_m
+    assert np.median(np.sum(got.normals[mine] * want.normals[yours], axis=1)) > np.cos(np.radians(0.5))
+    for one in (got, under_focal_length(got, -step)):  # points lie on the planes of their pixels
+        cells = one.layers["cells"][one.pixels[:, 0], one.pixels[:, 1]]
+        heights_m = np.sum(cells[:, : planes.DISTANCE] * one.points_m, axis=1) + cells[:, planes.DISTANCE]
+        np.testing.assert_allclose(heights_m, 0.0, atol=1e-6)
+        np.testing.assert_allclose(one.normals, cells[:, : planes.DISTANCE], atol=1e-6)
+    np.testing.assert_allclose(under_focal_length(got, -step).points_m, view.points_m, atol=1e-12)
+
+
+CENTRE_M, FAR = np.array([0.0, 0.0, 0.8]), np.diag(np.repeat([0.1, 0.001], 3) ** 2)
+
+
+def posterior_of(pose: PoseGaussian, seed: int = 0) -> Posterior:
+    """A posterior with samples of a Gaussian, whose moments they have exactly."""
+    drawn = np.random.default_rng(seed).normal(size=(400, 6))
+    white = np.linalg.solve(np.linalg.cholesky(np.cov(drawn.T, bias=True)), (drawn - drawn.mean(axis=0)).T).T
+    samples = pose.mean @ se3.exp(white @ np.linalg.cholesky(pose.covariance).T)
+    weights = np.full(400, 1 / 400)
+    return Posterior(1, 0, pose, Outcome.CONVERGED, overlap=0.8, samples=samples, weights=weights, seconds=0.0)
+
+
+def about_centre(pose: PoseGaussian) -> Array:
+    return se3.covariance_about(pose.covariance, CENTRE_M)
+
+
+def test_of_poses_far_apart_what_their_derivative_does_not_tell_widens_the_posterior(rng: np.random.Generator) -> None:
+    by_focal, bend = rng.normal(size=6), np.array([0.0, 4.0, 0.0, 0.0, 0.0, 0.0])  # per unit, rad
+    pose = PoseGaussian(se3.translation(np.array([0.1, 0.0, 0.0])), se3.covariance_about(FAR, -CENTRE_M), by_focal)
+
+    def under(log_factor: float, bend: Array | float = 0.0) -> Posterior:
+        moved = pose.under(log_factor)
+        return posterior_of(replace(moved, mean=se3.moved(moved.mean, log_factor * bend * np.ones(6), CENTRE_M)))
+
+    found, sigma = posterior_of(pose), 0.02
+    same = averaged(found, under, sigma, CENTRE_M).pose
+    np.testing.assert_allclose(about_centre(same), FAR, rtol=0.02, atol=1e-5)  # to first order in ξ
+    np.testing.assert_array_equal(same.by_focal, by_focal)
+    bent = averaged(found, lambda log_factor: under(log_factor, bend), sigma, CENTRE_M).pose
+    np.testing.assert_allclose(about_centre(bent)[1, 1], FAR[1, 1] + (sigma * bend[1]) ** 2, rtol=0.03)
+    np.testing.assert_allclose(about_centre(bent)[0, 0], FAR[0, 0], rtol=0.03)
+
+
+def test_precise_poses_separate_modes_and_known_focal_lengths_are_not_averaged() -> None:
+    def never(_: float) -> Posterior:
+        raise AssertionError
+
+    far = PoseGaussian(np.eye(4), FAR)
+    apart = tuple(Mode(0.5, replace(far, mean=se3.exp(np.array([angle, 0.0, 0, 0, 0, 0])))) for angle in (0.0, 1.0))
+    for found, sigma in (
+        (posterior_of(replace(far, covariance=0.1 * FAR)), 0.02),
+        (replace(posterior_of(far), modes=apart), 0.02),
+        (replace(posterior_of(far), outcome=Outcome.NO_OVERLAP), 0.02),
+        (posterior_of(far), 0.0),
+    ):
+        assert averaged(found, never, sigma, CENTRE_M) is found
+
+
+@pytest.mark.parametrize(("name", "wider"), [("tube", True), ("box", False)])
+def test_a_body_of_revolution_may_have_turned_under_a_wrong_focal_length(name: str, wider: bool) -> None:
+    """Under it, it is none, and seems not to have turned."""
+    sequence = open_sequence(bundled(name))
+    noise = sequence.sensor()
+    assert noise is not None
+    focal = FocalFactor(0.93, stated_px=sequence.frame(0).camera.fx)
+    frames = [RefocusedSequence(sequence, focal).frame(index) for index in (0, 2)]
+    found = []
+    for sigma_focal in (0.0, 0.04):
+        target, source = (Sensor(*noise[:3], sigma_focal=sigma_focal).ray_image(frame) for frame in frames)
+        density = GeneralPrior().between(source, target)
+        found.append(VisibilityRegistrar().register(source, target, density, rng=np.random.default_rng(0)))
+    known, uncertain = (np.sqrt(one.pose.rotation_variance_rad2) for one in found)
+    if wider:
+        assert uncertain > 1.3 * known
+    else:
+        assert uncertain == known
+        np.testing.assert_array_equal(found[0].pose.mean, found[1].pose.mean)
 
 
 def test_inverse_and_composed_motions_follow_as_their_parts_do(rng: np.random.Generator) -> None:

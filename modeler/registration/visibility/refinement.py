@@ -23,8 +23,6 @@ from modeler.registration.visibility.points import OWN_RIM
 from modeler.se3 import rows
 from modeler.types import Array, Camera
 
-_FAR_RAD = 0.1  # largest sd of a rotation from which derivatives by the focal length differ between the samples
-_FOCAL_POSES = 12  # at which they are computed
 _MIN_LEVEL = 1e-4  # of the scatter relative to its shape: residuals of a hundredth of their predicted sd
 
 
@@ -77,12 +75,6 @@ class Refiner:
         step = steps @ to_basis.T @ information
         scatter = rng.normal(size=(len(poses), 6)) @ root.T
         moved = (step + scatter) @ narrowed.T @ basis.T  # method.md, eq. 16
-        # The derivative by the focal length differs between poses far apart, which spreads the samples.
-        sigma_focal = pair.forward.image.sigma_focal
-        if sigma_focal > 0.0 and np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > _FAR_RAD:
-            followed = basis @ (np.eye(6) - narrowed @ narrowed) @ to_basis
-            local = _by_focal_at(pair, mode, poses, noise, spread) @ followed.T
-            moved += sigma_focal * rng.normal(size=(len(poses), 1)) * (local - by_focal)  # method.md, eq. 29
         from_centre = se3.adjoint(se3.translation(centre_m))
         return Refined(se3.moved(poses, moved, centre_m), np.asarray(from_centre @ by_focal, dtype=np.float64))
 
@@ -123,25 +115,6 @@ class Refiner:
         kept = np.linalg.inv(np.eye(6) + information)
         by_focal = spread @ axes @ (solution - kept @ kept @ solution)
         return spread @ axes, information, np.asarray(by_focal, dtype=np.float64)
-
-
-def _by_focal_at(pair: PairLikelihood, mode: Array, poses: Array, noise: MatchNoise, spread: Array) -> Array:
-    """Return the derivatives (n, 6) of the solutions at poses (n, 4, 4) by the logarithm of the focal length.
-
-    They are computed at some poses along the widest direction; the others have those of the nearest.
-    """
-    offsets = np.linalg.solve(spread, se3.difference(mode, poses, pair.centre_m).T).T
-    order = np.argsort(offsets[:, int(np.argmax(offsets.var(axis=0)))], kind="stable")
-    used = order[np.linspace(0, len(order) - 1, min(_FOCAL_POSES, len(order))).round().astype(np.int64)]
-    found = []
-    for pose in poses[used]:
-        surface, _ = _equations(pair, pose, noise)
-        product = (surface.by_own @ spread).T * surface.weights @ (surface.by_other @ spread)
-        scales, axes = np.linalg.eigh(0.5 * (product + product.T))
-        gradient = axes.T @ surface.focal_gradient(spread)
-        found.append(spread @ axes @ (gradient / (1.0 + np.maximum(scales, 0.0))))
-    nearest = np.argmin(np.sum((offsets[:, None] - offsets[used]) ** 2, axis=2), axis=1)
-    return np.array(found)[nearest]
 
 
 class Refined(NamedTuple):

@@ -9,7 +9,9 @@ from functools import partial
 
 import numpy as np
 
+from modeler.rays import under_focal_length
 from modeler.registration.posterior import MIN_MODE_SHARE, failed, share_at_limit, weighted_gaussian
+from modeler.registration.visibility.focal_length import averaged
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.registration.visibility.refinement import Refiner
 from modeler.registration.visibility.ridge import without_chance
@@ -88,6 +90,21 @@ class VisibilityRegistrar(AbstractRegistrar):
         self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior of target_from_source; its outcome states failure."""
+
+        def under(log_factor: float) -> Posterior:
+            there, here = (under_focal_length(view, log_factor) for view in (source, target))
+            return self._under(there, here, density, rng)
+
+        found = self._under(source, target, density, rng)
+        found = averaged(found, under, source.sigma_focal, source.centroid_m)
+        if found.outcome is Outcome.CONVERGED and self._is_ambiguous(found.pose):
+            return replace(found, outcome=Outcome.AMBIGUOUS)
+        return found
+
+    def _under(
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, rng: np.random.Generator
+    ) -> Posterior:
+        """Return the posterior under the focal length of the views."""
         started = time.perf_counter()
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
@@ -201,8 +218,11 @@ class VisibilityRegistrar(AbstractRegistrar):
             return Outcome.NO_OVERLAP
         if effective_samples < self.sampler.min_effective:
             return Outcome.DEGENERATE
+        return Outcome.AMBIGUOUS if self._is_ambiguous(pose) else Outcome.CONVERGED
+
+    def _is_ambiguous(self, pose: PoseGaussian) -> bool:
         sigma_rad = np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])
-        return Outcome.AMBIGUOUS if sigma_rad > np.deg2rad(self.max_sigma_deg) else Outcome.CONVERGED
+        return bool(sigma_rad > np.deg2rad(self.max_sigma_deg))
 
 
 def overlapping(
