@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pydoc
 import re
 import subprocess
@@ -28,6 +29,41 @@ def test_the_package_is_imported_without_what_it_is_made_of() -> None:
     code = "import sys, modeler; print('numpy' in sys.modules, modeler.TablePrior.__name__, 'numpy' in sys.modules)"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ended.stdout.split() == ["False", "TablePrior", "True"]
+
+
+AWAKE = """
+import os, time
+def ticks(task):
+    return sum(map(int, open(f"/proc/self/task/{task}/stat").read().rpartition(")")[2].split()[11:13]))
+others = set(os.listdir("/proc/self/task"))
+import numpy, scipy.linalg
+blas = set(os.listdir("/proc/self/task")) - others
+from modeler import GeneralPrior, Sensor
+from modeler.registration import VisibilityRegistrar
+from sequences import bundled, open_sequence
+sequence = open_sequence(bundled("box"))
+frames = [sequence.frame(index) for index in (0, 1)]
+def registered(seed):
+    target, source = (Sensor(*sequence.sensor()).ray_image(frame) for frame in frames)
+    density = GeneralPrior().between(source, target)
+    return VisibilityRegistrar().register(source, target, density, rng=numpy.random.default_rng(seed)).usable
+registered(0)
+time.sleep(0.5)  # what imports woke falls asleep again
+before = sum(map(ticks, blas))
+print(len(blas), all([registered(seed) for seed in range(4)]), sum(map(ticks, blas)) - before)
+"""
+"""A task's time is counted in ticks of 10 ms; an awakened thread of BLAS spins for longer."""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are not listed here")
+def test_registration_leaves_the_threads_of_blas_asleep() -> None:
+    """Once awake, they take cores from the kernels: a pair took a third longer."""
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    ended = subprocess.run([sys.executable, "-c", AWAKE], capture_output=True, text=True, check=True, env=environment)
+    threads, usable, ticks = ended.stdout.split()
+    if threads == "0":
+        pytest.skip("BLAS has no threads here")
+    assert (usable, ticks) == ("True", "0")
 
 
 def test_every_public_name_is_there_and_documented() -> None:

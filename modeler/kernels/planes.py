@@ -18,6 +18,7 @@ RIM = 7  # of a pixel of the object, in the same place: weight of errors near it
 CELL_SIZE = 8
 
 _NOWHERE_M = 1e9  # outside every ball
+_APART = 32  # of every so many rows, each thread processes some
 # RAGGED: object without a reliable plane, or an occluder.
 MISSING, SURFACE, RAGGED, BACKGROUND = 0.0, 1.0, 2.0, 3.0
 
@@ -136,19 +137,22 @@ def local_planes(depth_m, mask, silhouette, intrinsics, ball, sigma_inverse, mea
     centres = padded(depth_m, mask, intrinsics, window, ball[1])
     points = centres if measured is None else padded(depth_m, measured, intrinsics, window, ball[1])
     images = depth_m, mask, silhouette, centres, points
-    return over_rows(_local_planes, np.arange(len(depth_m)), *images, window, intrinsics, ball, sigma_inverse)
+    cells = np.empty((*depth_m.shape, CELL_SIZE), dtype=np.float32)
+    apart = np.argsort(np.arange(len(cells)) % _APART, kind="stable")  # every thread gets its share of the object
+    over_rows(_local_planes, apart, cells, *images, window, intrinsics, ball, sigma_inverse)
+    return cells
 
 
 @numba.njit(cache=True, nogil=True)
-def _local_planes(rows, depth_m, mask, silhouette, centres, points, window, intrinsics, ball, sigma_inverse):
+def _local_planes(rows, cells, depth_m, mask, silhouette, centres, points, window, intrinsics, ball, sigma_inverse):
     width = depth_m.shape[1]
     fx, fy, cx, cy = intrinsics
     radius_m, reach, stride = ball
     top, bottom, left, right = window
-    cells = np.zeros((len(rows), width, CELL_SIZE), dtype=np.float32)
     line, sums = np.empty((6, right - left), dtype=np.float32), np.empty((10, right - left))
     for row in rows:
-        found = cells[row - rows[0]]
+        found = cells[row]
+        found[:] = 0.0
         for column in range(width):
             found[column, SILHOUETTE] = silhouette[row, column]
             if depth_m[row, column] > 0.0:
@@ -177,7 +181,7 @@ def _local_planes(rows, depth_m, mask, silhouette, centres, points, window, intr
             if found[column, KIND] == RAGGED:
                 w, h = (column - cx) / fx, (row - cy) / fy
                 fit_plane(found[column], sums[:, column - left], w, h, fx, fy, sigma_inverse)
-    return cells
+    return rows
 
 
 @numba.njit(cache=True)

@@ -97,6 +97,7 @@ def linearise(points, transformed, found, centre, surface_m2, rows):
         rows[3, j], rows[4, j], rows[5, j] = normal_x, normal_y, normal_z
 
 
+@numba.njit(cache=True)
 def bisected(points, halvings):
     """Return the patch index (n,) of each point (n, 3), by recursive bisection across the longest side.
 
@@ -104,16 +105,50 @@ def bisected(points, halvings):
         points: (n, 3).
         halvings: depth of the recursion; there are 2 to this power patches.
     """
-    groups = [np.arange(len(points))]
+    count = len(points)
+    order, ends, patches = np.arange(count), np.array([0, count]), np.empty(count, dtype=np.int64)
     for _ in range(halvings):
-        halves = []
-        for group in groups:
-            side = int(np.argmax(np.ptp(points[group], axis=0))) if len(group) else 0
-            middle = len(group) // 2
-            order = group[np.argpartition(points[group, side], middle)] if len(group) > 1 else group
-            halves += [order[:middle], order[middle:]]
-        groups = halves
-    patches = np.empty(len(points), dtype=np.int64)
-    for number, group in enumerate(groups):
-        patches[group] = number
+        halves = np.empty(2 * len(ends) - 1, dtype=np.int64)
+        halves[::2] = ends
+        for k in range(len(ends) - 1):
+            first, last = ends[k], ends[k + 1]
+            halves[2 * k + 1] = first + (last - first) // 2
+            if last - first > 1:
+                _separate(order, points[:, _longest_side(points, order[first:last])], first, halves[2 * k + 1], last)
+        ends = halves
+    for k in range(len(ends) - 1):
+        patches[order[ends[k] : ends[k + 1]]] = k
     return patches
+
+
+@numba.njit(cache=True)
+def _longest_side(points, chosen):
+    """Return the axis along which the points with these indices extend most."""
+    longest, side = -1.0, 0
+    for axis in range(3):
+        low = high = points[chosen[0], axis]
+        for k in chosen:
+            low, high = min(low, points[k, axis]), max(high, points[k, axis])
+        if high - low > longest:
+            longest, side = high - low, axis
+    return side
+
+
+@numba.njit(cache=True)
+def _separate(order, values, first, middle, last):
+    """Sort order[first:last] so far that no value before the middle is above one from there on (Hoare 1961, FIND)."""
+    left, right = first, last - 1
+    while left < right:
+        pivot, i, j = values[order[middle]], left, right
+        while i <= j:
+            while values[order[i]] < pivot:
+                i += 1
+            while values[order[j]] > pivot:
+                j -= 1
+            if i <= j:
+                order[i], order[j] = order[j], order[i]
+                i, j = i + 1, j - 1
+        if j < middle:
+            left = i
+        if i > middle:
+            right = j

@@ -19,7 +19,7 @@ from modeler.registration.posterior import FLOOR
 from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.likelihood import DirectedLikelihood, MatchNoise, PairLikelihood
 from modeler.registration.visibility.photometric import without_shift
-from modeler.registration.visibility.points import OWN_RIM
+from modeler.registration.visibility.points import OWN_RIM, IntArray
 from modeler.se3 import rows
 from modeler.types import Array, Camera
 
@@ -95,11 +95,10 @@ class Refiner:
         if 2**halvings <= len(spread):  # the scatter of six equations would be singular
             return spread, np.zeros((6, 6)), np.zeros(6)
         patches = point_to_plane.bisected(surface.arms, halvings)  # of colours, too: they are those of the same matches
-        members = (patches == np.arange(2**halvings)[:, None]).astype(np.float64)
-        sensitivity, variability = surface.scatter(spread, members, pair.patches)
+        sensitivity, variability = surface.scatter(spread, patches, pair.patches)
         focal_gradient = surface.focal_gradient(spread)
         if pair.colour is not None and len(colours.residuals):
-            by_colour, scatter = colours.scatter(spread, members, pair.colour.patches(noise.band))
+            by_colour, scatter = colours.scatter(spread, patches, pair.colour.patches(noise.band))
             shifts = np.asarray(np.linalg.solve(spread, pair.colour.shifts(mode)), dtype=np.float64)
             kept, coupled = without_shift(by_colour, shifts), by_colour @ shifts
             sensitivity = sensitivity + kept @ by_colour
@@ -240,7 +239,7 @@ class Equations(NamedTuple):
             by_nuisance: (n,) derivatives of the residuals by β.
         """
         weighted = self.weights * by_nuisance
-        coupled = weighted @ (0.5 * (self.by_own + self.by_other))
+        coupled = _products(0.5 * (self.by_own + self.by_other), weighted)
         share = coupled / (1.0 + weighted @ by_nuisance)
         own, other = (by_motion - by_nuisance[:, None] * share for by_motion in (self.by_own, self.by_other))
         explained = Explained(-(weighted @ self.residuals) * share, np.outer(coupled, share))
@@ -253,15 +252,16 @@ class Equations(NamedTuple):
             basis: (6, 6) of ξ.
         """
         # As in J: in products of both surfaces, the noise of normals averages out.
-        found = self.by_own.T @ (self.weights * self.focal_other) + self.by_other.T @ (self.weights * self.focal_own)
+        found = _products(self.by_own, self.weights * self.focal_other)
+        found += _products(self.by_other, self.weights * self.focal_own)
         return np.asarray(0.5 * basis.T @ found, dtype=np.float64)
 
-    def scatter(self, basis: Array, members: Array, independent: float) -> tuple[Array, Array]:
+    def scatter(self, basis: Array, patches: IntArray, independent: float) -> tuple[Array, Array]:
         """Return sensitivity (6, 6) and variability (6, 6) of the sum of the equations (method.md, eq. 14 and 15).
 
         Args:
             basis: (6, 6) of ξ.
-            members: (p, n) 1 if an equation belongs to a patch of the surface, else 0.
+            patches: (n,) number of the patch of the surface to which an equation belongs.
             independent: number of patches whose errors are independent.
         """
         by_own, by_other = self.by_own @ basis, self.by_other @ basis
@@ -269,8 +269,9 @@ class Equations(NamedTuple):
         product = (by_own.T * self.weights) @ by_other + basis.T @ self.pattern_curvatures.sum(axis=0) @ basis
         scales, axes = np.linalg.eigh(0.5 * (product + product.T))
         by_both = 0.5 * (by_own + by_other)
-        scores = members @ (by_both * (self.weights * self.residuals)[:, None] + self.pattern_slopes @ basis)
-        variability = shrunk(scores, (by_both.T * self.weights) @ by_both) / visible_share(independent / len(members))
+        of_match = by_both * (self.weights * self.residuals)[:, None] + self.pattern_slopes @ basis
+        scores = np.stack([np.bincount(patches, column) for column in of_match.T], axis=1).astype(np.float64)
+        variability = shrunk(scores, (by_both.T * self.weights) @ by_both) / visible_share(independent / len(scores))
         return (axes * np.maximum(scales, 0.0)) @ axes.T, variability
 
 
@@ -321,8 +322,13 @@ def _pattern_derivatives(
         return np.zeros((len(used), 6)), np.zeros((1, 6, 6))
     slopes, curvatures = pattern.derivatives(used, camera)
     slopes, jacobians = slopes @ to_source.T, _position_jacobians(arms) @ to_source
-    curvature = np.einsum("nik,nkl,njl->ij", jacobians, curvatures, jacobians, optimize=True)[None]
+    curvature = np.einsum("nil,njl->ij", jacobians @ curvatures, jacobians)[None]
     return _by_motion(arms, slopes), np.asarray(curvature, dtype=np.float64)
+
+
+def _products(rows: Array, factors: Array) -> Array:
+    """Return the sum (k,) of rows (n, k) times factors (n,), without BLAS, whose threads would stay awake for long."""
+    return np.asarray(np.einsum("nk,n->k", rows, factors), dtype=np.float64)
 
 
 def _by_motion(arms: Array, slopes: Array) -> Array:
