@@ -92,16 +92,16 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return the posterior of target_from_source; its outcome states failure."""
 
         def under(log_factor: float) -> Posterior:
-            there, here = (under_focal_length(view, log_factor) for view in (source, target))
-            return self._under(there, here, density, rng)
+            other_source, other_target = (under_focal_length(view, log_factor) for view in (source, target))
+            return self._given_focal_length(other_source, other_target, density, rng)
 
-        found = self._under(source, target, density, rng)
+        found = self._given_focal_length(source, target, density, rng)
         found = averaged(found, under, source.sigma_focal, source.centroid_m)
         if found.outcome is Outcome.CONVERGED and self._is_ambiguous(found.pose):
             return replace(found, outcome=Outcome.AMBIGUOUS)
         return found
 
-    def _under(
+    def _given_focal_length(
         self, source: RayImage, target: RayImage, density: AbstractPoseDensity, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior under the focal length of the views."""
