@@ -109,6 +109,8 @@ def _table(records: Sequence[Record]) -> str:
     for record in records:
         variants.setdefault((record["variant"], record["kind"]), {})[record["case"]] = record
     defaults = [cases for (_, kind), cases in variants.items() if kind == "default"]
+    if not defaults:
+        return "no seed of the default is registered yet, to compare with: --variants 0 3"
     titles = ["variant", "", "pairs", *(measure.title for measure in MEASURES), "new / mended", "time"]
     lines = [" | ".join(["", *titles, ""]).strip(), "|" + "---|" * len(titles)]
     for (name, kind), own in variants.items():
