@@ -24,7 +24,7 @@ from modeler.kernels.gpu.memory import forget
 from modeler.rays import Sensor
 from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.se3 import rows
-from modeler.types import Array, RayImage
+from modeler.types import RayImage
 from sequences import bundled, open_sequence
 
 CORES = 2
@@ -85,7 +85,7 @@ def _pairs(device: gpu.Device, count: int, views: list[RayImage], timed: Timed) 
         pairs.append((forward.projection(STRIDE), backward.projection(STRIDE), *parameters))
         poses.append(rows(speed.PRIORS["general"].between(source, target).sample(STARTS, rng)))
     every, numbers = np.concatenate(poses), np.repeat(np.arange(count, dtype=np.int32), STARTS)
-    found: dict[str, Array] = {}
+    found: dict[str, np.ndarray] = {}
 
     def there() -> None:
         forget()
