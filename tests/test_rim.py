@@ -15,7 +15,7 @@ from modeler.kernels.point_to_plane import FACING_WEIGHT, OTHER_RIM, WEIGHT
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor, rim_weights
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
-from modeler.registration.visibility.likelihood import PairLikelihood, nonnegative_solution
+from modeler.registration.visibility.likelihood import PairLikelihood, nonnegative_solution, significant_variances
 from modeler.registration.visibility.points import OWN_RIM
 from modeler.registration.visibility.refinement import Equations
 from modeler.se3 import rows
@@ -103,6 +103,22 @@ def test_noises_are_the_nonnegative_least_squares(rng: np.random.Generator) -> N
         zeros += int(np.count_nonzero(want == 0.0))
     assert 50 < zeros < 350
     assert nonnegative_solution(5.0, 0.0, 1.0, 0.0, 0.0, 0.0) == (0.2, 0.0)  # nothing near silhouettes
+
+
+def test_chance_does_not_pass_for_errors_near_silhouettes(rng: np.random.Generator) -> None:
+    """Groups of ten squares are alike, as neighbouring points are."""
+    found = {0.0: list[float](), 4.0: list[float]()}
+    for rim_m2, variances in found.items():
+        for _ in range(400):
+            rims = np.repeat(rng.uniform(0.0, 1.0, 80), 10)
+            variance = 1.0 + rim_m2 * rims
+            excess = variance * np.repeat(rng.chisquare(1, 80), 10)
+            table = np.column_stack([np.ones(800), rims, excess])
+            variances.append(significant_variances(table.T @ table, 80.0)[1])
+    assert np.mean(np.array(found[0.0]) > 0.0) < 0.06
+    assert np.mean(np.array(found[4.0]) > 0.0) > 0.5
+    constant = np.column_stack([np.ones(50), np.zeros(50), np.full(50, 0.3)])
+    assert significant_variances(constant.T @ constant, 20.0) == pytest.approx((0.3, 0.0))
 
 
 def test_variances_grow_by_those_of_both_rims() -> None:

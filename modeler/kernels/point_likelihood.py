@@ -316,11 +316,12 @@ def residual_excess(pose, projection, rims, blur_m):
         blur_m: least noise of the surfaces with which points are selected.
 
     Returns:
-        (2, 3): normal equations, matrix | right side in m².
+        (3, 3): sums of products of the factors of b², of those of the variance near silhouettes, and of the excess in
+            m²: normal equations, matrix | right side, and the sum of squares below them.
     """
     transformed, pixels, looked_up = buffers(projection.points.shape[1])
     project(pose, projection, transformed, pixels, looked_up)
-    sums, rim_m2 = np.zeros((2, 3)), np.float64(projection.rim_m2)
+    sums, rim_m2 = np.zeros((3, 3)), np.float64(projection.rim_m2)
     for j in range(pixels.shape[0]):
         if looked_up[KIND, j] != SURFACE or transformed[FACING, j] < 0.5:
             continue
@@ -335,5 +336,6 @@ def residual_excess(pose, projection, rims, blur_m):
             sums[1, 1] += rim * rim
             sums[0, 2] += apart * excess
             sums[1, 2] += rim * excess
-    sums[1, 0] = sums[0, 1]
+            sums[2, 2] += excess * excess
+    sums[1, 0], sums[2, 0], sums[2, 1] = sums[0, 1], sums[0, 2], sums[1, 2]
     return sums

@@ -26,6 +26,7 @@ _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a fraction of its pixels' la
 _RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; width of the ramps of f and g
 _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).astype(np.float32)  # see `Projection`
 _DESCENT_STRIDE = 4  # every fourth point is used for descent
+_SIGNIFICANT = 2.0  # standard errors above which errors near silhouettes are part of the model
 _TAIL = 0.01  # probability of rejecting a true pose by eq. 22
 _MISFIT = 0.5  # mean of r² / 2τ² if variances are right
 
@@ -131,7 +132,7 @@ class DirectedLikelihood:
         return point_likelihood.classify(pose, self.projection(1), self.parameters(blur_m))
 
     def residual_excess(self, pose: Array, blur_m: float) -> Array:
-        """Return the sums (2, 3) for eq. 8 and 31 of method.md over matches under a pose (12,): matrix | right side."""
+        """Return the sums (3, 3) for eq. 8 and 31 of method.md over matches under a pose (12,)."""
         least_m = float(np.hypot(blur_m, self._min_blur_m))
         return point_likelihood.residual_excess(pose, self.projection(1), self.points[:, OWN_RIM], least_m)
 
@@ -353,14 +354,14 @@ class PairLikelihood:
         """Return the noise b of matching surfaces, beyond that of points and planes, and that near silhouettes, in m.
 
         Nuisance parameters at their most likely values given a pose (4, 4) (method.md, eq. 8 and 31): the effect of
-        smoothing on curved surfaces, sensor noise common to neighbours, and depth flattened near outlines. `blur_m` is
-        the value of b at which matches are selected, and returned with too few of them.
+        smoothing on curved surfaces, sensor noise common to neighbours, and depth flattened near outlines, if that is
+        significant. `blur_m` is the value of b at which matches are selected, and returned with too few of them.
         """
         sums = self.forward.residual_excess(rows(pose), blur_m)
         sums += self.backward.residual_excess(rows(se3.inverse(pose)), blur_m)
         if sums[0, 0] <= _MIN_MATCHES:
             return blur_m, self.forward.rim_m
-        surface_m2, rim_m2 = nonnegative_solution(*sums.ravel().tolist())
+        surface_m2, rim_m2 = significant_variances(sums, 2.0 * self.patches)
         return math.sqrt(surface_m2), math.sqrt(rim_m2)
 
     def with_rim_m(self, rim_m: float) -> PairLikelihood:
@@ -464,6 +465,22 @@ def _match_table(hidden_share: float) -> np.ndarray:
 def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:
     """Return the regulariser for equations of every `stride`-th point, without their weight `stride`."""
     return regulariser._replace(precision=regulariser.precision / stride, damping=regulariser.damping / stride)
+
+
+def significant_variances(sums: Array, independent: float) -> tuple[float, float]:
+    """Return b² and the variance near silhouettes in m²; 0 for the latter within two of its standard errors.
+
+    Args:
+        sums: (3, 3), see `point_likelihood.residual_excess`.
+        independent: number of independent squares among those of the matches.
+    """
+    (aa, ab, a), (_, bb, b), (_, _, square) = sums.tolist()
+    surface_m2, rim_m2 = nonnegative_solution(aa, ab, a, ab, bb, b)
+    determinant = max(aa * bb - ab * ab, 1e-9 * aa * bb)
+    scatter = max(square - surface_m2 * a - rim_m2 * b, 0.0) / aa  # aa is about the number of matches
+    if rim_m2**2 * determinant > _SIGNIFICANT**2 * scatter * aa * max(aa / independent, 1.0):
+        return surface_m2, rim_m2
+    return max(a, 0.0) / aa, 0.0
 
 
 def nonnegative_solution(aa: float, ab: float, a: float, _: float, bb: float, b: float) -> tuple[float, float]:
