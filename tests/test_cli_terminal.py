@@ -147,7 +147,7 @@ def test_a_terminal_sees_how_far_it_is_and_how_long_it_takes(scene: Path) -> Non
 @pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
 def test_a_terminal_sees_what_to_do_next_while_frames_come(scene: Path, tmp_path: Path) -> None:
     growing = shutil.copytree(scene, tmp_path / "box")
-    options = ["--watch", "--idle-s", "3", "--out", str(tmp_path / "run"), *QUICK]
+    options = ["--watch", "--idle-s", "6", "--out", str(tmp_path / "run"), *QUICK]
     assert "next: turn by " in on_a_terminal([*COMMAND, "build", str(growing), *options])
 
 
