@@ -69,9 +69,8 @@ class Sensor:
             view: as this sensor made it.
             log_factor: logarithm of the other focal length over that of the view.
         """
-        camera, factor = view.frame.camera, math.exp(log_factor)
-        scaled = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
-        return self.ray_image(replace(view.frame, camera=scaled), view.plane and _drawn_plane(view.plane, factor))
+        factor = math.exp(log_factor)
+        return self.ray_image(_drawn_frame(view.frame, factor), view.plane and _drawn_plane(view.plane, factor))
 
     def ray_image(self, frame: Frame, plane: Plane | None = None) -> RayImage:
         """Make a segmented frame ready for registration; without object pixels it has no points.
@@ -208,7 +207,7 @@ def under_focal_length(view: RayImage, log_factor: float) -> RayImage:
         view: as `Sensor.ray_image` made it.
         log_factor: logarithm of the other focal length over that of the view.
     """
-    camera, factor = view.frame.camera, math.exp(log_factor)
+    factor = math.exp(log_factor)
     cells = view.layers["cells"].copy()
     surface = cells[..., planes.KIND] == planes.SURFACE
     on_surface = cells[surface]
@@ -221,12 +220,18 @@ def under_focal_length(view: RayImage, log_factor: float) -> RayImage:
     variance_m2 = (view.layers["variance_m2"] / lengths**2).astype(view.layers["variance_m2"].dtype)
     return replace(
         view,
-        frame=replace(view.frame, camera=replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)),
+        frame=_drawn_frame(view.frame, factor),
         plane=view.plane and _drawn_plane(view.plane, factor),
         points_m=view.points_m / (factor, factor, 1.0),
         normals=normals,
         layers={**view.layers, "cells": cells, "variance_m2": variance_m2},
     )
+
+
+def _drawn_frame(frame: Frame, factor: float) -> Frame:
+    """Return the frame whose points have x and y divided by a factor: that of a longer focal length."""
+    camera = frame.camera
+    return replace(frame, camera=replace(camera, fx=camera.fx * factor, fy=camera.fy * factor))
 
 
 def _drawn(normals: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
