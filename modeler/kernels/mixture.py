@@ -6,11 +6,12 @@ import numba
 import numpy as np
 
 from modeler.kernels.lie_group import difference
+from modeler.kernels.threads import over_rows
 
 _NEGLIGIBLE = 40.0  # nats below the best Gaussian
+_ROWS = 1000  # least number of densities per thread: waking one takes as long as computing some hundred
 
 
-@numba.njit(cache=True, error_model="numpy")
 def log_densities(poses, means, roots, widths, log_weights, centre):
     """Return the log density (n,) at each pose, with respect to the uniform measure of rotation (rad³) and translation.
 
@@ -25,6 +26,11 @@ def log_densities(poses, means, roots, widths, log_weights, centre):
         log_weights: (k,), not necessarily normalised.
         centre: (3,) point in m.
     """
+    return over_rows(_log_densities, poses, means, roots, widths, log_weights, centre, least=_ROWS // len(means))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _log_densities(poses, means, roots, widths, log_weights, centre):
     count = len(means)
     log_tops, bounds, places = np.empty(count), np.empty(count), np.empty((count, 3))
     for k in range(count):

@@ -365,7 +365,9 @@ class PairLikelihood:
         return math.sqrt(surface_m2), math.sqrt(rim_m2)
 
     def with_rim_m(self, rim_m: float) -> PairLikelihood:
-        """Return the pair with another standard deviation of depth errors near silhouettes in m (eq. 31)."""
+        """Return the pair with this standard deviation of depth errors near silhouettes in m (eq. 31)."""
+        if rim_m == self.forward.rim_m == self.backward.rim_m:
+            return self  # with its cached projections
         forward, backward = (replace(side, rim_m=rim_m) for side in (self.forward, self.backward))
         return replace(self, forward=forward, backward=backward)
 

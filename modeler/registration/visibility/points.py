@@ -27,7 +27,7 @@ def spread_points(view: RayImage, count: int, rng: np.random.Generator) -> IntAr
 
 def points_of(view: RayImage, chosen: IntArray) -> Array:
     """Return the `point_rows` of a view's surface points with these indices."""
-    variances_m2 = np.asarray(view.layers["variance_m2"], dtype=np.float64)[chosen]
+    variances_m2 = np.asarray(view.layers["variance_m2"][chosen], dtype=np.float64)
     rows, columns = view.pixels[chosen].T
     rims = np.asarray(view.layers["cells"][rows, columns, planes.RIM], dtype=np.float64)
     return point_rows(view.points_m[chosen], view.normals[chosen], variances_m2, view.frame.camera, rims)

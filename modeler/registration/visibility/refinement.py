@@ -24,6 +24,7 @@ from modeler.se3 import rows
 from modeler.types import Array, Camera
 
 _MIN_LEVEL = 1e-4  # of the scatter relative to its shape: residuals of a hundredth of their predicted sd
+_STEP_SIGMAS = 0.1  # of the samples, at which iterations end; a last step follows; 0.01 moves means by 0.02 to 0.05 sd
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ def _mode(
         pose = se3.moved(pose, step, centre_m)
         surface_m, rim_m = pair.noises_m(pose, fine_m)
         pair, noise = pair.with_rim_m(rim_m), noise._replace(surface_m=surface_m)
-        if np.linalg.norm(np.linalg.solve(spread, step)) < 0.01:  # standard deviations
+        if np.linalg.norm(np.linalg.solve(spread, step)) < _STEP_SIGMAS:
             break
     return pair, pose, pair.match_noise(pose, noise.surface_m)
 

@@ -17,9 +17,9 @@ from modeler.types import AbstractPoseDensity, Array
 
 LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
 
-_NEGLIGIBLE = 1e-6  # of the heaviest weight: lighter samples are left out of fits of two Gaussians
+_NEGLIGIBLE = 1e-6  # of the heaviest weight: lighter samples are left out of fits
 _INFLATION, _WIDE_FRACTION = 2.0, 0.3  # a fifth fewer rounds on a printed carton, a tenth on others; 0.5 is similar
-_EM_STEPS = 12  # proposals need no convergence
+_EM_STEPS, _MEAN_STEPS = 4, 2  # proposals need no convergence
 _MIN_PART = 0.05  # of the weight: the few samples of a smaller part do not determine a Gaussian
 _WHITE_FLOOR = 1e-4  # of variances in whitened coordinates
 
@@ -240,7 +240,8 @@ class AdaptiveSampler:
 
 def _fitted(poses: Array, weights: Array, centre_m: Array) -> GaussianMixture:
     """Return the Gaussian fitted to weighted poses (n, 4, 4)."""
-    mean, covariance = se3.mean(poses, weights, about_m=centre_m)
+    heavy = weights > _NEGLIGIBLE * weights.max()
+    mean, covariance = se3.mean(poses[heavy], weights[heavy], about_m=centre_m, iterations=_MEAN_STEPS)
     spread = np.asarray(np.linalg.cholesky(covariance + FLOOR), dtype=np.float64)
     return GaussianMixture(mean[None], spread[None], np.zeros(1), centre_m)
 
