@@ -6,7 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration.by_camera import CameraStudy, Trial, equal_volume, main, summary, text
+from calibration.by_camera import (
+    CameraStudy,
+    Trial,
+    conformal_factors,
+    conformal_text,
+    equal_volume,
+    main,
+    read,
+    summary,
+    table,
+    text,
+)
 from calibration.depth_cameras import CAMERAS, TimeOfFlight, World
 from calibration.specimens import Specimen
 from loops import cameras
@@ -71,6 +82,28 @@ def test_volumes_are_compared_at_the_same_coverage() -> None:
     assert equal_volume(sure) - equal_volume(true) == pytest.approx(3.0 * np.log(100.0), abs=1e-6)
     assert "1.0" in summary(true)
     assert "-" in summary([])
+
+
+def test_conformal_factors_make_regions_hold_the_truth_that_were_too_small(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    tuning, held_out = (
+        [_trial(4.0 * one) for one in rng.chisquare(6, 4000)]
+        + [_trial(one, outcome="ambiguous") for one in rng.chisquare(6, 4000)]
+        + [_trial(1.0, outcome="degenerate") for _ in range(10)]
+        + [_trial(1e6, usable=False), _trial(1e6, method="icp")]
+        for _ in range(2)
+    )
+    path = tmp_path / "tuning.csv"
+    path.write_text(table(tuning))
+    factors = conformal_factors(read(path))
+    assert factors == {
+        "converged": pytest.approx(4.0, rel=0.1),
+        "ambiguous": pytest.approx(1.0, rel=0.1),
+        "degenerate": np.inf,
+    }
+    as_is, with_factors = (float(word) for word in conformal_text(held_out, factors).splitlines()[-1].split()[-2:])
+    assert with_factors == pytest.approx(95.0, abs=1.0)
+    assert as_is < 80.0
 
 
 def test_the_study_by_camera_runs_and_repeats_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
