@@ -32,7 +32,7 @@ class RangeNoise(NamedTuple):
 
     Errors that averaging removes, such as the steps of a disparity, do not count beside smooth ones.
     """
-    sigma_inverse: float = 0.0
+    sigma_inverse_per_m: float = 0.0
     """Standard deviation of inverse depth in 1/m of errors averaged as smoothing does."""
     pattern_share: float | None = None
     """Share of the variance of errors, averaged as smoothing does, that repeats from frame to frame; None if no two

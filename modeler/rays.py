@@ -43,7 +43,7 @@ class Sensor:
 
     The default is that of noise smoothed over 1 px, as our renderer's. `measured` has that of a scene.
     """
-    sigma_inverse: float = 0.0
+    sigma_inverse_per_m: float = 0.0
     """Standard deviation of inverse depth in 1/m of the errors of smoothed surface; `measured` has that of a scene."""
     pattern_share: float = 0.0
     """Share of the variance of errors that is fixed-pattern noise: a pixel repeats it from frame to frame.
@@ -60,7 +60,9 @@ class Sensor:
         if noise is None:
             return self
         share = self.pattern_share if noise.pattern_share is None else noise.pattern_share
-        return replace(self, noise_area_px=noise.area_px, sigma_inverse=noise.sigma_inverse, pattern_share=share)
+        return replace(
+            self, noise_area_px=noise.area_px, sigma_inverse_per_m=noise.sigma_inverse_per_m, pattern_share=share
+        )
 
     def refocused(self, view: RayImage, log_factor: float) -> RayImage:
         """Return a view as it is under another focal length: x and y of every point shrink as it grows.
@@ -101,7 +103,7 @@ class Sensor:
             )
             surface = outline & (depth_m > 0)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        ball, sigma_inverse, (sharing, area_px) = self._smoothing(frame, mask, outline)
+        ball, sigma_inverse_per_m, (sharing, area_px) = self._smoothing(frame, mask, outline)
         # The object may go on behind what hides it, so its silhouette is known only beyond.
         covered = outline if frame.occluder is None else outline | frame.occluder
         silhouette = planes.silhouette_distance(covered, self.max_silhouette_px)
@@ -113,7 +115,7 @@ class Sensor:
             silhouette,
             intrinsics,
             ball,
-            sigma_inverse,
+            sigma_inverse_per_m,
             None if surface is mask else mask,
         )
         if frame.occluder is not None:
@@ -134,7 +136,7 @@ class Sensor:
             layers={"cells": cells, "variance_m2": variance_m2},
             sharing=sharing,
             error_area_px=area_px,
-            range_noise_m=self.sigma_inverse * float(np.median(points_m[:, 2])) ** 2 if len(points_m) else 0.0,
+            range_noise_m=self.sigma_inverse_per_m * float(np.median(points_m[:, 2])) ** 2 if len(points_m) else 0.0,
             pattern_share=self.pattern_share,
         )
 

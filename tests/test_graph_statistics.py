@@ -170,7 +170,7 @@ def test_a_biased_distance_of_all_views_is_part_of_the_covariances() -> None:
     shift = sigma**2 * np.outer(OBJECT_M, OBJECT_M)
     values = []
     for seed in range(100):
-        solution = solve(_graph(np.random.default_rng(seed), 0.0, 0.0, sigma), {}, common_shift=shift)
+        solution = solve(_graph(np.random.default_rng(seed), 0.0, 0.0, sigma), {}, common_shift_m2=shift)
         k = 1 + seed % (COUNT - 1)
         values.append(nees(PoseGaussian(solution.trajectory[k], solution.covariances[k]), TRUTH[k]))
     assert np.mean(values) == pytest.approx(6.0, abs=TOLERANCE)
@@ -179,7 +179,7 @@ def test_a_biased_distance_of_all_views_is_part_of_the_covariances() -> None:
 def test_a_biased_distance_of_all_views_does_not_speak_against_a_model() -> None:
     graph = _graph(np.random.default_rng(0), 0.0)
     shift = 0.1**2 * np.outer(OBJECT_M, OBJECT_M)
-    alone, shifted = solve(graph, {}), solve(graph, {}, common_shift=shift)
+    alone, shifted = solve(graph, {}), solve(graph, {}, common_shift_m2=shift)
     seen = RayImage(Frame(0, 0.0, np.zeros((1, 1), np.float32), CAMERA), None, 0.0, 0.0, OBJECT_M[None], OBJECT_M[None],
                     np.zeros((1, 2), np.int64))  # fmt: skip
     spreads = [spread_of_positions(dict.fromkeys(TRUTH, seen), solution) for solution in (alone, shifted)]

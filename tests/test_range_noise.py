@@ -20,7 +20,7 @@ MASK[150:230, 200:280] = True
 NORMAL = np.array([0.1, -0.5, -0.8])
 
 
-def plane_frame(sigma_inverse: float, width_px: float, *, bend: float = 0.0, index: int = 0) -> Frame:
+def plane_frame(sigma_inverse_per_m: float, width_px: float, *, bend: float = 0.0, index: int = 0) -> Frame:
     """A slanted plane behind a box at 0.7 m, with noise of inverse depth that is smooth over a width (sd) in px."""
     rng = np.random.default_rng(index)
     w, h = CAMERA.rays()
@@ -29,14 +29,14 @@ def plane_frame(sigma_inverse: float, width_px: float, *, bend: float = 0.0, ind
     if width_px:
         noise = gaussian_filter(noise, width_px, mode="wrap")
         noise /= noise.std()
-    depth_m = 1.0 / (inverse + sigma_inverse * noise)
+    depth_m = 1.0 / (inverse + sigma_inverse_per_m * noise)
     return Frame(index, float(index), np.where(MASK, 0.7, depth_m).astype(np.float32), CAMERA, MASK)
 
 
-@pytest.mark.parametrize("sigma_inverse", [3e-4, 3e-3])
+@pytest.mark.parametrize("sigma_inverse_per_m", [3e-4, 3e-3])
 @pytest.mark.parametrize("width_px", [0.0, 1.0, 3.0])
-def test_the_correlated_area_is_found_whatever_the_strength(sigma_inverse: float, width_px: float) -> None:
-    noise = range_noise([(plane_frame(sigma_inverse, width_px, index=k), MASK) for k in range(4)])
+def test_the_correlated_area_is_found_whatever_the_strength(sigma_inverse_per_m: float, width_px: float) -> None:
+    noise = range_noise([(plane_frame(sigma_inverse_per_m, width_px, index=k), MASK) for k in range(4)])
     assert noise is not None
     # Of a Gaussian mean of width s the autocorrelation is one of width √2 s. Wide errors pass for the plane's in part.
     expected_px = max(4.0 * np.pi * width_px**2, 1.0)
@@ -44,7 +44,7 @@ def test_the_correlated_area_is_found_whatever_the_strength(sigma_inverse: float
     # Averaged over 6 × 6 px: the variance of independent errors falls to a 36th, that of wide ones hardly.
     lags = np.abs(np.subtract.outer(np.arange(6), np.arange(6)))
     correlation = np.exp(-((lags / (2.0 * width_px)) ** 2)) if width_px else np.eye(6)
-    assert noise.sigma_inverse == pytest.approx(sigma_inverse * correlation.mean(), rel=0.1)
+    assert noise.sigma_inverse_per_m == pytest.approx(sigma_inverse_per_m * correlation.mean(), rel=0.1)
 
 
 def test_errors_that_averaging_removes_do_not_hide_smooth_ones() -> None:
@@ -99,7 +99,7 @@ def test_a_scene_tells_the_sensor() -> None:
         0.001,
         0.0007,
         noise_area_px=noise.area_px,
-        sigma_inverse=noise.sigma_inverse,
+        sigma_inverse_per_m=noise.sigma_inverse_per_m,
         pattern_share=noise.pattern_share,
     )
     assert Sensor().measured(noise._replace(pattern_share=None)).pattern_share == Sensor().pattern_share
@@ -121,7 +121,7 @@ def test_views_of_a_noisy_camera_overlap_where_they_fit() -> None:
     poses = tabletop.turntable(24)[:2]
     shared = {}
     for told in (0.0, sigma_m / 0.76**2):
-        sensor = Sensor(0.001, 0.001, noise_area_px=4.0 * np.pi * width_px**2, sigma_inverse=told)
+        sensor = Sensor(0.001, 0.001, noise_area_px=4.0 * np.pi * width_px**2, sigma_inverse_per_m=told)
         views = []
         for index, pose in enumerate(poses):
             frame = tabletop.view(tabletop.BRICK, pose, index).frame

@@ -98,11 +98,11 @@ def test_noises_are_the_nonnegative_least_squares(rng: np.random.Generator) -> N
     for _ in range(200):
         design, right = rng.uniform(size=(8, 2)), rng.normal(0.1, 1.0, 8)
         want = optimize.nnls(design, right)[0]
-        sums = np.column_stack([design.T @ design, design.T @ right])
-        assert nonnegative_solution(*sums.ravel().tolist()) == pytest.approx(want, abs=1e-9)
+        (aa, ab), (_, bb) = (design.T @ design).tolist()
+        assert nonnegative_solution(aa, ab, bb, *(design.T @ right).tolist()) == pytest.approx(want, abs=1e-9)
         zeros += int(np.count_nonzero(want == 0.0))
     assert 50 < zeros < 350
-    assert nonnegative_solution(5.0, 0.0, 1.0, 0.0, 0.0, 0.0) == (0.2, 0.0)  # nothing near silhouettes
+    assert nonnegative_solution(5.0, 0.0, 0.0, 1.0, 0.0) == (0.2, 0.0)  # nothing near silhouettes
 
 
 def test_chance_does_not_pass_for_errors_near_silhouettes(rng: np.random.Generator) -> None:

@@ -45,7 +45,7 @@ class SharedCovariance:
     """B, as a fraction of the harmonic mean of all edges' covariances."""
     focal: FocalLength | None = None
     """Estimate of the focal length; None: exact."""
-    common_shift: Array | None = None
+    common_shift_m2: Array | None = None
     """(3, 3) covariance in m², in camera coordinates, of a shift of the surface in all views, added to B; None: 0."""
 
     def __call__(self, target: int, source: int) -> Array:
@@ -76,7 +76,7 @@ class SharedCovariance:
             apart = self.focal.by_focal.get(source, zero) - self.focal.by_focal.get(target, zero)
             moved = self.focal.sigma * se3.adjoint(se3.inverse(self.independent.trajectory[source])) @ apart
             covariance = covariance + np.outer(moved, moved)  # eq. G14
-        if self.common or self.common_shift is not None:
+        if self.common or self.common_shift_m2 is not None:
             left = np.eye(6) - se3.adjoint(source_from_target)
             covariance = covariance + left @ self._common_covariance @ left.T  # eq. G10
         return 0.5 * (covariance + covariance.T)
@@ -102,8 +102,8 @@ class SharedCovariance:
         if self.common:
             informations = [factor.root_information.T @ factor.root_information for factor in self.factors]
             covariance += self.common * np.linalg.inv(np.mean(informations, axis=0))
-        if self.common_shift is not None:
-            covariance[3:, 3:] += self.common_shift
+        if self.common_shift_m2 is not None:
+            covariance[3:, 3:] += self.common_shift_m2
         return covariance
 
 

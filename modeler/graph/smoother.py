@@ -59,7 +59,7 @@ class Smoother:
     """The turntable, if any; not together with shared noise. Each solution is then a batch solution."""
     focal: FocalLength | None = None
     """Estimate of the focal length, whose uncertainty is added to the covariances; None: exact."""
-    common_shift: Array | None = None
+    common_shift_m2: Array | None = None
     """(3, 3) covariance in m² of a shift of the surface common to all views; see `SharedCovariance`. None: 0."""
     graph: PoseGraph = field(default_factory=PoseGraph)
     """The graph."""
@@ -156,7 +156,7 @@ class Smoother:
             edge_poses={(factor.source, factor.target): factor.pose for factor in several},
             mode_weights={(factor.source, factor.target): _weights(factor, state.weights) for factor in several},
             focal=self.focal,
-            common_shift=self.common_shift,
+            common_shift_m2=self.common_shift_m2,
             camera_from_axis=None if with_axis is None else with_axis.camera_from_axis,
         )
 
@@ -195,9 +195,9 @@ class Smoother:
             found = before.at(trajectory, factors)
         else:
             found = RelativeCovariance(trajectory, root, factors, () if with_axis is None else with_axis.rows)
-        if not (factors and (self.shared or self.common or self.focal or self.common_shift is not None)):
+        if not (factors and (self.shared or self.common or self.focal or self.common_shift_m2 is not None)):
             return found
-        return SharedCovariance(found, factors, self.shared, self.common, self.focal, self.common_shift)
+        return SharedCovariance(found, factors, self.shared, self.common, self.focal, self.common_shift_m2)
 
     def _with_axis(
         self,
@@ -254,7 +254,7 @@ def solve(
     common: float = 0.0,
     axis: CommonAxis | None = None,
     focal: FocalLength | None = None,
-    common_shift: Array | None = None,
+    common_shift_m2: Array | None = None,
 ) -> Solution:
     """Optimise the poses of all frames that accepted edges connect with the first.
 
@@ -270,10 +270,10 @@ def solve(
         common: see `Smoother`.
         axis: the turntable, if any.
         focal: see `Smoother`; of a solution of the same graph.
-        common_shift: see `Smoother`.
+        common_shift_m2: see `Smoother`.
 
     Raises:
         ValueError: if an accepted edge's covariance is not positive definite.
     """
-    parts = outlier_distance, shared, common, axis, focal, common_shift
+    parts = outlier_distance, shared, common, axis, focal, common_shift_m2
     return Smoother(*parts, solution=Solution(guess)).to(graph).solution

@@ -113,7 +113,7 @@ def add_line(centres, points, row, shift, pad, radius_m2, step, sums):
             sums[5, j] += weighted * weighted
 
 
-def local_planes(depth_m, mask, silhouette, intrinsics, ball, sigma_inverse, measured=None):
+def local_planes(depth_m, mask, silhouette, intrinsics, ball, sigma_inverse_per_m, measured=None):
     """Fit a plane to every object pixel's neighbours within a ball.
 
     A plane is linear in inverse depth over the image (1/z = N · (w, h, 1)), where triangulating cameras have constant
@@ -126,7 +126,7 @@ def local_planes(depth_m, mask, silhouette, intrinsics, ball, sigma_inverse, mea
         silhouette: (h, w) copied into the cells: `silhouette_distance` outside the object, `rim_weights` on it.
         intrinsics: (4,) fx, fy, cx, cy in px.
         ball: radius in m; half-width of its window in px; stride between the pixels that are read.
-        sigma_inverse: sensor noise of 1/z, in 1/m.
+        sigma_inverse_per_m: sensor noise of 1/z, in 1/m.
         measured: (h, w) bool, the object pixels to which planes are fitted; the depth of others only determines where
             to look for neighbours. None: all.
 
@@ -139,12 +139,14 @@ def local_planes(depth_m, mask, silhouette, intrinsics, ball, sigma_inverse, mea
     images = depth_m, mask, silhouette, centres, points
     cells = np.empty((*depth_m.shape, CELL_SIZE), dtype=np.float32)
     apart = np.argsort(np.arange(len(cells)) % _APART, kind="stable")  # every thread gets its share of the object
-    over_rows(_local_planes, apart, cells, *images, window, intrinsics, ball, sigma_inverse)
+    over_rows(_local_planes, apart, cells, *images, window, intrinsics, ball, sigma_inverse_per_m)
     return cells
 
 
 @numba.njit(cache=True, nogil=True)
-def _local_planes(rows, cells, depth_m, mask, silhouette, centres, points, window, intrinsics, ball, sigma_inverse):
+def _local_planes(
+    rows, cells, depth_m, mask, silhouette, centres, points, window, intrinsics, ball, sigma_inverse_per_m
+):
     width = depth_m.shape[1]
     fx, fy, cx, cy = intrinsics
     radius_m, reach, stride = ball
@@ -180,12 +182,12 @@ def _local_planes(rows, cells, depth_m, mask, silhouette, centres, points, windo
         for column in range(left, right):
             if found[column, KIND] == RAGGED:
                 w, h = (column - cx) / fx, (row - cy) / fy
-                fit_plane(found[column], sums[:, column - left], w, h, fx, fy, sigma_inverse)
+                fit_plane(found[column], sums[:, column - left], w, h, fx, fy, sigma_inverse_per_m)
     return rows
 
 
 @numba.njit(cache=True)
-def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse):
+def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse_per_m):
     """Write the plane fitted to a pixel's neighbours into its cell (8,), if they determine one (method.md, eq. 1).
 
     Args:
@@ -196,7 +198,7 @@ def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse):
         h: (row - cy) / fy of the pixel.
         fx: focal length along rows in px.
         fy: focal length along columns in px.
-        sigma_inverse: least noise of 1/z, in 1/m.
+        sigma_inverse_per_m: least noise of 1/z, in 1/m.
     """
     n, swx, swy, sxx, sxy, syy, sb, sxb, syb, sbb = sums
     if n < 6.0:
@@ -212,7 +214,7 @@ def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse):
     norm = math.sqrt(plane_x * plane_x + plane_y * plane_y + plane_z * plane_z)
     # method.md, eq. 2
     residual = sbb - offset * sb - slope_x * sxb - slope_y * syb
-    spread = max(residual / max(n - 3.0, 1.0), sigma_inverse * sigma_inverse)
+    spread = max(residual / max(n - 3.0, 1.0), sigma_inverse_per_m * sigma_inverse_per_m)
     cell[NORMAL_X], cell[NORMAL_Y], cell[NORMAL_Z] = -plane_x / norm, -plane_y / norm, -plane_z / norm
     cell[DISTANCE] = 1.0 / norm
     # The distance of a point from the plane is (1 - N · p) / |N|: its noise is z times that of 1/z over |N|.

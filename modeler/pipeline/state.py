@@ -207,7 +207,7 @@ class State:
         if distance_sigma > 0.0 and self.views:
             middle_m = np.mean([view.centroid_m for view in self.views.values()], axis=0)
             shift = distance_sigma**2 * np.outer(middle_m, middle_m)
-        smoother = replace(self.smoother, axis=axis, shared=shared, common=common, focal=focal, common_shift=shift)
+        smoother = replace(self.smoother, axis=axis, shared=shared, common=common, focal=focal, common_shift_m2=shift)
         return replace(self, smoother=smoother.to(self.graph))
 
     def retries(self) -> Iterator[tuple[int, int]]:

@@ -109,7 +109,7 @@ class Solution:
     """Weights (m,) of the modes of a multimodal edge, given all edges together, by (source, target)."""
     focal: FocalLength | None = None
     """Estimate of the focal length, whose uncertainty is part of the covariances; None: exact."""
-    common_shift: Array | None = None
+    common_shift_m2: Array | None = None
     """(3, 3) covariance in m² of a shift of the surface in all views, part of the covariances; None: 0. It moves poses
     relative to the camera, but does not deform the model."""
     camera_from_axis: Array | None = None

@@ -299,10 +299,10 @@ def spread_of_positions(views: Mapping[int, RayImage], solution: Solution, facto
 
 def _of_common_shift(solution: Solution, frame: int) -> Array:
     """Return the covariance (3, 3) in m² of a frame's position due to a shift in all views (method.md, eq. G10)."""
-    if solution.common_shift is None:
+    if solution.common_shift_m2 is None:
         return np.zeros((3, 3))
     left = np.eye(3) - solution.trajectory[frame][:3, :3].T  # the pose of the graph's root is the identity
-    return np.asarray(left @ solution.common_shift @ left.T, dtype=np.float64)
+    return np.asarray(left @ solution.common_shift_m2 @ left.T, dtype=np.float64)
 
 
 def spread_by_focal_length(views: Mapping[int, RayImage], solution: Solution, frame: int) -> tuple[float, float]:

@@ -477,7 +477,7 @@ def significant_variances(sums: Array, independent: float) -> tuple[float, float
         independent: number of independent squares among those of the matches.
     """
     (aa, ab, a), (_, bb, b), (_, _, square) = sums.tolist()
-    surface_m2, rim_m2 = nonnegative_solution(aa, ab, a, ab, bb, b)
+    surface_m2, rim_m2 = nonnegative_solution(aa, ab, bb, a, b)
     determinant = max(aa * bb - ab * ab, 1e-9 * aa * bb)
     scatter = max(square - surface_m2 * a - rim_m2 * b, 0.0) / aa  # aa is about the number of matches
     if rim_m2**2 * determinant > _SIGNIFICANT**2 * scatter * aa * max(aa / independent, 1.0):
@@ -485,8 +485,8 @@ def significant_variances(sums: Array, independent: float) -> tuple[float, float
     return max(a, 0.0) / aa, 0.0
 
 
-def nonnegative_solution(aa: float, ab: float, a: float, _: float, bb: float, b: float) -> tuple[float, float]:
-    """Return x, y ≥ 0 of least squares, from the rows (aa, ab | a) and (ab, bb | b) of the normal equations."""
+def nonnegative_solution(aa: float, ab: float, bb: float, a: float, b: float) -> tuple[float, float]:
+    """Return x, y ≥ 0 of least squares, from the normal equations aa x + ab y = a and ab x + bb y = b."""
     determinant = aa * bb - ab * ab
     if determinant > 1e-9 * aa * bb:
         x, y = (bb * a - ab * b) / determinant, (aa * b - ab * a) / determinant
