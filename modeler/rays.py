@@ -29,7 +29,7 @@ class Sensor:
     taken at another moment."""
     sigma_focal: float = 0.0
     """Standard deviation of the logarithm of the focal length; 0 = it is taken for known."""
-    smoothing: float = 0.28
+    smoothing: float = 0.24
     """Radius of the ball in which planes are fitted, as a share of the geometric mean of noise and object's extent.
 
     Smoothing over a ball of radius r displaces a surface whose radius of curvature is about the extent by r² / extent,

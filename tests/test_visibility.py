@@ -111,19 +111,22 @@ def test_the_choice_of_points_moves_an_answer_by_less_than_half_its_standard_dev
     sequence = open_sequence(bundled(name))
     noise = sequence.sensor()
     assert noise is not None
-    target, source = (Sensor(*noise).ray_image(sequence.frame(index)) for index in (0, 1))
-    density = GeneralPrior().between(source, target)
-    found = [
-        about_point(
-            VisibilityRegistrar().register(source, target, density, rng=np.random.default_rng(seed)).pose,
-            source.centroid_m,
-        )
-        for seed in range(6)
-    ]
-    moved = np.array([se3.log(se3.inverse(found[0].mean) @ pose.mean) for pose in found])
-    moved -= moved.mean(axis=0)
-    stated = np.mean([pose.covariance for pose in found], axis=0)
-    assert np.sum(moved * np.linalg.solve(stated, moved.T).T) / 5 / 6 < 0.5**2
+    squares = []
+    for first in (0, 2, 4):
+        target, source = (Sensor(*noise).ray_image(sequence.frame(index)) for index in (first, first + 1))
+        density = GeneralPrior().between(source, target)
+        found = [
+            about_point(
+                VisibilityRegistrar().register(source, target, density, rng=np.random.default_rng(seed)).pose,
+                source.centroid_m,
+            )
+            for seed in range(6)
+        ]
+        moved = np.array([se3.log(se3.inverse(found[0].mean) @ pose.mean) for pose in found])
+        moved -= moved.mean(axis=0)
+        stated = np.mean([pose.covariance for pose in found], axis=0)
+        squares.append(np.sum(moved * np.linalg.solve(stated, moved.T).T) / 5 / 6)
+    assert np.mean(squares) < 0.5**2
 
 
 def test_limits_narrower_than_the_search_are_an_outcome(flashlight, rng):

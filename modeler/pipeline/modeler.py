@@ -41,6 +41,7 @@ from modeler.types import (
     Step,
 )
 
+_FOCAL_ROUNDS = 5  # of registering the edges under an estimate, at most; three are enough on most captures
 _FOCAL_REACH = 5.0  # prior standard deviations: nominal focal lengths of captures are off by up to 4.5
 _MIN_SEGMENT = 3  # frames that fit each other: two may do so by chance
 
@@ -408,7 +409,7 @@ class Run:
                 state, at = moved.reregistered(self.modeler.tracker(moved).spans), log_factor
             return MovingGraph.of(state.graph, state.solution).estimate(sigma, -at)
 
-        focal = estimate_focal_length(estimate_at, rounds=3, tolerance=1.0, reach=_FOCAL_REACH * sigma)
+        focal = estimate_focal_length(estimate_at, rounds=_FOCAL_ROUNDS, tolerance=0.25, reach=_FOCAL_REACH * sigma)
         return (state if focal.log_factor == at else state.under(focal.log_factor - at, sensor)), focal
 
     def _step(self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge]) -> Step:
