@@ -227,6 +227,23 @@ def test_a_mean_far_from_the_prior_is_believed_only_where_loops_tell_it(sigma: f
         assert (found.log_factor, found.sigma) == (0.0, 0.02)
 
 
+@pytest.mark.parametrize("share", [0.35, 0.6, 1.0])
+def test_steps_that_are_too_short_are_followed_to_where_they_end(share: float) -> None:
+    """And the less of the way they go, the more the noise of edges moves that place."""
+    true, asked = 0.05, list[float]()
+
+    def estimate_at(log_factor: float) -> FocalLength:
+        asked.append(log_factor)
+        step = share * (true - log_factor)
+        sigma = float(np.hypot(0.004, 0.003))
+        return FocalLength(step, sigma, 0.05, 9, sigmas_before=3.0, sigmas_after=1.0, by_focal={}, noise_sigma=0.003)
+
+    found = estimate_focal_length(estimate_at, rounds=5, tolerance=0.25, reach=0.1)
+    assert found.log_factor == pytest.approx(true, abs=1e-9)
+    assert len(asked) <= 3
+    assert found.sigma == pytest.approx(np.hypot(0.004, 0.003 / share))
+
+
 def test_an_open_chain_tells_nothing_and_is_as_uncertain_as_the_focal_length(rng: np.random.Generator) -> None:
     graph, _ = ring(0.0, rng, luck=1.0, closed=False)
     solution = solve(graph, {})

@@ -81,7 +81,8 @@ class MovingGraph:
         conditions_met = 6 * sum(optimum.inlier)
         residual = 2.0 * (optimum.error - self.threshold * optimum.inlier.count(False))
         inflation = max(residual / (conditions_met - 1), 1.0) if conditions_met else 1.0  # of the edges' covariances
-        sigma = float(np.linalg.norm([np.sqrt(inflation / curvature), _DERIVATIVE_ERROR * best, ROTATION_BIAS]))
+        noise_sigma = float(np.sqrt(inflation / curvature))
+        sigma = float(np.linalg.norm([noise_sigma, _DERIVATIVE_ERROR * best, ROTATION_BIAS]))
         return FocalLength(
             log_factor=best,
             sigma=min(sigma, prior_sigma),
@@ -90,6 +91,7 @@ class MovingGraph:
             sigmas_before=float(np.sqrt(before)),
             sigmas_after=float(np.sqrt(after)),
             by_focal={frame: se3.log(more[frame] @ se3.inverse(less[frame])) / (2.0 * step) for frame in more},
+            noise_sigma=noise_sigma,
         )
 
     def at(self, log_factor: float) -> Optimum:
@@ -149,8 +151,12 @@ def estimate_focal_length(
         if abs(step) <= tolerance * estimate.sigma or centre == before or number == rounds - 1:
             break
         estimate = estimate_at(centre)
-        share = float(np.clip((step - estimate.log_factor) / (centre - before), _MIN_SHARE, 1.0))
+        if abs(centre - before) > estimate.sigma:  # in less, the noise of registrations would show
+            share = float(np.clip((step - estimate.log_factor) / (centre - before), _MIN_SHARE, 1.0))
     if estimate.told_by == "prior" and abs(centre) > _MAX_SIGMAS * np.sqrt(estimate.prior_sigma**2 - estimate.sigma**2):
         # Farther from the prior's mean than such weak evidence can lead: the rounds disagree, so that an edge is wrong.
         centre, estimate = 0.0, replace(estimate, sigma=estimate.prior_sigma)
-    return replace(estimate, log_factor=centre, sigmas_before=first.sigmas_before)
+    # Noise moves the end of the iteration by as many times more as its steps are too short.
+    more = estimate.noise_sigma * np.sqrt(1.0 / share**2 - 1.0)
+    sigma = min(float(np.hypot(estimate.sigma, more)), estimate.prior_sigma)
+    return replace(estimate, log_factor=centre, sigma=sigma, sigmas_before=first.sigmas_before)

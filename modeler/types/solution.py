@@ -72,6 +72,8 @@ class FocalLength:
     """The same at the mean."""
     by_focal: Mapping[int, Array] = field(repr=False)
     """By frame number (6,) derivative of a pose: it moves to exp(by_focal · log_factor) object_from_camera."""
+    noise_sigma: float = 0.0
+    """The part of its standard deviation that is due to the noise of edges."""
 
     @property
     def factor(self) -> float:
