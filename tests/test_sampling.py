@@ -46,6 +46,13 @@ def gaussian(mean: Array, sigmas: Array) -> GaussianMixture:
     return GaussianMixture(mean[None], np.diag(sigmas)[None], np.zeros(1), CENTRE_M)
 
 
+def test_a_mixture_may_have_thousands_of_gaussians() -> None:
+    one, count = gaussian(ABOUT, SIGMAS), 3000
+    many = GaussianMixture(one.means.repeat(count, 0), one.spreads.repeat(count, 0), np.zeros(count), CENTRE_M)
+    poses = one.sample(5, np.random.default_rng(0))
+    np.testing.assert_allclose(many.log_density(poses), one.log_density(poses) + np.log(count), atol=1e-9)
+
+
 def away(xi: Array) -> Array:
     return se3.moved(ABOUT, xi, CENTRE_M)
 

@@ -25,7 +25,7 @@ _STEP = 0.005  # of finite differences, at most a quarter of the prior's standar
 _ROUNDS = 8  # of Newton's method at most; near the optimum two or three are enough
 _MAX_SIGMAS = 3.0  # prior standard deviations: range of the grid, and of estimates that hardly exceed the prior
 _GRID = 0.02  # largest spacing, in the logarithm, of starting values for Newton's method
-_MIN_SHARE = 0.3  # of the way to the optimum that a step goes: the least of ten rendered runs, see method.md
+_MIN_SHARE = 0.3  # of the way to the optimum that a step goes: ten rendered runs have 0.25 to 0.75, see method.md
 _DERIVATIVE_ERROR = 0.3  # relative, of an estimate: noise of the derivatives biases it to 0, by 29 % on the bundled box
 
 

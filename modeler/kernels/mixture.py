@@ -26,7 +26,8 @@ def log_densities(poses, means, roots, widths, log_weights, centre):
         log_weights: (k,), not necessarily normalised.
         centre: (3,) point in m.
     """
-    return over_rows(_log_densities, poses, means, roots, widths, log_weights, centre, least=_ROWS // len(means))
+    least = max(_ROWS // len(means), 1)
+    return over_rows(_log_densities, poses, means, roots, widths, log_weights, centre, least=least)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
