@@ -41,7 +41,7 @@ from modeler.types import (
     Step,
 )
 
-_FOCAL_ROUNDS = 5  # of registering the edges under an estimate, at most; three are enough on most captures
+_FOCAL_ROUNDS = 5  # registrations of the edges at most; eight captures take one to five
 _FOCAL_REACH = 5.0  # prior standard deviations: nominal focal lengths of captures are off by up to 4.5
 _MIN_SEGMENT = 3  # frames that fit each other: two may do so by chance
 

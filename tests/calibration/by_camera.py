@@ -317,6 +317,7 @@ def chosen(half: Half, per_class: int) -> tuple[Specimen, ...]:
 
 
 def table(trials: Sequence[Trial]) -> str:
+    """Return trials as CSV, for `read`."""
     stream = io.StringIO()
     writer = csv.DictWriter(stream, [one.name for one in fields(Trial)], lineterminator="\n")
     writer.writeheader()
