@@ -14,6 +14,7 @@ from calibration.by_camera import (
     equal_volume,
     main,
     read,
+    standard_error,
     summary,
     table,
     text,
@@ -82,6 +83,16 @@ def test_volumes_are_compared_at_the_same_coverage() -> None:
     assert equal_volume(sure) - equal_volume(true) == pytest.approx(3.0 * np.log(100.0), abs=1e-6)
     assert "1.0" in summary(true)
     assert "-" in summary([])
+
+
+def test_the_standard_error_of_a_mean_allows_for_correlation_within_shapes() -> None:
+    rng = np.random.default_rng(0)
+    of_shapes, alone = rng.normal(size=(2, 400))
+    shapes = [str(number) for number in range(400)]
+    assert standard_error(alone, shapes) == pytest.approx(1.0 / np.sqrt(400.0), rel=0.1)
+    repeated = standard_error(np.repeat(of_shapes, 3), [shape for shape in shapes for _ in range(3)])
+    assert repeated == pytest.approx(standard_error(of_shapes, shapes))
+    assert np.isnan(standard_error(alone, ["box"] * 400))
 
 
 def test_conformal_factors_make_regions_hold_the_truth_that_were_too_small(tmp_path: Path) -> None:

@@ -182,13 +182,35 @@ def judged(trial: Trial, posterior: Posterior, truth: Array, source: RayImage, t
     )
 
 
+_HEAD: Final = f"{'pairs':>5}{'NEES/6':>8}{'± se':>7}{'median':>8}{'50 %':>6}{'95 %':>6}"
+
+
 def summary(trials: Sequence[Trial]) -> str:
-    """Return NEES/6, its median and coverage of some answers in words of a table."""
-    squares = np.array([one.nees for one in trials if one.usable])
-    if not len(squares):
-        return f"{0:>5}{'-':>8}{'-':>8}{'-':>6}{'-':>6}"
+    """Return NEES/6, its standard error and median, and the coverage of some answers in words of a table."""
+    usable = [one for one in trials if one.usable]
+    if not usable:
+        return f"{0:>5}{'-':>8}{'-':>7}{'-':>8}{'-':>6}{'-':>6}"
+    squares = np.array([one.nees for one in usable])
+    error = standard_error(squares, [one.shape for one in usable])
     inside = [100.0 * np.mean(squares <= chdtri(6, 1.0 - level)) for level in (0.5, 0.95)]
-    return f"{len(squares):>5}{squares.mean() / 6:8.2f}{np.median(squares) / 6:8.2f}{inside[0]:6.0f}{inside[1]:6.0f}"
+    return (
+        f"{len(squares):>5}{squares.mean() / 6:8.2f}{error / 6:7.2f}{np.median(squares) / 6:8.2f}"
+        f"{inside[0]:6.0f}{inside[1]:6.0f}"
+    )
+
+
+def standard_error(values: Array, shapes: Sequence[str]) -> float:
+    """Return the standard error of a mean whose values may be correlated within shapes, but not between them.
+
+    Args:
+        values: (n,).
+        shapes: of each.
+    """
+    deviations = values - values.mean()
+    sums = np.array([deviations[[shape == one for one in shapes]].sum() for shape in set(shapes)])
+    if len(sums) < 2:
+        return float("nan")
+    return float(np.sqrt(len(sums) / (len(sums) - 1) * np.sum(sums**2)) / len(values))
 
 
 def equal_volume(trials: Sequence[Trial]) -> float:
@@ -229,16 +251,15 @@ def conformal_text(trials: Sequence[Trial], factors: Mapping[str, float]) -> str
 
 def text(trials: Sequence[Trial]) -> str:
     """Return the tables that a person reads."""
-    head = f"{'pairs':>5}{'NEES/6':>8}{'median':>8}{'50 %':>6}{'95 %':>6}"
     ours = [one for one in trials if one.method == OURS]
     lines = []
     for stated in dict.fromkeys(one.stated for one in trials):
-        lines += [f"focal length {stated}", f"{'':32}{'general':^33}{'table':^33}", f"{'':32}{head}{head}"]
+        lines += [f"focal length {stated}", f"{'':32}{'general':^40}{'table':^40}", f"{'':32}{_HEAD}{_HEAD}"]
         for camera in dict.fromkeys(one.camera for one in trials):
             some = [one for one in ours if (one.camera, one.stated) == (camera, stated)]
             lines.append(f"{camera:<32}" + "".join(summary([o for o in some if o.prior == p]) for p in PRIORS))
         lines.append("")
-    lines += ["both priors, camera by camera", f"{'':56}{head}"]
+    lines += ["both priors, camera by camera", f"{'':56}{_HEAD}"]
     for camera, stated in dict.fromkeys((one.camera, one.stated) for one in ours):
         some = [one for one in ours if (one.camera, one.stated) == (camera, stated)]
         for title, parts in _parts(some).items():
