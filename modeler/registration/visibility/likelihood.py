@@ -21,6 +21,7 @@ from modeler.registration.visibility.points import OWN_RIM, IntArray, points_of,
 from modeler.se3 import matrices, rows
 from modeler.types import Array, RayImage
 
+_ROUNDING_M = 1e-6  # of depths in single precision: planes without noise may match exactly
 _MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
 _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a fraction of its pixels' lateral noise, which is independent
 _RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; width of the ramps of f and g
@@ -362,7 +363,7 @@ class PairLikelihood:
         if sums[0, 0] <= _MIN_MATCHES:
             return blur_m, self.forward.rim_m
         surface_m2, rim_m2 = significant_variances(sums, 2.0 * self.patches)
-        return math.sqrt(surface_m2), math.sqrt(rim_m2)
+        return max(math.sqrt(surface_m2), _ROUNDING_M), math.sqrt(rim_m2)
 
     def with_rim_m(self, rim_m: float) -> PairLikelihood:
         """Return the pair with this standard deviation of depth errors near silhouettes in m (eq. 31)."""

@@ -16,6 +16,7 @@ from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 
 _STRIDE = 2  # every second point is used for scores
+_COARSE_STRIDE = 8  # where the best pose need only be roughly right
 OPEN_ROTATION_RAD = 1.0
 """Standard deviation of an open rotation: it is 1.33 if all are equally likely, 1.0 within limits of 130°."""
 
@@ -89,7 +90,7 @@ class Search:
     """Blur of the surfaces in the last stage of the descent, as a fraction of the object's size."""
     matcher: FeatureMatcher = field(default_factory=FeatureMatcher)
     """Matches features for further starts, if the prior has more basins than `max_starts` reach."""
-    stages: int = 4
+    stages: int = 3
     """Stages of the descent, each with half the blur of the previous one."""
     steps: int = 4
     """Gauss-Newton steps at each blur."""
@@ -129,7 +130,7 @@ class Search:
             min_overlap: overlap of the best pose inside the prior's support above which poses beyond it count only
                 within a basin of the support.
         """
-        fine_m, parts = self.fine_m(pair), density.alternatives
+        parts = density.alternatives
         priors = [_moments(pair, part, rng) for part in parts]
         descents = [self._descended(pair, part, prior, rng) for part, prior in zip(parts, priors, strict=True)]
         started, poses = (np.concatenate(kind) for kind in zip(*descents, strict=True))
@@ -137,7 +138,8 @@ class Search:
         inside = np.isfinite(density.log_evidence(poses))
         outside = poses[~inside]
         poses, part = (poses[inside], part[inside]) if inside.any() else (started, part)
-        likelihoods = pair.tempered(poses, fine_m, stride=_STRIDE)
+        blur_m = self._noise_m(pair, poses)
+        likelihoods = pair.tempered(poses, blur_m, stride=_STRIDE)
         # One alternative may be far denser than another, so that the likelihood alone does not rank modes.
         scores = likelihoods + density.log_evidence(poses) if len(parts) > 1 else likelihoods
         order = np.argsort(-scores, kind="stable")
@@ -145,14 +147,14 @@ class Search:
         order = order[scores[order] > scores.max() + 2.0 * np.log(MIN_MODE_SHARE)]
         poses, part = poses[order], part[order]
         precisions = np.array([np.linalg.inv(prior.covariance) for prior in priors], dtype=np.float64)[part]
-        spreads = _spreads(pair, precisions, poses, fine_m)
+        spreads = _spreads(pair, precisions, poses, blur_m)
         found = Candidates(poses, scores[order], spreads, any(_is_open(prior) for prior in priors))
         if pair.overlap(found.poses[0]) > min_overlap:
             outside = self._near_support(pair, priors[-1], density, outside)
         found = found.distinct(pair.centre_m)
         if not len(outside):
             return found
-        gains = pair.tempered(outside, fine_m, stride=_STRIDE) - likelihoods[order[0]]
+        gains = pair.tempered(outside, blur_m, stride=_STRIDE) - likelihoods[order[0]]
         best = int(np.argmax(gains))
         return replace(found, beyond_gain=float(gains[best]), beyond=outside[best : best + 1])
 
@@ -172,7 +174,7 @@ class Search:
     def _drawn(self, pair: PairLikelihood, density: AbstractPoseDensity, count: int, rng: np.random.Generator) -> Array:
         """Return starting poses (n, 4, 4): samples of the prior that match best at twice the coarsest blur."""
         poses, blur = density.sample(self.proposals * count, rng), self.finest * 2.0**self.stages
-        found = pair.scores(poses, blur * pair.size_m, stride=8)
+        found = pair.scores(poses, blur * pair.size_m, stride=_COARSE_STRIDE)
         # A coarse match determines the depth less well than a fine one: each has the weight -log(blur / size).
         matches = np.log(blur) * found.explained * pair.points
         scores = found.surface - matches + found.colours / pair.temper
@@ -188,6 +190,15 @@ class Search:
             distances = se3.difference(motions, motions[kept[-1]], pair.centre_m) / self.extent(pair)
             remaining &= np.linalg.norm(distances, axis=1) > 1.0
         return motions[kept]
+
+    def _noise_m(self, pair: PairLikelihood, poses: Array) -> float:
+        """Return the noise of surfaces at the best of some poses (n, 4, 4), and at least the smallest blur.
+
+        With less, likelihoods of poses that fit equally well differ by the noise, so that all but one would be dropped.
+        """
+        fine_m = self.fine_m(pair)
+        best = np.argmax(pair.tempered(poses, fine_m, stride=_COARSE_STRIDE))
+        return max(pair.noises_m(poses[best], fine_m)[0], fine_m)
 
     def _regulariser(self, pair: PairLikelihood, prior: PoseGaussian) -> Regulariser:
         """Return the regulariser of a descent: the prior's Gaussian, and damping (method.md, eq. 10).
