@@ -15,7 +15,7 @@ from modeler.closure.map_view import composed
 from modeler.evaluation import nees, rotation_error_deg, true_motion
 from modeler.fusion import widened
 from modeler.graph import MovingGraph, PoseGraph, estimate_focal_length, solve
-from modeler.graph.focal import ROTATION_BIAS
+from modeler.graph.focal import RELIEF_ERROR
 from modeler.kernels import planes
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
@@ -262,7 +262,7 @@ def test_covariances_are_those_of_a_graph_with_the_focal_length_as_a_variable(rn
     graph, _ = ring(0.0, rng, luck=1e-3)
     solution, prior_sigma = solve(graph, {}), 0.02
     found = MovingGraph.of(graph, solution).estimate(prior_sigma)
-    found = replace(found, sigma=float(np.sqrt(found.sigma**2 - ROTATION_BIAS**2)))
+    found = replace(found, sigma=float(np.sqrt(found.sigma**2 - RELIEF_ERROR**2)))
     rows = [np.eye(1, 61, 60) / prior_sigma]
     for one in graph.edges:
         local = np.linalg.inv(np.linalg.cholesky(one.posterior.pose.covariance))

@@ -18,8 +18,8 @@ from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, 
 from modeler.graph.smoother import Smoother
 from modeler.types import Array, FocalLength, Solution
 
-ROTATION_BIAS = 0.004
-"""Relative error common to all rotations, which loops cannot distinguish from a focal length: measured on renders."""
+RELIEF_ERROR = 0.008
+"""Relative error of the depth's relief, which loops cannot distinguish from a focal length: measured, see method.md."""
 
 _STEP = 0.005  # of finite differences, at most a quarter of the prior's standard deviation: a few posterior ones
 _ROUNDS = 8  # of Newton's method at most; near the optimum two or three are enough
@@ -82,7 +82,7 @@ class MovingGraph:
         residual = 2.0 * (optimum.error - self.threshold * optimum.inlier.count(False))
         inflation = max(residual / (conditions_met - 1), 1.0) if conditions_met else 1.0  # of the edges' covariances
         noise_sigma = float(np.sqrt(inflation / curvature))
-        sigma = float(np.linalg.norm([noise_sigma, _DERIVATIVE_ERROR * best, ROTATION_BIAS]))
+        sigma = float(np.linalg.norm([noise_sigma, _DERIVATIVE_ERROR * best, RELIEF_ERROR]))
         return FocalLength(
             log_factor=best,
             sigma=min(sigma, prior_sigma),
