@@ -27,7 +27,6 @@ Register = Callable[[RayImage, RayImage, AbstractPrior], Posterior]
 
 _LIMIT_STEPS = 2.0  # steps for which limits hold, as where a run places a view that one step's do not
 _MAX_ROUNDS = 6  # of registering the edges again about the estimate; on captures two to four are enough
-_CONVERGED = 0.25  # standard deviations by which the last round moved the estimate
 _NODE = 0.05  # of log c, for derivatives: posteriors' own scatter, a twentieth of it, then moves them by some 2 %
 _SAME_MODE = Smoother.outlier_distance  # standard deviations
 
@@ -69,7 +68,7 @@ class FocalCalibrator:
             graph = MovingGraph([factor for factor in found if factor is not None], root, {})
             return graph.estimate(self.prior_sigma, -centre)
 
-        return estimate_focal_length(estimate_at, rounds=_MAX_ROUNDS, tolerance=_CONVERGED, reach=self.reach)
+        return estimate_focal_length(estimate_at, rounds=_MAX_ROUNDS, reach=self.reach)
 
     def _registered(self, edge: Edge, made: _Made, register: Register, prior: AbstractPrior) -> Factor | None:
         """Return an edge under another focal length; None if its change is unknown.

@@ -25,6 +25,7 @@ _STEP = 0.005  # of finite differences, at most a quarter of the prior's standar
 _ROUNDS = 8  # of Newton's method at most; near the optimum two or three are enough
 _MAX_SIGMAS = 3.0  # prior standard deviations: range of the grid, and of estimates that hardly exceed the prior
 _GRID = 0.02  # largest spacing, in the logarithm, of starting values for Newton's method
+_CONVERGED = 0.25  # standard deviations that the last registration of the edges moves the estimate: see method.md
 _MIN_SHARE = 0.3  # of the way to the optimum that a step goes: ten rendered runs have 0.25 to 0.75, see method.md
 _DERIVATIVE_ERROR = 0.3  # relative, of an estimate: noise of the derivatives biases it to 0, by 29 % on the bundled box
 
@@ -127,7 +128,7 @@ class MovingGraph:
 
 
 def estimate_focal_length(
-    estimate_at: Callable[[float], FocalLength], *, rounds: int, tolerance: float, reach: float
+    estimate_at: Callable[[float], FocalLength], *, rounds: int, reach: float, tolerance: float = _CONVERGED
 ) -> FocalLength:
     """Return the focal length, estimated iteratively from edges registered under each estimate (method.md, eq. S2).
 
@@ -138,8 +139,8 @@ def estimate_focal_length(
         estimate_at: returns the estimate by edges registered under a focal length, relative to it; its argument is the
             logarithm of this focal length over the given one.
         rounds: largest number of registrations of the edges.
-        tolerance: step in standard deviations below which the iteration ends.
         reach: largest absolute logarithm.
+        tolerance: step in standard deviations below which the iteration ends.
     """
     first = estimate = estimate_at(0.0)
     centre, share = 0.0, 1.0

@@ -409,7 +409,7 @@ class Run:
                 state, at = moved.reregistered(self.modeler.tracker(moved).spans), log_factor
             return MovingGraph.of(state.graph, state.solution).estimate(sigma, -at)
 
-        focal = estimate_focal_length(estimate_at, rounds=_FOCAL_ROUNDS, tolerance=0.25, reach=_FOCAL_REACH * sigma)
+        focal = estimate_focal_length(estimate_at, rounds=_FOCAL_ROUNDS, reach=_FOCAL_REACH * sigma)
         return (state if focal.log_factor == at else state.under(focal.log_factor - at, sensor)), focal
 
     def _step(self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge]) -> Step:

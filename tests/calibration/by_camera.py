@@ -44,6 +44,7 @@ NOMINAL: Final = 0.02
 STEPS_DEG: Final = (12.0, 25.0, 40.0)
 _RENDERER: Final = "our renderer"
 _CLASSES: Final = ("asymmetric", "near-symmetric", "n-fold", "revolution")
+_HEAD: Final = f"{'pairs':>5}{'NEES/6':>8}{'± se':>7}{'median':>8}{'50 %':>6}{'95 %':>6}"
 
 
 @final
@@ -182,9 +183,6 @@ def judged(trial: Trial, posterior: Posterior, truth: Array, source: RayImage, t
     )
 
 
-_HEAD: Final = f"{'pairs':>5}{'NEES/6':>8}{'± se':>7}{'median':>8}{'50 %':>6}{'95 %':>6}"
-
-
 def summary(trials: Sequence[Trial]) -> str:
     """Return NEES/6, its standard error and median, and the coverage of some answers in words of a table."""
     usable = [one for one in trials if one.usable]
@@ -204,10 +202,10 @@ def standard_error(values: Array, shapes: Sequence[str]) -> float:
 
     Args:
         values: (n,).
-        shapes: of each.
+        shapes: (n,) names.
     """
-    deviations = values - values.mean()
-    sums = np.array([deviations[[shape == one for one in shapes]].sum() for shape in set(shapes)])
+    _, numbers = np.unique(shapes, return_inverse=True)
+    sums = np.bincount(numbers, values - values.mean())
     if len(sums) < 2:
         return float("nan")
     return float(np.sqrt(len(sums) / (len(sums) - 1) * np.sum(sums**2)) / len(values))
