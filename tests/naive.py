@@ -87,6 +87,8 @@ def visibility(pose, projection, parameters):
             seen = np.log((1 - hidden) * np.exp(max(match, -700)) + hidden)
             if in_front > 0 and match < np.log(hidden):
                 seen = max(match, -max_point_cost)
+            if in_front <= 0:
+                seen *= 1 - np.clip((square - 9) / (36 - 9), 0, 1)
             gain = faces * seen
             if in_front > 0:
                 gain -= (1 - faces) * min(0.5 * square, max_point_cost)

@@ -33,6 +33,8 @@ MIN_AGREEMENT = np.float32(0.8)
 """Least cosine between the normals of a point and of the surface that it matches."""
 MAX_SIGMAS = np.float32(3.0)
 """Largest distance of a match from the surface in standard deviations."""
+HIDDEN_SIGMAS = np.float32(6.0)
+"""Distance behind the surface in standard deviations from which on a point is hidden, and no inexact match."""
 
 LOOSE_SIGMAS = 4.0
 """The same for `classify`: possible noise is not counted as a contradiction."""
@@ -48,6 +50,7 @@ _OF_SURFACE, _OF_BACKGROUND, _OF_NOTHING = np.float32(SURFACE), np.float32(BACKG
 # newly compiled kernel would not return the same bits as a cached one.
 VECTOR_MATHS = {"contract", "arcp", "nsz", "reassoc"}
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)  # a plain 0.5 would promote to double precision
+MATCH_LIMIT, HIDDEN_FROM = HALF * MAX_SIGMAS * MAX_SIGMAS, HALF * HIDDEN_SIGMAS * HIDDEN_SIGMAS
 
 # Rows of the points, and of `transform_points`.
 VARIANCE_M2, COLUMN, ROW = 6, 7, 8
@@ -256,11 +259,13 @@ def sum_over_points(points, transformed, looked_up, parameters):
         # With the expected deficit due to the fixed pattern, which is the same in both views (eq. 27).
         misfit = half_square + HALF * transformed[PATTERN, j]
         match = parameters.typical_misfit - misfit - parameters.normal_cost * (ONE - agreement)
-        matches = (half_square < HALF * MAX_SIGMAS * MAX_SIGMAS) & (agreement > MIN_AGREEMENT)
+        matches = (half_square < MATCH_LIMIT) & (agreement > MIN_AGREEMENT)
         position = (min(max(match, TABLE_LOW), TABLE_HIGH) - TABLE_LOW) * _PER_STEP
         node = min(np.int32(position), last)
         low, high = table[np.uint32(node)], table[np.uint32(node + np.int32(1))]
         seen = low + (position - np.float32(node)) * (high - low)
+        decided = min(max((half_square - MATCH_LIMIT) / (HIDDEN_FROM - MATCH_LIMIT), ZERO), ONE)
+        seen = seen if in_front > ZERO else (ONE - decided) * seen
         # A point in front of the measured surface cannot be occluded.
         seen = max(match, -max_point_cost) if (in_front > ZERO) & (match < log_hidden) else seen
         on_surface = faces * seen - ((ONE - faces) * min(half_square, max_point_cost) if in_front > ZERO else ZERO)

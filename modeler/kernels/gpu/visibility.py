@@ -37,7 +37,8 @@ DISTANCE, POINT_VARIANCE = wp.constant(planes.DISTANCE), wp.constant(twin.VARIAN
 COLUMN, ROW = wp.constant(twin.COLUMN), wp.constant(twin.ROW)
 TABLE_LOW, TABLE_HIGH = wp.constant(float(twin.TABLE_LOW)), wp.constant(float(twin.TABLE_HIGH))
 LAST, PER_STEP = wp.constant(twin.TABLE_STEPS - 1), wp.constant(float(twin._PER_STEP))
-MIN_AGREEMENT, MAX_SIGMAS = wp.constant(float(twin.MIN_AGREEMENT)), wp.constant(float(twin.MAX_SIGMAS))
+MIN_AGREEMENT = wp.constant(float(twin.MIN_AGREEMENT))
+MATCH_LIMIT, HIDDEN_FROM = wp.constant(float(twin.MATCH_LIMIT)), wp.constant(float(twin.HIDDEN_FROM))
 
 Pair = tuple[Projection, Projection, LikelihoodParameters, LikelihoodParameters]
 
@@ -98,8 +99,10 @@ def of_surface(
         hidden = wp.min(half_square, of.max_point_cost)
         if match < table[0]:
             seen = wp.max(match, -of.max_point_cost)
+    else:
+        seen *= 1.0 - wp.clamp((half_square - MATCH_LIMIT) / (HIDDEN_FROM - MATCH_LIMIT), 0.0, 1.0)
     explained = wp.float32(0.0)
-    if half_square < 0.5 * MAX_SIGMAS * MAX_SIGMAS and agreement > MIN_AGREEMENT:
+    if half_square < MATCH_LIMIT and agreement > MIN_AGREEMENT:
         explained = faces
     return faces * seen - (1.0 - faces) * hidden, explained
 

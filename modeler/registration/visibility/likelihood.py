@@ -67,11 +67,9 @@ class VisibilityLikelihood:
     surface_detail: float = 0.003
     """Least error of local planes on a curved surface, as a fraction of the object's size."""
     hidden_share: float = 0.5
-    """Prior probability η that a point that faces the other camera is hidden by another part of the object.
-
-    Points behind the measured surface cost -log η. With a lower value, the inside of a bowl, which is hidden at any
-    turn, would indicate zero rotation.
-    """
+    """Prior probability η that a point that faces the other camera is hidden by another part of the object."""
+    missing_share: float = 0.5
+    """Prior probability that surface that faces the camera is not measured; 1 = holes are no evidence."""
     max_point_cost: float = 10.0
     """Upper bound K (nats) of the cost of one point."""
     normal_cost: float = 2.0
@@ -169,7 +167,7 @@ class DirectedLikelihood:
             clearance_m=np.float32(3.0 * self.image.sigma_r_m),
             max_point_cost=np.float32(self.model.max_point_cost),
             normal_cost=np.float32(self.model.normal_cost),
-            unmeasured_gain=np.float32(np.log(max(self.model.hidden_share, 1.0 - self.image.measured_share))),
+            unmeasured_gain=np.float32(np.log(max(self.model.missing_share, 1.0 - self.image.measured_share))),
             typical_misfit=np.float32(typical_misfit),
             support=self._support(blur_m),
             table=_match_table(self.model.hidden_share),
@@ -371,6 +369,11 @@ class PairLikelihood:
             return self  # with its cached projections
         forward, backward = (replace(side, rim_m=rim_m) for side in (self.forward, self.backward))
         return replace(self, forward=forward, backward=backward)
+
+    def without_holes(self) -> PairLikelihood:
+        """Return the pair for which surface that should be seen where nothing was measured is no evidence."""
+        model = replace(self.forward.model, missing_share=1.0)
+        return replace(self, forward=replace(self.forward, model=model), backward=replace(self.backward, model=model))
 
     def overlap(self, target_from_source: Array) -> float:
         """Return the fraction of matches among the points that both cameras should see."""

@@ -47,20 +47,6 @@ class ModeSamples:
     typical_misfit: float
     """Misfit μ of a typical match (nats)."""
 
-    def compared(self, pair: PairLikelihood, reference: ModeSamples) -> WeightedSamples:
-        """Return the samples with their evidence under the nuisance parameters of another mode (method.md, eq. 13).
-
-        Its own noise estimate would favour a mode that matches badly.
-        """
-        if reference is self:
-            return self.samples
-        samples, best = self.samples, int(np.argmax(self.samples.log_likelihoods))
-        own, referred = (
-            float(pair.tempered(samples.poses[best : best + 1], one.noise_m, typical_misfit=one.typical_misfit)[0])
-            for one in (self, reference)
-        )
-        return replace(samples, log_evidence=samples.log_evidence + referred - own)
-
 
 @dataclass(frozen=True)
 class VisibilityRegistrar(AbstractRegistrar):
@@ -114,8 +100,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         noisy = pair.with_rim_m(pair.noises_m(found.poses[0], self.search.fine_m(pair))[1])
         modes_found = found.modes(pair.centre_m, self.search.extent(pair))[: self.max_modes]
         sampled = [self._sampled(noisy, density, mode, rng) for mode in modes_found]
-        reference = min(sampled, key=lambda mode: mode.noise_m)
-        compared = [mode.compared(noisy, reference) for mode in sampled]
+        compared = comparable(sampled, noisy)
         if found.open_rotation:
             compared = overlapping(compared, pair.overlap, self.min_overlap)
         dense = self.likelihood.denser(noisy, rng)
@@ -223,6 +208,28 @@ class VisibilityRegistrar(AbstractRegistrar):
     def _is_ambiguous(self, pose: PoseGaussian) -> bool:
         sigma_rad = np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])
         return bool(sigma_rad > np.deg2rad(self.max_sigma_deg))
+
+
+def comparable(modes: list[ModeSamples], pair: PairLikelihood) -> list[WeightedSamples]:
+    """Return the samples of modes with evidence that can be compared (method.md, eq. 13).
+
+    All modes get the nuisance parameters of the one that matches best, as its own noise estimate would favour a mode
+    that matches badly. Holes are left out: of modes that look alike, the one that moves less surface into shadows would
+    win.
+    """
+    if len(modes) == 1:
+        return [modes[0].samples]
+    reference = min(modes, key=lambda mode: mode.noise_m)
+    compared, gains = pair.without_holes(), []
+    for mode in modes:
+        best = mode.samples.poses[[np.argmax(mode.samples.log_likelihoods)]]
+        common = compared.tempered(best, reference.noise_m, typical_misfit=reference.typical_misfit)
+        gains.append(float((common - pair.tempered(best, mode.noise_m, typical_misfit=mode.typical_misfit))[0]))
+    of_reference = gains[modes.index(reference)]
+    return [
+        replace(mode.samples, log_evidence=mode.samples.log_evidence + gain - of_reference)
+        for mode, gain in zip(modes, gains, strict=True)
+    ]
 
 
 def overlapping(
