@@ -32,8 +32,10 @@ class RangeNoise(NamedTuple):
 
     Errors that averaging removes, such as the steps of a disparity, do not count beside smooth ones.
     """
-    sigma_inverse_per_m: float = 0.0
+    sigma_inverse_per_m: float
     """Standard deviation of inverse depth in 1/m of errors averaged as smoothing does."""
+    pixel_sigma_inverse_per_m: float
+    """The same of single pixels."""
     pattern_share: float | None = None
     """Share of the variance of errors, averaged as smoothing does, that repeats from frame to frame; None if no two
     frames show the same plane."""
@@ -60,9 +62,10 @@ def range_noise(looks: Sequence[tuple[Frame, BoolArray]]) -> RangeNoise | None:
         if sigma == 0.0:
             continue
         # Averaging changes the variance, but not the integral of the autocovariance.
-        integral_px = float(np.mean(noise**2)) * _correlated_area(noise.reshape(-1, tile_px, tile_px))
+        variance = float(np.mean(noise**2))
+        integral_px = variance * _correlated_area(noise.reshape(-1, tile_px, tile_px))
         area_px = _area_before_averaging(integral_px / sigma**2)
-        return RangeNoise(area_px, sigma, _pattern_share(smoothed, calm))
+        return RangeNoise(area_px, sigma, variance**0.5, _pattern_share(smoothed, calm))
     return None
 
 

@@ -32,6 +32,8 @@ class Sensor:
     smoothing: float = 0.24
     """Radius of the ball in which planes are fitted, as a share of the geometric mean of noise and object's extent.
 
+    The noise is `sigma_r_m`, or that of pixels of planes around the object if it is less.
+
     Smoothing over a ball of radius r displaces a surface whose radius of curvature is about the extent by r² / extent,
     away from the camera, so that the image of a turning object lags behind it. With this radius the displacement is the
     same share of the noise, whatever the noise (method.md, eq. 1).
@@ -45,6 +47,8 @@ class Sensor:
     """
     sigma_inverse_per_m: float = 0.0
     """Standard deviation of inverse depth in 1/m of the errors of smoothed surface; `measured` has that of a scene."""
+    pixel_sigma_inverse_per_m: float = math.inf
+    """The same of single pixels; infinite = unknown."""
     pattern_share: float = 0.0
     """Share of the variance of errors that is fixed-pattern noise: a pixel repeats it from frame to frame.
 
@@ -61,7 +65,11 @@ class Sensor:
             return self
         share = self.pattern_share if noise.pattern_share is None else noise.pattern_share
         return replace(
-            self, noise_area_px=noise.area_px, sigma_inverse_per_m=noise.sigma_inverse_per_m, pattern_share=share
+            self,
+            noise_area_px=noise.area_px,
+            sigma_inverse_per_m=noise.sigma_inverse_per_m,
+            pixel_sigma_inverse_per_m=noise.pixel_sigma_inverse_per_m,
+            pattern_share=share,
         )
 
     def refocused(self, view: RayImage, log_factor: float) -> RayImage:
@@ -164,8 +172,9 @@ class Sensor:
         extent_m = metres_per_px * float(np.hypot(np.ptp(rows), np.ptp(columns)))
         density = rows.size / float(outline.sum())
         sparse_px = np.sqrt(self.min_neighbours / (np.pi * max(density, 0.01)))
-        # method.md, eq. 1
-        radius_m = max(self.smoothing * np.sqrt(self.sigma_r_m * extent_m), sparse_px * metres_per_px)
+        # method.md, eq. 1; no more noise than stated, as unevenness of planes adds to theirs
+        noise_m = min(self.pixel_sigma_inverse_per_m * middle_m**2, self.sigma_r_m)
+        radius_m = max(self.smoothing * np.sqrt(noise_m * extent_m), sparse_px * metres_per_px)
         reach_px = int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, max(16, np.ceil(1.2 * sparse_px))))
         # A stride of 2 px is enough where a wide window holds many pixels.
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours

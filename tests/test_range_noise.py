@@ -45,6 +45,7 @@ def test_the_correlated_area_is_found_whatever_the_strength(sigma_inverse_per_m:
     lags = np.abs(np.subtract.outer(np.arange(6), np.arange(6)))
     correlation = np.exp(-((lags / (2.0 * width_px)) ** 2)) if width_px else np.eye(6)
     assert noise.sigma_inverse_per_m == pytest.approx(sigma_inverse_per_m * correlation.mean(), rel=0.1)
+    assert noise.pixel_sigma_inverse_per_m == pytest.approx(sigma_inverse_per_m, rel=0.05 if width_px < 3.0 else 0.1)
 
 
 def test_errors_that_averaging_removes_do_not_hide_smooth_ones() -> None:
@@ -100,10 +101,23 @@ def test_a_scene_tells_the_sensor() -> None:
         0.0007,
         noise_area_px=noise.area_px,
         sigma_inverse_per_m=noise.sigma_inverse_per_m,
+        pixel_sigma_inverse_per_m=noise.pixel_sigma_inverse_per_m,
         pattern_share=noise.pattern_share,
     )
     assert Sensor().measured(noise._replace(pattern_share=None)).pattern_share == Sensor().pattern_share
     assert Sensor().measured(Segmenter().scene([]).range_noise) == Sensor()
+
+
+def test_balls_are_smaller_where_planes_show_less_noise_than_stated() -> None:
+    frame = plane_frame(1e-3, 0.0)
+    stated = Sensor(sigma_r_m=0.004, min_neighbours=5.0)
+
+    def ball_px(sensor: Sensor) -> float:
+        return sensor.ray_image(frame).error_area_px - sensor.noise_area_px
+
+    quarter, more = (replace(stated, pixel_sigma_inverse_per_m=share * 0.004 / 0.7**2) for share in (0.25, 2.0))
+    assert ball_px(quarter) == pytest.approx(0.25 * ball_px(stated))  # ρ² is proportional to the noise: eq. 1
+    assert ball_px(more) == ball_px(stated)  # the planes may be uneven
 
 
 def test_the_more_pixels_err_alike_the_fewer_patches_a_view_has() -> None:

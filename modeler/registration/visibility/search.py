@@ -138,8 +138,8 @@ class Search:
         inside = np.isfinite(density.log_evidence(poses))
         outside = poses[~inside]
         poses, part = (poses[inside], part[inside]) if inside.any() else (started, part)
-        blur_m = self._noise_m(pair, poses)
-        likelihoods = pair.tempered(poses, blur_m, stride=_STRIDE)
+        blur_m, misfit = self._nuisance(pair, poses)
+        likelihoods = pair.tempered(poses, blur_m, typical_misfit=misfit, stride=_STRIDE)
         # One alternative may be far denser than another, so that the likelihood alone does not rank modes.
         scores = likelihoods + density.log_evidence(poses) if len(parts) > 1 else likelihoods
         order = np.argsort(-scores, kind="stable")
@@ -154,7 +154,7 @@ class Search:
         found = found.distinct(pair.centre_m)
         if not len(outside):
             return found
-        gains = pair.tempered(outside, blur_m, stride=_STRIDE) - likelihoods[order[0]]
+        gains = pair.tempered(outside, blur_m, typical_misfit=misfit, stride=_STRIDE) - likelihoods[order[0]]
         best = int(np.argmax(gains))
         return replace(found, beyond_gain=float(gains[best]), beyond=outside[best : best + 1])
 
@@ -191,14 +191,16 @@ class Search:
             remaining &= np.linalg.norm(distances, axis=1) > 1.0
         return motions[kept]
 
-    def _noise_m(self, pair: PairLikelihood, poses: Array) -> float:
-        """Return the noise of surfaces at the best of some poses (n, 4, 4), and at least the smallest blur.
+    def _nuisance(self, pair: PairLikelihood, poses: Array) -> tuple[float, float]:
+        """Return the noise b in m and the misfit μ of a typical match at the best of some poses (n, 4, 4).
 
-        With less, likelihoods of poses that fit equally well differ by the noise, so that all but one would be dropped.
+        b is at least the smallest blur. With less noise, likelihoods of poses that fit equally well would differ by
+        chance, and with a larger misfit by their numbers of matches, so that all but one would be dropped.
         """
         fine_m = self.fine_m(pair)
-        best = np.argmax(pair.tempered(poses, fine_m, stride=_COARSE_STRIDE))
-        return max(pair.noises_m(poses[best], fine_m)[0], fine_m)
+        best = poses[np.argmax(pair.tempered(poses, fine_m, stride=_COARSE_STRIDE))]
+        blur_m = max(pair.noises_m(best, fine_m)[0], fine_m)
+        return blur_m, pair.typical_misfit(best, blur_m)
 
     def _regulariser(self, pair: PairLikelihood, prior: PoseGaussian) -> Regulariser:
         """Return the regulariser of a descent: the prior's Gaussian, and damping (method.md, eq. 10).
